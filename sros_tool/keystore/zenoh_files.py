@@ -39,7 +39,7 @@ from sros_tool.names import is_expression
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
-from sros_tool.pki.crl import SUPERSEDED, load_crl
+from sros_tool.pki.crl import SUPERSEDED, RevocationList, load_crl
 from sros_tool.policy.model import ALLOW, RIGHTS, Enclave, Source
 from sros_tool.policy.patterns import overlap
 from sros_tool.policy.rights import Right, Rules, nodes_from_text, parts
@@ -217,8 +217,7 @@ def _before_revocation(configuration: Configuration, state: OpenedEnclave) -> st
         crl = load_crl(data, CRL_FILE)
     except SrosError:
         return ""  # a problem of the enclave that is told elsewhere
-    dates = [iso(each.date) for each in crl.revoked if each.reason != SUPERSEDED]
-    if configuration.revoked >= max(dates, default=""):
+    if configuration.revoked >= last_revocation(lists=(crl,)):
         return ""
     return f"it is from before the last revocation in {CRL_FILE}, and may give the revoked rights"
 
@@ -296,16 +295,15 @@ class ZenohChange:
     """What a transaction changes in the enclaves of a keystore, as far as Zenoh depends on it.
 
     ``issued`` are the new permissions of enclaves, ``gone`` the enclaves that are revoked,
-    ``replaced`` those whose earlier certificates are; ``revoked`` is when the last enclave is
-    revoked, if the transaction does it.  ``stated`` are the policies of the enclaves, by whose
-    lines errors are told.
+    ``replaced`` those whose earlier certificates are; ``recorded`` are the entries that it adds to
+    the ledger.  ``stated`` are the policies of the enclaves, by whose lines errors are told.
     """
 
     issued: Mapping[str, SignedRights] = field(default_factory=dict)
     gone: Collection[str] = ()
     replaced: Collection[str] = ()
     stated: Mapping[str, Enclave | None] = field(default_factory=dict)
-    revoked: str = ""
+    recorded: Sequence[Entry] = ()
 
 
 NO_CHANGE = ZenohChange()
@@ -440,7 +438,8 @@ def zenoh_documents(
         read |= each
     rules = {name: each for name, each in read.items() if not isinstance(each, str)}
     left_out = {name: each for name, each in read.items() if isinstance(each, str)}
-    revoked = max(last_revocation(reader.ledger.entries), change.revoked)
+    recorded = (*reader.ledger.entries, *change.recorded)
+    revoked = last_revocation(recorded, keystore.revocation_lists)
     try:
         files = _router_files(network, of_network, rules, revoked)
     except TooManyExpressions:
@@ -489,11 +488,21 @@ def zenoh_documents(
     return ZenohDocuments(files, enclaves, left_out, nodes, existing, reader.ledger)
 
 
-def last_revocation(entries: Iterable[Entry]) -> str:
-    """Return when an enclave was revoked last, by entries of the ledger; "" if none was."""
-    moments = (
+def last_revocation(entries: Iterable[Entry] = (), lists: Iterable[RevocationList] = ()) -> str:
+    """Return when an enclave was revoked last, by entries of the ledger and by lists; "" if never.
+
+    Certificates that were replaced by others of the same enclave do not count: their reason is
+    `SUPERSEDED`.
+    """
+    moments = [
         entry.time for entry in entries if entry.what == "revocation" and entry.reason != SUPERSEDED
-    )
+    ]
+    moments += [
+        iso(revoked.date)
+        for revocations in lists
+        for revoked in revocations.revoked
+        if revoked.reason != SUPERSEDED
+    ]
     return max(moments, default="")
 
 

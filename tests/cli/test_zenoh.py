@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ import pytest
 from sros_tool.keystore import zenoh_files
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
+from sros_tool.pki.crl import Revoked, sign_crl
+from sros_tool.pki.keys import load_key
 from sros_tool.policy.rights import NodeName
 from sros_tool.translate_zenoh.rights import StatedRight, remote_of
 from sros_tool.zenoh.access import AccessRule, Flow, Message, RemoteRights, in_order
@@ -246,6 +249,33 @@ def test_a_file_of_before_a_revocation_is_refused_where_the_list_is_newer(folder
     assert "it is from before the last revocation in crl.pem" in checked.out
     refused = sros("env", "robot", "/a", "--rmw", "rmw_zenoh_cpp", cwd=folder)
     assert (refused.status, "before the last revocation" in refused.err) == (2, True)
+
+
+@pytest.mark.parametrize("reason", ["keyCompromise", "superseded"])
+def test_files_are_in_step_after_a_revocation_for_any_reason(reason: str, folder: Path) -> None:
+    sros("zenoh", "ks", "--mode", "peer", cwd=folder).ok()
+    sros("revoke", "ks", "/b", "--reason", reason, cwd=folder).ok()
+    sros("zenoh", "ks", "--check", cwd=folder).ok()
+    sros("env", "ks", "/a", "--rmw", "rmw_zenoh_cpp", cwd=folder).ok()
+
+
+def test_a_revocation_that_is_in_the_list_alone_counts(folder: Path) -> None:
+    """The ledger does not have what another program put into the list."""
+    sros("zenoh", "ks", "--mode", "peer", cwd=folder).ok()
+    sros("revoke", "ks", "/b", cwd=folder).ok()
+    home = folder / "ks"
+    authority = Keystore(home).ca_certificate("identity")
+    key = load_key((home / "private/identity_ca.key.pem").read_bytes(), "key")
+    now = datetime.now(UTC)
+    more = (Revoked(99, now + timedelta(minutes=1)),)
+    list_file = (home / "public/identity_ca.crl.pem").resolve()
+    list_file.write_bytes(
+        sign_crl(authority, key, more, number=9, this_update=now, next_update=now + timedelta(9))
+    )
+    env = ("env", "ks", "/a", "--rmw", "rmw_zenoh_cpp")
+    assert "before the last revocation" in sros(*env, cwd=folder).err
+    sros("zenoh", "ks", cwd=folder).ok()
+    sros(*env, cwd=folder).ok()
 
 
 def test_a_file_of_an_earlier_version_is_refused_with_what_to_do(

@@ -50,7 +50,6 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.keys import PublicKey
 from sros_tool.pki.token import TokenUri
 from sros_tool.policy.model import Enclave
-from sros_tool.validity import iso
 from sros_tool.zenoh.configuration import ZenohNetwork, check_network
 
 if TYPE_CHECKING:
@@ -384,9 +383,7 @@ class KeystoreChange:
         if self.template.zenoh is None:
             return
         from sros_tool.keystore.issuing.zenoh import keep_zenoh
-        from sros_tool.keystore.zenoh_files import ZenohChange, last_revocation
-
-        revoked = max(last_revocation(self.entries), iso(self.now) if gone else "")
+        from sros_tool.keystore.zenoh_files import ZenohChange
 
         self.zenoh = keep_zenoh(
             self.transaction,
@@ -397,7 +394,7 @@ class KeystoreChange:
             signer=lambda: self.permissions,
             now=self.now,
             change=ZenohChange(
-                issued, gone=gone, replaced=replaced, stated=stated or {}, revoked=revoked
+                issued, gone=gone, replaced=replaced, stated=stated or {}, recorded=self.entries
             ),
         ).without(created)
         self.notes += self.zenoh.notes
