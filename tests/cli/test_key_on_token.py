@@ -203,6 +203,7 @@ def test_the_pin_reaches_the_node_of_its_token_and_no_other(root: Path, tmp_path
     file.chmod(0o644)
     refused = sros("run", root, "/arm", "--", "true", env={**os.environ, **FAST})
     assert (refused.status, "chmod 600" in refused.err) == (2, True)
+    assert "is missing or not protected" in refused.err
     assert "[enclave.pin-file]" in sros("check", "keystore", root).out
     file.unlink()
     refused = sros("run", root, "/arm", "--", "true", env={**os.environ, **FAST})

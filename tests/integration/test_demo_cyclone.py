@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
+import os
 import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -19,19 +22,16 @@ from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime import cyclone
 from sros_tool.runtime.cyclone import load_cyclone
-from tests.support.children import PATIENCE
+from tests.support.children import apart
 
 pytestmark = pytest.mark.dds
 
 DOMAIN = 110
 
 PREAMBLE = """
-import os, sys, time
+import os, time
 from pathlib import Path
 from sros_tool.runtime.cyclone import DdsError, Participant, Publication, SecurityRefusedError
-from sros_tool.runtime.netns import enter_isolation, try_isolation
-if try_isolation().isolated:
-    enter_isolation()
 from sros_tool.runtime.variables import choose_enclave, domain_of
 def join():
     return Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
@@ -70,16 +70,15 @@ def child(keystores: KeystoreSet) -> Callable[[Identity, str], list[str]]:
     """Runs code in a process of its own with an identity; returns the lines that it prints."""
 
     def run(identity: Identity, code: str, domain: int = DOMAIN) -> list[str]:
-        environment = {"PATH": "/usr/bin:/bin", **keystores.environment(identity, domain)}
-        done = subprocess.run(
-            [sys.executable, "-c", PREAMBLE + textwrap.dedent(code)],
-            env={**environment, "PYTHONPATH": str(Path(__file__).parents[2])},
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE,
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout.splitlines()
+        def work() -> list[str]:
+            os.environ.clear()
+            os.environ.update(keystores.environment(identity, domain))
+            said = io.StringIO()
+            with redirect_stdout(said):
+                exec(PREAMBLE + textwrap.dedent(code), {})
+            return said.getvalue().splitlines()
+
+        return apart(work)
 
     return run
 

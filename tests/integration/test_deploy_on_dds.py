@@ -21,8 +21,8 @@ from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.runtime.environment import secured_environment
 from tests.integration.converse import converse, listener, talker
-from tests.support.children import importing, python, run
-from tests.support.harness import policy_text, publish, snapshot
+from tests.support.children import importing, run
+from tests.support.harness import forked, policy_text, publish, snapshot
 
 pytestmark = pytest.mark.dds
 
@@ -102,6 +102,6 @@ def test_what_run_starts_is_what_dds_loads(home: Path, tmp_path: Path) -> None:
     made = create_request(robot, CAMERA)
     archive = sign_request(home, made.file.read_bytes(), now=datetime.now(UTC)).archive
     import_answer(robot, archive, now=datetime.now(UTC))
-    done = python("-m", "sros_tool", "run", robot, CAMERA, "--", "env")
+    done = forked("run", robot, CAMERA, "--", "env")
     expected = secured_environment(robot, CAMERA, DOMAIN)
-    assert {f"{name}={value}" for name, value in expected.items()} <= set(done.stdout.split("\n"))
+    assert {f"{name}={value}" for name, value in expected.items()} <= set(done.ok().out.split("\n"))

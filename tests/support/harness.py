@@ -46,7 +46,16 @@ class Ended:
 def sros(
     *arguments: object, env: Mapping[str, str | None] | None = None, cwd: Path | None = None
 ) -> Ended:
-    """Run the program in this process; a value None in ``env`` unsets the variable."""
+    """Run the program in this process; a value None in ``env`` unsets the variable.
+
+    It executes no command, which would take the place of the tests: a test fails where it would.
+    """
+    executed: list[object] = []
+
+    def execute(*command: object) -> NoReturn:
+        executed.append(command)
+        raise SystemExit
+
     words = [str(argument) for argument in arguments]
     before = dict(os.environ), Path.cwd(), sys.argv, signal.getsignal(signal.SIGTERM), os.execve
     out = io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True)
@@ -60,7 +69,7 @@ def sros(
         if cwd:
             os.chdir(cwd)
         sys.argv = ["sros", *words]
-        os.execve = _refuse_to_execute  # type: ignore[assignment]
+        os.execve = execute  # type: ignore[assignment]
         with redirect_stdout(out), redirect_stderr(err):
             try:
                 main(words)
@@ -73,6 +82,7 @@ def sros(
         sys.argv = before[2]
         signal.signal(signal.SIGTERM, before[3])
         os.execve = before[4]
+    assert not executed, f"a command was executed: {executed}"
     said = [stream.buffer.getvalue().decode(errors="replace") for stream in (out, err)]
     return Ended(status, *said)
 
@@ -192,11 +202,6 @@ def _become_program(
 def _read(descriptor: int) -> str:
     with open(descriptor, "rb") as pipe:
         return pipe.read().decode(errors="replace")
-
-
-def _refuse_to_execute(*_: object) -> NoReturn:
-    # It would end the tests, and with the status of the command.
-    raise AssertionError("a command was executed")
 
 
 def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
