@@ -779,8 +779,12 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
 
     def is_announced(domain: int, right: str, name: str) -> bool:
         last = (name.replace("/", "%"), "type/hash/qos")
+        ns, _, node_name = name.rpartition("/")[0].rpartition("/")
+        # A service of a node itself is announced by that node alone.
+        its_own = tuple(part.replace("/", "%") for part in (enclave, ns or "/", node_name))
         tokens = (
-            "/".join((f"@ros2_lv/{domain}/z/0/1", kinds[right], *node, *last)) for node in nodes
+            "/".join((f"@ros2_lv/{domain}/z/0/1", kinds[right], *node, *last))
+            for node in (*nodes, its_own)
         )
         announcing = (enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN)
         return any(control.allows(*announcing, token) for token in tokens)

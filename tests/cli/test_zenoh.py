@@ -19,7 +19,8 @@ from sros_tool.pki.crl import Revoked, sign_crl
 from sros_tool.pki.keys import load_key
 from sros_tool.policy.rights import NodeName
 from sros_tool.translate_zenoh.rights import StatedRight, remote_of
-from sros_tool.zenoh.access import AccessRule, Flow, Message, RemoteRights, in_order
+from sros_tool.zenoh.access import AccessRule, Flow, Message, Remote, RemoteRights, in_order
+from sros_tool.zenoh.document import parse_configuration
 from tests.support.harness import policy_text, publish, snapshot, sros
 
 TOKEN = (Message.LIVELINESS_TOKEN,)
@@ -368,3 +369,24 @@ def test_rules_that_are_not_the_permissions_are_not_written(
     ended = sros("zenoh", "ks", cwd=folder)
     assert (ended.status, "would not have the intended content" in ended.err) == (2, True)
     assert snapshot(folder) == before
+
+
+def test_a_node_in_any_namespace_announces_its_own_services(folder: Path) -> None:
+    """Of ``*/n/get_parameters``, the name ``/n/get_parameters`` is of the node /n alone."""
+    (folder / "any.xml").write_text(
+        '<policy version="0.2.0"><enclaves><enclave path="/a"><profiles><profile ns="*" node="n">'
+        '<services reply="ALLOW"><service>~/get_parameters</service></services>'
+        "</profile></profiles></enclave></enclaves></policy>"
+    )
+    sros("create_permission", "ks", "/a", "any.xml", cwd=folder).ok()
+    sros("zenoh", "ks", cwd=folder).ok()
+    access = parse_configuration((folder / "ks" / ROUTER).read_bytes(), ROUTER).access
+    announcing = (Remote("/a"), Flow.INGRESS, Message.LIVELINESS_TOKEN)
+    for node, service, announced in (
+        ("%/n", "%n", True),
+        ("%x/n", "%x%n", True),
+        ("%x/n", "%n", False),
+        ("%/m", "%m", False),
+    ):
+        token = f"@ros2_lv/0/z/0/1/SS/%a/{node}/{service}%get_parameters/type/hash/qos"
+        assert access.decide(*announcing, token).allowed is announced, token

@@ -30,6 +30,7 @@ TYPE = "std_msgs::msg::dds_::String_/RIHS01_" + "0" * 64
 BUFFERS = ("_buf_cpu", "_buf/0a1b")
 """Where images of /chatter would be sent, below its key (`sros_tool.zenoh.releases`)."""
 GRAPH = "@ros2_lv/0/**"
+MOST_TOKENS = 1_000_000
 WITHIN = 60.0
 """Seconds within which what is allowed has to happen; usually it takes parts of one."""
 PAUSE = 0.5
@@ -194,8 +195,11 @@ def nodes(session: zenoh.Session) -> set[str]:
 
 
 def tokens_of(session: zenoh.Session) -> list[list[str]]:
-    """The parts of all tokens that a session sees."""
-    found = session.liveliness().get(GRAPH, timeout=5.0)
+    """The parts of all tokens that a session sees.
+
+    What the session knows is in the channel before it can be read: more than its size blocks it.
+    """
+    found = session.liveliness().get(GRAPH, zenoh.handlers.FifoChannel(MOST_TOKENS), timeout=5.0)
     return [str(each.ok.key_expr).split("/") for each in found if each.ok is not None]
 
 
