@@ -217,7 +217,7 @@ def _before_revocation(configuration: Configuration, state: OpenedEnclave) -> st
         crl = load_crl(data, CRL_FILE)
     except SrosError:
         return ""  # a problem of the enclave that is told elsewhere
-    if configuration.revoked >= last_revocation(lists=(crl,)):
+    if configuration.revoked >= _last_revocation(lists=(crl,)):
         return ""
     return f"it is from before the last revocation in {CRL_FILE}, and may give the revoked rights"
 
@@ -439,7 +439,7 @@ def zenoh_documents(
     rules = {name: each for name, each in read.items() if not isinstance(each, str)}
     left_out = {name: each for name, each in read.items() if isinstance(each, str)}
     recorded = (*reader.ledger.entries, *change.recorded)
-    revoked = last_revocation(recorded, keystore.revocation_lists)
+    revoked = _last_revocation(recorded, keystore.revocation_lists)
     try:
         files = _router_files(network, of_network, rules, revoked)
     except TooManyExpressions:
@@ -488,7 +488,7 @@ def zenoh_documents(
     return ZenohDocuments(files, enclaves, left_out, nodes, existing, reader.ledger)
 
 
-def last_revocation(entries: Iterable[Entry] = (), lists: Iterable[RevocationList] = ()) -> str:
+def _last_revocation(entries: Iterable[Entry] = (), lists: Iterable[RevocationList] = ()) -> str:
     """Return when an enclave was revoked last, by entries of the ledger and by lists; "" if never.
 
     Certificates that were replaced by others of the same enclave do not count: their reason is
