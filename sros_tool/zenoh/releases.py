@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 _LEAST_ZENOH = "1.3"
-"""The first Zenoh that accepts all settings of the files."""
+"""The first Zenoh that accepts all settings of the files; 0.2.3 has a state shortly before it."""
 
 Version = tuple[int, int, int]
 
