@@ -122,7 +122,7 @@ class OpenedZenoh:
 
     def domains(self) -> tuple[int, ...]:
         """Return the ROS domains that the configurations are for, sorted."""
-        controls = (each.access_control for each in self.configurations.values())
+        controls = (configuration.access_control for configuration in self.configurations.values())
         return tuple(sorted(set().union(*map(domains_of, controls))))
 
 
@@ -137,7 +137,7 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
         for file, signed in ZENOH_SIGNED.items()
         if any(map(_exists, (folder / file, folder / signed)))
     )
-    found: dict[str, Configuration] = {}
+    configurations: dict[str, Configuration] = {}
     problems: list[ZenohProblem] = []
     if not present:
         text = "the enclave has neither it nor router.json5"
@@ -147,16 +147,16 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
         if isinstance(read, ZenohProblem):
             problems.append(read)
             continue
-        found[file] = read
+        configurations[file] = read
         if (text := _before_revocation(read, state)) or (
             text := _out_of_date(read, file, name, state)
         ):
             problems.append(ZenohProblem(file, text, ZenohFault.OUT_OF_DATE))
     certified = common_name_of(state.certificate.subject) if state.certificate else name
-    if found and certified != name:
+    if configurations and certified != name:
         text = f"its common name is {certified or '(none)'}, by which Zenoh knows the process"
         problems.append(ZenohProblem(CERTIFICATE_FILE, text, ZenohFault.OTHER_NAME))
-    return OpenedZenoh(present, found, tuple(problems))
+    return OpenedZenoh(present, configurations, tuple(problems))
 
 
 def is_signed(
@@ -183,9 +183,9 @@ def _exists(path: Path) -> bool:
 def _read(folder: Path, file: str, state: OpenedEnclave) -> Configuration | ZenohProblem:
     """Return a configuration that the permissions CA signed, or what is wrong with it."""
     signed_file = ZENOH_SIGNED[file]
-    for each, fault in ((file, ZenohFault.MISSING), (signed_file, ZenohFault.UNSIGNED)):
-        if not _exists(folder / each):
-            return ZenohProblem(each, "missing", fault)
+    for needed, fault in ((file, ZenohFault.MISSING), (signed_file, ZenohFault.UNSIGNED)):
+        if not _exists(folder / needed):
+            return ZenohProblem(needed, "missing", fault)
     try:
         document = state.read_once.read(folder / file, "Zenoh configuration")
         message = state.read_once.read(folder / signed_file, "signed document")
@@ -232,14 +232,14 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
     control = configuration.access_control
     domains = _joined_domains(state.grant, domains_of(control))
     # Only the keystore knows which nodes a policy names: here it is what the permissions CA signed.
-    nodes = nodes_in_rules((rule for each in control.remotes for rule in each.rules), name)
+    nodes = nodes_in_rules((rule for remote in control.remotes for rule in remote.rules), name)
     try:
         stated = {domain: _recorded_rights(name, state.grant, domain) for domain in domains}
         own = remote_of(name, stated, nodes)
     except SrosError as error:
         return f"Zenoh cannot state the permissions of the enclave: {error.what}"
     # The router may do what the enclave lets it, and other processes nothing else.
-    mirrored = joined(each.mirrored() for each in own.rules)
+    mirrored = joined(rule.mirrored() for rule in own.rules)
     if not any(remote.rules == mirrored for remote in control.remotes) or not all(
         is_within(remote, own) for remote in control.remotes
     ):
@@ -341,7 +341,7 @@ def drifted(
     """
 
     def compare(paths: Sequence[str]) -> list[Drifted]:
-        found = []
+        differing = []
         for path in paths:
             document, present = wanted.files[path], _present(keystore, path)
             kind = None
@@ -352,13 +352,13 @@ def drifted(
             elif not is_signed(keystore.root / path, document, authority, keystore.files):
                 kind = Drift.UNSIGNED
             if kind:
-                found.append(Drifted(wanted.enclaves[path], path, kind))
-        return found
+                differing.append(Drifted(wanted.enclaves[path], path, kind))
+        return differing
 
-    found = [each for _, part in map_slices(list(wanted.files), compare) for each in part]
+    files = [file for _, part in map_slices(list(wanted.files), compare) for file in part]
     stale = stale_files(keystore.root, wanted.files, wanted.existing)
-    found += (each for each in stale if each.enclave not in gone)
-    return tuple(found)
+    files += (file for file in stale if file.enclave not in gone)
+    return tuple(files)
 
 
 class ZenohDrift(NamedTuple):
@@ -434,10 +434,12 @@ def zenoh_documents(
         names.remove(router)
     reader = _RightsReader(keystore, authority, of_network, network, now, change, only)
     read: dict[str, _RulesOfEnclave | str] = {}
-    for _, each in map_slices(names, reader.read):
-        read |= each
-    rules = {name: each for name, each in read.items() if not isinstance(each, str)}
-    left_out = {name: each for name, each in read.items() if isinstance(each, str)}
+    for _, of_enclaves in map_slices(names, reader.read):
+        read |= of_enclaves
+    rules = {
+        name: of_enclave for name, of_enclave in read.items() if not isinstance(of_enclave, str)
+    }
+    left_out = {name: why for name, why in read.items() if isinstance(why, str)}
     recorded = (*reader.ledger.entries, *change.recorded)
     revoked = _last_revocation(recorded, keystore.revocation_lists)
     try:
@@ -453,7 +455,9 @@ def zenoh_documents(
         ) from None
     direct = network.mode is Mode.PEER
     listen = (_ANY_PORT_HERE,) if direct else ()
-    between = RightsBetween(each.rights for each in rules.values() if each.rights and direct)
+    between = RightsBetween(
+        of_enclave.rights for of_enclave in rules.values() if of_enclave.rights and direct
+    )
 
     def session(name: str) -> bytes:
         router = rules[name].router
@@ -484,7 +488,7 @@ def zenoh_documents(
     enclaves |= {_session_path(name): name for name in chosen}
     if only:
         existing = tuple(name for name in existing if name in only)
-    nodes = {name: each.nodes for name, each in rules.items()}
+    nodes = {name: of_enclave.nodes for name, of_enclave in rules.items()}
     return ZenohDocuments(files, enclaves, left_out, nodes, existing, reader.ledger)
 
 
@@ -514,7 +518,7 @@ def _peers(name: str, router: RenderedRights, between: RightsBetween) -> list[Re
     """
     try:
         # Zenoh takes no policy without rules.
-        found = [render_rights(each) for each in between.of_all(name) if each.rules]
+        rendered = [render_rights(rights) for rights in between.of_all(name) if rights.rules]
     except TooManyExpressions:
         raise PolicyError(
             f"what {name} and another enclave may send each other cannot be said to Zenoh",
@@ -522,8 +526,8 @@ def _peers(name: str, router: RenderedRights, between: RightsBetween) -> list[Re
             "of these that takes too many key expressions.",
             "Use fewer wildcards, or client mode: `sros zenoh --mode client`.",
         ) from None
-    found.append(router)
-    return sorted(found, key=lambda each: each.name)
+    rendered.append(router)
+    return sorted(rendered, key=lambda rights: rights.name)
 
 
 def _tls(endpoints: Iterable[str]) -> tuple[str, ...]:
@@ -548,7 +552,7 @@ def _router_files(
     for name in rules:
         sides[network.router_of(name).name].append(name)
     together = {
-        router: joined_rights(router, (each for n in of if (each := rules[n].rights)))
+        router: joined_rights(router, (rights for n in of if (rights := rules[n].rights)))
         for router, of in sides.items()
         if network.routers
     }
@@ -573,22 +577,22 @@ def _router_files(
 
 def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int, ...]:
     """Return the ROS domains of the network, all of which the governance has."""
-    if others := [each for each in network.domains if each not in domains]:
+    if others := [domain for domain in network.domains if domain not in domains]:
         raise UsageError(
             f"the Zenoh network has domain {others[0]}, and keystore '{root}' only {domains}",
             "DDS and Zenoh would enforce different rights.",
             f"Name other domains with `sros zenoh --domain`, or add the domain with `sros "
             f"update_keystore {quote(str(root))} --domain {domains},{others[0]} --allow-looser`.",
         )
-    found = network.domains or tuple(domains)
-    if len(found) > _MOST_DOMAINS:
+    chosen = network.domains or tuple(domains)
+    if len(chosen) > _MOST_DOMAINS:
         raise UsageError(
-            f"keystore '{root}' is for {len(found)} domains, and a Zenoh network for at most "
+            f"keystore '{root}' is for {len(chosen)} domains, and a Zenoh network for at most "
             f"{_MOST_DOMAINS}",
             "Its rules state every right once for each domain.",
             "Name those that run on Zenoh with `sros zenoh --domain`.",
         )
-    return found
+    return chosen
 
 
 # ── the rights of each enclave ─────────────────────────────────────────────────────────────
@@ -634,14 +638,18 @@ class _RightsReader:
         self._only = only
         self.ledger = keystore.ledger
         self._recorded = RecordedRights(keystore, self.ledger)
-        self._revoked = {one.serial for each in keystore.revocation_lists for one in each.revoked}
+        self._revoked = {
+            certificate.serial
+            for revocations in keystore.revocation_lists
+            for certificate in revocations.revoked
+        }
 
     def read(self, names: Sequence[str]) -> dict[str, _RulesOfEnclave | str]:
         """Return the rules of enclaves, or why they get none, as a clause."""
-        found: dict[str, _RulesOfEnclave | str] = {}
+        rules: dict[str, _RulesOfEnclave | str] = {}
         for begin in range(0, len(names), _IN_A_ROW):
-            found |= self._read_some(names[begin : begin + _IN_A_ROW])
-        return found
+            rules |= self._read_some(names[begin : begin + _IN_A_ROW])
+        return rules
 
     def _read_some(self, names: Sequence[str]) -> dict[str, _RulesOfEnclave | str]:
         """Do what `read` does, each step for all of the enclaves before the next step."""
@@ -656,7 +664,7 @@ class _RightsReader:
                     left_out[name] = error.what
             return done
 
-        issued = {name: each for name in names if (each := self._change.issued.get(name))}
+        issued = {name: rights for name in names if (rights := self._change.issued.get(name))}
         certificates = for_each((e for e in names if e not in issued), self._certificate)
         messages = for_each(certificates, self._message)
         signed = for_each(messages, lambda name: self._keystore.files.signed(messages[name]))
@@ -664,13 +672,13 @@ class _RightsReader:
         grants = for_each(
             verified, lambda name: self._grant(name, signed[name].document, certificates[name])
         )
-        grants |= {name: each.grant for name, each in issued.items()}
+        grants |= {name: rights.grant for name, rights in issued.items()}
         joined = for_each(grants, lambda name: self._joined(grants[name]))
         stated = {
             name: {domain: _recorded_rights(name, grants[name], domain) for domain in domains}
             for name, domains in joined.items()
         }
-        remotes = {name: self._remote(name, each) for name, each in stated.items()}
+        remotes = {name: self._remote(name, rights) for name, rights in stated.items()}
         asked = [name for name in remotes if not self._only or name in self._only]
         for name in asked:
             _prove(name, remotes[name], stated[name])
@@ -678,7 +686,7 @@ class _RightsReader:
             name: render_rights(as_router(self._network.router_of(name).name, remotes[name]))
             for name in asked
         }
-        rendered = {name: render_rights(each) for name, each in remotes.items()}
+        rendered = {name: render_rights(rights) for name, rights in remotes.items()}
         return {
             name: left_out[name]
             if name in left_out
@@ -699,10 +707,10 @@ class _RightsReader:
             raise error if path.exists() else KeystoreError("it has no certificate yet") from None
         if certificate.serial_number in self._revoked:
             raise KeystoreError("its certificate is revoked")
-        if (found := common_name_of(certificate.subject)) != name:
+        if (certified := common_name_of(certificate.subject)) != name:
             raise KeystoreError(
-                f"its certificate has the common name {found or '(none)'!r}, by which Zenoh knows "
-                "a process"
+                f"its certificate has the common name {certified or '(none)'!r}, by which Zenoh "
+                "knows a process"
             )
         return certificate
 
@@ -790,7 +798,7 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
         return any(control.allows(*announcing, token) for token in tokens)
 
     for domain, rights in stated.items():
-        rules = Rules([each.right for each in rights])
+        rules = Rules([stated_right.right for stated_right in rights])
         names = {(e.right.kind, name) for e in rights for name in _examples(e.right.name)}
         for kind, name in names:
             for right in RIGHTS[kind]:
@@ -810,7 +818,7 @@ def _are_exactly(
     """
     keys: dict[str, set[str]] = {right: set() for right in _PROOF}
     for domain, rights in stated.items():
-        if is_expression("".join([each.right.name for each in rights])):
+        if is_expression("".join([stated_right.right.name for stated_right in rights])):
             return False
         for (_, qualifier, right, name), _ in rights:
             if qualifier is not ALLOW:
@@ -819,11 +827,11 @@ def _are_exactly(
     return all(
         keys[right]
         == {
-            each.removesuffix("/**").removesuffix("/$*::$*/*")
-            for each in found.all
-            if not each.endswith("/@adv/**")
+            key.removesuffix("/**").removesuffix("/$*::$*/*")
+            for key in expressions.all
+            if not key.endswith("/@adv/**")
         }
-        for right, found in passing.items()
+        for right, expressions in passing.items()
     )
 
 
@@ -832,14 +840,14 @@ def _announced(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str, str]
 
     Return None if they are not all in the enclave's own name.
     """
-    found = set()
+    announced = set()
     for key in tokens.all:
         if not key.endswith("/@adv/**"):
             token = _TOKEN.fullmatch(key)
             if not token or token[3] != enclave.replace("/", "%"):
                 return None
-            found.add((token[1], _ANNOUNCED[token[2]], (token[4] or "").replace("%", "/")))
-    return found
+            announced.add((token[1], _ANNOUNCED[token[2]], (token[4] or "").replace("%", "/")))
+    return announced
 
 
 def _to_announce(stated: Mapping[int, Sequence[StatedRight]]) -> set[tuple[str, str, str]]:
@@ -940,29 +948,29 @@ def _recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
             "It allows what no rule names, on some vendors of DDS and not on others.",
             "State the rights of the enclave in a policy, with `sros create_permission`.",
         )
-    rules = tuple(each for each in grant.rules if domain in each.domains.closed())
+    rules = tuple(rule for rule in grant.rules if domain in rule.domains.closed())
     rights = grant_rights(enclave, grant._replace(rules=rules))
-    raw = {each for each in rights if not each.name.startswith("/")}
+    raw = {right for right in rights if not right.name.startswith("/")}
     rights -= raw
-    if {each.right for each in raw if each.name == "*" and each.qualifier is ALLOW} == {
+    if {right.right for right in raw if right.name == "*" and right.qualifier is ALLOW} == {
         "publish",
         "subscribe",
     }:
         rights |= {
             Right(enclave, ALLOW, right, "/*") for right in (*RIGHTS["topics"], *RIGHTS["services"])
         }
-        raw -= {each for each in raw if each.name == "*"}
-    for each in sorted(raw):
-        if each.name.startswith(f"{_TOPICS}*"):
-            rights |= {each._replace(name=each.name.removeprefix(_TOPICS))}
-        elif each.qualifier is not ALLOW or _meets_ros_names(each.name):
+        raw -= {right for right in raw if right.name == "*"}
+    for right in sorted(raw):
+        if right.name.startswith(f"{_TOPICS}*"):
+            rights |= {right._replace(name=right.name.removeprefix(_TOPICS))}
+        elif right.qualifier is not ALLOW or _meets_ros_names(right.name):
             raise PolicyError(
-                f"{source}: {each.describe()} cannot be said to Zenoh",
+                f"{source}: {right.describe()} cannot be said to Zenoh",
                 "It is a name of DDS, and not certainly one of ROS.",
                 "State the rights of the enclave in a policy, with `sros create_permission`.",
             )
-    parted = (part for each in rights for part in parts(each))
-    return tuple([StatedRight(each, source) for each in sorted(set(parted))])
+    parted = (part for right in rights for part in parts(right))
+    return tuple([StatedRight(right, source) for right in sorted(set(parted))])
 
 
 _TOPICS = "rt"
@@ -971,4 +979,6 @@ _TOPICS = "rt"
 
 def _meets_ros_names(topic: str) -> bool:
     """Return whether a wildcard of DDS also matches topics of ROS names."""
-    return is_expression(topic) and any(overlap(topic, f"{each}/*") for each in ("rt", "rq", "rr"))
+    return is_expression(topic) and any(
+        overlap(topic, f"{prefix}/*") for prefix in ("rt", "rq", "rr")
+    )

@@ -123,7 +123,7 @@ class _Tokens:
         self._nodes = _places(nodes)
         self._of_names = {
             f"{'' if ns == '%' else ns}%{name}": f"{ns}/{name}"
-            for ns, _, name in (each.partition("/") for each in self._nodes)
+            for ns, _, name in (place.partition("/") for place in self._nodes)
             if "*" not in ns + name
         }
 
@@ -138,16 +138,16 @@ class _Tokens:
             without = dict.fromkeys(
                 e for name in sides[False].get(right, ()) for e in _listed(name)
             )
-            stated = dict.fromkeys(each for name in names for each in _listed(name))
+            stated = dict.fromkeys(expression for name in names for expression in _listed(name))
             if without:
                 never = Names(without)
                 stated = {n: None for n in stated if is_expression(n) or not never.meets(n)}
-            wild = [each for each in stated if is_expression(each)]
+            wild = [expression for expression in stated if is_expression(expression)]
             allowed += self._announced(right, stated)
             denied += [
                 self._key(_KINDS[right], "*/*", part, ANY_CHUNKS)
                 for name in without
-                if any(overlap(each, name) for each in wild)
+                if any(overlap(wide, name) for wide in wild)
                 for part in _parts(name)
             ]
         return tuple(allowed), tuple(denied)
@@ -168,7 +168,7 @@ class _Tokens:
         parts = [part for name in names for part in _parts(name)]
         owners = {part: self._owner(right, part) for part in parts}
         everybody = self._nodes
-        if len(everybody) * sum(not each for each in owners.values()) > _MOST_TOKENS:
+        if len(everybody) * sum(not owner for owner in owners.values()) > _MOST_TOKENS:
             everybody = ("*/*",)
         return [
             self._key(_KINDS[right], node, part, ANY_CHUNKS)

@@ -15,7 +15,9 @@ from tests.support.harness import policy_text, publish, sros
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a keystore that has a Zenoh network, and an export; only to be copied."""
     folder = tmp_path_factory.mktemp("zenoh")
-    (folder / "p.xml").write_text(policy_text({"/a": publish("/x"), "/b": publish("/y")}))
+    policy = policy_text({"/a": publish("/x"), "/b": publish("/y")})
+    # Each enclave has a node of another name.
+    (folder / "p.xml").write_text('node="m"'.join(policy.rsplit('node="n"', 1)))
     (folder / "more.xml").write_text(policy_text({"/a": publish("/x", "/more")}))
     sros("generate_artifacts", "-k", "ks", "-p", "p.xml", cwd=folder).ok()
     sros("zenoh", "ks", cwd=folder).ok()
