@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.dds.decision_documents import allow, grant, permissions, publish, subscribe
-from tests.dds.signer_rows import SIGNER, YES, Made, Row, authority, rows, write_enclave
+from tests.dds.signer_rows import NOW, SIGNER, YES, Made, Row, authority, rows, write_enclave
 from tests.integration.fastdds import fastdds_vendor
 from tests.integration.vendor_oracle import (
     PEER,
@@ -47,7 +47,8 @@ def test_the_next_permissions_ca_needs_the_name_of_the_old_one(
     turned = Row("", Made(permissions=(new, old)), "", "", "")
     write_enclave(turned, peer, PEER, OPEN, PEER_PERMISSIONS)
     seconds = 8 if expected == YES else 2.5
-    (reply,) = ask_fastdds_folders([(own, peer, "UTC")], TOPIC, tmp_path, seconds=seconds)
+    pair = own, peer, "UTC"
+    (reply,) = ask_fastdds_folders([pair], TOPIC, tmp_path, seconds=seconds, made=NOW)
     assert reply.end == "joined" and reply.answers == (expected,), reply
 
 
@@ -68,8 +69,8 @@ def test_every_row(asked: str, tmp_path: Path) -> None:
 
     def ask(some: Sequence[Pair], seconds: float) -> list[Reply]:
         if asked == "Cyclone DDS":
-            return ask_cyclone_folders(some, TOPIC, pairs[0][0], seconds=seconds)
-        return ask_fastdds_folders(some, TOPIC, tmp_path, seconds=seconds)
+            return ask_cyclone_folders(some, TOPIC, pairs[0][0], seconds=seconds, made=NOW)
+        return ask_fastdds_folders(some, TOPIC, tmp_path, seconds=seconds, made=NOW)
 
     expected = [row.answer(vendor) for row in table]
     replies = with_patience(ask, pairs, lambda place, _: expected[place] == YES)

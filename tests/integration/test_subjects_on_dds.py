@@ -18,7 +18,7 @@ from sros_tool.dds.decision.answers import AccessVerb, Outcome, Refusal
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.pki.certificates import subject_text
 from tests.dds.decision_documents import access_of, allow, grant, permissions, publish, subscribe
-from tests.dds.signer_rows import REFUSED, YES, Made, write_enclave
+from tests.dds.signer_rows import NOW, REFUSED, YES, Made, write_enclave
 from tests.dds.signer_rows import Row as Files
 from tests.integration.fastdds import fastdds_vendor
 from tests.integration.vendor_oracle import (
@@ -120,8 +120,8 @@ def test_every_row(asked: str, tmp_path: Path) -> None:
 
     def ask(some: Sequence[Pair], seconds: float) -> list[Reply]:
         if asked == "Cyclone DDS":
-            return ask_cyclone_folders(some, TOPIC, peer, seconds=seconds)
-        return ask_fastdds_folders(some, TOPIC, tmp_path, seconds=seconds)
+            return ask_cyclone_folders(some, TOPIC, peer, seconds=seconds, made=NOW)
+        return ask_fastdds_folders(some, TOPIC, tmp_path, seconds=seconds, made=NOW)
 
     expected = [answer_of(row, vendor) for row in ROWS]
     replies = with_patience(ask, pairs, lambda place, _: expected[place] == YES)

@@ -318,8 +318,9 @@ def ask_fastdds_folders(
     domain: int = 0,
     seconds: float = MATCH_SECONDS,
     at_once: int = 6,
+    made: datetime | None = None,
 ) -> list[Reply]:
-    """What Fast DDS does with each pair of enclaves."""
+    """What Fast DDS does with each pair of enclaves, whose dates count from ``made`` (now)."""
     lines = [
         f"{own}\t{own}\t{domain}\t{zone}\t{peer}\t{peer}\t{int(seconds * 1000)}\tpublish\x1f{topic}"
         for own, peer, zone in pairs
@@ -330,7 +331,7 @@ def ask_fastdds_folders(
         asked = [lines[place] for place in places]
         return _spread(asked, at_once, partial(_ask_programs, program))
 
-    return _replies(fastdds_stack(), _forms_of_pairs(pairs, topic, domain), ask, seconds)
+    return _replies(fastdds_stack(), _forms_of_pairs(pairs, topic, domain, made), ask, seconds)
 
 
 def ask_cyclone_folders(
@@ -341,8 +342,12 @@ def ask_cyclone_folders(
     domain: int = 0,
     seconds: float = MATCH_SECONDS,
     at_once: int = 6,
+    made: datetime | None = None,
 ) -> list[Reply]:
-    """What Cyclone DDS does with each pair of enclaves; ``whole`` is one that lacks nothing."""
+    """What Cyclone DDS does with each pair of enclaves, whose dates count from ``made`` (now).
+
+    ``whole`` is an enclave that lacks nothing.
+    """
     records = [
         {
             "whole": str(whole),
@@ -360,12 +365,16 @@ def ask_cyclone_folders(
     def ask(places: list[int]) -> list[Reply]:
         return ask_cyclone_records([records[place] for place in places], at_once)
 
-    return _replies(cyclone_stack(), _forms_of_pairs(pairs, topic, domain), ask, seconds)
+    return _replies(cyclone_stack(), _forms_of_pairs(pairs, topic, domain, made), ask, seconds)
 
 
-def _forms_of_pairs(pairs: Sequence[Pair], topic: str, domain: int) -> list[str]:
+def _forms_of_pairs(
+    pairs: Sequence[Pair], topic: str, domain: int, made: datetime | None
+) -> list[str]:
     now = datetime.now(UTC)
-    return [f"{topic} {domain} {zone}\n{form_of((own, peer), now)}" for own, peer, zone in pairs]
+    return [
+        f"{topic} {domain} {zone}\n{form_of((own, peer), now, made)}" for own, peer, zone in pairs
+    ]
 
 
 # ── both ───────────────────────────────────────────────────────────────────────────────────

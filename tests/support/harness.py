@@ -135,6 +135,8 @@ class Running(Forked):
 
         def begin() -> None:
             os.setsid()
+            # As Python has it at its start, whatever the tests have made of it.
+            signal.signal(signal.SIGINT, signal.default_int_handler)
             if first:
                 first()
 

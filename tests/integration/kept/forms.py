@@ -62,10 +62,14 @@ _HASHES: dict[str, hashes.HashAlgorithm] = {
 """Of a digest, or of a signature with it; RSA-PSS is not among them."""
 
 
-def form_of(folders: Sequence[Path], now: datetime) -> str:
-    """Return the form of enclaves that belong together; keys are counted through all of them."""
+def form_of(folders: Sequence[Path], now: datetime, made: datetime | None = None) -> str:
+    """Return the form of enclaves that belong together; keys are counted through all of them.
+
+    Moments are told by their distance from ``made``, if the enclaves were made then and signed
+    until ``now``, and else from ``now``.
+    """
     contents = [(name, _content(folder / name)) for folder in folders for name in FILES]
-    writer = _Writer(now)
+    writer = _Writer(made or now, now)
     for _, content in contents:
         if isinstance(content, bytes):
             writer.learn(content)
@@ -77,7 +81,7 @@ def form_of(folders: Sequence[Path], now: datetime) -> str:
 
 def form_of_text(text: str, now: datetime) -> str:
     """Return the form of a document in clear."""
-    return _Writer(now).text(text)
+    return _Writer(now, now).text(text)
 
 
 def _content(path: Path) -> bytes | str:
@@ -91,7 +95,8 @@ def _content(path: Path) -> bytes | str:
 class _Writer:
     """Writes forms; knows the keys and the random words that came so far."""
 
-    def __init__(self, now: datetime) -> None:
+    def __init__(self, made: datetime, now: datetime) -> None:
+        self._made = made
         self._now = now
         self._keys: dict[bytes, Any] = {}
         self._names: dict[bytes, str] = {}
@@ -165,7 +170,7 @@ class _Writer:
             at = datetime(*parts, tzinfo=UTC)  # type: ignore[misc, arg-type]
         except ValueError:
             return written
-        seconds = round((at - self._now).total_seconds())
+        seconds = 0 if self._made < at <= self._now else round((at - self._made).total_seconds())
         days = round(seconds / 86400)
         if abs(days) > 400 and abs(seconds - 86400 * days) > _QUARTER // 2:
             return f"<{written}, {'past' if seconds < 0 else 'to come'}>"
