@@ -374,14 +374,33 @@ def _heard_of(speaker: PartyRecord, listener: PartyRecord) -> list[Event]:
 
 def _judge_view(case: _Case) -> _Finding:
     claim, observer, topic = case.claim, case.subject, case.talker.topic
-    if not case.sent(case.talker):
+    serves = case.record.row.party(claim.talker).role is Role.SERVER
+    # A server only has to be there: nobody has to call it.
+    if not serves and not case.sent(case.talker):
         return _undecided(f"{claim.talker} sent nothing in the window")
     looks = [e for e in observer.events if e.kind is EventKind.SEEN and _in_window(e, case.record)]
     if not looks:
         return _undecided(f"{claim.subject} counted nothing in the window")
     most = max(event.publishers.get(topic, 0) for event in looks)
-    publishers = f"{observer.through} counts {most} publishers on {topic}"
-    return case.result(most > 0, f"{publishers} in {len(looks)} polls")
+    counted = f"{most} {'servers' if serves else 'publishers'} on {topic}"
+    return case.result(most > 0, f"{observer.through} counts {counted} in {len(looks)} polls")
+
+
+def _judge_loss(case: _Case) -> _Finding:
+    claim, topic = case.claim, case.talker.topic
+    if not any(event.kind is EventKind.SENT for event in case.talker.events):
+        return _undecided(f"{claim.talker} found no node")
+    looks = [event for event in case.subject.events if event.kind is EventKind.SEEN]
+    most = max((event.publishers.get(topic, 0) for event in looks), default=0)
+    if not most:
+        return _undecided(f"{claim.subject} never saw a publisher on {topic}")
+    # After the window the talker itself ends.
+    inside = [event for event in looks if _in_window(event, case.record)]
+    if not inside:
+        return _undecided(f"{claim.subject} counted nothing in the window")
+    left = inside[-1].publishers.get(topic, 0)
+    detail = f"{case.subject.through} counts {left} publishers on {topic}, {most} before"
+    return case.result(not left, f"{detail}; {claim.talker} tried it")
 
 
 def _judge_wire(case: _Case) -> _Finding:
@@ -417,6 +436,7 @@ _JUDGES: Mapping[Relation, Callable[[_Case], _Finding]] = {
     Relation.IS_ANSWERED: _judge_answers,
     Relation.EXECUTES: _judge_execution,
     Relation.SEES: _judge_view,
+    Relation.LOSES: _judge_loss,
     Relation.READABLE: _judge_wire,
 }
 

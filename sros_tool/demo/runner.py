@@ -287,7 +287,7 @@ class _Runner:
             options += ["--server", self._text(index, servers[0])] if len(servers) == 1 else []
         if party.role is Role.OBSERVER:
             for other in row.parties:
-                if other.role is Role.TALKER and (other.other_topic or other.topic):
+                if other.role in (Role.TALKER, Role.SERVER) and (other.other_topic or other.topic):
                     options += ["--also", plan.keystores.topic(other, plan.topic)]
         if plan.backend.on_zenoh:
             options += ["--size", str(party.size)] if party.size else []
@@ -370,9 +370,11 @@ class _Runner:
             mark = f"{processes[claim.talker].text}: "
             heard = [e for e in events if e.kind is EventKind.HEARD and e.text.startswith(mark)]
             return len(heard) >= _ENOUGH_MESSAGES
-        if claim.relation is Relation.SEES:
+        if claim.relation in (Relation.SEES, Relation.LOSES):
             topic = processes[claim.talker].topic
-            return any(event.publishers.get(topic) for event in events)
+            seen = any(event.publishers.get(topic) for event in events)
+            lost = seen and not events[-1].publishers.get(topic)
+            return lost if claim.relation is Relation.LOSES else seen
         return True
 
 

@@ -28,7 +28,15 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from sros_tool.demo.nodes import ROLES, Call, Hear, enclave_in, parse_options
+from sros_tool.demo.nodes import (
+    ROLES,
+    Call,
+    Hear,
+    NodeOptions,
+    NodeRole,
+    enclave_in,
+    parse_options,
+)
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 
 _POLL_SECONDS = 0.02
@@ -108,12 +116,13 @@ class _ZenohNode:
         self, session: zenoh.Session, domain: str, enclave: str, name: str, size: int
     ) -> None:
         self._session, self._domain, self._size = session, domain, size
-        self._place = f"{self.wire_name(enclave)}/%/{name}"
+        self._enclave = self.wire_name(enclave)
+        self._place = f"{self._enclave}/%/{name}"
         self._entities = 0
         self._graph: set[str] = set()
         self._declared: list[object] = []
         self._keep = self._declared.append  # what nobody keeps is undeclared
-        self._announce("NN")
+        self._announce(_NODE)
 
     def _announce(self, kind: str, name: str = "", types: tuple[str, str] = ("", "")) -> bytes:
         """Put an entity of the node into the graph, and return its GID."""
@@ -185,19 +194,44 @@ class _ZenohNode:
         return call
 
     def watch(self) -> None:
-        """Begin to discover publishers, by the tokens in the graph."""
+        """Begin to discover nodes and what they have, by the tokens in the graph."""
 
         def change(sample: zenoh.Sample) -> None:
-            added = sample.kind == zenoh.SampleKind.PUT
-            (self._graph.add if added else self._graph.discard)(str(sample.key_expr))
+            token = str(sample.key_expr)
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._graph.add(token)
+                return
+            self._graph.discard(token)
+            if _kind_of(token) == _NODE:
+                # As rmw_zenoh: all of the node goes with it, and nobody looks at the enclave.
+                node = _node_of(token)
+                self._graph.difference_update({e for e in self._graph if _node_of(e) == node})
 
         graph = self._session.liveliness()
         self._keep(graph.declare_subscriber(f"@ros2_lv/{self._domain}/**", change, history=True))
 
     def publications(self) -> Sequence[str]:
-        """Return the topics of the publishers that are there, as in their tokens."""
-        entities = [token.split("/") for token in tuple(self._graph)]
-        return [entity[9] for entity in entities if len(entity) > 9 and entity[5] == "MP"]
+        """Return topics of publishers and services of servers that are there, as in tokens."""
+        tokens = [token for token in tuple(self._graph) if _kind_of(token) in ("MP", "SS")]
+        return [token.split("/")[9] for token in tokens]
+
+    def erase(self, name: str) -> int:
+        """Take nodes of this name out of the graph, and return of how many it was tried.
+
+        The token of a node ends, under the enclave of this process, as if the node did.
+        """
+        others = [
+            chunks
+            for token in tuple(self._graph)
+            if _kind_of(token) == _NODE
+            and (chunks := token.split("/"))[8] == name
+            and chunks[6] != self._enclave
+        ]
+        for chunks in others:
+            token = "/".join((*chunks[:6], self._enclave, *chunks[7:]))
+            own = self._session.liveliness().declare_token(token)
+            own.undeclare()  # type: ignore[no-untyped-call]
+        return len(others)
 
     def wire_name(self, topic: str) -> str:
         """Return a name as it is in tokens."""
@@ -207,6 +241,20 @@ class _ZenohNode:
         """Return the key expression of a ROS name with its type and the hash of the type."""
         parts = ("**",) if name == "/**" else (name.strip("/"), *kind)
         return "/".join((self._domain, *parts))
+
+
+_NODE = "NN"
+
+
+def _kind_of(token: str) -> str:
+    """Return the kind of what a graph token announces."""
+    return token.split("/")[5]
+
+
+def _node_of(token: str) -> tuple[str, ...]:
+    """Return what names a node in its tokens: session, number, namespace and name."""
+    chunks = token.split("/")
+    return (*chunks[2:4], *chunks[7:9])
 
 
 _GID = b"\1" * 16
@@ -251,7 +299,22 @@ def _flood(endpoint: str, events: EventWriter, stop: threading.Event) -> None:
             useless.sendall(_GARBAGE)
 
 
-_FLOODER = "flooder"
+class _Eraser(NodeRole):
+    """A node that takes the nodes of talkers out of the graph."""
+
+    def __init__(self, node: _ZenohNode, options: NodeOptions, events: EventWriter) -> None:
+        self._graph = node
+        super().__init__(node, options, events)
+
+    def prepare(self) -> None:
+        self._graph.watch()
+
+    def act(self) -> None:
+        if self._graph.erase("talker"):
+            self.sent(f"erased {self._sent + 1}")
+
+
+_FLOODER, _ERASER = "flooder", "eraser"
 
 
 class _RefusedError(Exception):
@@ -304,7 +367,7 @@ def _address(endpoint: str) -> tuple[str, int]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a role until stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    roles = (*(role for role in ROLES if role != "composed"), _FLOODER)
+    roles = (*(role for role in ROLES if role != "composed"), _FLOODER, _ERASER)
     options = parse_options("sros_tool.demo.zenoh_node", roles, arguments)
     events = EventWriter(options.report)
     stop = threading.Event()
@@ -329,7 +392,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         name = options.role if options.role != "router" else "rmw_zenohd"
         node = _ZenohNode(session, domain, enclave_in(arguments, ""), name, options.size)
-        role = ROLES[options.role](node, options, events)
+        kind = _Eraser if options.role == _ERASER else ROLES[options.role]
+        role = kind(node, options, events)
         stage = ProcessStage.RUNNING
         events.report(EventKind.READY)
         while not stop.wait(_POLL_SECONDS):

@@ -39,6 +39,7 @@ CLOSED = {
     RowStatus.NOT_DECEIVED,
     RowStatus.NOT_ANSWERED,
     RowStatus.NOT_VISIBLE,
+    RowStatus.NOT_ERASED,
     RowStatus.NOT_READABLE,
 }
 BY_NAME = pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)

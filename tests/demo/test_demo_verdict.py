@@ -9,6 +9,7 @@ import pytest
 from sros_tool.demo.result import PartyRecord, RowRecord, RowResult, judge_row
 from sros_tool.demo.scenarios.communication import ROWS
 from sros_tool.demo.scenarios.model import Row, RowStatus
+from sros_tool.demo.scenarios.on_zenoh import ATTACKS as ZENOH_ATTACKS
 from sros_tool.demo.wire import WireCount
 from sros_tool.runtime.events import Event, EventKind, ProcessStage
 from sros_tool.values import as_plain
@@ -224,6 +225,33 @@ def test_side_by_side(secured: list[str], unsecured: list[str], observed: RowSta
         unsecured_listener=listener(*unsecured),
     )
     assert result.observed is observed
+
+
+@pytest.mark.parametrize(
+    ("before", "inside", "after", "tries", "observed"),
+    [
+        (1, 1, 0, True, RowStatus.NOT_ERASED),  # when the window is over, the talker ends
+        (1, 0, 0, True, RowStatus.ERASED),
+        (0, 0, 0, True, RowStatus.UNDECIDED),
+        (1, 1, 1, False, RowStatus.UNDECIDED),
+    ],
+)
+def test_a_node_that_is_erased(
+    before: int, inside: int, after: int, tries: bool, observed: RowStatus
+) -> None:
+    erasing = next(each for each in ZENOH_ATTACKS.rows if each.expected is RowStatus.NOT_ERASED)
+    looks = tuple(
+        Event(EventKind.SEEN, moment, publishers={"/c": count})
+        for moment, count in ((50, before), (103, inside), (900, after))
+    )
+    eraser = (READY, *((Event(EventKind.SENT, 60, "erased 1"),) if tries else ()))
+    records = {
+        "router": PartyRecord(events=(READY,)),
+        "talker": talker("S"),
+        "observer": PartyRecord(events=(READY, *looks)),
+        "eraser": PartyRecord(events=eraser, topic="/c"),
+    }
+    assert judge_row(RowRecord(erasing, 0, records, WINDOW)).observed is observed
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,8 @@ class Role(StrEnum):
     """A talker and a listener in one node."""
     FLOODER = "flooder"
     """A program that opens useless connections to the router."""
+    ERASER = "eraser"
+    """A node that takes the nodes of talkers out of the graph of Zenoh."""
 
 
 SPEAKING = frozenset({Role.TALKER, Role.RELAY, Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED})
@@ -63,6 +65,8 @@ class RowStatus(StrEnum):
     DISTURBED = "disturbed"
     VISIBLE = "visible"
     NOT_VISIBLE = "not visible"
+    ERASED = "erased"
+    NOT_ERASED = "not erased"
     READABLE = "readable"
     NOT_READABLE = "not readable"
     CRASHED = "crashed"
@@ -87,6 +91,7 @@ class Relation(StrEnum):
     IS_REFUSED = "is refused"
     STARTS = "starts"
     SEES = "sees"
+    LOSES = "loses a node because of"
     READABLE = "is readable"
 
 
@@ -109,6 +114,8 @@ STATUS_OF: dict[tuple[Relation, bool], RowStatus] = {
     (Relation.STARTS, False): RowStatus.REFUSED,
     (Relation.SEES, True): RowStatus.VISIBLE,
     (Relation.SEES, False): RowStatus.NOT_VISIBLE,
+    (Relation.LOSES, True): RowStatus.ERASED,
+    (Relation.LOSES, False): RowStatus.NOT_ERASED,
     (Relation.READABLE, True): RowStatus.READABLE,
     (Relation.READABLE, False): RowStatus.NOT_READABLE,
 }

@@ -725,7 +725,8 @@ _WILDCARD_ROWS = (
 class _FalseToken(NamedTuple):
     """A graph token that an impostor announces: for its node ``talker``, of the enclave ``part``.
 
-    ``announced`` is the enclave that it names in place of its own.
+    ``announced`` is the enclave that it names in place of its own; ``role`` says whether ``topic``
+    is a topic or a service.
     """
 
     attack: str
@@ -733,6 +734,7 @@ class _FalseToken(NamedTuple):
     part: str
     topic: str
     announced: str = ""
+    role: Role = Role.TALKER
 
 
 _TOKENS = (
@@ -755,6 +757,14 @@ _TOKENS = (
         "guest",
         "/rosout",
     ),
+    _FalseToken(
+        "another enclave announces a service",
+        "a token passes only for names that its sender has a right to: `wait_for_service` finds"
+        " nothing",
+        "guest",
+        "/not_offered",
+        role=Role.SERVER,
+    ),
 )
 
 
@@ -763,7 +773,7 @@ def _announcing(
 ) -> Row:
     """Return a row in which an enclave announces a publisher to an observer of the graph."""
     impostor = replace(
-        _attacker(f"impostor on {token.topic[1:]}", Role.TALKER, keystore, token.part, token.topic),
+        _attacker(f"impostor on {token.topic[1:]}", token.role, keystore, token.part, token.topic),
         announced=token.announced,
     )
     observer = _rightful("observer", Role.OBSERVER, keystore, "client")
@@ -799,7 +809,57 @@ def _false_token_rows(token: _FalseToken) -> tuple[Row, ...]:
     )
 
 
-_TOKEN_ROWS = tuple(row for token in _TOKENS for row in _false_token_rows(token))
+_NAMES_OF_TOKENS = "rules that bind tokens to names"
+_SERVICE_TOKEN = _TOKENS[-1]
+_ERASING = "another enclave erases a node"
+
+
+def _erasing(how: str, keystore: KeystoreChoice, world: str, removed: str = "") -> Row:
+    """Return a row in which the guest takes the talker out of the graph of an observer."""
+    wide, talker, _ = _topic_pair(keystore)
+    eraser = _attacker("eraser", Role.ERASER, keystore)
+    observer = _rightful("observer", Role.OBSERVER, keystore, "client")
+    return _attempt(
+        f"{_ERASING}{how}",
+        RowStatus.ERASED if removed else RowStatus.NOT_ERASED,
+        "the graph looks at session and name of a token that ends, and at no enclave"
+        if removed
+        else "a token passes only for nodes that the policy of its sender names",
+        Claim(Relation.LOSES, "observer", "eraser"),
+        (wide, talker, observer, eraser),
+        () if removed else (Claim(Relation.SEES, "observer", "talker"),),
+        world=world,
+        removed=removed,
+    )
+
+
+_TOKEN_ROWS = (
+    *(row for token in _TOKENS for row in _false_token_rows(token)),
+    *tries(
+        _SERVICE_TOKEN.attack,
+        _announcing(
+            _SERVICE_TOKEN,
+            zenoh_forger.tokens_of_any_name_through_the_router,
+            "names through the router",
+            ", tokens of any name through the router",
+            _NAMES_OF_TOKENS,
+        ),
+    ),
+    *tries(
+        _ERASING,
+        _erasing("", OWN, _PEERS),
+        _erasing(", through the router", zenoh_forger.through_the_router, _CLIENTS),
+        _erasing(
+            ", tokens of any name", zenoh_forger.tokens_of_any_name, "erased", _NAMES_OF_TOKENS
+        ),
+        _erasing(
+            ", tokens of any name through the router",
+            zenoh_forger.tokens_of_any_name_through_the_router,
+            "erased through the router",
+            _NAMES_OF_TOKENS,
+        ),
+    ),
+)
 
 
 # ── what was valid earlier ─────────────────────────────────────────────────────────────────

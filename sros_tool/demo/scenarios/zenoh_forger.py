@@ -206,6 +206,12 @@ def tokens_of_any_name(copy: KeystoreCopy) -> None:
     _widen_tokens(copy, of_enclave)
 
 
+def tokens_of_any_name_through_the_router(copy: KeystoreCopy) -> None:
+    """Let the sessions connect to the router alone, and announce any node and any name."""
+    through_the_router(copy)
+    tokens_of_any_name(copy)
+
+
 def _widen_tokens(copy: KeystoreCopy, wider: Callable[[str], str]) -> None:
     """Replace the key expressions for graph tokens in all files."""
 
