@@ -91,9 +91,9 @@ class AccessControl:
         as a whole, so that a wider subscription, query or put is dropped and not cut down.
         """
         rules = [
-            each.allows
-            for each in self._rules(common_name, flow, message)
-            if _include(each.key_expressions, key)
+            rule.allows
+            for rule in self._rules(common_name, flow, message)
+            if _include(rule.key_expressions, key)
         ]
         return bool(rules) and all(rules)
 
@@ -115,14 +115,14 @@ class AccessControl:
     ) -> KeyExpressions:
         rules = self._rules(common_name, flow, message)
         return KeyExpressions(
-            each for rule in rules if rule.allows is allows for each in rule.key_expressions
+            key for rule in rules if rule.allows is allows for key in rule.key_expressions
         )
 
     def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
         """Return what `Enforcement.decide` does for the same access control, read from its file."""
         own = None if remote.common_name is None else self._by_name.get(remote.common_name)
         if own is None:
-            stated = any(each.rules for each in self.remotes)
+            stated = any(rights.rules for rights in self.remotes)
             return AccessDecision(False, (), (), _NO_SUBJECT if stated else _NO_RULE_AT_ALL)
         applying = [
             (rule.allows, name)
@@ -148,8 +148,10 @@ class AccessControl:
 
     @cached_property
     def _ids(self) -> Mapping[str, list[str]]:
-        names = [each.common_name for each in self.remotes]
-        return dict(zip(names, rule_ids([each.rules for each in self.remotes], names), strict=True))
+        names = [remote.common_name for remote in self.remotes]
+        return dict(
+            zip(names, rule_ids([remote.rules for remote in self.remotes], names), strict=True)
+        )
 
     def names(self) -> frozenset[str]:
         """Return the common names that rules are for."""
@@ -207,7 +209,7 @@ _FEW = 16
 
 def _include(expressions: tuple[str, ...], key: str) -> bool:
     if len(expressions) <= _FEW:
-        return any(includes(each, key) for each in expressions)
+        return any(includes(wide, key) for wide in expressions)
     return _search(expressions).include(key)
 
 
@@ -222,12 +224,12 @@ def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     Rules of the same direction and messages become one; key expressions that others of the same
     rule include are left out.
     """
-    found: dict[tuple[Flow, tuple[Message, ...], bool], set[str]] = {}
+    expressions: dict[tuple[Flow, tuple[Message, ...], bool], set[str]] = {}
     for flow, messages, keys, allows in rules:
-        found.setdefault((flow, messages, allows), set()).update(keys)
+        expressions.setdefault((flow, messages, allows), set()).update(keys)
     return in_order(
         AccessRule(flow, messages, _needed(frozenset(keys)), allows)
-        for (flow, messages, allows), keys in found.items()
+        for (flow, messages, allows), keys in expressions.items()
     )
 
 
@@ -239,13 +241,13 @@ def _needed(keys: frozenset[str]) -> tuple[str, ...]:
 def in_order(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     """Return rules of different directions and messages in the order of `joined`."""
     return tuple(
-        sorted(rules, key=lambda each: (*_place(each.flow, each.messages), not each.allows))
+        sorted(rules, key=lambda rule: (*_place(rule.flow, rule.messages), not rule.allows))
     )
 
 
 def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
     """Return the rights of all enclaves together, for a process named ``name``."""
-    return RemoteRights(name, joined(rule for each in rights for rule in each.rules))
+    return RemoteRights(name, joined(rule for of_enclave in rights for rule in of_enclave.rules))
 
 
 class RightsBetween:
@@ -258,7 +260,7 @@ class RightsBetween:
     def __init__(self, rights: Iterable[RemoteRights]) -> None:
         """Take the rights of all enclaves, whose processes connect to each other."""
         self._rules = {
-            each.common_name: [_RuleOfPeer.of(rule) for rule in each.rules] for each in rights
+            remote.common_name: [_RuleOfPeer.of(rule) for rule in remote.rules] for remote in rights
         }
 
     def of_all(self, own: str) -> Iterator[RemoteRights]:
@@ -267,27 +269,30 @@ class RightsBetween:
         Raises:
             TooManyExpressions: that takes too many key expressions.
         """
-        mine = [_RuleOfPeer.of(each.rule.mirrored()) for each in self._rules[own]]
-        denied = [each for each in mine if not each.rule.allows]
+        mine = [_RuleOfPeer.of(rule_of_peer.rule.mirrored()) for rule_of_peer in self._rules[own]]
+        denied = [rule_of_peer for rule_of_peer in mine if not rule_of_peer.rule.allows]
         meeting: dict[_Place, list[tuple[tuple[Message, ...], RuleKeys]]] = {}
         for remote, theirs in self._rules.items():
-            found: dict[_Place, tuple[str, ...]] = {}
+            shared: dict[_Place, tuple[str, ...]] = {}
             for place, _, keys in theirs:
                 if place not in meeting:
                     meeting[place] = [
-                        (messages, each.keys)
-                        for each in mine
-                        if (messages := _shared(place, each.place))
+                        (messages, rule_of_peer.keys)
+                        for rule_of_peer in mine
+                        if (messages := _shared(place, rule_of_peer.place))
                     ]
                 for messages, others in meeting[place]:
                     if both := keys.common(others):
                         same = (place[0], messages, True)
-                        found[same] = _sorted(found.get(same, ()), both)
-            for place, rule, _ in (*(each for each in theirs if not each.rule.allows), *denied):
-                found[place] = _sorted(found.get(place, ()), rule.key_expressions)
+                        shared[same] = _sorted(shared.get(same, ()), both)
+            for place, rule, _ in (
+                *(rule_of_peer for rule_of_peer in theirs if not rule_of_peer.rule.allows),
+                *denied,
+            ):
+                shared[place] = _sorted(shared.get(place, ()), rule.key_expressions)
             rules = (
                 AccessRule(flow, messages, keys, allows)
-                for (flow, messages, allows), keys in found.items()
+                for (flow, messages, allows), keys in shared.items()
             )
             yield RemoteRights(remote, in_order(rules))
 
@@ -311,7 +316,7 @@ def _shared(one: _Place, other: _Place) -> tuple[Message, ...]:
     """Return the messages that two rules allow in the same direction."""
     if one[0] is not other[0] or not (one[2] and other[2]):
         return ()
-    return tuple(each for each in one[1] if each in other[1])
+    return tuple(message for message in one[1] if message in other[1])
 
 
 def _sorted(some: tuple[str, ...], others: tuple[str, ...]) -> tuple[str, ...]:
@@ -350,7 +355,7 @@ _ORDER = {message: number for number, message in enumerate(Message)}
 
 @lru_cache(maxsize=64)  # the rules of all enclaves have the same few
 def _place(flow: Flow, messages: tuple[Message, ...]) -> tuple[bool, list[int]]:
-    return flow is Flow.EGRESS, [_ORDER[each] for each in messages]
+    return flow is Flow.EGRESS, [_ORDER[message] for message in messages]
 
 
 @dataclass(frozen=True, slots=True)
@@ -410,7 +415,9 @@ class AclSubject:
         )
 
 
-PROPERTIES = tuple(each.name for each in fields(AclSubject) if each.name not in ("id", "line"))
+PROPERTIES = tuple(
+    property_.name for property_ in fields(AclSubject) if property_.name not in ("id", "line")
+)
 """The names of a subject's properties."""
 
 
@@ -477,34 +484,40 @@ class Enforcement:
 
     def subjects_of(self, remote: Remote) -> tuple[AclSubject, ...]:
         """Return the subjects that match a remote process, in the order of the file."""
-        ids = {each for one in self._matching(remote) for each in self._combinations[one]}
-        return tuple(each for each in self.subjects if each.id in ids)
+        ids = {
+            subject_id
+            for combination in self._matching(remote)
+            for subject_id in self._combinations[combination]
+        }
+        return tuple(subject for subject in self.subjects if subject.id in ids)
 
     def names(self) -> frozenset[str]:
         """Return the common names that subjects state: those of enclaves that rules are for."""
-        return frozenset(n for each in self.subjects for n in each.cert_common_names or ())
+        return frozenset(
+            name for subject in self.subjects for name in subject.cert_common_names or ()
+        )
 
     def unclear(self) -> str:
         """Return why names alone do not decide what passes, as a clause; "" if they do."""
-        for each in self.subjects:
-            stated = {name for name in PROPERTIES if getattr(each, name) is not None}
-            if each.cert_common_names is not None and len(stated) > 1:
+        for subject in self.subjects:
+            stated = {name for name in PROPERTIES if getattr(subject, name) is not None}
+            if subject.cert_common_names is not None and len(stated) > 1:
                 more = ", ".join(sorted(stated - {"cert_common_names"}))
-                return f"its subject {each.id[:80]!r} has conditions besides the name: {more}"
+                return f"its subject {subject.id[:80]!r} has conditions besides the name: {more}"
         if any(
-            not each.allows and set(each.messages) != {Message.LIVELINESS_TOKEN}
-            for each in self.rules
+            not rule.allows and set(rule.messages) != {Message.LIVELINESS_TOKEN}
+            for rule in self.rules
         ):
             return "it has denials, which do not hold for messages with wildcards"
-        for each in self.subjects:
-            if key := self._only_history(each.id):
-                return f"its subject {each.id[:80]!r} gets the history of {key[:80]!r} alone"
+        for subject in self.subjects:
+            if key := self._only_history(subject.id):
+                return f"its subject {subject.id[:80]!r} gets the history of {key[:80]!r} alone"
         return ""
 
     def _only_history(self, subject: str) -> str:
         """Return a key whose history (``@adv``) a subject gets without the key itself, or ""."""
-        keys: dict[Flow, list[str]] = {each: [] for each in Flow}
-        history: dict[Flow, set[str]] = {each: set() for each in Flow}
+        keys: dict[Flow, list[str]] = {flow: [] for flow in Flow}
+        history: dict[Flow, set[str]] = {flow: set() for flow in Flow}
         for rule in self.rules_of(subject):
             for flow, message in product(rule.flows, rule.messages):
                 if message not in _OF_HISTORY:
@@ -534,7 +547,7 @@ class Enforcement:
         """
         if not self.enabled:
             return AccessDecision(True, (), (), "access control is off")
-        subjects = tuple(each.id for each in self.subjects_of(remote))
+        subjects = tuple(subject.id for subject in self.subjects_of(remote))
         default = "ALLOW" if self.allows_by_default else "DENY"
         if not self._rules_of:
             return self._by_default(subjects, f"no rule is in force, and the default is {default}")
@@ -545,7 +558,7 @@ class Enforcement:
             applying = [
                 rule
                 for rule in self._in_force[combination].get((flow, message), ())
-                if any(includes(each, key) for each in rule.key_expressions)
+                if any(includes(wide, key) for wide in rule.key_expressions)
             ]
             denied = [rule.id for rule in applying if not rule.allows]
             allowed = [rule.id for rule in applying if rule.allows]
@@ -560,7 +573,7 @@ class Enforcement:
 
     def key_expressions_of(self, rule: str) -> tuple[str, ...]:
         """Return the key expressions of a rule, by its id."""
-        return next(each.key_expressions for each in self.rules if each.id == rule)
+        return next(stated.key_expressions for stated in self.rules if stated.id == rule)
 
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
         """Return the key expressions that rules of subjects with a name allow."""
@@ -594,13 +607,13 @@ class Enforcement:
         combinations = self._matching(remote)
         if not self._rules_of or not combinations:
             return everything if self.allows_by_default else NameSet()
-        found = []
+        passing = []
         for combination in combinations:
             rules = self._in_force[combination].get((flow, message), ())
             denied = of(key for rule in rules if not rule.allows for key in rule.key_expressions)
             allowed = of(key for rule in rules if rule.allows for key in rule.key_expressions)
-            found.append((everything if self.allows_by_default else allowed) - denied)
-        return NameSet.union(found)
+            passing.append((everything if self.allows_by_default else allowed) - denied)
+        return NameSet.union(passing)
 
     def _by_default(self, subjects: tuple[str, ...], why: str) -> AccessDecision:
         return AccessDecision(self.allows_by_default, (), subjects, why)
@@ -608,43 +621,45 @@ class Enforcement:
     @cached_property
     def _combinations(self) -> Mapping[_Combination, tuple[str, ...]]:
         """The ids of the subjects for each combination of their values."""
-        found: dict[_Combination, list[str]] = {}
+        ids_of: dict[_Combination, list[str]] = {}
         for subject in self.subjects:
             values = (getattr(subject, name) or (None,) for name in PROPERTIES)
             for combination in product(*values):
-                found.setdefault(combination, []).append(subject.id)
-        return {one: _once(ids) for one, ids in found.items()}
+                ids_of.setdefault(combination, []).append(subject.id)
+        return {one: _once(subjects) for one, subjects in ids_of.items()}
 
     @cached_property
     def _rules_of(self) -> Mapping[str, tuple[AclRule, ...]]:
-        rules = {each.id: each for each in self.rules}
-        found: dict[str, dict[str, AclRule]] = {}
+        rules = {rule.id: rule for rule in self.rules}
+        rules_of: dict[str, dict[str, AclRule]] = {}
         for policy in self.policies:
             for subject in policy.subjects:
-                found.setdefault(subject, {}).update((each, rules[each]) for each in policy.rules)
-        return {subject: tuple(of.values()) for subject, of in found.items()}
+                rules_of.setdefault(subject, {}).update(
+                    (rule, rules[rule]) for rule in policy.rules
+                )
+        return {subject: tuple(of.values()) for subject, of in rules_of.items()}
 
     @cached_property
     def _in_force(
         self,
     ) -> Mapping[_Combination, Mapping[tuple[Flow, Message], tuple[AclRule, ...]]]:
-        found: dict[_Combination, dict[tuple[Flow, Message], dict[str, AclRule]]] = {}
+        in_force: dict[_Combination, dict[tuple[Flow, Message], dict[str, AclRule]]] = {}
         for combination, ids in self._combinations.items():
-            of = found.setdefault(combination, {})
-            for rule in (rule for each in ids for rule in self.rules_of(each)):
+            of = in_force.setdefault(combination, {})
+            for rule in (rule for subject in ids for rule in self.rules_of(subject)):
                 for place in product(rule.flows, rule.messages):
                     of.setdefault(place, {})[rule.id] = rule
         return {
             combination: {place: tuple(rules.values()) for place, rules in of.items()}
-            for combination, of in found.items()
+            for combination, of in in_force.items()
         }
 
     @cached_property
     def _combinations_by_name(self) -> Mapping[str | None, tuple[_Combination, ...]]:
-        found: dict[str | None, list[_Combination]] = {}
-        for each in self._combinations:
-            found.setdefault(each[0], []).append(each)
-        return {name: tuple(of) for name, of in found.items()}
+        by_name: dict[str | None, list[_Combination]] = {}
+        for combination in self._combinations:
+            by_name.setdefault(combination[0], []).append(combination)
+        return {name: tuple(of) for name, of in by_name.items()}
 
     def _matching(self, remote: Remote) -> list[_Combination]:
         values: tuple[tuple[str | None, ...], ...] = (
