@@ -281,6 +281,9 @@ def without_certificate(copy: KeystoreCopy) -> None:
     def change(document: _Document) -> None:
         _tls(document)["enable_mtls"] = False
         document["listen"]["endpoints"] = []
+        # Nobody can connect to it: so it has to connect, whichever id is greater.
+        gossip = document["scouting"]["gossip"]
+        gossip["autoconnect_strategy"]["peer"]["to_peer"] = "always"
 
     _edit_part(copy, "talker", change)
 
