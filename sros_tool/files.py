@@ -245,10 +245,13 @@ def read_toml(data: bytes, what: str, remedy: str = "", *, longest: int = _LONGE
     try:
         return parse_toml(data.decode(), longest)
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        why = str(error)
-        raise DocumentError(
-            f"{what} is not valid TOML", f"{why[:1].upper()}{why[1:]}.", remedy
-        ) from error
+        raise toml_error(error, what, remedy) from error
+
+
+def toml_error(error: ValueError, what: str, remedy: str = "") -> DocumentError:
+    """Return the error for a file, named ``what``, that the parser of TOML refused."""
+    why = str(error)
+    return DocumentError(f"{what} is not valid TOML", f"{why[:1].upper()}{why[1:]}.", remedy)
 
 
 def parse_toml(text: str, longest: int = _LONGEST_DOCUMENT) -> dict[str, Any]:

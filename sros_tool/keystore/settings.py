@@ -227,6 +227,8 @@ def _unsigned(
 
 def _differences(old: Template, new: Template, origin: str) -> Iterator[str]:
     """Yield a clause for each key with different values; name and description do not count."""
+    if old == new:
+        return
     before, after = settings_values(old), settings_values(new)
     for key in dict.fromkeys((*before, *after)):
         old_value, new_value = before.get(key, "nothing"), after.get(key, "nothing")

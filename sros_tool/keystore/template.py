@@ -6,15 +6,17 @@ A keystore keeps a copy of its settings (``sros.toml``), which apply to enclaves
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import timedelta
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError, SrosError, UsageError
-from sros_tool.files import parse_toml, read_toml, templates_dir
+from sros_tool.files import parse_toml, templates_dir, toml_error
 from sros_tool.names import check_enclave_name, expand, expression_problem
 from sros_tool.pki.token import refuse_pin
 from sros_tool.policy.model import DomainProtection, Level, NamedProtection, TopicProtection
@@ -113,19 +115,23 @@ def read_template(path: Path) -> Template:
 
 def decode_template(data: bytes, path: Path, what: str, remedy: str) -> Template:
     """Return the template in ``data``; ``path``, ``what`` and ``remedy`` are for errors."""
-    table = read_toml(data, f"the {what} '{path}'", remedy)
     try:
-        return _template(table, path.stem)
+        return parse_template(data.decode(), path.stem)
     except _TemplateError as error:
         raise DocumentError(f"the {what} '{path}' is not valid", f"{error}.", remedy) from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise toml_error(error, f"the {what} '{path}'", remedy) from error
 
 
 class _TemplateError(ValueError):
     """A key of a template that is missing, unknown, or has a value that is not valid."""
 
 
+@lru_cache(maxsize=16)
 def parse_template(text: str, name: str) -> Template:
     """Return the template in TOML text; ``name`` is its name if the text states none.
+
+    The last texts are not parsed again: most verbs read the settings several times.
 
     Raises:
         tomllib.TOMLDecodeError: the text is not TOML.
