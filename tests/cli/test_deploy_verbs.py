@@ -15,7 +15,16 @@ from pathlib import Path
 import pytest
 
 from tests.support.children import run
-from tests.support.harness import policy_text, publish, remains, snapshot, sros, topics_of
+from tests.support.harness import (
+    Ended,
+    Running,
+    policy_text,
+    publish,
+    remains,
+    snapshot,
+    sros,
+    topics_of,
+)
 
 NAME, FOLDER = "/arm/camera", "enclaves/arm/camera"
 PROGRAM = f"{sys.executable} -m sros_tool"
@@ -30,6 +39,19 @@ def importable(monkeypatch: pytest.MonkeyPatch) -> None:
 def shell(script: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     script = script.replace("sros ", f"{PROGRAM} ")
     return run(["bash", "-c", f"set -o pipefail; {script}"], cwd=cwd, status=None)
+
+
+def signed_and_imported(
+    request: Path, folder: Path, *, signing: str = "", importing: str = ""
+) -> tuple[Ended, Ended]:
+    """Run ``sros sign_request ks - <request | sros import - robot`` with options, in forks."""
+    pipe = folder / "pipe"
+    if not pipe.exists():
+        os.mkfifo(pipe)
+    words = ("sign_request", "ks", "-", *signing.split())
+    signed = Running(*words, cwd=folder, read_from=request, write_to=pipe)
+    imported = Running("import", "-", "robot", *importing.split(), cwd=folder, read_from=pipe)
+    return signed.end(), imported.end()
 
 
 def asked(tmp_path: Path, name: str = NAME) -> Path:
@@ -166,10 +188,12 @@ def test_one_pipe_from_the_request_to_the_answer(keystore: Path, tmp_path: Path)
     assert ended.returncode == 0, ended
     assert "imported enclave" in ended.stdout
     sros("verify", tmp_path / "robot").ok()
-    ended = shell(line, tmp_path)
-    assert "already exists" in ended.stderr
-    assert "the answer is empty" in ended.stderr
-    assert shell(line.replace("ks -", "ks - --renew"), tmp_path).returncode == 0
+    refused, without_answer = signed_and_imported(request, tmp_path)
+    assert "already exists" in refused.err
+    assert "the answer is empty" in without_answer.err
+    assert without_answer.status == 2
+    for done in signed_and_imported(request, tmp_path, signing="--renew"):
+        done.ok()
 
 
 def test_roots_from_the_environment(keystore: Path, tmp_path: Path) -> None:
@@ -327,8 +351,8 @@ def test_a_finding_outside_of_its_enclave_names_its_file_from_the_root(tmp_path:
 
 def test_a_robot_follows_a_rotation_of_the_cas_by_answers(keystore: Path, tmp_path: Path) -> None:
     asked_for = asked(tmp_path)
-    line = f"cat {asked_for} | sros sign_request ks --renew - | sros import - robot"
-    assert shell(line.replace("--renew ", ""), tmp_path).returncode == 0
+    for ended in signed_and_imported(asked_for, tmp_path):
+        ended.ok()
     answer = tmp_path / "answer.tar.gz"
     for _stage in ("distribute", "reissue", "retire"):
         sros("rotate_ca", keystore, "--next").ok()
@@ -339,9 +363,11 @@ def test_a_robot_follows_a_rotation_of_the_cas_by_answers(keystore: Path, tmp_pa
         sros("verify", tmp_path / "robot").ok()
     # A robot that missed the stages of the rotation cannot trust the new CAs.
     sros("rotate_ca", keystore, "--finish").ok()
-    refused = shell(line, tmp_path)
-    assert "has not signed it" in refused.stderr
-    assert shell(line.replace("import", "import --force"), tmp_path).returncode == 0
+    signed, refused = signed_and_imported(asked_for, tmp_path, signing="--renew")
+    signed.ok()
+    assert (refused.status, "has not signed it" in refused.err) == (2, True)
+    for ended in signed_and_imported(asked_for, tmp_path, signing="--renew", importing="--force"):
+        ended.ok()
     sros("verify", tmp_path / "robot").ok()
 
 

@@ -120,7 +120,8 @@ def forked(
 class Running(Forked):
     """A forked run of the program, at which a test can look and which it can send signals.
 
-    It leads a session of its own, and calls ``first`` before the program.
+    It leads a session of its own, and calls ``first`` before the program.  Its standard input is
+    the file ``read_from``, and its standard output goes to the file ``write_to``, if any.
     """
 
     def __init__(
@@ -129,6 +130,8 @@ class Running(Forked):
         env: Mapping[str, str] | None = None,
         cwd: Path | None = None,
         first: Callable[[], object] | None = None,
+        read_from: Path = Path(os.devnull),
+        write_to: Path | None = None,
     ) -> None:
         words = [str(argument) for argument in arguments]
         self._out, self._err = TemporaryFile(), TemporaryFile()  # noqa: SIM115 - live as long
@@ -141,7 +144,8 @@ class Running(Forked):
                 first()
 
         def work() -> int:
-            _become_program(words, None, cwd, begin, self._out.fileno(), self._err.fileno())
+            out = os.open(write_to, os.O_WRONLY) if write_to else self._out.fileno()
+            _become_program(words, None, cwd, begin, out, self._err.fileno(), read_from)
 
         super().__init__(work, env=dict(env or os.environ), errors=Path(os.devnull))
 
@@ -174,10 +178,11 @@ def _become_program(
     first: Callable[[], object] | None,
     out: int,
     err: int,
+    read_from: Path = Path(os.devnull),
 ) -> NoReturn:
     status = 70
     try:
-        for descriptor, source in ((0, os.open(os.devnull, os.O_RDONLY)), (1, out), (2, err)):
+        for descriptor, source in ((0, os.open(read_from, os.O_RDONLY)), (1, out), (2, err)):
             os.dup2(source, descriptor)
         os.closerange(3, 1024)
         sys.stdin, sys.stdout, sys.stderr = os.fdopen(0), os.fdopen(1, "w"), os.fdopen(2, "w")
