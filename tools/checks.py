@@ -26,7 +26,7 @@ LONG = "--long"
 WITH_DDS = ("tests/integration", "tests/explain")
 """The folders with tests that start DDS processes; pytest imports only these for them."""
 
-COLLECT = ["-m", "pytest", "--collect-only", "-qq"]
+COLLECT = ["-m", "pytest", "--collect-only", "-qq", "-p", "tools.import_tests"]
 """pytest compiles the tests for its messages; once, before five processes would do it each."""
 
 LINT = {
