@@ -41,8 +41,9 @@ class Change:
 
     def git(self, *words: str) -> str:
         nobody = {"GIT_CONFIG_GLOBAL": "/dev/null", "GIT_CONFIG_NOSYSTEM": "1"}
+        # Each commit would start two more processes, to see whether there is much to pack.
         done = subprocess.run(
-            ["git", "-C", str(self.folder), *words],
+            ["git", "-C", str(self.folder), "-c", "maintenance.auto=false", *words],
             env={"PATH": "/usr/bin:/bin", **PERSON, **nobody},
             capture_output=True,
             check=True,
