@@ -117,6 +117,7 @@ def enclaves(keystore: Path) -> list[str]:
     return list(json.loads(sros("list_enclaves", keystore, "--json").ok().out)["enclaves"])
 
 
+@sometimes("nobody revoked is an error")
 @pytest.mark.parametrize(
     ("revoke", "said"),
     [
