@@ -239,7 +239,7 @@ def _fleet_policies(policies: Iterable[AnyPath | Policy], fleet: AnyPath) -> lis
     for policy in policies:
         if not isinstance(policy, str | PathLike):
             raise UsageError(
-                "a policy that was read already has no placeholders for a fleet",
+                "an already parsed policy cannot be expanded for a fleet",
                 "",
                 "Pass the path of its file.",
             )
@@ -254,7 +254,7 @@ def fleet_status(
     max_age: timedelta | None = None,
     now: datetime | None = None,
 ) -> FleetStatus:
-    """Return what each robot of a fleet has, by what it last confirmed.
+    """Return the deployment status of each robot of a fleet, by its last confirmation.
 
     Args:
         keystore: A keystore with a fleet, or its path.

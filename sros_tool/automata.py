@@ -214,7 +214,7 @@ class Automaton:
 
     @cached_property
     def levels(self) -> tuple[tuple[int, int], ...]:
-        """The positions, as bits, from which so many letters at least lead to an end."""
+        """Lower bounds on the number of letters to an end, each with its positions as bits."""
         before: dict[int, list[int]] = {}
         for at, letters, to in self.edges:
             if letters:
@@ -438,7 +438,7 @@ class SearchLimit:
     """A limit on the number of search steps of one question."""
 
     def __init__(self, most: int = 600_000) -> None:
-        """Allow ``most`` steps: some ten seconds."""
+        """Set the limit to ``most`` steps; the default takes about ten seconds."""
         self._left = most
 
     def spend(self, steps: int) -> None:
@@ -454,9 +454,9 @@ class SearchLimit:
 
 def _too_many() -> DocumentError:
     return DocumentError(
-        "it cannot be decided which names so many wildcards match",
-        "The names that they have in common, and not in common, are too many to be told apart, "
-        "such as with many '?' after a '*'.",
+        "there are too many wildcards to decide which names they match",
+        "The sets of names that the wildcards share are too many to compare, such as with many "
+        "'?' after a '*'.",
         "Write names instead of wildcards, or fewer wildcards.",
     )
 
@@ -615,7 +615,7 @@ class Surroundings:
 
 
 def _around(node: _Node, best: Callable[[Surroundings], tuple[int, int]]) -> Surroundings | None:
-    """Return a superset of a set; of several candidates the one with the least ``best``."""
+    """Return the superset of a set for which ``best`` returns the smallest value."""
     match node:
         case _Some():
             return Surroundings(node.exact, node.automata)
@@ -742,7 +742,7 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
 
 
 def _width(around: Surroundings) -> tuple[int, int]:
-    """Return the sort key of a superset: first those with few automata that share no name."""
+    """Return the sort key of a superset: few automata that share no name come first."""
     if len(around.automata) > _FEW:
         return len(around.automata), 0
     rough, _ = _roughness(around)
@@ -808,7 +808,7 @@ class _Search:
         self._taken = _Taken(name for name in taken if node.truth(_asked_of(name)))
 
     def shortest(self, limit: SearchLimit, longest: int | None) -> str | None:
-        """Return the shortest name, and of these the first one to be found, or None."""
+        """Return a shortest name, or None if there is no name."""
         machine, taken = self._machine, self._taken
         start = machine.start, 0
         costs = {start: 0}
@@ -870,7 +870,7 @@ def _machine(automata: tuple[Automaton, ...]) -> _Machine:
 
 
 class _Class(NamedTuple):
-    """Letters that every automaton treats alike, with the best letter for examples."""
+    """Letters that every automaton treats in the same way, with the best letter for examples."""
 
     letters: Letters
     best: str
@@ -900,11 +900,11 @@ class _Machine:
         )
 
     def ended(self, reached: int) -> _Ask:
-        """Return a function: does one of some automata accept a name that ends at ``reached``?"""
+        """Return a test for the automata that accept a name that ends at ``reached``."""
         return lambda some: any(reached & self._ends[automaton] for automaton in some.automata)
 
     def going_on(self, reached: int) -> _Ask:
-        """Return a function: can one of some automata accept a continuation from ``reached``?"""
+        """Return a test for the automata that can accept a longer name after ``reached``."""
 
         def ask(some: _Some) -> _Truth:
             if any(reached & self._endless[automaton] for automaton in some.automata):
@@ -926,7 +926,7 @@ class _Machine:
 
 
 def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
-    """Group letters that all edges treat alike into classes, best letters first."""
+    """Group letters that all edges treat in the same way into classes, best letters first."""
     by_letters: dict[Letters, list[tuple[int, int]]] = {}
     for at, letters, to in edges:
         by_letters.setdefault(letters, []).append((at, to))

@@ -309,8 +309,8 @@ def _uses_zenoh(named: str | None, rmw: str) -> bool:
     if (middleware := middleware_of(rmw)) and middleware.name == "Zenoh":
         raise UsageError(
             f"{RMW} is {rmw!r}, which is not an RMW that sros knows to enforce security",
-            f"Of those on Zenoh, sros knows only {RMW_ZENOH}.",
-            f"Set {RMW} to another one, or name one with --rmw.",
+            f"The only RMW on Zenoh that sros knows is {RMW_ZENOH}.",
+            f"Set {RMW} to another RMW, or name an RMW with --rmw.",
         )
     return False
 
@@ -483,8 +483,8 @@ def _router_notes(session: Configuration | None) -> Iterator[Note]:
     router = session.access_control.remotes[0].common_name if session.access_control.remotes else ""
     yield Note(
         "zenoh.no-router",
-        f"nothing listens at {', '.join(endpoints)}, where the router {router} has to: a node "
-        "waits for it, and says nothing until then. Start the router in its own enclave.",
+        f"nothing listens at {', '.join(endpoints)}, the endpoint of the router {router}: a node "
+        "waits for the router, without any output. Start the router in its own enclave.",
     )
 
 
@@ -595,13 +595,14 @@ def _check_mounted(root: Path, enclave: str, target: Path) -> None:
     if inner := enclaves_below(root, enclave):
         raise KeystoreError(
             f"the folder of enclave {enclave} also has {', '.join(inner[:3])}",
-            "The container would get the private keys of all of them.",
+            "The container would get the private keys of all these enclaves.",
             f"Export this enclave alone, {export}, and name DIR as the keystore.",
         )
     if open_keystore(root).is_home and target == root.absolute():
         raise KeystoreError(
             f"a container cannot use '{target}' itself",
-            "Files of an enclave are links to others of the keystore, which it would not have.",
+            "Some files of an enclave are links to other files of the keystore, which the "
+            "container would not have.",
             f"Export the enclave, {export}, and name the path of DIR with --target.",
         )
 
@@ -662,8 +663,8 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
     if node is None:
         raise UsageError(
             f"the command '{command[0]}' names no node",
-            "Its enclave is that of the node's name in the policy, which `--ros-args -r "
-            "__node:=NAME` gives.",
+            "The policy assigns enclaves to node names, and `--ros-args -r __node:=NAME` sets "
+            "the name.",
             "Give the node a name in the launch file, or start this command in an enclave of its "
             "own: `sros run ROOT NAME -- COMMAND`.",
         )

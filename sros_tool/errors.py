@@ -1,4 +1,4 @@
-"""The exceptions of sros: each says what happened, why, and what to do.
+"""The exceptions of sros: each has an error, its reason, and a remedy.
 
 Only the command line prints them, with the exit status `NOT_DONE`: an error says that something
 could not be asked or done, and is never the answer "no".
@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 NOT_DONE = 2
-"""Exit status for what could not be asked or done; 1 is the answer "no", or findings."""
+"""Exit status of a command that failed; 1 means the answer "no", or findings."""
 
 
 class SrosError(Exception):

@@ -153,7 +153,7 @@ class Folder:
     # ── making ─────────────────────────────────────────────────────────────────────────────
 
     def create(self, path: str, mode: int) -> int:
-        """Make the new file ``path``; ``mode`` are its permission bits, less those of the umask.
+        """Make the new file ``path``; ``mode`` has its permission bits (before umask).
 
         Returns:
             A descriptor for writing, which the caller closes.
@@ -244,13 +244,13 @@ class Folder:
     # ── moving and removing ────────────────────────────────────────────────────────────────
 
     def replace(self, source: str, target: str) -> None:
-        """Rename ``source`` to ``target``, and replace a file or link that is there."""
+        """Rename ``source`` to ``target``; replace an existing file or link."""
         here, name, there, new = self._pair(source, target)
         with self._naming(target):
             os.replace(name, new, src_dir_fd=here, dst_dir_fd=there)
 
     def rename(self, source: str, target: str) -> None:
-        """Rename the folder ``source`` to ``target``, where at most an empty folder is."""
+        """Rename the folder ``source`` to ``target``, which is missing or an empty folder."""
         here, name, there, new = self._pair(source, target)
         with self._naming(target):
             os.rename(name, new, src_dir_fd=here, dst_dir_fd=there)

@@ -1,4 +1,4 @@
-"""An action for launch files of ROS 2 that starts each node in the enclave of its policy.
+"""A launch action of ROS 2 that starts each node in the enclave that its policy names.
 
 In Python ``SecuredNodes(keystore="keystore", policy="policy.xml")`` from this module, in XML
 ``<secured_nodes keystore="keystore" policy="policy.xml"/>``, before the nodes: it holds for what
@@ -23,7 +23,7 @@ from launch.utilities import normalize_to_list_of_substitutions, perform_substit
 from sros_tool.runtime.environment import REFUSING
 
 _PREFIX, _FILTER = "launch-prefix", "launch-prefix-filter"
-"""Launch configurations: words before each command, and the commands that get them."""
+"""Launch configurations: a prefix, and a pattern of the commands that get it."""
 
 
 @expose_action("secured_nodes")

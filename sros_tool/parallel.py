@@ -53,7 +53,7 @@ class Tally:
         self._place = place
 
     def add(self) -> None:
-        """Count one more item as done."""
+        """Count an item as done."""
         self._counts[self._place] += 1
 
     def done(self) -> int:

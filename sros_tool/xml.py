@@ -146,8 +146,8 @@ def parse(
     if as_bytes and encoding.upper() not in _UTF_8:
         raise DocumentError(
             f"{name} is not in UTF-8",
-            f"It has the encoding {encoding}, but DDS vendors read its bytes as UTF-8, and could "
-            "read other rights in them.",
+            f"It has the encoding {encoding}, but DDS vendors read all documents as UTF-8, and "
+            "could read other rights.",
             "Write it in UTF-8.",
         )
     return root

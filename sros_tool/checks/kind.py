@@ -39,7 +39,7 @@ class Severity(StrEnum):
         return self.weight < Severity(other).weight
 
     def __le__(self, other: str) -> bool:
-        """Return whether this is at most as severe."""
+        """Return whether this severity is ``other`` or lower."""
         return self.weight <= Severity(other).weight
 
     def __gt__(self, other: str) -> bool:
@@ -47,7 +47,7 @@ class Severity(StrEnum):
         return self.weight > Severity(other).weight
 
     def __ge__(self, other: str) -> bool:
-        """Return whether this is at least as severe."""
+        """Return whether this severity is ``other`` or higher."""
         return self.weight >= Severity(other).weight
 
 
@@ -70,7 +70,7 @@ class FindingKind(NamedTuple):
     severity: Severity
     """Severity of the findings of this kind."""
     title: str
-    """What is wrong, as a clause."""
+    """Clause that names the fault."""
     why: str
     """Why it matters."""
     source: str
@@ -147,7 +147,7 @@ class Finding(NamedTuple):
     subject: str
     """The enclave, variable or file that the finding is about."""
     text: str
-    """What is wrong in detail, as a clause."""
+    """Details of the fault, as a clause."""
     file: str = ""
     """Path of the file with the problem, or null."""
     line: int | None = None

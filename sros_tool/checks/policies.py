@@ -289,7 +289,7 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _is_of_a_node(name: str) -> bool:
-    """Return whether every node offers this service, so that it needs no client in the policy."""
+    """Return whether every node offers this service; it then needs no client in the policy."""
     return name.rpartition("/")[2] in NODE_SERVICES
 
 
@@ -441,7 +441,7 @@ _STARTING = {
     NO_PARAMETER_SERVICES: "offer its parameter services",
     NO_TYPE_DESCRIPTION: "offer ~/get_type_description",
 }
-"""What a node does when it starts, for each kind of finding that denies it."""
+"""Kind of finding → action of a starting node that the policy denies."""
 _LISTENER = "transform_listener_impl_"
 """Name prefix of the nodes of tf2_ros listeners, which have no parameter services."""
 _OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)

@@ -197,7 +197,7 @@ def _unread_files(process: Process, enclave: ProcessEnclave) -> Iterator[Finding
 
 @dataclass(frozen=True, slots=True)
 class _Loaded:
-    """The certificates and permissions that a process loaded at its start, as far as known.
+    """The certificates and permissions that a process loaded at its start.
 
     ``windows`` maps a description, such as "its certificate", to a validity.  ``grant`` is the
     grant in the loaded permissions.  ``revoked`` is a clause that says when and why the
@@ -497,7 +497,7 @@ _MOST_NODES = 20
 
 
 class Security(StrEnum):
-    """Whether a process runs secured, as far as sros can see."""
+    """Whether sros sees that a process runs secured."""
 
     SECURED = "secured"
     OPEN = "open"

@@ -142,9 +142,9 @@ class SharedCause(NamedTuple):
     """The common cause of several findings."""
 
     title: str
-    """What is wrong."""
+    """Short title of the fault."""
     text: str
-    """What is wrong in detail, and why it matters."""
+    """Details of the fault, and its effect."""
     remedy: str
     """How to resolve all these findings."""
     findings: Sequence[int]

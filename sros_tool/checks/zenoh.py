@@ -228,9 +228,9 @@ _WITH_WILDCARDS = frozenset(Message) - {Message.REPLY, Message.LIVELINESS_TOKEN}
 """The messages that can name a key with wildcards."""
 _FEW = 3
 _MOST_PAIRS = 1000
-"""So many pairs of subjects are counted at most."""
+"""Maximum number of pairs of subjects that are counted."""
 _COMPARISON = 20
-"""What comparing two subjects counts, in characters."""
+"""Cost of the comparison of two subjects, in characters."""
 
 
 def configuration_findings(path: Path) -> Iterator[Finding]:
@@ -407,7 +407,7 @@ def _described(subject: AclSubject) -> str:
 
 
 def _denials(document: ConfigurationDocument) -> Iterator[Finding]:
-    """Yield a finding for each rule whose denial something passes."""
+    """Yield a finding for each denial that messages can bypass."""
     access, limit = document.access, ComparisonLimit()
     reported: set[tuple[str, str]] = set()
     for subject in access.subjects:
@@ -456,7 +456,7 @@ def _wildcard_past(
 def _overruled(
     rule: AclRule, others: Sequence[AclSubject], access: Enforcement, limit: ComparisonLimit
 ) -> str:
-    """Return which of the subjects that match the same processes allows what a rule denies."""
+    """Return the subject among ``others`` that allows a message which ``rule`` denies, or ""."""
     for other, flow, message in product(others, rule.flows, rule.messages):
         same = [
             each
@@ -488,7 +488,7 @@ def _meet(one: str, other: str, limit: ComparisonLimit) -> bool:
 # ── what is printed of a configuration ──────────────────────────────────────────────────────
 
 VERBS = {"publish": "publish", "subscribe": "subscribe", "request": "call", "reply": "serve"}
-"""The word for each right to a name, of those that rules of Zenoh give."""
+"""Right to a name → verb in text output; only rights that Zenoh rules can give."""
 
 Verb = Annotated[str, Words(VERBS.values()), "The right."]
 
@@ -519,11 +519,11 @@ class SubjectRights(NamedTuple):
     id: str | None
     """Its id; null without access control."""
     names: Sequence[str] | None
-    """The common names of its certificates; null for everybody."""
+    """The common names of the subject's certificates; null for everybody."""
     own: bool
     """Whether the rights are those of the process itself, by rules that bind only itself."""
     rights: Sequence[AllowedName]
-    """What it may do."""
+    """Rights of the subject."""
     unsaid: Sequence[KeyRight]
     """Rights to keys that no ROS name states exactly."""
     denied: Sequence[KeyRight]
@@ -531,7 +531,7 @@ class SubjectRights(NamedTuple):
 
 
 class ReadConfiguration(NamedTuple):
-    """What an existing configuration allows whom."""
+    """The rights that an existing configuration gives to each subject."""
 
     file: str
     """The configuration, as it was named."""
@@ -540,7 +540,7 @@ class ReadConfiguration(NamedTuple):
     enforced: bool
     """Whether access control is on."""
     subjects: Sequence[SubjectRights]
-    """To whom its rules apply."""
+    """Subjects of the rules, with their rights."""
     findings: Sequence[Finding]
     """The findings that are warnings or errors."""
     output: Path | None
@@ -552,7 +552,7 @@ class ReadConfiguration(NamedTuple):
 
 
 def subject_rights(behind: RightsBehindRules) -> SubjectRights:
-    """Return what is printed of the rights of a subject."""
+    """Return the rights of a subject for the output."""
     return SubjectRights(
         behind.subject or None,
         behind.names,

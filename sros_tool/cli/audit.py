@@ -199,7 +199,7 @@ _NO_PATCH = "no patch was written: no added right would allow what is denied"
 
 
 def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:
-    """Write missing rights to ``patch``; return what was done in words, "" if none is missing."""
+    """Write missing rights to ``patch``; return a clause about it, "" if no right is missing."""
     from sros_tool.graph.learn import render
 
     if patch is None or not audited.missing.profiles:

@@ -1,4 +1,4 @@
-"""The verbs that report what is wrong: `check`, `doctor`, and `metrics` for Prometheus."""
+"""The verbs that report faults: `check`, `doctor`, and `metrics` for Prometheus."""
 
 from __future__ import annotations
 
@@ -745,7 +745,7 @@ def doctor(report: Path | None, force: bool, as_json: bool) -> None:
 def _report_sections(
     diagnosis: Diagnosis, provider: SecurityProvider | None, findings: Sequence[Finding]
 ) -> dict[str, list[str]]:
-    """Return the lines of a support report; of findings only what is the same for all users."""
+    """Return the lines of a support report; findings are counted by kind, without names."""
     words = {True: "enforces security", False: "does not enforce", None: "could not be tried"}
     stacks = [
         f"{stack.name}: {words[stack.enforces]}. {stack.dds} {stack.version}. {stack.evidence}"

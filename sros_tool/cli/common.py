@@ -519,7 +519,7 @@ def moment_of(text: str | None) -> datetime:
             return now() + parse_duration(text)
     raise UsageError(
         f"--at {text!r} is not a date",
-        f"It is neither a date from {_YEARS[0]} to {_YEARS[1]} nor a duration.",
+        f"It is not a duration, and not a date from {_YEARS[0]} to {_YEARS[1]}.",
         "Write 2027-06-01, 2027-06-01T12:00:00Z, or 90d for 90 days from now.",
     )
 
@@ -927,7 +927,7 @@ class _Line:
         signal.setitimer(signal.ITIMER_REAL, _FIRST, _EVERY)
 
     def step(self, _name: str) -> None:
-        """Count one more item as done."""
+        """Count an item as done."""
         self._done += 1
 
     def pause(self) -> None:

@@ -562,7 +562,7 @@ _DOES = {
 
 
 def _zenoh_lines(explanation: ZenohExplanation) -> Iterator[str]:
-    """Yield the answer of Zenoh as lines, those of the policy, and what to change or to do."""
+    """Yield lines with Zenoh's answer, the policy lines behind it, and the remedy."""
     answer, stated, allowed = explanation.answer, explanation.stated, explanation.allowed
     may = f"yes: {answer.enclave} may" if allowed else f"no: {answer.enclave} may not"
     mode = f" in {answer.mode} mode" if answer.mode else ""
@@ -585,7 +585,7 @@ def _zenoh_lines(explanation: ZenohExplanation) -> Iterator[str]:
 
 
 def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
-    """Yield the links on which the right is decided: those that drop a message first."""
+    """Yield the links on which the right is decided; links that drop messages come first."""
     links = sorted(answer.links, key=lambda link: link.passes)
     for number, link in enumerate(links[:_MOST_SHOWN]):
         between = " and ".join(link.enclaves)
@@ -739,7 +739,9 @@ def _show_reach(
     if rest:
         raise UsageError("--reach takes an enclave, and no operation or name")
     if zenoh and policy:
-        raise UsageError("--reach on Zenoh takes no --policy", "It reads the files of Zenoh.")
+        raise UsageError(
+            "--reach on Zenoh takes no --policy", "It uses the keystore's Zenoh files."
+        )
     if zenoh:
         source = load_zenoh_rights(Keystore(root or keystore_from_environment()))
     else:

@@ -314,7 +314,7 @@ def _lines(status: FleetStatus, moment: datetime, robots: Sequence[str]) -> Iter
 
 
 def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
-    """Yield in words how a robot's files differ from what it should have, the worst first."""
+    """Yield clauses on how a robot's files differ from the keystore's, the worst first."""
     if robot.state == "never":
         yield counted(robot.enclaves, "enclave")
     if robot.revoked:

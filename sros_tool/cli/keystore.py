@@ -584,7 +584,7 @@ def _print_open_rights(root: Path, template: Template) -> None:
 
 
 def _open_rights(root: Path, template: Template) -> list[Note]:
-    """Return warnings about what a template permits that should be restricted."""
+    """Return warnings about rights that a template gives and that should be restricted."""
     from sros_tool.keystore.template import EVERYTHING
 
     change = f"`sros update_keystore {quote(str(root))} --template production`"

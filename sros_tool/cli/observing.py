@@ -1,4 +1,4 @@
-"""What the verbs that observe the ROS graph share: options, the observer, its failures."""
+"""Common parts of the verbs that observe the ROS graph: options, the observer, its failures."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def observing_options(enclave_help: str) -> Callable[[Decorated], Decorated]:
 
 
 def check_duration(watch: str | None, spin_time: float | None) -> None:
-    """Raise `UsageError` if both ways to say how long to observe are given."""
+    """Raise `UsageError` if both --watch and --spin-time are given."""
     if watch is not None and spin_time is not None:
         raise UsageError("--watch and --spin-time exclude each other", "", "Choose one.")
 
@@ -228,7 +228,8 @@ def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
             "the DDS of this rclpy was built without DDS Security, so it cannot observe a secured "
             "robot",
             f"DDS says: {line}",
-            "Use a ROS 2 whose DDS has it, such as the packages of Ubuntu; `sros doctor` shows "
+            "Use a ROS 2 whose DDS has DDS Security, such as the packages of Ubuntu; `sros "
+            "doctor` shows "
             "which DDS here enforces security.",
         )
     name = environment.get(ENCLAVE) or os.environ.get(ENCLAVE) or "/"
@@ -491,7 +492,7 @@ def _present_policy(file: Path | None) -> Policy | None:
 def _printed(
     plan: Draft | None, file: Path | None, learned: Learned, observation: Observation, dry_run: bool
 ) -> LearnedPolicy:
-    """Return what ``--json`` prints of what was learned; without a ``plan``, no file changes."""
+    """Return the ``--json`` output about learned rights; without a ``plan``, no file changes."""
     from sros_tool.graph.learn import LearnedPolicy
     from sros_tool.policy.merge import merge_notes
     from sros_tool.policy.rights import order, policy_rights

@@ -239,7 +239,7 @@ def diff_policy(
 
 
 _MOST_LINES, _MOST_PICTURE, _MOST_LINKS = 12_000, 25_000, 250
-"""Characters of a difference in Markdown, and characters and arrows of its picture.
+"""Maximum characters of a difference in Markdown, and maximum characters and arrows of its picture.
 
 A comment on GitHub has at most 65,536 characters; Mermaid draws at most 50,000, and 500 arrows.
 """
@@ -630,7 +630,7 @@ def _convert(
 _MOST_NEW_LINES = 20
 """Maximum number of reach lines, and of enclaves in a line, in text output; JSON has all."""
 _MOST_CHARACTERS = 12_000
-"""Characters of each list in Markdown."""
+"""Maximum length of each list in Markdown, in characters."""
 
 
 def _show_new_access(

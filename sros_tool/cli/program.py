@@ -252,7 +252,7 @@ _PHRASES = {
 
 
 def report_error(error: BaseException, arguments: Sequence[str], name: str = "sros") -> int:
-    """Print what is wrong, why, and what to do; return the exit status.
+    """Print an error with its reason and remedy; return the exit status.
 
     ``arguments`` are the words of the command line: messages begin with what its verb does.
     ``name`` is what help calls the program.

@@ -1,4 +1,4 @@
-"""The verb `review`: what a change of policies and keystores adds, read from commits."""
+"""The verb `review`: access that a change of policies and keystores adds, read from two commits."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from sros_tool.proof.review import Review, ReviewRequest, ReviewStep
 
 _MOST = 60_000
-"""Characters of the Markdown: a comment on GitHub has at most 65,536."""
+"""Maximum length of the Markdown, in characters: a comment on GitHub has at most 65,536."""
 _SIGNS = {0: "🟢", 1: "🔴", 2: "⚪"}
 _WORDS = {0: "nothing found", 1: "found", 2: "could not be decided"}
 _TITLES = {
@@ -362,7 +362,7 @@ def _text(result: Review) -> list[str]:
 
 
 def _verdict(result: Review) -> str:
-    """Return the result in one sentence, with what it leaves out."""
+    """Return a sentence with the result and the parts that were not reviewed."""
     counts = [sum(step.status == status for step in result.steps) for status in (1, 2)]
     words = [
         f"{counted(count, 'step')} {word}"

@@ -341,7 +341,7 @@ def run(
     if (other := named_enclave(command)) and other != name:
         raise UsageError(
             f"the command names the enclave {other}, and sros would run it in {name}",
-            "ROS_SECURITY_ENCLAVE_OVERRIDE, which sros sets, counts more than --enclave.",
+            "ROS_SECURITY_ENCLAVE_OVERRIDE, which sros sets, overrides --enclave.",
             f"Leave `--enclave {shlex.quote(other)}` out, or name the same enclave: `sros run "
             f"{shlex.quote(str(root))} {shlex.quote(other)} -- COMMAND`.",
         )
@@ -514,7 +514,7 @@ def units(
         )
     if jobs and (rest[1:] or several) and there is None:
         raise UsageError(
-            f"the nodes run where the keystore is in {INSTALLED}, and the jobs are for '{root}'",
+            f"the node units are for the keystore {INSTALLED}, and the job units are for '{root}'",
             "One folder of units is for one machine.",
             "Run two commands with two folders, or name the keystore with --target.",
         )

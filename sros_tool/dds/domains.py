@@ -68,7 +68,7 @@ class DomainSet:
 
     @classmethod
     def of(cls, *pairs: tuple[int, int]) -> DomainSet:
-        """Return the set of these ranges, sorted, and joined where they touch."""
+        """Return the set of the ranges ``pairs``, sorted, with adjacent ranges joined."""
         joined: list[tuple[int, int]] = []
         for first, last in sorted(pairs):
             if joined and first <= joined[-1][1] + 1:

@@ -1,4 +1,4 @@
-"""The permissions document of DDS Security: grants, rules, their XML, and what vendors read alike.
+"""The permissions document of DDS Security: grants, rules, their XML, and its portable form.
 
 Names follow the specification (DDS-Security 1.1, 9.4.1.3 and the schema
 omg_shared_ca_permissions of 20170901).
@@ -348,7 +348,7 @@ _CONSEQUENCES = {
 
 
 Meets = Callable[[str], bool]
-"""A function: does an expression share a name with one of some other expressions?"""
+"""A function that tells whether an expression shares a name with other expressions."""
 
 
 def _meets_text(names: Sequence[str]) -> Meets:
@@ -420,7 +420,7 @@ def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
         yield Note(
             "portable.enclave-names",
             f"Cyclone DDS 0.10 mistakes {some_pairs(pairs)}, if the first enclave presents the "
-            "(public) permissions of the second, because all parts of its name occur there. "
+            "(public) permissions of the second one, which contain all parts of its name. "
             "Choose names that do not consist of parts of another name, such as /robot_admin.",
         )
 

@@ -74,7 +74,7 @@ _RIGHTS = {
     Role.CLIENT: "request",
 }
 _MOST_FAULTY = 8
-"""The most enclaves with faulty or revoked files that get a row."""
+"""Maximum number of enclaves with faulty or revoked files that get a row."""
 
 
 class CastMember(NamedTuple):
@@ -121,7 +121,7 @@ class UserKeystore(NamedTuple):
         shutil.copytree(self.root, target, symlinks=True, ignore=_all_but(self.root, folders))
 
     def keyring(self) -> Keyring:
-        """Return the keyring of the CA keys: in the keystore, else where its settings say."""
+        """Return the keyring of the CA keys: in the keystore, or where its settings say."""
         inside = {role: self.root.absolute() / ca_key(role) for role in ROLES}
         places = {role: f"file:{path}" for role, path in inside.items() if path.exists()}
         return Keyring(places=places)
@@ -249,7 +249,7 @@ class _Enclaves(NamedTuple):
         yield from rows[:_MOST_FAULTY]
 
     def not_tried(self, cast: Mapping[str, str]) -> Iterator[str]:
-        """Yield what a proof of the keystore needs and this cast cannot try."""
+        """Yield the tests that a proof of the keystore needs and this cast cannot run."""
         more = len(self.revoked) + len(self.faulty) - _MOST_FAULTY
         if more > 0:
             yield f"{more} more enclaves with faulty or revoked files"

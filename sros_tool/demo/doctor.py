@@ -232,7 +232,7 @@ _PRESENT = (
     "ZENOH_ROUTER_CONFIG_URI",
     "ZENOH_SESSION_CONFIG_URI",
 )
-"""Environment variables of which only the presence is reported."""
+"""Environment variables that are reported as set or not set, without their values."""
 _PACKAGES = (
     "click",
     "cryptography",

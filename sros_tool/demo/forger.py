@@ -98,8 +98,8 @@ class KeystoreCopy:
         """
         if part not in self.cast:
             raise UncastError(
-                f"the keystore has no enclave that can be the {part}",
-                "None has the permissions that this part of the attack needs.",
+                f"the keystore has no enclave for the part {part}",
+                "No enclave has the permissions that this part of the attack needs.",
             )
         return self.cast[part]
 
@@ -108,7 +108,7 @@ class KeystoreCopy:
         return enclave_path(self.root, self.enclave(part))
 
     def authorities(self, root: Path | None = None) -> Authorities:
-        """Return the CAs with their keys, of this keystore or of the foreign one.
+        """Return the CAs of this keystore, or of the foreign keystore, with their keys.
 
         Raises:
             SrosError: a key of a CA cannot be loaded.
@@ -164,7 +164,7 @@ class KeystoreCopy:
         return render_permissions(Permissions(grants))
 
     def sign(self, document: bytes, root: Path | None = None) -> bytes:
-        """Sign a document with the permissions CA of this keystore, or of the foreign one."""
+        """Sign a document with the permissions CA of this keystore, or of the foreign keystore."""
         authority = self.authorities(root).permissions
         return smime.sign(document, authority.certificate, authority.key)
 
@@ -516,7 +516,7 @@ def _revocation_not_delivered(copy: KeystoreCopy, part: str) -> None:
 
 
 def identity_copied_by_another_user(copy: KeystoreCopy) -> None:
-    """Keep only those of the talker's files that another user of the machine can read.
+    """Remove the talker's files that another user of the machine cannot read.
 
     Raises:
         UnavailableError: this process does not run as root.

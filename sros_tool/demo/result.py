@@ -94,7 +94,7 @@ class RowResult:
     """The result of one row."""
 
     name: str
-    """What the row tries."""
+    """Name of the row: the attack or the action that it tries."""
     expected: RowStatus
     """The expected outcome."""
     observed: RowStatus
@@ -102,7 +102,7 @@ class RowResult:
     mechanism: str
     """Why this outcome is expected."""
     detail: str
-    """What was observed, with counts."""
+    """Observation, with counts of messages."""
     domain: int
     """ROS domain of the row."""
     seconds: float = 0.0
@@ -113,7 +113,7 @@ class RowResult:
     open_because: str = ""
     """Why the attack is known to succeed, or an empty string."""
     remedy: str = ""
-    """What a user can do against the attack, or an empty string."""
+    """Defence against the attack, or an empty string."""
     accepted: bool = False
     """Whether `--accept-open` names the row."""
     unaccepted: bool = False
@@ -147,7 +147,7 @@ class RowResult:
 
     @property
     def untried(self) -> bool:
-        """Whether an attack that has to fail was not tried, so that it may succeed unseen.
+        """Whether an attack that has to fail was not tried: it may succeed.
 
         A row without its defence, or of an attack that is known to succeed or was accepted, proves
         nothing of a keystore; and what does not apply to it cannot succeed.
@@ -513,7 +513,7 @@ class KeystoreSummary(NamedTuple):
     elsewhere: int = 0
     """Number of enclaves whose key is elsewhere; the demo did not try them."""
     not_tried: tuple[str, ...] = ()
-    """What a proof needs and the demo did not try; if not empty, the exit status is not 0."""
+    """Tests that a proof needs and the demo did not run; with any, the exit status is not 0."""
 
 
 @shows("name", "title", "as_expected", "cast", "keystore", "rows", "cost")
@@ -543,7 +543,7 @@ class ScenarioResult:
 
     @property
     def not_tried(self) -> tuple[str, ...]:
-        """What a proof of the user's keystore needs and the demo did not try.
+        """Tests that a proof of the user's keystore needs and the demo did not run.
 
         The demo's own keystores are to show what works, and prove nothing of other ones.
         """

@@ -87,7 +87,7 @@ def _spin(nodes: Sequence[Any], ended: Callable[[], bool]) -> None:
 
 
 def _until_signalled() -> Callable[[], bool]:
-    """Handle SIGINT and SIGTERM; return a function that says whether one of them came.
+    """Handle SIGINT and SIGTERM; return a function that tells whether a signal has arrived.
 
     Not rclpy's handlers: they shut its context down in the middle of a callback, or just before a
     wait without end, and a KeyboardInterrupt inside its C++ becomes another error there ("Unable to

@@ -123,7 +123,7 @@ class RunPlan:
 
     @property
     def rows_at_once(self) -> int:
-        """The number of worlds (groups of rows that share processes) to run in parallel."""
+        """The number of groups of rows (with common processes) to run in parallel."""
         # Routers of one machine listen at the same port.
         return 1 if self.backend.on_zenoh and not self.own_networks else self.backend.rows_at_once
 
@@ -393,7 +393,7 @@ def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProces
 
 
 def worlds(rows: Sequence[Row]) -> list[list[int]]:
-    """Group rows that share a world; return the indexes of the rows."""
+    """Group rows that can share processes; return the indexes of the rows."""
     groups: dict[object, list[int]] = {}
     for index, row in enumerate(rows):
         groups.setdefault(row.world or index, []).append(index)

@@ -186,7 +186,7 @@ def mapped_segments(process: int) -> frozenset[Path]:
 
 
 def shared_memory(texts: Mapping[str, str], segments: Collection[Path]) -> dict[str, int]:
-    """Return how many of the segments contain the text of each party."""
+    """Return for each party the number of shared memory segments that contain its text."""
     return {
         name: sum(_shows(path, text) for path in segments) if text else 0
         for name, text in texts.items()

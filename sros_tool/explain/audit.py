@@ -1,4 +1,4 @@
-"""Find what a policy or a keystore would deny to the nodes of an observed ROS graph.
+"""Find the rights that observed ROS nodes use and a policy or a keystore denies.
 
 DDS Security has no permissive mode: a rule denies, or there is no security.  So nothing is enforced
 here.  The decision engine decides every endpoint of the graph, in the enclave in which its process
@@ -262,12 +262,12 @@ class AuditResult(NamedTuple):
     unseen: Sequence[EnclaveNode]
     """The nodes of the policy or keystore that were not seen, and so not judged."""
     unjudged: Sequence[str]
-    """Things that were seen and not judged, with their number in words; ``notes`` has the names."""
+    """Observed things that were not judged, as counts in words; ``notes`` has their names."""
     observation: Observation
     settled: bool
     """Whether the ROS graph stopped changing before the result."""
     partial: bool
-    """Whether ``--partial`` accepted what was not seen or not judged."""
+    """Whether ``--partial`` accepted nodes and things that were not seen or not judged."""
     patch: Path | None
     """The policy with the rights to add that was written (``--patch``), or null."""
     dry_run: DryRun
@@ -395,7 +395,7 @@ _STRAYS = "not judged, because the writers or readers of these topics belong to 
 
 
 def _unjudged(observation: Observation) -> list[tuple[Note, str]]:
-    """Return notes on the observed things that are not judged, with their number in words.
+    """Return notes on observed things that are not judged, each with a count in words.
 
     The words are "" for tools that only observe.
     """

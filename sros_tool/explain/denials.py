@@ -219,13 +219,13 @@ _WHOLE = (
 _ELSEWHERE = "not proposed, because the log names another enclave than --enclave: {}"
 _SEVERAL = Note(
     "log.several-enclaves",
-    "the log names several enclaves, and each denial counts for the enclave that its process "
+    "the log names several enclaves, and each denial is assigned to the enclave that its process "
     "named last; check that no two processes wrote to the log at the same time without a label, "
     "such as the [talker-1] of ros2 launch",
 )
 
 _NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")
-"""Common parts, widest first: a node that lacks one right of a part probably lacks all of them."""
+"""Common parts, the largest first: a node that lacks a right of a part probably lacks the part."""
 
 
 def learned_from_logs(
@@ -369,7 +369,7 @@ def _whole_parts(
     has: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
-    """Return the first common part of which a node has no right and was denied one, if any."""
+    """Return the first common part with a denied right of a node that has no right of the part."""
     if is_expression(place[1]):
         return ()
     for part in _NODE_PARTS:

@@ -402,7 +402,7 @@ _SHOWN = 3
 
 
 def _edits(lift: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
-    """Yield a replacement for each group of the policy that contains one of these denials."""
+    """Yield a replacement for each group of the policy that contains denials from ``lift``."""
     groups: dict[Source, Group] = {}
     lifted: dict[Source, set[tuple[str, str]]] = {}
     for right in lift:

@@ -142,7 +142,7 @@ class SearchedKeystore:
 
     @cached_property
     def rotates(self) -> bool:
-        """Whether a rotation of CAs is in the stage in which the new CAs have issued all files."""
+        """Whether a CA rotation is in the stage in which the new CAs have issued all files."""
         try:
             return read_rotation(self._keystore).stage is RotationStage.REISSUE
         except SrosError:
@@ -187,7 +187,7 @@ def explain_log_of(
         named = signed_enclave(keystore, name, asking.at)
         if named is None:
             raise UsageError(
-                f"no keystore is named for enclave {name}",
+                f"the keystore of enclave {name} is missing in the command",
                 "",
                 "Write the keystore before the enclave.",
             )
@@ -218,8 +218,7 @@ def explain_log_of(
 _NOTES = (
     Note(
         "log.only-text",
-        "a process can print any line: only what is shown after 'found' was examined in the "
-        "enclave",
+        "a process can print any line: only the lines after 'found' were checked in the enclave",
     ),
 )
 
@@ -407,7 +406,7 @@ _GRAPH: Mapping[tuple[str, bool], str] = {
 
 
 def _dropped(lines: Iterable[str], root: str) -> Iterator[LogFinding]:
-    """Yield a finding for each right whose lack made Zenoh's access control drop messages."""
+    """Yield a finding for each missing right because of which Zenoh dropped messages."""
     numbered = ((n, *labelled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
     groups: dict[tuple[str, str, str], list[DroppedMessage]] = {}
     for message in dropped_messages(numbered):
@@ -662,7 +661,7 @@ class _Examiner:
     def _causes(
         self, enclave: LoadedEnclave, answer: Answer, faults: tuple[Fault, ...]
     ) -> Iterator[tuple[str, str]]:
-        """Yield the enclave's faults with remedies; only those in ``faults``, if it has some."""
+        """Yield the enclave's faults with remedies: the ones in ``faults``, or else all."""
         fitting = [problem for problem in answer.problems if problem.fault in faults]
         for problem in fitting or answer.problems:
             yield str(problem), remedy(problem.fault, self._root, enclave.name, problem.file)

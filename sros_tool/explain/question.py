@@ -123,7 +123,10 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
         )
     if word == _JOIN:
         if name or kind:
-            raise UsageError("join takes neither a name nor a type", "It is about the domain.")
+            raise UsageError(
+                "join takes no name and no type",
+                "The question is whether the enclave may join the domain.",
+            )
         return Question(_JOIN)
     fitting = [each for each in TYPES if (word, each) in _RIGHTS]
     chosen = kind or fitting[0]

@@ -28,7 +28,7 @@ from sros_tool.wording import first_few
 _PART = r"[A-Za-z_][A-Za-z0-9_]*"
 MAX_ENCLAVES = 1_000_000
 MAX_PATTERNS = 1_000
-"""Most enclaves and most paths with a placeholder of one fleet."""
+"""Maximum number of enclaves, and of paths with a placeholder, of one fleet."""
 
 _VALUES = {"robot": _PART, "namespace": f"(?:/{_PART})*"}
 

@@ -301,8 +301,8 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
         if wrong:
             raise PolicyError(
                 "the policy cannot be narrowed for all robots at once",
-                "A wildcard does not mean the same for every robot, so it is unclear who may "
-                f"{wrong[0]}.",
+                "A wildcard matches different names on different robots, so it is unclear which "
+                "enclaves may {wrong[0]}.",
                 "Replace the wildcard by the names that the robots use.",
             )
 

@@ -19,7 +19,7 @@ from sros_tool.names import expression_problem
 
 MAX_ROBOTS = 10_000
 ROUTERS = "/{robot}/router"
-"""The usual path of the enclaves of robots' Zenoh routers."""
+"""Default path of the enclave of each robot's Zenoh router."""
 _MAX_NAME = 64
 """Longest name of a robot or group in characters: longer ones fit into no enclave's name."""
 __MAX_NAMESPACE = 245
@@ -36,7 +36,7 @@ _USER = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}\$?", re.ASCII)
 
 
 class Robot(NamedTuple):
-    """A robot: its ROS namespace, and how it is reached.
+    """A robot: its ROS namespace, and its network address.
 
     ``domain`` is its ROS_DOMAIN_ID, or None for every domain of the keystore.  ``address`` is a
     host name or IP address, ``user`` the account there, or "" for that of ssh.  ``groups`` are
@@ -57,7 +57,7 @@ class Robot(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """Robots by their names, and the names of the robots of each group; both sorted.
+    """The robots by name, and the robot names of each group; both sorted.
 
     ``enclaves`` are paths of enclaves with a placeholder, such as ``/{robot}/base``: they say
     which robot an enclave belongs to.  ``routers`` is the path of the enclaves of the robots' Zenoh
@@ -177,7 +177,7 @@ def address_problem(address: str) -> str:
 
 
 def router_problem(router: str) -> str:
-    """Return why ``router`` is not where a Zenoh router is reached, as a sentence; "" if it is."""
+    """Return why ``router`` is no address of a Zenoh router, as a sentence; "" if it is one."""
     from sros_tool.zenoh.configuration import is_endpoint  # most fleets name no routers
 
     return "" if is_endpoint(router) else "It is not HOST:PORT, such as r7.example.com:7447."

@@ -275,7 +275,7 @@ def _criteria(endpoints: Iterable[Endpoint], direction: str) -> tuple[Criteria, 
 
 
 def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, ...]:
-    """Return a group for each kind of right, in the order of the policy language.
+    """Return a group of rights for topics, services and actions each, in this order.
 
     Names in a group are sorted, and relative to the node where that is shorter.
     """
@@ -683,7 +683,7 @@ class AskingLine(NamedTuple):
     enclave: str | None
     """The enclave that the line names; null if the line names none."""
     direction: Annotated[str, Words((PUBLISH, SUBSCRIBE))]
-    """What was denied."""
+    """The denied direction."""
     topic: str
     """The DDS topic that was denied."""
 

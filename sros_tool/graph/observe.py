@@ -364,7 +364,7 @@ def resolve(sighting: Sighting) -> Observation:
 def _enclaves(
     sighting: Sighting, processes: dict[str, frozenset[_Name]]
 ) -> dict[str, frozenset[str]]:
-    """Map each process to its possible enclaves, as few as the sighting allows.
+    """Map each process to its possible enclaves; the sighting excludes all others.
 
     ``processes`` maps participants to the names of their nodes.
     """

@@ -24,7 +24,7 @@ class Effect(StrEnum):
     LOOSER = "looser"
     TIGHTER = "tighter"
     LATER = "later"
-    """Changes nothing now: applies to what is made later."""
+    """Changes nothing now: applies to files that are made later."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -275,7 +275,7 @@ class RouterFacts(NamedTuple):
 
 
 def router_facts(router: ZenohRouter) -> RouterFacts:
-    """Return what is shown of a router."""
+    """Return the facts about a router for the output."""
     return RouterFacts(
         router.name, router.endpoints, router.listening(), router.enclaves, router.crossing
     )
@@ -957,14 +957,14 @@ class HistoryStatus(StrEnum):
 
 @shows(spread=("entry",))
 class HistoryItem(NamedTuple):
-    """An entry of the ledger, and the present state of what it records."""
+    """An entry of the ledger, and the present state of the recorded item."""
 
     entry: Entry
     """Entry of the ledger."""
     status: HistoryStatus
     """Present state of the certificate or document."""
     path: str
-    """Its file in the keystore; empty if there is none."""
+    """File of the item in the keystore; empty if it has no file."""
 
 
 class History(NamedTuple):
@@ -981,7 +981,7 @@ class History(NamedTuple):
 
 
 def history(root: Path, *, now: datetime) -> History:
-    """Return the entries of a keystore's ledger, with the present state of what they record."""
+    """Return the entries of a keystore's ledger, with the present state of the recorded items."""
     issued, revoked_files = _files(root, _active_paths(root)), _files(root, _revoked_paths(root))
     retired = _files(root, _retired_paths(root))
     keystore = Keystore(root)

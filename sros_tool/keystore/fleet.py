@@ -152,7 +152,7 @@ class EnclaveDomains(NamedTuple):
             raise KeystoreError(
                 f"the robot {robot.name} is in domain {robot.domain}, and the keystore is for "
                 f"domain {self.keystore}",
-                "In a domain that the governance does not name, no enclave can communicate.",
+                "An enclave can communicate only in the domains that the governance names.",
                 f"Add it with `sros update_keystore KEYSTORE --domain "
                 f"{self.keystore},{robot.domain} --allow-looser`, or change it in the fleet "
                 "file.",

@@ -51,7 +51,7 @@ from sros_tool.values import NamedKeystore, Words, shows
 
 
 class State(StrEnum):
-    """The state of a robot's file, compared with the keystore; for a robot, that of its worst file.
+    """State of a robot's file, compared with the keystore; for a robot, that of its worst file.
 
     The order is from good to bad.
     """
@@ -546,7 +546,7 @@ class _Stages:
                 self._at_home[kind] = certificates, self.at_home if new else self.COMPLETE
 
     def of(self, compared: _ComparedRobot) -> str:
-        """Return the stage of the robot's least advanced CA file; "" if it confirmed none."""
+        """Return the stage of the robot's least advanced CA file; "" if it confirmed no CA file."""
         stages = {
             self._stage(kind, certificates)
             for kind, files in compared.authorities.items()

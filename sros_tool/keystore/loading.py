@@ -134,7 +134,7 @@ def vendor_problems(
 
 
 def _when_met(problem: Problem) -> int:
-    """Return the sort key of a problem: the order in which a process meets problems."""
+    """Return the sort key of a problem: the order in which a process notices problems."""
     if problem.fault in BEFORE_DDS:
         return 0
     early = (*_ON_READING, *_OF_CA) if problem.file == IDENTITY_CA_FILE else _ON_READING
@@ -256,7 +256,7 @@ def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
 def _signature_problems(
     traits: VendorTraits, file: str, state: OpenedEnclave, signers: Certificates, at: datetime
 ) -> Iterator[Problem]:
-    """Yield the problem for which the vendor refuses the signature of a document, if it exists."""
+    """Yield the reason for which the vendor refuses the signature of a document, if it does."""
     if file not in state.files or not signers:
         return
     try:

@@ -55,7 +55,7 @@ class KeptZenoh:
 
 
 class EnclaveResult(NamedTuple, Generic[Outcome]):
-    """An enclave, and what was done with it."""
+    """The outcome of a command for an enclave."""
 
     name: str
     """Name of the enclave."""
@@ -66,7 +66,7 @@ class EnclaveResult(NamedTuple, Generic[Outcome]):
     """Serial number of the certificate, in hexadecimal; null if a dry run did not issue it, or it
     cannot be read."""
     sha256: str | None
-    """SHA-256 of its certificate (DER), in hexadecimal; null as above."""
+    """SHA-256 of the certificate (DER), in hexadecimal; null without a certificate."""
     valid_until: datetime | None
     """First expiry of certificate and permissions, in UTC; null if ``serial`` is null."""
 
@@ -97,13 +97,13 @@ class AuthorityFacts(NamedTuple):
     """A CA, and its certificate."""
 
     roles: Sequence[Annotated[str, Words(ROLES)]]
-    """What the CA signs."""
+    """Roles of the CA."""
     subject: str | None
     """Subject of the certificate; null if a dry run did not make it."""
     serial: str | None
-    """Serial number of its certificate, in hexadecimal; null as above."""
+    """Serial number of the certificate, in hexadecimal; null without a certificate."""
     sha256: str | None
-    """SHA-256 of its certificate (DER), in hexadecimal; null as above."""
+    """SHA-256 of the certificate (DER), in hexadecimal; null without a certificate."""
     valid_until: datetime | None
     """Expiry of the certificate, in UTC; null if ``subject`` is null."""
 

@@ -1,4 +1,4 @@
-"""An enclave as DDS loads it, and the participant that each vendor makes of it.
+"""An enclave as DDS loads it, and the participant that each vendor creates for it.
 
 Only this module combines the decisions of a vendor: which files it refuses to load, how it reads
 the documents, and whether the participant may join.
@@ -159,7 +159,7 @@ def loaded(name: str, folder: Path, state: OpenedEnclave, *, at: datetime) -> Lo
 
 
 def _portable(permissions: Permissions | None, document: bytes) -> Permissions | None:
-    """Return ``permissions`` if all vendors read the document alike; else None."""
+    """Return ``permissions`` if all vendors read the document in the same way; else None."""
     return permissions if permissions and canonical_permissions(permissions, document) else None
 
 
@@ -429,7 +429,7 @@ def evaluated(
 
 
 def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> OpenedEnclave:
-    """Return an enclave's state without the faults that some vendor in ``made`` accepts.
+    """Return an enclave's state without the faults that at least one vendor in ``made`` accepts.
 
     Documents that a vendor loads count as the enclave's documents if a CA signed them; a document
     that the enclave signed itself stays a fault, whatever vendor accepts it (CVE-2023-24011).

@@ -67,8 +67,8 @@ def with_stated(
             f'{other.source}: {other} has protect="{other.word}", and {stated_protection} has '
             f'protect="{stated_protection.word}" at {stated_protection.source}',
             "A keystore has one governance for all enclaves, so each name has one protection; a "
-            "wildcard says it of all names that it matches.",
-            "Say the same in both places, or in one of them only.",
+            "wildcard protects all names that it matches.",
+            "State the same protection in both places, or only one protection.",
         )
     raised = _Raising(protection)
     for stated_protection in {
@@ -163,7 +163,7 @@ class _Raising:
             f'{stated.source}: {stated} has protect="{stated.word}", and the settings of the '
             f"keystore protect {other} in their own way",
             "Some names match both wildcards, and it is unclear which of the two decides.",
-            "Say it in the policy of names that only one of the wildcards matches, or change the "
+            "In the policy, protect names that only one of the wildcards matches, or change the "
             "settings: `sros update_keystore --help` describes --rule and --drop-rule.",
         )
 

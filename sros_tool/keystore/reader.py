@@ -488,7 +488,7 @@ class Keystore:
         )
 
     def identity(self, name: str, *, now: datetime) -> EnclaveIdentity:
-        """Return the certificate of an enclave, and what is wrong with its files of identity.
+        """Return the certificate of an enclave, and the faults of its identity files.
 
         It reads neither governance nor permissions: Zenoh needs none of them.
         """
@@ -610,7 +610,7 @@ class Problem(NamedTuple):
 
 @dataclass(frozen=True)
 class OpenedEnclave:
-    """The content of an enclave's files, as far as they can be read, and their problems.
+    """The readable content of an enclave's files, and their problems.
 
     ``permissions_bytes`` is the size of ``permissions.p7s``.
     """
@@ -701,7 +701,7 @@ class OpenedEnclave:
 
 
 class EnclaveIdentity(NamedTuple):
-    """The certificate of an enclave, and the problems of it, of its key and of its identity CA.
+    """The certificate of an enclave, and the problems of certificate, key and identity CA.
 
     The key may be missing in a keystore if it was generated on the robot and stays there.
     """

@@ -210,7 +210,7 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
 def _links(
     sources: Mapping[Path, RightsSource], files: Mapping[str, Path], routers: Sequence[str]
 ) -> RouterLinks | None:
-    """Return what passes between several routers, and which of them has rules for an enclave.
+    """Return the messages that pass between routers, and the router with rules for each enclave.
 
     ``files`` are the folders of the enclaves, and ``sources`` what the configurations in them give.
     """
@@ -229,7 +229,7 @@ def _links(
 
 
 def check_routers(root: Path, known: Mapping[str, Collection[str]]) -> None:
-    """Raise `KeystoreError` if one of several routers has no rules for another one.
+    """Raise `KeystoreError` if a router has no rules for another router of the keystore.
 
     ``known`` maps the enclave of each router to the names for which its configuration has rules.
     A router that has none for any enclave has nothing to pass on.
@@ -240,8 +240,8 @@ def check_routers(root: Path, known: Mapping[str, Collection[str]]) -> None:
             raise KeystoreError(
                 f"keystore '{root}' has the files of several routers that are not connected",
                 f"{ROUTER_FILE} of {name} has no rules for {', '.join(strangers[:5])}, so it is "
-                "not known which of them routes.",
-                "Remove those that no process uses, or write all files again: "
+                "not known which file the router uses.",
+                "Remove the files that no process uses, or write all files again: "
                 f"`sros zenoh {quote(str(root))}`.",
             )
 
@@ -474,7 +474,7 @@ class SourcesDifference(NamedTuple):
     """The enclaves that were compared; None for all."""
     rights: RightsDifference
     protections: Sequence[tuple[str, StatedProtection]]
-    """What only one of two policies says about protection, with "-" for the first or "+"."""
+    """Protections that only one of two policies states, with "-" for the first or "+"."""
 
     def __bool__(self) -> bool:
         return bool(self.rights or self.protections)
@@ -498,7 +498,7 @@ def compare_sources(first: RightsSource, second: RightsSource) -> SourcesDiffere
 def _protection_differences(
     first: RightsSource, second: RightsSource
 ) -> list[tuple[str, StatedProtection]]:
-    """Return what only one of two policies says about protection, with "-" or "+"."""
+    """Return the protections that only one of two policies states, with "-" or "+"."""
     if first.protections is None or second.protections is None:
         return []
     protections, other = set(first.protections), set(second.protections)

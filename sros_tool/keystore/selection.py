@@ -144,7 +144,8 @@ def _of_robots(
         raise KeystoreError(
             f"'{root}' is no keystore with a fleet, so it has no robot {robots[0]!r}",
             "An export for a robot has the enclaves of that robot alone, and not the fleet.",
-            "Leave --robot out, choose enclaves with --match, or name the keystore at home.",
+            "Leave --robot out, choose enclaves with --match, or name the keystore from which it "
+            "was exported.",
         )
     if fleet is None:
         raise KeystoreError(
@@ -184,7 +185,7 @@ _SHOWN = 5
 _ALIKE = 0.75
 """Lowest similarity (`difflib`) that counts as a typo: one of four letters differs."""
 _WHOLE_ALIKE = 0.9
-"""Lowest similarity for a typo in a full name: names in the same namespace begin alike."""
+"""Lowest similarity for a typo in a full name: names in a namespace have the same beginning."""
 
 
 def no_such_enclave(

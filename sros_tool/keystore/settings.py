@@ -116,10 +116,10 @@ class PresentSettings(NamedTuple):
         """
         if self.without_settings and protection_for(self.governance) is None:
             raise KeystoreError(
-                "the governance of the keystore states what settings cannot",
+                "the governance of the keystore has rules that settings cannot express",
                 "It has several domain rules, no rule for * at its end, or a rule for a DDS topic "
                 "that is no topic, service or action of ROS. A single change would replace it.",
-                "Name all settings with --template, which shows with --dry-run what it replaces.",
+                "Replace all settings with --template; --dry-run shows the changes.",
             )
         return self.settings
 

@@ -260,7 +260,7 @@ def _zenoh(table: _Table) -> ZenohNetwork:
 
 
 def _zenoh_routers(tables: _Table) -> Iterator[ZenohRouter]:
-    """Yield the further routers of a network, each with its enclaves."""
+    """Yield the other routers of a network, each with its enclaves."""
     from sros_tool.zenoh.configuration import ZenohRouter
 
     for name in tables.names():
@@ -359,7 +359,7 @@ def with_values(
         if (kind, name) in dropped and len(left) == len(entries):
             raise UsageError(
                 f"the {kind} {name} has no protection of its own",
-                "Only what `[[protection...]]` of the settings names can be dropped.",
+                "Only names with a `[[protection...]]` table in the settings can be dropped.",
                 "See sros.toml of the keystore.",
             )
         protection[kind] = left
@@ -374,7 +374,7 @@ def with_values(
             inner = inner.get(part) if isinstance(inner, dict) else None
         if path == ["zenoh"] and inner is None:
             raise UsageError(
-                "the keystore has no files for Zenoh yet, so no settings of them",
+                "the keystore has no files for Zenoh yet, so they have no settings",
                 "",
                 "Write them first, for example with `sros zenoh KEYSTORE --mode peer`.",
             )

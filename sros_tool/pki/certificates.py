@@ -90,7 +90,7 @@ def enclave_subject(name: str, *, unique: bool) -> x509.Name:
 
 
 def has_unique_part(subject: x509.Name) -> bool:
-    """Return whether an enclave's subject has a part besides its common name (a unique OU)."""
+    """Return whether an enclave's subject has a unique OU next to its common name."""
     return len(subject.rdns) > 1 or any(len(rdn) > 1 for rdn in subject.rdns)
 
 
@@ -120,8 +120,8 @@ def check_signer(certificate: x509.Certificate) -> None:
     if tolerant.is_tolerated(certificate):
         raise PkiError(
             f"sros cannot sign with the CA {subject_text(certificate.subject)}",
-            "Its certificate breaks rules of X.509 (RFC 5280); DDS reads it all the same, but "
-            "programs that issue certificates do not.",
+            "Its certificate breaks rules of X.509 (RFC 5280); DDS reads it nevertheless, but "
+            "sros cannot issue certificates with it.",
             "Issue the certificate of the CA again, without the damage or with other extensions.",
         )
 
@@ -165,7 +165,7 @@ def _builder(
     if isinstance(subject, TolerantName):
         raise PkiError(
             f"no certificate can have the subject {subject_text(subject)}",
-            "It has characters that its types of text do not allow.",
+            "Its text types (ASN.1) do not allow some of its characters.",
             "Create the enclave again, with another subject.",
         )
     return x509.CertificateBuilder(
@@ -263,7 +263,7 @@ def _blocks(data: bytes, what: str) -> Iterator[pem_file.Block]:
 
 @lru_cache(maxsize=8)  # several readers ask for the certificate of an enclave, or for all of them
 def _known_blocks(data: bytes) -> tuple[tuple[pem_file.Block, ...], str]:
-    """Return the blocks before the first damaged one, and what is damaged ("" if nothing is)."""
+    """Return the PEM blocks before the first damaged block, and a clause on the damage, or ""."""
     blocks: list[pem_file.Block] = []
     try:
         blocks.extend(pem_file.blocks(data))
@@ -633,7 +633,7 @@ _UNUSUAL = re.compile(rb"[^A-Za-z0-9/_]")
 
 
 class CertificateForm(NamedTuple):
-    """The form of a certificate file, without what is different in every certificate.
+    """The form of a certificate file: all that certificates of the same kind have in common.
 
     ``common`` is equal for files that differ in the own parts of their certificates alone.
     ``validity`` is the period in DER.

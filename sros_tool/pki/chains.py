@@ -452,7 +452,7 @@ _ALWAYS_ASKED = {ExtensionOID.CERTIFICATE_POLICIES, ExtensionOID.POLICY_CONSTRAI
 
 
 def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
-    """Yield why no policy holds for the whole chain, if its certificates demand one (pcy_tree.c).
+    """Yield a fault if a demanded policy is not valid for the whole chain (pcy_tree.c).
 
     Also where a certificate has a policy twice, or translates policies, which sros does not follow.
     """

@@ -106,7 +106,7 @@ def sign_crl(
             raise PkiError(
                 f"the serial number {each.serial:x} cannot be put on a revocation list",
                 "Serial numbers are positive, and have at most 159 bits (RFC 5280, 4.1.2.2).",
-                "Sign the list with the program that issued that certificate.",
+                "Sign the revocation list with the program that issued the certificate.",
             )
         entry = (
             x509.RevokedCertificateBuilder().serial_number(each.serial).revocation_date(each.date)

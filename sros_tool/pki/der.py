@@ -43,7 +43,7 @@ def children(data: bytes) -> list[Value]:
             length = int.from_bytes(data[begin : begin + size], "big")
             begin += size
             if length < 0x80 or length >> 8 * (size - 1) == 0:
-                raise PkiError("a DER value has a longer length than it needs")
+                raise PkiError("a DER value has a length that is not encoded in the shortest form")
         if tag & 0x1F == 0x1F or tag == 0:
             raise PkiError("a DER value has a form that is not supported")
         after = begin + length

@@ -159,7 +159,7 @@ def _unreadable(name: str, reason: str = "") -> PkiError:
 
 
 def _key_block(data: bytes, name: str) -> bytes:
-    """Return the first private key of a PEM file as OpenSSL reads it, in the usual form of PEM."""
+    """Return the first private key of a PEM file as OpenSSL reads it, as a standard PEM block."""
     damaged = False
     try:
         for block in pem_file.blocks(data):

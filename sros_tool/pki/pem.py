@@ -15,10 +15,10 @@ from sros_tool.errors import PkiError
 from sros_tool.pki import der
 
 CERTIFICATES = ("CERTIFICATE", "X509 CERTIFICATE", "TRUSTED CERTIFICATE")
-"""Labels of certificates; the last one may carry what the certificate is trusted for."""
+"""Labels of certificates; a block with the last label can also contain trust settings."""
 
 _PIECE = re.compile(rb"[^\n]{0,253}\n|[^\n]{1,254}")
-"""Matches what OpenSSL reads as one line: a line, or 254 characters of a longer line."""
+"""Matches a line as OpenSSL reads it: a whole line, or 254 characters of a longer line."""
 _BEGIN = re.compile(rb"-----BEGIN (.*)-----", re.DOTALL)
 _END = b"-----END "
 _NOT_AT_START = re.compile(rb"[^\n]-----BEGIN ")
@@ -27,7 +27,7 @@ _ALONE = re.compile(
     rb"-----BEGIN ([A-Z0-9 ]{1,60})-----\n((?:[A-Za-z0-9+/]{1,76}\n)*[A-Za-z0-9+/]{1,76}={0,2}\n)"
     rb"-----END \1-----\n"
 )
-"""Matches a file with a single block without headers: the usual form, read fast."""
+"""Matches a file with a single block without headers: the common form, read fast."""
 _BLANKS = bytes(range(0x21))
 _BETWEEN = b" \t\r\n"
 _BOM = b"\xef\xbb\xbf"
@@ -58,13 +58,13 @@ def blocks(data: bytes) -> Iterator[Block]:
     for piece in pieces:
         line = (piece.removeprefix(_BOM) if start else piece).rstrip(_BLANKS)
         if b"\0" in line and line.startswith(b"-----BEGIN "):
-            raise PkiError("a line '-----BEGIN' in it has a zero byte")
+            raise PkiError("one of its '-----BEGIN' lines has a zero byte")
         begin = _BEGIN.fullmatch(line)
         start = bool(begin)
         if begin:
             yield _block(begin[1], pieces)
         elif _BEGIN.match(line) and line[-1] > 0x7F:
-            raise PkiError("a line '-----BEGIN' in it ends with a byte beyond ASCII")
+            raise PkiError("one of its '-----BEGIN' lines ends with a byte beyond ASCII")
 
 
 def read_as_text(data: bytes) -> bytes:

@@ -203,7 +203,7 @@ class SignedDocument(NamedTuple):
         return self.signatures[0].signer_among(self.certificates)
 
     def verify(self, authority: x509.Certificate) -> None:
-        """Verify that ``authority`` itself signed this document, and nobody else.
+        """Verify that ``authority`` signed this document, and that it is the only signer.
 
         Stricter than Cyclone DDS 0.10.2 and Fast DDS 2.9.1, which accept any signer with a chain to
         the authority (the CVE-2023-24011 class; both measured).
@@ -237,7 +237,7 @@ class SignedDocument(NamedTuple):
 
 
 def _other_signer(signer: x509.Certificate | None, authority: x509.Certificate) -> str:
-    """Return a clause that tells the wrong signer from ``authority``; None: it is not embedded."""
+    """Return a clause on the wrong signer; ``signer`` is None if it is not embedded."""
     name = authority.subject.rfc4514_string()
     if signer is None:
         return f"by a certificate that is not embedded, not by the permissions CA {name}"
@@ -334,7 +334,7 @@ def _split(message: bytes) -> tuple[bytes | None, bytes]:
         if (form := kind_of(message)) not in ("", SIGNED_MESSAGE):
             raise PkiError("it is not an S/MIME signed message", f"It is {form}.")
         raise PkiError(
-            "it has a line end, or a zero byte, that programs read in different ways",
+            "it has a line end or a zero byte, which programs read in different ways",
             "The lines of a signed document end with CR and LF, or with LF.",
         )
     head, _, body = text.partition(b"\n\n")

@@ -50,12 +50,12 @@ def _module_of(parsed: TokenUri, *, named: bool) -> str:
     if parsed.module:
         raise UsageError(
             f"the PKCS#11 module '{parsed.module}' is not loaded",
-            "Only the keystore names it, and users other than root could have put it there; its "
-            "code would run in this process.",
+            "Its path comes only from the keystore, and users other than root can change the "
+            "file. Its code would run in this process.",
             f"If you trust it, set {MODULE_VARIABLE} to its path.",
         )
     raise UsageError(
-        f"no PKCS#11 module is named for the token {parsed.token!r}",
+        f"no PKCS#11 module is known for the token {parsed.token!r}",
         "",
         f"Add ?module-path=FILE to the URI, or set {MODULE_VARIABLE}.",
     )
@@ -92,7 +92,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
 
     @property
     def never_left(self) -> bool:
-        """Whether the token says that the key was made on it, and that it never gives it out."""
+        """Whether the token says that the key was made on the token and cannot be exported."""
         if self._private is None:
             return True  # one that is only planned, perhaps without the package for tokens
         from pkcs11 import Attribute, PKCS11Error
@@ -309,7 +309,7 @@ def _create(session: Any, parsed: TokenUri) -> None:
         raise PkiError(
             f"the token {parsed.token!r} already has a key {parsed.object!r}",
             "",
-            "Choose another object name.",
+            "Choose another object name (object=LABEL).",
         )
     parameters = session.create_domain_parameters(
         pkcs11.KeyType.EC,
@@ -434,8 +434,8 @@ def parse_enclave_uri(uri: str, name: str) -> TokenUri:
     if kind != "private" or too_long or not all(map(str.isprintable, texts)):
         raise UsageError(
             "the PKCS#11 URI cannot name the key of an enclave",
-            f"A token has at most {_LONGEST_TOKEN} bytes, an object {_LONGEST_OBJECT}, its type is "
-            "private, and nothing in it is a control character.",
+            f"The token name has at most {_LONGEST_TOKEN} bytes, the object name at most "
+            f"{_LONGEST_OBJECT}; neither has control characters. The type, if stated, is private.",
             "Write pkcs11:token=NAME;object=LABEL?pin-source=FILE.",
         )
     return parsed
@@ -454,7 +454,7 @@ def token_file(parsed: TokenUri) -> bytes:
 
 
 def read_token_file(data: bytes) -> TokenUri:
-    """Return the key that a ``key.p11`` names; an error shows nothing of it, as it may have a PIN.
+    """Return the key that a ``key.p11`` names; errors do not show the content (PIN).
 
     The RMWs read its first word, so nothing may follow.
 
@@ -492,7 +492,7 @@ def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:
             shown = f" {name!r}" if name.replace("-", "").isalpha() else ""
             raise UsageError(
                 f"the attribute{shown} of a PKCS#11 URI is not accepted",
-                "RFC 7512 does not allow it, or not in this part of the URI, or it is there twice.",
+                "It is unknown in RFC 7512, in the wrong part of the URI, or repeated.",
                 "Write pkcs11:token=NAME;object=LABEL?module-path=FILE&pin-source=FILE.",
             )
         attributes[name] = unquote(value)
@@ -523,7 +523,7 @@ def pin_file_problem(place: TokenUri) -> str:
 
 
 def pin_line_break(place: TokenUri) -> str:
-    """Return what a line break after the PIN does, as a clause; "" if there is none."""
+    """Return a clause on the effect of a line break after the PIN; "" if there is no line break."""
     try:
         pin = read_bytes(Path(place.pin_source), "file with the PIN", most=_LONGEST_PIN)
     except DocumentError:

@@ -103,7 +103,7 @@ class TolerantName:
 
 
 class _Signed:
-    """What a CA signed: a value in DER of the signed part, an algorithm and the signature."""
+    """A signed DER value of a CA: the signed part, the algorithm and the signature."""
 
     _LABEL = b""
 
@@ -529,7 +529,7 @@ _ONE = der.encode_integer(1)
 def _certificate_with(
     *, algorithm: bytes = _ED25519, subject: bytes = _NOBODY, extension: bytes = b""
 ) -> x509.Certificate:
-    """Build a certificate around DER parts of another one, so that `cryptography` parses them.
+    """Build a certificate from DER parts of another one, so that `cryptography` parses them.
 
     Raises:
         ValueError: `cryptography` does not read a part.

@@ -160,7 +160,7 @@ class Includer:
         if any(child.get(_XML_BASE) is not None for child in (element, *element.iterancestors())):
             raise PolicyError(
                 f"{where}: the include of {_short(href)} is below an xml:base",
-                "sros resolves includes from the file in which they stand.",
+                "sros resolves an include from the folder of the file that contains it.",
                 f"Remove the xml:base, and write the path from '{place.file.parent}'.",
             )
         if place.linked and href:
@@ -341,7 +341,7 @@ def _short(text: str) -> str:
 def _too_large(where: str, limit: str) -> PolicyError:
     return PolicyError(
         f"{where}: the policy and its includes are too large",
-        f"They have more than {limit}; what is included again counts again.",
+        f"They have more than {limit}; a file counts each time it is included.",
         "Divide the policy, or include smaller files.",
     )
 
@@ -597,7 +597,8 @@ class _Reader:
         ):
             raise PolicyError(
                 f"{where}: the processing instructions of a name are not valid",
-                "There can be one of sros, directly between the name and its end tag. A misspelt "
+                "Only one <?sros ...?> is allowed, directly between the name and its end tag. A "
+                "misspelt "
                 "one would leave the name without protection.",
                 _EXAMPLE,
             )
@@ -668,7 +669,7 @@ class _Reader:
             return parts
         raise PolicyError(
             f"{where}: {_short(text)} has a placeholder for the robots of a fleet",
-            "Without a fleet it stands for nothing.",
+            "Without a fleet it has no value.",
             "Name the fleet's file with --fleet FILE, or the robot in place of the placeholder "
             "where the verb has no --fleet.",
         )
@@ -920,7 +921,7 @@ class _EarlierReader(_Reader):
             raise PolicyError(
                 f"{where}: the policy is of version {version} already",
                 "There is nothing to convert.",
-                "Use it as it is.",
+                "Use the file without conversion.",
             )
         if len(tags) != 1 or tags[0] not in ("enclaves", *_EARLIER_BLOCKS):
             raise PolicyError(

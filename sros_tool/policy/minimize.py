@@ -95,7 +95,7 @@ class EnclaveUse:
 
 @dataclass(frozen=True, slots=True)
 class MinimizedPolicy:
-    """The narrowed policy with its includes written out, and a comparison for each enclave."""
+    """The narrowed policy without includes, and a comparison for each enclave."""
 
     policy: Policy
     uses: tuple[EnclaveUse, ...]

@@ -221,7 +221,7 @@ class ComparisonLimit:
         if self._left < 0:
             raise DocumentError(
                 "there are too many similar names with wildcards to compare",
-                "Almost every one of them has to be compared with every other one.",
+                "Nearly all pairs of these names have to be compared.",
                 "Replace wildcards by the names that they stand for, or by fewer wildcards, or "
                 "divide the rules between several enclaves.",
             )

@@ -1,4 +1,4 @@
-"""Subtract name expressions from another one; the result is a union of expressions.
+"""Subtract name expressions from an expression; the result is a union of expressions.
 
 For access control that only allows, such as that of Zenoh.  The result is exact on ROS names, whose
 characters are few: "/*" without "/ab" is every name that begins with another letter than a, "/a",
@@ -25,7 +25,7 @@ _PIECE = re.compile(r"\[(!?)([^\]]+)\]|(\?)|([^?\[]+)")
 _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
 _STARS = re.compile(r"\*\*+")
 _MOST_CHARACTERS = 1_000_000
-"""Most characters that one search compares: about one second."""
+"""Maximum number of characters that a search compares: about one second."""
 
 
 class CannotSubtract(Exception):  # noqa: N818 - the caller makes an error of it

@@ -108,7 +108,7 @@ class Repository:
             raise DocumentError(
                 f"git finds no reference '{name}'",
                 "",
-                "`git for-each-ref` shows what there is. Fetch it first.",
+                "Fetch the reference first; `git for-each-ref` shows the existing ones.",
             )
         return self._peeled(digits, name)
 
@@ -132,7 +132,7 @@ class Repository:
                 raise DocumentError(
                     f"the name '{base}' is ambiguous",
                     f"It is {_either(candidates)}.",
-                    "Write the one that you mean in full.",
+                    "Write the full name, such as refs/remotes/origin/main.",
                 )
             base, found = next(iter(candidates.items()), (base, ""))
         if found and rest:
@@ -161,7 +161,7 @@ class Repository:
                 raise DocumentError(
                     f"'{name}' is {_either(candidates)}, but no branch of the remote '{remote}'",
                     "Anybody who may push tags or branches can create one with this name.",
-                    f"Fetch '{wanted}', or write in full what you mean.",
+                    f"Fetch '{wanted}', or write the full reference name.",
                 )
         described = name.rpartition("-g")[2]
         if _ABBREVIATED.match(name) or (_ABBREVIATED.match(described) and not candidates):
@@ -260,7 +260,7 @@ class Repository:
         if len(parents) < 2:
             raise DocumentError(
                 f"the commit {merge} is no merge",
-                "Only a merge says what it is merged into.",
+                "The base follows only from the parents of a merge commit.",
                 "Name the base itself, or check out the merge commit of the code host.",
             )
         return parents[0]
@@ -425,7 +425,8 @@ class Repository:
                 raise UsageError(
                     f"{name} is '{place}', inside of the work tree '{top}'",
                     "Git reads settings there, and a fetch runs programs that they name.",
-                    f"Set {name} to a place elsewhere, or fetch the commit before the review.",
+                    f"Set {name} to a path outside of the work tree, or fetch the commit before "
+                    "the review.",
                 )
 
     # ── git ────────────────────────────────────────────────────────────────────────────────
@@ -551,7 +552,7 @@ def _unknown(name: str) -> DocumentError:
     return DocumentError(
         f"git finds no revision '{name}'",
         "",
-        "`git log --oneline` and `git branch` show what there is. In a shallow clone, such as "
+        "`git log --oneline` and `git branch` list revisions. In a shallow clone, such as "
         "on a server for tests, fetch it first.",
     )
 

@@ -815,7 +815,7 @@ def _together(files: Sequence[Path], fleet: Fleet | None) -> Policy:
         PolicyError: there is none, or two have the same enclave.
     """
     if not files:
-        raise PolicyError("requirements need a policy, and there is none to read")
+        raise PolicyError("requirements need a policy, and HEAD has no policy")
     policies = [read_policy_for(file, fleet) for file in files]
     first, *others = policies
     enclaves = {enclave.path: enclave for enclave in first.enclaves}

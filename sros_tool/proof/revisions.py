@@ -119,7 +119,7 @@ def find_revision(text: str) -> Revision:
     name, colon, path = text.removeprefix(PREFIX).partition(":")
     if not name or not colon or not path or any(ord(each) < 32 for each in text):
         raise UsageError(
-            f"'{text}' names no policy at a revision",
+            f"'{text}' is not a policy in a revision",
             "",
             "Write git:REVISION:PATH, such as git:main:policies/robot.xml.",
         )
@@ -135,6 +135,7 @@ def find_revision(text: str) -> Revision:
         raise DocumentError(
             f"'{PREFIX}{name}:{path}' does not exist",
             "",
-            "Paths start at the top of the repository; with ./ at the working directory.",
+            "A path starts at the top of the repository; with ./, it starts at the working "
+            "directory.",
         )
     return Revision(repository, name, commit, path)

@@ -175,7 +175,7 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
         if not source.sound or note.id in UNCERTAIN:
             raise DocumentError(
                 f"'{path}' cannot be compared: {note.text.rstrip('.')}",
-                "What it gives is not certain.",
+                "It is not certain which rights it gives.",
                 f"`sros check {quote(str(path))}` shows what is wrong with it.",
             )
     if source.kind == "policy":
@@ -197,7 +197,7 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         if len(permissions.grants) > 1:
             raise DocumentError(
                 f"the permissions of {enclave} in '{path}' have several grants",
-                "Vendors differ in which one of them counts.",
+                "Vendors differ in which grant they use.",
                 "Sign one grant for each enclave.",
             )
     if source.kind == "zenoh":
@@ -296,7 +296,7 @@ def _of_all(root: Path, folders: Iterable[Path]) -> Governance:
         if smime.parse(data).document != wanted:
             raise DocumentError(
                 f"'{root}' cannot be compared: '{file}' is not the governance of the keystore",
-                "What the enclave and its peers protect is not certain.",
+                "It is not certain which protection applies to the enclave and its peers.",
                 f"`sros check {quote(str(root))}` shows what is wrong with it.",
             )
         same.add(data)
@@ -354,11 +354,17 @@ def _trusts(
             found = load_crl(data, CRL_FILE)
             key = next((key for certificate, key in keys if signed_by(found.list, certificate)), "")
             if refusal := refusal_of(found.list) or ("" if key else "it is of another CA"):
-                raise DocumentError(f"its revocation list refuses everybody: {refusal}")
+                raise DocumentError(
+                    f"its revocation list makes DDS refuse every enclave: {refusal}"
+                )
             if len(found.revoked) < len(found.list) or names_issuers(found.list):
-                raise DocumentError("its revocation list has entries that may revoke nothing")
+                raise DocumentError(
+                    "its revocation list has entries that perhaps revoke no certificate"
+                )
             if lists.setdefault(key, found.list.signature) != found.list.signature:
-                raise DocumentError("it has several revocation lists of one CA, and one counts")
+                raise DocumentError(
+                    "it has several revocation lists of one CA, and DDS uses only one"
+                )
             signed = iso(found.this_update)
             revoked |= {
                 (key, entry.serial)
@@ -377,7 +383,7 @@ def _trusts(
             except SrosError as error:
                 raise DocumentError(
                     f"'{authority.parent}' cannot be compared: {error.what}",
-                    "Whom it refuses is not certain.",
+                    "It is not certain which certificates it refuses.",
                     error.remedy,
                 ) from error
     return found

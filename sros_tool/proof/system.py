@@ -338,7 +338,7 @@ def _keystore_system(
             and (file := enclave_path(root, name) / PERMISSIONS_FILE).exists()
         ):
             raise KeystoreError(
-                f"what enclave {name} may do is not known: '{file}' cannot be read",
+                f"the rights of enclave {name} are not known: '{file}' cannot be read",
                 "",
                 f"`sros check {quote(str(root))}` shows what is wrong with it.",
             )
@@ -346,7 +346,7 @@ def _keystore_system(
     if names and not documents:
         raise KeystoreError(
             f"keystore '{root}' has no governance that can be read",
-            "Without it, it is not known what is protected, and whose rights are asked for.",
+            "Without a governance, it is not known which topics are protected and need rights.",
             f"`sros check {quote(str(root))}` shows what is wrong with it.",
         )
     if len(documents) > _MOST_GOVERNANCES:

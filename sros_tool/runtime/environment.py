@@ -141,7 +141,7 @@ def render_environment(variables: Mapping[str, str], form: str) -> str:
         if form in _UNREADABLE and _UNREADABLE[form](value):
             raise UsageError(
                 f"{name} cannot be written in the form {form}: {value!r}",
-                "What reads that form would find another value, or more than a value.",
+                "A program that reads this form would get another value, or several values.",
                 "Move the keystore to a path of letters, digits and /._- only, or use `sros run`.",
             )
     if form == "json":

@@ -138,5 +138,5 @@ def test_names_are_distinct() -> None:
 
 def test_a_part_that_nobody_plays_is_named() -> None:
     copy = KeystoreCopy(Path("ks"), Path("other"), {}, "/t", 0, datetime(2026, 1, 1, tzinfo=UTC))
-    with pytest.raises(KeystoreError, match="no enclave that can be the admin"):
+    with pytest.raises(KeystoreError, match="no enclave for the part"):
         forger.borrowed_permissions(copy)

@@ -368,7 +368,7 @@ def test_access_control_that_is_off_is_told(tmp_path: Path) -> None:
         (["/a", "publish", "/x", "--type", "service"], "nobody can publish a service"),
         (["/a", "serve", "/x", "--type", "action"], "nobody can serve an action"),
         (["/a", "execute", "/x", "--type", "service"], "nobody can execute a service"),
-        (["/a", "join", "/x"], "join takes neither"),
+        (["/a", "join", "/x"], "join takes no name"),
         (["/a", "publish", "/x", "--at", "soon"], "--at 'soon' is not a date"),
         (["/a", "publish", "/x", "--at", "9999-12-31"], "is not a date"),
         (["/a", "publish", "/x", "--at", "0001-01-01"], "is not a date"),

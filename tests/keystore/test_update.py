@@ -675,7 +675,9 @@ def test_a_governance_of_one_s_own_is_not_replaced_unasked(tmp_path: Path) -> No
     before = snapshot(root)
     for words in (("--set", "permissions.validity=30d"), ("--domain", "0,7", "--allow-looser")):
         ended = sros("update_keystore", root, *words)
-        assert (ended.status, "states what settings cannot" in ended.err) == (2, True), ended
+        assert (ended.status, "has rules that settings cannot express" in ended.err) == (2, True), (
+            ended
+        )
     assert snapshot(root) == before
     sros("update_keystore", root, "--template", "production", "--allow-looser").ok()
 

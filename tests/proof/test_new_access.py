@@ -431,8 +431,8 @@ def test_a_revision_is_read_with_its_own_includes(repository: Path) -> None:
         ("git:--output=x:policies/robot.xml", "finds no revision '--output=x'"),
         ("git:main:policies/none.xml", "does not exist"),
         ("git:main:../robot.xml", "outside of the repository"),
-        ("git:main", "names no policy at a revision"),
-        ("git::robot.xml", "names no policy at a revision"),
+        ("git:main", "is not a policy in a revision"),
+        ("git::robot.xml", "is not a policy in a revision"),
         ("git:main:policies/link.xml", "is a symbolic link"),
         ("git:main:policies/fallback.xml", "is a symbolic link"),
         ("git:main:policies/through.xml", "is no folder of the revision"),
@@ -495,7 +495,7 @@ def test_a_path_of_a_revision_is_from_its_top(repository: Path) -> None:
     words = ("diff_policy", "--no-new-access", "git:main:robot.xml", "robot.xml")
     ended = sros(*words, cwd=repository / "policies")
     assert ended.status == 2
-    assert "'git:main:robot.xml' does not exist. Paths start at the top of the" in ended.err
+    assert "'git:main:robot.xml' does not exist. A path starts at the top of the" in ended.err
 
 
 @pytest.mark.parametrize("name", ["robots/evil.xml", "evil.XML", "robots/evil.inc", "robots/link"])

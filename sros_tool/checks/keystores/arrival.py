@@ -48,7 +48,7 @@ class ArrivalFinding(NamedTuple):
     file: str
     """The file that the finding is about, relative to the enclave's folder or to DIR."""
     text: str
-    """What is wrong, and what to do about it."""
+    """The fault and its remedy."""
 
 
 class VerifiedFolder(NamedTuple):

@@ -328,7 +328,7 @@ def _with(
 
 
 def _kinds(findings: Sequence[Finding]) -> str:
-    """Return text with the titles of the findings' kinds and how often each occurs."""
+    """Return text with the title of each kind of finding and the number of its findings."""
     counted = Counter(finding.kind.title for finding in findings if finding.severity >= WARNING)
     return "; ".join(
         f"{title} ({number} times)" if number > 1 else title for title, number in counted.items()

@@ -1,4 +1,4 @@
-"""Checks of each DDS vendor's decisions on an enclave: whether a node can start, and its rights.
+"""Check how each DDS vendor decides on an enclave: whether a node can start, and its rights.
 
 The decision engine is the one of `sros explain`.  A vendor's refusal is not reported if another
 finding already names its cause.
@@ -191,7 +191,7 @@ def check_vendors(evaluation: EnclaveEvaluation, known: Collection[Finding]) -> 
 
 
 def _domains(state: OpenedEnclave) -> tuple[int, ...]:
-    """Return example domains of an enclave, one for each combination of document rules."""
+    """Return example domains of an enclave: one for each group of domains with the same rules."""
     if state.governance is None:
         return (0,)
     rules = [rule.domains for rule in state.governance.domain_access_rules]

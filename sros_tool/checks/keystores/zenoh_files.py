@@ -104,7 +104,7 @@ _KINDS = {
     "malformed": OUT_OF_DATE,
     "out-of-date": OUT_OF_DATE,
 }
-"""The kind of each fault, by its id; that of another name is ``enclave.name-mismatch``."""
+"""Fault id → kind of finding; a wrong common name is reported as ``enclave.name-mismatch``."""
 
 
 def check_own_zenoh(enclave: CheckedEnclave) -> Iterator[Finding]:
@@ -138,7 +138,7 @@ def _of_opened(enclave: CheckedEnclave, opened: OpenedZenoh) -> Iterator[Finding
 def check_network(
     keystore: CheckedKeystore, only: Collection[str] | None = None
 ) -> Iterator[Finding]:
-    """Yield findings about a keystore's Zenoh network, or about the part of some enclaves in it."""
+    """Yield findings about a keystore's Zenoh network, or only about the files of some enclaves."""
     network = keystore.settings.zenoh if keystore.settings else None
     authorities = keystore.authorities.get(PERMISSIONS)
     if network is None or not authorities:
@@ -172,7 +172,7 @@ def check_network(
 
 
 def _of_drift(keystore: CheckedKeystore, drift: Drifted) -> Iterator[Finding]:
-    """Yield findings about a configuration that is not as it should be, with what is wrong."""
+    """Yield a finding for each difference between a configuration and the keystore."""
     from sros_tool.keystore.zenoh_files import Drift, open_zenoh
 
     file = keystore.shown(drift.path)

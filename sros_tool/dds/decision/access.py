@@ -338,7 +338,7 @@ def _trimmed(traits: VendorTraits, text: str) -> str:
 def _partitions(
     traits: VendorTraits, rule: Rule, criteria: tuple[Criteria, ...]
 ) -> tuple[str, ...]:
-    """Return the partitions that ``criteria`` name, or the ones that the vendor implies."""
+    """Return the partitions that ``criteria`` name, or else the vendor's default partitions."""
     everywhere = not rule.allow and traits.deny_partitions is DenyPartitions.ANY_OR_ALL
     implied = ("*",) if everywhere else _DEFAULT_PARTITION
     if implied is _DEFAULT_PARTITION and not any(criterion.partitions for criterion in criteria):
@@ -432,7 +432,7 @@ def _decide_join(
     rules: list[NumberedRule],
     otherwise: RuleVerdict,
 ) -> _Joining:
-    """Return whether the participant may join; without matching ``rules``, ``otherwise`` counts."""
+    """Return whether the participant may join: ``otherwise`` if none of the ``rules`` matches."""
     where = f"domain {governed.domain}"
     if traits.always_needs_allow_rule and not any(rule.allow for rule in grant.rules):
         text = "the grant has no allow rule, so the participant does not start"
@@ -595,7 +595,7 @@ class Access:
         return NameSet.union(topics) & _usable_topics(self._traits.topic_names)
 
     def protection(self) -> tuple[tuple[NameSet, DomainRule, TopicRule], ...]:
-        """Return the topic rules of the domain, each with its topics: the first match counts."""
+        """Return the topic rules of the domain, each with the topics for which it decides."""
         domain = self._governed.rule
         if domain is None:
             return ()

@@ -70,7 +70,7 @@ def _read(
 
 @lru_cache(maxsize=8)  # all enclaves of a keystore have the same governance
 def canonical_governance(document: bytes) -> Governance | None:
-    """Return the governance in a document that all vendors read alike, as sros writes it."""
+    """Return the governance in a document as sros writes it, or None; all vendors read it alike."""
     with suppress(DocumentError):
         governance = parse_governance(document)
         if is_plain_governance(governance) and _is_written(render_governance(governance), document):
@@ -89,7 +89,7 @@ def _is_written(written: bytes, document: bytes) -> bool:
 
 
 def is_plain_governance(governance: Governance) -> bool:
-    """Return whether all vendors read the governance's texts, values and domain ranges alike."""
+    """Return whether all vendors read the same texts, values and domain ranges in a governance."""
     texts = []
     for rule in governance.domain_access_rules:
         if not (_are_plain_domains(rule.domains) and rule.topic_access_rules):
@@ -108,7 +108,7 @@ def _has_valid_values(rule: DomainRule | TopicRule) -> bool:
 
 
 def is_plain_permissions(permissions: Permissions) -> bool:
-    """Return whether all vendors read the permissions' texts and domain ranges alike."""
+    """Return whether all vendors read the same texts and domain ranges in the permissions."""
     texts = []
     for grant in permissions.grants:
         if not (grant.name and grant.rules):

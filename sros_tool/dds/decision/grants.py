@@ -100,7 +100,7 @@ def _whole_attributes(granted: str, certified: str) -> bool:
 
 
 def _trimmed(text: bytes, start: int, end: int) -> bytes:
-    """Strip blanks from ``text[start:end]`` as Fast DDS 2.9.1 does, which leaves some.
+    """Strip blanks from ``text[start:end]`` as Fast DDS 2.9.1 does, which does not remove all.
 
     Each side stops where the part would have one byte left, and not at the end of a shorter part.
     """

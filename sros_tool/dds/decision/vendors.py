@@ -71,9 +71,9 @@ class DenyPartitions(Enum):
     """The partitions of an endpoint that a deny rule must name to apply to it."""
 
     ANY_OR_ALL = auto()
-    """At least one of the endpoint's; a rule without partitions applies to all partitions."""
+    """At least one partition of the endpoint; a rule without partitions applies to all."""
     ANY_OR_DEFAULT = auto()
-    """At least one; a rule without partitions applies only to the default one (Cyclone DDS)."""
+    """At least one partition; a rule without any applies to the default partition (Cyclone DDS)."""
     IGNORED = auto()
     """A deny rule applies in all partitions, whatever it names (Fast DDS)."""
 
@@ -140,7 +140,7 @@ class VendorTraits:
     escapes_subjects: bool = False
     """A character beyond ASCII in a certificate's subject is compared as ``\\C3\\B6``."""
     longest_subject: int | None = None
-    """Length, in bytes, to which a certificate's subject is cut before it is compared."""
+    """Number of bytes of a certificate's subject that are compared; the rest is ignored."""
     crashes_on_empty_subject: bool = False
     """A certificate without any attribute in its subject crashes the process, and its peers'."""
     moments: Moments = Moments.STANDARD

@@ -349,7 +349,7 @@ class Row:
 
 
 def together(rows: Sequence[Row]) -> Row:
-    """Join rows of one world to one row with all parties, claims and controls.
+    """Join rows that share processes to one row with all parties, claims and controls.
 
     Raises:
         ValueError: two parties of one name differ.

@@ -36,7 +36,7 @@ from sros_tool.demo.scenarios.policies import ACTION, SERVICE, zenoh_policy
 
 _ROUTER = "/router"
 _PEERS, _CLIENTS = "peers", "clients"
-"""The worlds with all defences: sessions connect to each other, or to the router alone."""
+"""The groups of rows with all defences: sessions connect to each other, or only to the router."""
 _CAST = {
     "talker": "/talker_listener/talker",
     "listener": "/talker_listener/listener",
@@ -64,7 +64,7 @@ def _scenario(name: str, title: str, *rows: Row) -> Scenario:
 
 
 def _router(keystore: KeystoreChoice | None) -> Party:
-    """Return the router of a world, unsecured without a keystore."""
+    """Return the router of a group of rows; unsecured if there is no keystore."""
     identity = UNSECURED if keystore is None else Identity(keystore, "router")
     return Party("router", Role.ROUTER, identity)
 
@@ -143,7 +143,7 @@ def _action_pair() -> tuple[Party, ...]:
 
 
 def _topic_rows(how: str, keystore: KeystoreChoice, world: str) -> tuple[Row, ...]:
-    """Return the rows of one way in which sessions connect."""
+    """Return the rows for sessions that connect in peer mode, or in client mode."""
     pair = _topic_pair(keystore)
     talker = _attacker("talker without permission", Role.TALKER, keystore, lawless=False)
     listener = _attacker("listener without permission", Role.LISTENER, keystore, lawless=False)
@@ -203,7 +203,7 @@ _ISOLATION = _scenario(
 
 
 def _unasked(name: str, role: Role, mechanism: str, party: str, server: str, client: str) -> Row:
-    """Return a row in which an enclave calls or serves what it has no right to."""
+    """Return a row in which an enclave calls or serves a service without the right to do so."""
     intruder = _attacker(party, role, OWN, lawless=False)
     calls = role in (Role.CLIENT, Role.ACTION_CLIENT)
     on_service = role in (Role.CLIENT, Role.SERVER)
@@ -351,7 +351,7 @@ def _outsider(name: str, keystore: KeystoreChoice, mechanism: str, evidence: str
 
 
 def _let_in(name: str, keystore: KeystoreChoice, removed: str) -> Row:
-    """Return a row in which the same process is heard, because a defence is missing."""
+    """Return a row in which messages of that process arrive, because a defence is missing."""
     wide, _, listener = _topic_pair(keystore)
     party = _attacker("attacker", Role.TALKER, keystore, "talker")
     return _attempt(

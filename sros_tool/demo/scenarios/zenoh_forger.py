@@ -100,7 +100,7 @@ def sessions_that_limit_themselves(copy: KeystoreCopy) -> None:
 
 
 def _for_everybody(router: str) -> _Change:
-    """Return a change: what a file lets the router do, it lets everybody do."""
+    """Return a change that gives the router's rights in a file to everybody."""
 
     def change(document: _Document) -> None:
         control = document["access_control"]
@@ -289,7 +289,7 @@ def without_certificate(copy: KeystoreCopy) -> None:
 
 
 def certificates_not_asked_for(copy: KeystoreCopy) -> None:
-    """Let nobody ask for certificates, and everybody do everything; the talker shows none."""
+    """Demand no certificates, and allow everything; the talker shows no certificate."""
 
     def change(document: _Document) -> None:
         _tls(document)["enable_mtls"] = False

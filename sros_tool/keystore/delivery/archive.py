@@ -16,7 +16,7 @@ SUFFIXES = (".tar.gz", ".tgz")
 _MAX_PACKED = 16 * 1024 * 1024
 MAX_UNPACKED = 40 * 1024 * 1024
 MAX_MEMBER = 17 * 1024 * 1024
-"""Largest size in bytes of a packed archive, of its unpacked content, and of a file in it.
+"""Maximum size in bytes of a packed archive, of its unpacked content, and of a file in it.
 
 A Zenoh configuration of the largest size that sros reads fits, with its signed document.
 """

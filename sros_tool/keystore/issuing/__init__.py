@@ -1,1 +1,1 @@
-"""Issuing by the CAs of a keystore: their keys, what they sign, and the proof of permissions."""
+"""Issue files with the CAs of a keystore: CA keys, signed files, and the proof of permissions."""

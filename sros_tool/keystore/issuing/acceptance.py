@@ -82,7 +82,7 @@ _NEEDED = _LOADED[:5]
 _ONLY_IDENTITY = {IDENTITY_CA_FILE, CRL.rpartition("/")[2]}
 """Shared files that vendors do not use to verify governance or permissions."""
 _CHOSEN = {Fault.DOCUMENT_SIZE, Fault.KEY_ON_TOKEN}
-"""Faults that follow from what the user asked for; notes report them."""
+"""Faults that follow from the user's own choices; notes report them."""
 _SHOWN = 5
 _EXAMPLE = "/example"
 _MOST_BROKEN = 20
@@ -253,7 +253,7 @@ def _would_be_shut_out(
 
 
 def _clauses(refused: Mapping[Vendor, str], what: str) -> str:
-    """Return clauses such as "A and B refuse ``what`` (reason)", one for each reason."""
+    """Return a clause for each reason, such as "A and B refuse ``what`` (reason)"."""
     by_reason: dict[str, list[str]] = {}
     for vendor, reason in refused.items():
         by_reason.setdefault(reason, []).append(vendor.title)

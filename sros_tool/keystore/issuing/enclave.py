@@ -250,7 +250,7 @@ class EnclaveWriter:
         return render_permissions(permissions) == text
 
     def _validity(self, name: str, usual: Window) -> Window:
-        """Return the validity ``usual``, shortened if the enclave is short-lived."""
+        """Return the default validity ``usual``, shortened if the enclave is short-lived."""
         longest = self._template.longest_validity(name)
         return usual if longest is None else usual.within(window(self._now, longest))
 
@@ -291,7 +291,7 @@ class EnclaveWriter:
         work: Callable[[str], Result],
         progress: Progress | None = None,
     ) -> dict[str, Result]:
-        """Run ``work`` for each enclave on all cores; map the enclaves to the results.
+        """Run ``work`` for all enclaves on all cores; map each enclave to its result.
 
         Everything that forked workers issue and stage is added to this writer and its transaction.
         With a CA key on a token, no workers are forked: the session of a token does not survive a

@@ -92,7 +92,7 @@ class Keyring:
             if not path.exists():
                 raise KeystoreError(
                     f"the key of the {role} CA is missing: '{path}'",
-                    "It may be kept elsewhere on purpose.",
+                    "It may be stored elsewhere on purpose.",
                     f"Put it back for this command, or set SROS_{role.upper()}_KEY to its place. "
                     "No new CA is created, because it would lock out every existing enclave.",
                 )
@@ -153,7 +153,7 @@ class Keyring:
         if not (compared or self._is_named(role)):
             raise KeystoreError(
                 f"the template names an existing key for the {role} CA: '{place}'",
-                "Whatever the new keystore signs would be valid wherever a CA with that key is "
+                "Files that the new keystore signs would be valid wherever a CA with that key is "
                 "trusted.",
                 f"If that is intended, name it yourself: --{role}-key {quote(place)}.",
             )
@@ -222,7 +222,7 @@ def check_places(keyring: Keyring, template: Template) -> None:
     if not template.separate_authorities and len({place or "" for place in named.values()}) > 1:
         raise KeystoreError(
             "a keystore with one CA for both roles needs one place for its key",
-            "The identity key and the permissions key are given different places.",
+            "The command names different places for the identity key and the permissions key.",
             "Name the same place for both, or use --ca-layout separate.",
         )
 

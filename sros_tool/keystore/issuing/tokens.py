@@ -58,7 +58,9 @@ def place_in(path: Path) -> TokenUri:
     try:
         return read_token_file(read_bytes(path, "place of the key"))
     except PkiError as error:
-        raise PkiError(f"'{path}' names no key on a token", error.why, "Write it again.") from error
+        raise PkiError(
+            f"'{path}' does not name a key on a token", error.why, "Write it again."
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -293,8 +293,8 @@ class KeystoreChange:
         check_network(network)
         if not self.is_new and (edits := found_edits(self.keystore, self.governance)):
             raise KeystoreError(
-                f"the settings of keystore '{self.root}' get other routers of Zenoh, and its files "
-                f"were edited by hand: {'; '.join(edits.clauses())}",
+                f"the settings of keystore '{self.root}' would get other Zenoh routers, but its "
+                f"files were edited by hand: {'; '.join(edits.clauses())}",
                 "Writing the settings would undo the edit, or apply it unnoticed.",
                 f"First apply or undo the edit: {edit_remedy(self.root)}",
             )

@@ -67,7 +67,7 @@ def raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection])
     demand = f"{less[0].source} demands that {less[0]} has protect={less[0].word!r}"
     if not (root / SETTINGS).exists():
         raise KeystoreError(
-            f"{demand}, and keystore '{root}' has no settings to state that",
+            f"{demand}, and keystore '{root}' has no settings for that",
             f"A keystore of ros2/sros2 has no {SETTINGS}.",
             f"Give it settings first: `sros update_keystore {quote(str(root))} --template "
             "NAME|FILE --dry-run` shows what they would change.",

@@ -215,8 +215,8 @@ def _of_no_robot(keystore: Keystore, names: Iterable[str]) -> Iterator[Note]:
         verb = "belongs" if len(without) == 1 else "belong"
         yield Note(
             "keystore.of-no-robot",
-            f"{first_few(without, _ENCLAVES_SHOWN)} {verb} to no robot, so nothing says whether "
-            "this stage is there: see to it before the next one.",
+            f"{first_few(without, _ENCLAVES_SHOWN)} {verb} to no robot, so it is unknown whether "
+            "their files are at this stage: check that before the next stage.",
         )
 
 
@@ -224,7 +224,7 @@ def _would_cut_off(root: Path, rotation: Rotation, robots: Sequence[str]) -> Key
     stage = "a rotation" if rotation.stage is RotationStage.NONE else f"the stage {rotation.stage}"
     return KeystoreError(
         f"not every robot has confirmed {stage}: {first_few(robots, _SHOWN)}",
-        "The next step would cut them off from the others.",
+        "After the next stage, they could not communicate with the other robots.",
         f"Deliver the present files and confirm them; see `sros fleet status "
         f"{quote(str(root))}`. --allow-unconfirmed goes on without them.",
     )
@@ -239,7 +239,7 @@ def _refuse_edited(keystore: Keystore) -> None:
         raise KeystoreError(
             f"files of keystore '{root}' were edited by hand: {'; '.join(edits.clauses())}",
             "The new CA would sign the governance without these edits.",
-            f"First carry it out or undo it: {edit_remedy(root)}",
+            f"First apply or undo the edit: {edit_remedy(root)}",
         )
 
 

@@ -96,7 +96,7 @@ class AuthorityStatus:
 
     file: str
     roles: tuple[Annotated[str, Words(ROLES)], ...]
-    """What the CA signs."""
+    """Roles of the CA."""
     state: Annotated[str, Words(("issuing", "next", "old"))]
     """Whether the CA issues now (``issuing``), will issue next, or issued before (``old``)."""
     subject: str

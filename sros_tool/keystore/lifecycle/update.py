@@ -159,17 +159,17 @@ def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, Dom
     if present.written is None and not present.without_settings:
         _ = Keystore(root).template  # raises what is wrong with them
         raise KeystoreError(
-            f"there is no {SETTINGS} in keystore '{root}', so it states no change",
+            f"there is no {SETTINGS} in keystore '{root}', so there is no change to apply",
             "",
-            "Write the settings of before again with `sros update_keystore "
-            f"{quote(str(root))} --discard-edits`.",
+            f"Restore the settings with `sros update_keystore {quote(str(root))} --discard-edits`.",
         )
     written = present.written or present.settings
     if present.settings.zenoh and not written.zenoh:
         raise KeystoreError(
             f"{SETTINGS} of keystore '{root}' has no table [zenoh] any more",
-            "The files of Zenoh would stay, and nothing would keep them in step.",
-            f"End it with `sros zenoh {quote(str(root))} --off`, after `sros update_keystore "
+            "The Zenoh files would stay, and no command would update them.",
+            f"Remove the Zenoh files with `sros zenoh {quote(str(root))} --off`, after `sros "
+            "update_keystore "
             f"{quote(str(root))} --discard-edits`.",
         )
     if not edits.governance:
@@ -179,17 +179,17 @@ def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, Dom
     protection = protection_for(governance)
     if protection is None:
         raise KeystoreError(
-            f"'{path}' states what the settings of a keystore cannot",
+            f"'{path}' has rules that the settings of a keystore cannot express",
             "It has several domain rules, no rule for * at its end, or a rule for a DDS topic that "
             "is no topic, service or action of ROS.",
-            f"State the protection in {SETTINGS} in its place: "
-            f"`sros update_keystore {quote(str(root))} --discard-edits` writes it anew.",
+            f"State the protection in {SETTINGS} instead: "
+            f"`sros update_keystore {quote(str(root))} --discard-edits` restores the file.",
         )
     if written.protection not in (present.settings.protection, protection):
         raise KeystoreError(
             f"{SETTINGS} and {GOVERNANCE_XML} of keystore '{root}' were edited, and differ",
             "Both state the protection of messages.",
-            f"Put one of them back, or both with `sros update_keystore {quote(str(root))} "
+            f"Restore one of the files, or both with `sros update_keystore {quote(str(root))} "
             "--discard-edits`.",
         )
     return replace(written, protection=protection), governance.domains().closed()
@@ -282,7 +282,7 @@ def update_keystore(
         if seen is not None and seen != present:
             raise KeystoreError(
                 f"the settings of keystore '{root}' have just changed",
-                "Somebody else changed them meanwhile.",
+                "Another command changed them in the meantime.",
                 "Nothing was changed. Run the command again.",
             )
         if present.edits and not replace_edits:
@@ -290,7 +290,7 @@ def update_keystore(
                 f"files of keystore '{root}' were edited by hand: "
                 f"{'; '.join(present.edits.clauses())}",
                 "The update would undo the edit.",
-                f"First carry it out or undo it: {edit_remedy(root)}",
+                f"First apply or undo the edit: {edit_remedy(root)}",
             )
         goal = _Goal(
             _checked_target(root, present, target), domains.closed() if domains else present.domains
@@ -601,7 +601,7 @@ class _Updater:
         if any(rule.domains.closed() != before for rule in grant.rules):
             raise KeystoreError(
                 f"the permissions of enclave {name} are not for domain {before}",
-                "So it is not certain which rights it shall have in other domains.",
+                "So its rights in other domains are not known.",
                 f"State them with `sros create_permission {quote(str(self._root))} {name} "
                 "POLICY_FILE`.",
             )
@@ -699,13 +699,15 @@ def trust_records(
         if ledger.gaps:
             raise KeystoreError(
                 f"the ledger of '{root}' is damaged: {ledger.gaps[0]}",
-                "Lines that were changed or removed are not taken on trust.",
+                "Damaged records cannot be trusted.",
                 f"See `sros check {quote(str(root))}`.",
             )
         last = RecordedRights(change.keystore, ledger).unproven()
         names = [name for name in change.names if name in last]
         if not names:
-            raise KeystoreError(f"no enclave of '{root}' has rights to take on trust")
+            raise KeystoreError(
+                f"no enclave of '{root}' has rights that a record without a chain states"
+            )
         entries: list[Entry] = []
         others: list[str] = []
         for name in names:
@@ -819,8 +821,8 @@ def _check_settings(change: KeystoreChange, *, edited: bool) -> None:
     root, where = change.root, quote(str(change.root))
     if not (root / SETTINGS).exists():
         raise KeystoreError(
-            f"keystore '{root}' has no settings, as ros2/sros2 makes it",
-            "Nothing would keep the files of Zenoh in step.",
+            f"keystore '{root}' was made by ros2/sros2 and has no settings",
+            "Without settings, no command would update the Zenoh files.",
             f"Run `sros update_keystore {where} --template sros2 --dry-run`, which shows what "
             "settings change, and then without --dry-run.",
         )
@@ -829,7 +831,7 @@ def _check_settings(change: KeystoreChange, *, edited: bool) -> None:
         raise KeystoreError(
             f"files of keystore '{root}' were edited by hand: {'; '.join(edits.clauses())}",
             "Writing the settings would undo the edit, or apply it unnoticed.",
-            f"First carry it out or undo it: {edit_remedy(root)}",
+            f"First apply or undo the edit: {edit_remedy(root)}",
         )
 
 
@@ -846,6 +848,7 @@ def _check_router(change: KeystoreChange, router: str) -> None:
     if change.recorded.policy(router, digest) not in ("", *usual):
         raise UsageError(
             f"the enclave {router} has rights of its own",
-            "The router passes on what all others say, so it would have the rights of all there.",
+            "The router forwards all messages, so a node in its enclave would have the rights of "
+            "all enclaves.",
             "Name an enclave of the router's own with --router.",
         )

@@ -302,5 +302,5 @@ def _foreign(folder: Folder, why: str) -> KeystoreError:
     return KeystoreError(
         f"'{folder.path / STAGE}' is not an interrupted change of yours",
         f"{why} Somebody else may have put it there, so that files are moved in your name.",
-        "Find out who can write to the keystore, look at what is in it, and remove it.",
+        "Find out who can write to the keystore, look at its content, and remove it.",
     )

@@ -160,7 +160,8 @@ class Transaction:
         if os.geteuid() == 0 and above.st_mode & stat.S_IWOTH and owner not in (0, above.st_uid):
             raise KeystoreError(
                 f"'{self.root}' belongs to user {owner}",
-                "Everybody can make such a folder there, and its owner would get the keys in it.",
+                "Every user can create a folder at this path, and its owner could read the keys "
+                "in it.",
                 "Choose another folder, or run sros as that user.",
             )
 
@@ -561,7 +562,7 @@ def _can_exchange(folder: Folder) -> bool:
 
 
 class _Bridge:
-    """Two ways to replace paths with links, each for a slice of the moves.
+    """Replace the paths of a slice of the moves with links, in one of two ways.
 
     One is `by_exchange`; the other is `keep`, followed by `by_replacement`.
     """
