@@ -20,7 +20,14 @@ from sros_tool.policy.model import ALLOW, Enclave, Group, Profile, Profiles, Qua
 from sros_tool.policy.model import DENY as DENY_
 from sros_tool.policy.model import RIGHTS as RIGHTS_OF
 from sros_tool.policy.patterns import matches
-from sros_tool.policy.rights import OWN_SERVICES, NodeName, Right, Rules, nodes_of_rights
+from sros_tool.policy.rights import (
+    OWN_SERVICES,
+    NodeName,
+    Right,
+    Rules,
+    nodes_not_shown,
+    nodes_of_rights,
+)
 from sros_tool.translate import permissions_for
 from sros_tool.translate_zenoh.graph import (
     announced_nodes,
@@ -518,6 +525,22 @@ def test_denied_services_of_a_node_take_it_away(
         announcing = ("/e", IN, Message.LIVELINESS_TOKEN)
         passes = partial(control.allows, *announcing)
         assert passes(example_token(0, "/e", control.allowed_keys(*announcing), passes))
+
+
+def test_a_node_that_the_policy_names_stays_without_services(tmp_path: Path) -> None:
+    """Its profile names it, whatever it may offer; ``nodes`` of the ledger have it."""
+    denied = '<services reply="DENY"><service>/*</service></services>'
+    own = f'<services reply="ALLOW"><service>~/get_parameters</service></services>{denied}'
+    named = enclave(tmp_path, publish("/chatter") + own, "/n")
+    assert nodes_not_shown(named) == (NodeName("/", "n"),)
+    rights = [each.right for each in stated_rights(named)]
+    for nodes, may in ((nodes_not_shown(named), True), ((NodeName("/", "m"),), False), ((), False)):
+        rules = tuple(graph_rules("/n", 0, rights, nodes))
+        assert tuple(graph_rules("/n", 0, rights, nodes_in_rules(rules, "/n"))) == rules
+        control = AccessControl((RemoteRights("/n", rules),))
+        for announced in ("NN/%n/%/n", "MP/%n/%/n/%chatter/t/h/q"):
+            key = f"@ros2_lv/0/z/0/0/{announced}"
+            assert control.allows("/n", IN, Message.LIVELINESS_TOKEN, key) is may, (nodes, key)
 
 
 OF_SEVERAL = {

@@ -25,7 +25,7 @@ from sros_tool.policy.model import (
     Qualifier,
     Source,
 )
-from sros_tool.policy.patterns import ComparisonLimit, Names, covers, matches
+from sros_tool.policy.patterns import ComparisonLimit, Names, covers, matches, overlap
 from sros_tool.values import Words, shows
 
 KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
@@ -312,6 +312,15 @@ class NodeName(NamedTuple):
     ns: str
     name: str
 
+    def is_within(self, wider: NodeName) -> bool:
+        """Return whether ``wider`` stands for all nodes that this name stands for."""
+        in_root = (wider.ns, self.ns) == ("/*", "/")
+        return covers(wider.ns, self.ns) and covers(wider.name, self.name) and not in_root
+
+    def meets(self, other: NodeName) -> bool:
+        """Return whether both names may stand for the same node."""
+        return overlap(self.ns, other.ns) and overlap(self.name, other.name)
+
 
 def nodes_of(enclave: Enclave) -> tuple[NodeName, ...]:
     """Return the nodes of an enclave, from the profiles of its policy."""
@@ -319,9 +328,20 @@ def nodes_of(enclave: Enclave) -> tuple[NodeName, ...]:
 
 
 def nodes_not_shown(enclave: Enclave) -> tuple[NodeName, ...]:
-    """Return the nodes of a policy's enclave that `nodes_of_rights` cannot derive."""
-    hidden = (profile for profile in enclave.all_profiles() if not any(map(_shows, profile.groups)))
-    return tuple(dict.fromkeys(map(_node_of, hidden)))
+    """Return the nodes of a policy's enclave that its permissions do not show.
+
+    `nodes_of_rights` derives the others, unless their own services are denied (`denied_nodes`).
+    """
+    profiles = tuple(enclave.all_profiles())
+    rights = {right for each in profiles for right in profile_rights(enclave.path, each)}
+    gone = denied_nodes(rights)
+    return tuple(
+        dict.fromkeys(
+            node
+            for profile, node in ((each, _node_of(each)) for each in profiles)
+            if not any(map(_shows, profile.groups)) or any(map(node.is_within, gone))
+        )
+    )
 
 
 def _node_of(profile: Profile) -> NodeName:

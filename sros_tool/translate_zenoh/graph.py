@@ -96,17 +96,24 @@ def graph_rules(
     """Yield what a process allows to processes of an enclave, as far as the graph is concerned.
 
     They may announce ``nodes`` and those whose own services they may offer, or any if there are
-    none, with what ``rights`` allow, in the name of their own enclave; and see everything.  A node
-    all of whose own services are allowed and denied is denied.  The right to ask has to be for
-    exactly the expression that rmw_zenoh asks for.  ``rights`` are to topics and services.
+    none, with what ``rights`` allow, in the name of their own enclave; and see everything.  Denials
+    of all own services of a node take it out of those that they may offer services of.  The right
+    to ask has to be for exactly the expression that rmw_zenoh asks for.  ``rights`` are to topics
+    and services.
     """
-    rights = tuple(rights)
-    known = dict.fromkeys((*nodes, *nodes_of_rights(rights)))
-    tokens = _Tokens(enclave, domain, known or [_ANY_NODE])
+    rights, nodes = tuple(rights), tuple(nodes)
+    offering, without = nodes_of_rights(rights), denied_nodes(rights)
+    left = [node for node in offering if not any(map(node.is_within, without))]
+    known = dict.fromkeys((*nodes, *left))
+    tokens = _Tokens(enclave, domain, known if known or offering else [_ANY_NODE])
     allowed, denied = tokens.of(rights)
-    denied += tokens.of_every_kind(denied_nodes(rights))
+    # A node of ``nodes`` stays, unless the denial is needed for others.
+    denied += tokens.of_every_kind(
+        [each for each in without if any(map(each.meets, left)) or not any(map(each.meets, nodes))]
+    )
     everything = f"{GRAPH}/{domain}/{ANY_CHUNKS}"
-    yield AccessRule(Flow.INGRESS, _ANNOUNCING, allowed)
+    if allowed:
+        yield AccessRule(Flow.INGRESS, _ANNOUNCING, allowed)
     if denied:
         yield AccessRule(Flow.INGRESS, _ANNOUNCING, denied, allows=False)
     yield AccessRule(Flow.EGRESS, _ANNOUNCING, (everything,))

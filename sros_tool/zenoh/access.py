@@ -339,10 +339,14 @@ def narrowed(rights: RemoteRights, most: Iterable[AccessRule], kept: str) -> Rem
 
 
 def is_within(remote: RemoteRights, own: RemoteRights) -> bool:
-    """Return whether a process whose rights are ``own`` lets a remote one do no more than that."""
-    mine = AccessControl((own,))
+    """Return whether a process whose rights are ``own`` lets a remote one do no more than that.
+
+    What the remote process is allowed and denied again, it does not get.
+    """
+    mine, others = AccessControl((own,)), AccessControl((remote,))
     return all(
         mine.allows(own.common_name, rule.flow.opposite(), message, key)
+        or not others.allows(remote.common_name, rule.flow, message, key)
         for rule in remote.rules
         if rule.allows
         for message in rule.messages

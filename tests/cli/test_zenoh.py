@@ -390,3 +390,13 @@ def test_a_node_in_any_namespace_announces_its_own_services(folder: Path) -> Non
     ):
         token = f"@ros2_lv/0/z/0/1/SS/%a/{node}/{service}%get_parameters/type/hash/qos"
         assert access.decide(*announcing, token).allowed is announced, token
+
+
+def test_tokens_that_are_allowed_and_denied_again_do_not_stop_an_export(folder: Path) -> None:
+    groups = '<services reply="{}"><service>{}</service></services>'
+    groups = groups.format("ALLOW", "/a*") + groups.format("DENY", "/*") + publish("/x")
+    (folder / "denied.xml").write_text(policy_text({"/a": groups}))
+    sros("create_permission", "ks", "/a", "denied.xml", cwd=folder).ok()
+    sros("zenoh", "ks", cwd=folder).ok()
+    sros("distribute_key", "ks", "/a", "robot", cwd=folder).ok()
+    assert "[zenoh." not in sros("verify", "robot", cwd=folder).out
