@@ -165,7 +165,7 @@ def test_a_fleet_has_one_policy_and_one_status(tmp_path: Path) -> None:
     assert [each.robot for each in sros_tool.fleet_status(made, ["r2"]).robots] == ["r2"]
     with pytest.raises(UsageError, match="one string"):
         sros_tool.fleet_status(made, "r2")
-    with pytest.raises(UsageError, match="was read already"):
+    with pytest.raises(UsageError, match="already parsed policy"):
         sros_tool.generate(made, sros_tool.read_policy(POLICY), fleet=fleet)
 
 

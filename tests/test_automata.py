@@ -162,7 +162,7 @@ def test_the_length_of_names_counts_in_bytes() -> None:
 def test_a_set_that_takes_too_many_steps_is_refused() -> None:
     wide = names_of(Style.FNMATCH, ["*[ab]" + "?" * 20])
     both = names_of(Style.FNMATCH, ["*a" + "?" * 20, "*b" + "?" * 20])
-    with pytest.raises(DocumentError, match="cannot be decided"):
+    with pytest.raises(DocumentError, match="too many wildcards"):
         (wide - both).example(SearchLimit(50_000))
 
 
@@ -186,10 +186,10 @@ def test_equal_wildcards_take_no_search() -> None:
 def test_looking_at_thousands_of_wildcards_counts() -> None:
     wild = names_of(Style.FNMATCH, [f"rt/*x{i}" for i in range(900)])
     none = names_of(Style.FNMATCH, ["rt/y?"])
-    with pytest.raises(DocumentError, match="so many wildcards"):
+    with pytest.raises(DocumentError, match="too many wildcards"):
         (none - wild).is_empty(SearchLimit(50))
     many = names_of(Style.FNMATCH, [f"rt/x{i}*" for i in range(9000)])
-    with pytest.raises(DocumentError, match="so many wildcards"):
+    with pytest.raises(DocumentError, match="too many wildcards"):
         (none - many).is_empty()
 
 

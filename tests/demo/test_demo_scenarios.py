@@ -11,6 +11,7 @@ from sros_tool.demo.scenarios.model import (
     SPEAKING,
     STATUS_OF,
     Relation,
+    Role,
     Row,
     Scenario,
 )
@@ -31,8 +32,8 @@ def test_claims_name_parties_of_the_row(row: Row) -> None:
     for claim in (*row.claims, *row.controls):
         row.party(claim.subject)
         if claim.talker:
-            calls = claim.relation is Relation.EXECUTES
-            assert row.party(claim.talker).role in (CALLING if calls else SPEAKING)
+            acting = {Relation.EXECUTES: CALLING, Relation.LOSES: {Role.ERASER}}
+            assert row.party(claim.talker).role in acting.get(claim.relation, SPEAKING)
 
 
 @EVERY_ROW

@@ -551,6 +551,6 @@ def test_wildcards_that_are_compared_count() -> None:
         lambda limit: side.meeting(topics, limit),
         lambda limit: side.perhaps_meeting([Automaton.sequence([None])], limit),
     ):
-        with pytest.raises(DocumentError, match="so many wildcards"):
+        with pytest.raises(DocumentError, match="too many wildcards"):
             ask(SearchLimit(100))
         assert ask(SearchLimit(10_000)) is not None
