@@ -247,7 +247,12 @@ def test_denials_are_subtracted(
             "policy.xml:2: DENY publish /*image* cannot be said to Zenoh, because line 1 of",
         ),
         (
-            publish("/*") + "\n" + DENY.format("publish", "/front_camera/*</topic><topic>/*/image"),
+            publish("/*")
+            + "\n"
+            + "".join(
+                DENY.format("publish", each)
+                for each in ("/front_camera/*", "/*/set_parameters", "/*/describe_parameters")
+            ),
             "policy.xml:2: DENY publish /front_camera/* cannot be said to Zenoh, because line 1 of",
         ),
         ("\n" + publish("/a???"), "policy.xml:2: the name /a???"),

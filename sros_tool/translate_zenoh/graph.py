@@ -19,6 +19,7 @@ from string import ascii_lowercase
 from typing import NamedTuple
 
 from sros_tool.names import is_expression
+from sros_tool.policy.choices import TooManyNames, listed
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import Names, covers, overlap
 from sros_tool.policy.rights import (
@@ -29,7 +30,6 @@ from sros_tool.policy.rights import (
     denied_nodes,
     nodes_of_rights,
 )
-from sros_tool.policy.subtraction import CannotSubtract, listed
 from sros_tool.wording import first_few
 from sros_tool.zenoh.access import AccessRule, Flow, Message
 from sros_tool.zenoh.key_expressions import (
@@ -196,7 +196,7 @@ def _listed(name: str) -> list[str]:
     """Return expressions with ``*`` alone; more than can be listed become wider ones."""
     try:
         return listed(name, _MOST_TOKENS)
-    except CannotSubtract:  # the keys of the name cannot be listed either, and are refused
+    except TooManyNames:  # the keys of the name cannot be listed either, and are refused
         return []
 
 

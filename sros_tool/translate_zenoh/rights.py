@@ -13,10 +13,15 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from typing import NamedTuple
 
 from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
 from sros_tool.names import check_enclave_name, expression_problem, is_expression
+from sros_tool.policy.choices import (
+    TooManyNames,
+    listed,
+)
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
@@ -28,7 +33,7 @@ from sros_tool.policy.model import (
     Profiles,
     Source,
 )
-from sros_tool.policy.patterns import ComparisonLimit, Names, covers
+from sros_tool.policy.patterns import ComparisonLimit, Names, covers, overlap
 from sros_tool.policy.rights import (
     KIND_OF,
     RIGHT_ORDER,
@@ -38,13 +43,6 @@ from sros_tool.policy.rights import (
     nodes_of,
     parts,
     placed_rights,
-)
-from sros_tool.policy.subtraction import (
-    IN_PART,
-    CannotSubtract,
-    SubtractionEffort,
-    listed,
-    subtract,
 )
 from sros_tool.translate_zenoh.graph import graph_rules
 from sros_tool.zenoh.access import (
@@ -56,13 +54,19 @@ from sros_tool.zenoh.access import (
     Flow,
     Message,
     RemoteRights,
-    in_order,
     joined,
 )
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.document import ConfigurationDocument
 from sros_tool.zenoh.key_expressions import ANY_CHUNKS, ANY_PART, canonical, includes, intersects
 from sros_tool.zenoh.releases import RELEASES
+from sros_tool.zenoh.rule_keys import Difference
+from sros_tool.zenoh.subtraction import (
+    MOST_EXPRESSIONS,
+    CannotSubtract,
+    Chunks,
+    subtract_all,
+)
 
 _TYPE = ("$*::$*", "*")
 """The type and its hash, with which the keys of topics and services end: rules do not check them.
@@ -80,13 +84,6 @@ _BELOW = {"publish": _BELOW_TOPICS, "subscribe": _BELOW_TOPICS}
 """What belongs to a right below its keys, whatever the release of rmw_zenoh."""
 _ADVANCED = f"@adv/{ANY_CHUNKS}"
 """What belongs to a topic with history (TRANSIENT_LOCAL), below its key."""
-_MOST_KEYS = 4096
-"""Most key expressions for the wildcards of one right of an enclave.
-
-With 4096 of them for publishing and for subscribing, a router of 1.10.2 opens 0.1 s later, and the
-first message of a topic takes 40 ms, all others no more than with few.
-"""
-
 _M = Message
 _IN, _OUT = Flow.INGRESS, Flow.EGRESS
 _DATA, _HISTORY = False, True
@@ -156,16 +153,18 @@ def remote_of(
         PolicyError: a right is one that rules of Zenoh cannot state; the text names the place.
     """
     rules: list[AccessRule] = []
+    made_of: dict[tuple[Flow, tuple[Message, ...]], list[Difference]] = {}
     for domain, rights in stated.items():
         of_names = [each.right for each in rights]
         rules += graph_rules(enclave, domain, of_names, nodes)
-        for right, keys in _allowed_keys(domain, rights):
+        for right, keys, difference in _allowed_keys(domain, rights):
             below = tuple([f"{key}/{_ADVANCED}" for key in keys])
-            rules += [
-                AccessRule(flow, messages, below if history else keys)
-                for flow, messages, history in (_MESSAGES[right] if keys else ())
-            ]
-    return RemoteRights(enclave, joined(rules))
+            for flow, messages, history in _MESSAGES[right] if keys else ():
+                rules.append(AccessRule(flow, messages, below if history else keys))
+                if difference:
+                    of = difference.below(_ADVANCED) if history else difference
+                    made_of.setdefault((flow, messages), []).append(of)
+    return RemoteRights(enclave, joined(rules), {place: tuple(of) for place, of in made_of.items()})
 
 
 def domains_of(control: AccessControl) -> set[int]:
@@ -218,7 +217,7 @@ def as_router(router: str, own: RemoteRights) -> RemoteRights:
 
     It may send and get what the process itself may get and send: it passes on what others said.
     """
-    return RemoteRights(router, in_order(rule.mirrored() for rule in own.rules))
+    return own.mirrored(router)
 
 
 def crossing_rules(names: Iterable[str], domains: Iterable[int]) -> tuple[AccessRule, ...]:
@@ -239,13 +238,15 @@ def crossing_rules(names: Iterable[str], domains: Iterable[int]) -> tuple[Access
 _EXACT_NAMES = re.compile(r"(?:/[^/#$*?\[]+)+")
 """Names in a row, none with a wildcard, and all of them keys of Zenoh."""
 _NO_KEY = re.compile(r"[#$]|//|/\Z")
-"""What only names have that others than sros wrote: `IN_PART` and `ANY_PART`, and empty parts."""
+"""What only names have that others than sros wrote."""
 
 
 def _allowed_keys(
     domain: int, stated: Iterable[StatedRight]
-) -> Iterator[tuple[str, tuple[str, ...]]]:
+) -> Iterator[tuple[str, tuple[str, ...], Difference | None]]:
     """Yield each right with the key expressions of all names that are allowed and not denied.
+
+    The third is what those of names with wildcards are made of, if there are some.
 
     Raises:
         PolicyError: a name, or what a denial leaves of it, cannot be said.
@@ -256,91 +257,77 @@ def _allowed_keys(
         side = allowed if qualifier is ALLOW else denied
         side.setdefault(right, {}).setdefault(name, source)
     for right, places in sorted(allowed.items()):
-        if right not in denied and _EXACT_NAMES.fullmatch("".join(places)):
-            end = "/".join(("", *_TYPE, *_BELOW.get(right, ())))
-            yield right, tuple([f"{domain}{name}{end}" for name in places])
+        end = "/".join(("", *_TYPE, *_BELOW.get(right, ())))
+        never = denied.get(right, {})
+        if not never and _EXACT_NAMES.fullmatch("".join(places)):
+            yield right, tuple([f"{domain}{name}{end}" for name in places]), None
             continue
-        for name, place in (*places.items(), *denied.get(right, {}).items()):
+        for name, place in (*places.items(), *never.items()):
             if _NO_KEY.search(name):
                 raise _no_key(name, place)
-        denials = _Denials(right, denied[right]) if right in denied else _NONE_DENIED
-        found: set[tuple[str, ...]] = set()
-        left = _MOST_KEYS
-        for name, place in sorted(places.items()):
-            if not is_expression(name):
-                found.update(() if denials.meet(name) else chunks_of(name))
-                continue
-            taken = denials.taken_from(name, place, left)
-            left -= len(taken)
-            found |= taken
-        names = _with_what_is_below(found)
-        chunks = (*_TYPE, *_BELOW.get(right, ()))
-        yield right, tuple([canonical((str(domain), *each, *chunks)) for each in names])
+        denials = Names(never)
+        exact = {
+            tuple(name[1:].split("/"))
+            for name in places
+            if not is_expression(name) and not denials.meets(name)
+        }
+        wild = {name: place for name, place in places.items() if is_expression(name)}
+        difference = Difference(str(domain), end, _forms(wild), _forms(never))
+        names = _with_what_is_below(exact | _names_of(difference, right, wild, never))
+        keys = tuple([canonical((str(domain), *each)) + end for each in names])
+        yield right, keys, difference if wild else None
 
 
-class _Denials:
-    """The denied names of a right, and where they are stated."""
-
-    def __init__(self, right: str, places: Mapping[str, Source]) -> None:
-        self._right = right
-        self._places: dict[str, Source] = {}
-        for name, place in places.items():
-            for each in _listed(name, place, _MOST_KEYS):
-                self._places.setdefault(each, place)
-        self._names = Names(self._places)
-        self._effort = SubtractionEffort()
-
-    def meet(self, name: str) -> bool:
-        """Return whether a name without wildcards is denied."""
-        return self._names.meets(name)
-
-    def taken_from(self, wide: str, place: Source, most: int) -> set[tuple[str, ...]]:
-        """Return the chunks of all names that ``wide``, stated at ``place``, allows after all.
-
-        Raises:
-            PolicyError: there are more than ``most``, or the difference cannot be said.
-        """
-        found: set[tuple[str, ...]] = set()
-        for name in _listed(wide, place, most):
-            denied = list(self._names.meeting(name))
-            names = [name]
-            if denied:
-                try:
-                    names = subtract(name, denied, most, self._effort)
-                except CannotSubtract as error:
-                    raise self._inside(name, place, error.denied, denied[0]) from None
-            for each in names:
-                if _number_of_chunks(each) <= most:
-                    found.update(chunks_of(each))
-                if _number_of_chunks(each) > most or len(found) > most:
-                    raise (
-                        self._inside(name, place, "", denied[0])
-                        if denied
-                        else _too_many(wide, place)
-                    )
-        return found
-
-    def _inside(self, wide: str, place: Source, inside: str, first: str) -> PolicyError:
-        allows = f"line {place.line} of '{place.file}' allows" if place.line else "they allow"
-        why = (
-            "and text between two wildcards leaves names of which there is no such list"
-            if inside
-            else f"and that takes more than {_MOST_KEYS} key expressions here"
-        )
-        denied = inside or first
-        return PolicyError(
-            f"{self._places[denied]}: DENY {self._right} {denied} cannot be said to Zenoh, because "
-            f"{allows} {wide}",
-            "A denial inside a wildcard does not hold in Zenoh against whoever asks or publishes "
-            f"with a wildcard. So sros lists what is left allowed, {why}.",
-            f"List the names to {self._right} in place of {wide}.",
-        )
+def _forms(places: Mapping[str, Source]) -> frozenset[Chunks]:
+    """Return the chunks of the key expressions that match some names."""
+    return frozenset(
+        chunks
+        for name, place in places.items()
+        for one in _listed(name, place)
+        for chunks in chunks_of(one)
+    )
 
 
-_NONE_DENIED = _Denials("", {})
+def _names_of(
+    difference: Difference, right: str, allowed: Mapping[str, Source], denied: Mapping[str, Source]
+) -> frozenset[Chunks]:
+    """Return the chunks of the names of a difference, as ``allowed`` and ``denied`` state it.
+
+    Raises:
+        PolicyError: they cannot be said, or take more than `MOST_EXPRESSIONS`.
+    """
+    try:
+        return difference.names()
+    except CannotSubtract:
+        pass
+    for (wide, place), (name, denying) in product(sorted(allowed.items()), sorted(denied.items())):
+        try:
+            subtract_all(_forms({wide: place}), _forms({name: denying}))
+        except CannotSubtract as error:
+            if error.denied:
+                why = "text between two wildcards leaves names of which there is no such list"
+                raise _cannot_deny(right, name, denying, wide, place, why) from None
+    why = f"that takes more than {MOST_EXPRESSIONS} key expressions here"
+    wide, place = min(allowed.items(), key=lambda item: (len(item[0]), item[0]))
+    for name, denying in denied.items():
+        if overlap(name, wide):
+            raise _cannot_deny(right, name, denying, wide, place, why)
+    raise _too_many(wide, place)
 
 
-def _with_what_is_below(found: set[tuple[str, ...]]) -> set[tuple[str, ...]]:
+def _cannot_deny(
+    right: str, denied: str, denying: Source, wide: str, allowing: Source, why: str
+) -> PolicyError:
+    allows = f"line {allowing.line} of '{allowing.file}' allows" if allowing.line else "they allow"
+    return PolicyError(
+        f"{denying}: DENY {right} {denied} cannot be said to Zenoh, because {allows} {wide}",
+        "A denial inside a wildcard does not hold in Zenoh against whoever asks or publishes with "
+        f"a wildcard. So sros lists what is left allowed, and {why}.",
+        f"List the names to {right} in place of {wide}.",
+    )
+
+
+def _with_what_is_below(found: frozenset[Chunks] | set[Chunks]) -> set[Chunks] | frozenset[Chunks]:
     """Return the same names, where a name and all names below it are one expression."""
     below = ("*", ANY_CHUNKS)
     if not any(each[-1] == ANY_CHUNKS for each in found):
@@ -351,12 +338,19 @@ def _with_what_is_below(found: set[tuple[str, ...]]) -> set[tuple[str, ...]]:
     }
 
 
-def _listed(name: str, place: Source, most: int) -> list[str]:
-    """Return the names of an expression, for each choice of its ``?`` and sets of characters."""
+def _listed(name: str, place: Source) -> list[str]:
+    """Return the names of an expression, for each choice of its ``?`` and sets of characters.
+
+    Raises:
+        PolicyError: they take more than `MOST_EXPRESSIONS`.
+    """
     try:
-        return listed(name, most)
-    except CannotSubtract:
-        raise _too_many(name, place) from None
+        names = listed(name, MOST_EXPRESSIONS)
+    except TooManyNames:
+        names = []
+    if not 0 < sum(map(_number_of_chunks, names)) <= MOST_EXPRESSIONS:
+        raise _too_many(name, place)
+    return names
 
 
 def _no_key(name: str, place: Source) -> PolicyError:
@@ -371,7 +365,7 @@ def _too_many(name: str, place: Source) -> PolicyError:
     return PolicyError(
         f"{place}: the name {name} cannot be said to Zenoh",
         "A key expression of Zenoh has no '?' and no set of characters, and a list of all names "
-        f"takes more than {_MOST_KEYS} key expressions.",
+        f"takes more than {MOST_EXPRESSIONS} key expressions.",
         "List the names, or use '*'.",
     )
 
@@ -382,15 +376,15 @@ def _number_of_chunks(name: str) -> int:
     return 1 << stars_within
 
 
-def chunks_of(name: str) -> list[tuple[str, ...]]:
+def chunks_of(name: str) -> list[Chunks]:
     """Return the chunks of the key expressions that together match the ROS names of ``name``.
 
-    ``name`` is absolute, with ``*`` and `IN_PART` as its only wildcards.  A ``*`` of a policy also
+    ``name`` is absolute, with ``*`` as its only wildcard.  A ``*`` of a policy also
     matches "/", so it becomes ``**`` where it stands next to a slash, and two expressions within a
     part of a name: `_number_of_chunks` tells beforehand whether that is too many.
     """
     if "*" not in name:
-        return [tuple(name.replace(IN_PART, ANY_PART)[1:].split("/"))]
+        return [tuple(name[1:].split("/"))]
     while "**" in name:
         name = name.replace("**", "*")
     if name.startswith("*"):  # a namespace with a wildcard: the star may also stand for nothing
@@ -399,10 +393,7 @@ def chunks_of(name: str) -> list[tuple[str, ...]]:
     found: list[list[str]] = [[]]
     for begin, *others in (part.split("*") for part in name[1:].split("/")):
         found = [before + each for before in found for each in _chunks_of_part([begin, *others])]
-    return [
-        tuple(canonical(part.replace(IN_PART, ANY_PART) for part in each).split("/"))
-        for each in found
-    ]
+    return [tuple(canonical(each).split("/")) for each in found]
 
 
 def _chunks_of_part(texts: list[str]) -> list[list[str]]:

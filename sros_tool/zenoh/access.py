@@ -19,7 +19,8 @@ from itertools import count, product
 from typing import NamedTuple, Protocol
 
 from sros_tool.automata import NameSet
-from sros_tool.zenoh.key_expressions import KeyExpressions, RuleKeys, includes, keys_of, names_of
+from sros_tool.zenoh.key_expressions import KeyExpressions, includes, names_of
+from sros_tool.zenoh.rule_keys import Difference, RuleKeys, keys_of
 
 
 class Message(StrEnum):
@@ -68,10 +69,32 @@ class AccessRule(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RemoteRights:
-    """What processes may send and get whose certificate has the common name ``common_name``."""
+    """What processes may send and get whose certificate has the common name ``common_name``.
+
+    ``made_of`` is what the keys with wildcards are, by direction and messages of their rule, where
+    denials made lists of them.
+    """
 
     common_name: str
     rules: tuple[AccessRule, ...]
+    made_of: Mapping[_Use, tuple[Difference, ...]] = field(default_factory=dict, compare=False)
+
+    def mirrored(self, common_name: str) -> RemoteRights:
+        """Return what the remote process has to allow to this one, whose name is given."""
+        return RemoteRights(
+            common_name,
+            in_order(rule.mirrored() for rule in self.rules),
+            {(flow.opposite(), messages): of for (flow, messages), of in self.made_of.items()},
+        )
+
+    def keys_of(self, rule: AccessRule) -> RuleKeys:
+        """Return the keys of one of the rules."""
+        made_of = self.made_of.get((rule.flow, rule.messages), ()) if rule.allows else ()
+        return keys_of(frozenset(rule.key_expressions), made_of)
+
+
+_Use = tuple[Flow, tuple[Message, ...]]
+"""The direction and messages of a rule."""
 
 
 @dataclass(frozen=True)
@@ -224,13 +247,19 @@ def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     Rules of the same direction and messages become one; key expressions that others of the same
     rule include are left out.
     """
-    expressions: dict[tuple[Flow, tuple[Message, ...], bool], set[str]] = {}
+    found: dict[tuple[Flow, tuple[Message, ...], bool], list[tuple[str, ...]]] = {}
     for flow, messages, keys, allows in rules:
-        expressions.setdefault((flow, messages, allows), set()).update(keys)
+        found.setdefault((flow, messages, allows), []).append(keys)
     return in_order(
-        AccessRule(flow, messages, _needed(frozenset(keys)), allows)
-        for (flow, messages, allows), keys in expressions.items()
+        AccessRule(flow, messages, _joined_keys(keys), allows)
+        for (flow, messages, allows), keys in found.items()
     )
+
+
+def _joined_keys(keys: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
+    if len(keys) == 1 and len(keys[0]) > _FEW:
+        return tuple(sorted(keys[0]))
+    return _needed(frozenset(each for some in keys for each in some))
 
 
 @lru_cache(maxsize=16)  # several messages of a right have the same keys
@@ -247,7 +276,15 @@ def in_order(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
 
 def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
     """Return the rights of all enclaves together, for a process named ``name``."""
-    return RemoteRights(name, joined(rule for of_enclave in rights for rule in of_enclave.rules))
+    of_all = list(rights)
+    made_of: dict[_Use, dict[Difference, None]] = {}
+    for use, of in (item for each in of_all for item in each.made_of.items()):
+        made_of.setdefault(use, {}).update(dict.fromkeys(of))
+    return RemoteRights(
+        name,
+        joined(rule for each in of_all for rule in each.rules),
+        {use: tuple(of) for use, of in made_of.items()},
+    )
 
 
 class RightsBetween:
@@ -259,9 +296,11 @@ class RightsBetween:
 
     def __init__(self, rights: Iterable[RemoteRights]) -> None:
         """Take the rights of all enclaves, whose processes connect to each other."""
-        self._rules = {
-            remote.common_name: [_RuleOfPeer.of(rule) for rule in remote.rules] for remote in rights
-        }
+        self._rules: dict[str, list[_RuleOfPeer]] = {}
+        self._mirrored: dict[str, list[_RuleOfPeer]] = {}
+        for each in rights:
+            self._rules[each.common_name] = _RuleOfPeer.of_all(each)
+            self._mirrored[each.common_name] = _RuleOfPeer.of_all(each.mirrored(each.common_name))
 
     def of_all(self, own: str) -> Iterator[RemoteRights]:
         """Yield what a process of the enclave ``own`` allows to processes of all enclaves.
@@ -269,8 +308,8 @@ class RightsBetween:
         Raises:
             TooManyExpressions: that takes too many key expressions.
         """
-        mine = [_RuleOfPeer.of(rule_of_peer.rule.mirrored()) for rule_of_peer in self._rules[own]]
-        denied = [rule_of_peer for rule_of_peer in mine if not rule_of_peer.rule.allows]
+        mine = self._mirrored[own]
+        denied = [each for each in mine if not each.rule.allows]
         meeting: dict[_Place, list[tuple[tuple[Message, ...], RuleKeys]]] = {}
         for remote, theirs in self._rules.items():
             shared: dict[_Place, tuple[str, ...]] = {}
@@ -307,9 +346,11 @@ class _RuleOfPeer(NamedTuple):
     keys: RuleKeys
 
     @classmethod
-    def of(cls, rule: AccessRule) -> _RuleOfPeer:
-        place = (rule.flow, rule.messages, rule.allows)
-        return cls(place, rule, keys_of(frozenset(rule.key_expressions)))
+    def of_all(cls, rights: RemoteRights) -> list[_RuleOfPeer]:
+        return [
+            cls((rule.flow, rule.messages, rule.allows), rule, rights.keys_of(rule))
+            for rule in rights.rules
+        ]
 
 
 def _shared(one: _Place, other: _Place) -> tuple[Message, ...]:
@@ -334,19 +375,22 @@ def narrowed(rights: RemoteRights, most: Iterable[AccessRule], kept: str) -> Rem
     graph = [rule for rule in rights.rules if rule.key_expressions[0].startswith(kept)]
     others = tuple(rule for rule in rights.rules if rule not in graph)
     limit = RemoteRights("", tuple(rule.mirrored() for rule in most))
-    both, _ = RightsBetween((RemoteRights(rights.common_name, others), limit)).of_all("")
+    some = RemoteRights(rights.common_name, others, rights.made_of)
+    both, _ = RightsBetween((some, limit)).of_all("")
     return RemoteRights(rights.common_name, in_order((*graph, *both.rules)))
 
 
 def is_within(remote: RemoteRights, own: RemoteRights) -> bool:
-    """Return whether a process whose rights are ``own`` lets a remote one do no more than that.
-
-    What the remote process is allowed and denied again, it does not get.
-    """
-    mine, others = AccessControl((own,)), AccessControl((remote,))
+    """Return whether a process whose rights are ``own`` lets a remote one do no more than that."""
+    mine, theirs = AccessControl((own,)), AccessControl((remote,))
     return all(
         mine.allows(own.common_name, rule.flow.opposite(), message, key)
-        or not others.allows(remote.common_name, rule.flow, message, key)
+        or not theirs.allows(remote.common_name, rule.flow, message, key)
+        or any(
+            message in each.messages and own.keys_of(each).include(key)
+            for each in own.rules
+            if each.flow is rule.flow.opposite()
+        )
         for rule in remote.rules
         if rule.allows
         for message in rule.messages

@@ -15,8 +15,7 @@ from itertools import count
 from sros_tool.automata import Automaton, Letters, NameSet
 from sros_tool.names import has_parts
 
-ANY_PART, ANY_CHUNKS = "$*", "**"
-_ANY_CHUNK = "*"
+ANY_PART, ANY_CHUNK, ANY_CHUNKS = "$*", "*", "**"
 _MANY = 65536
 _LITERAL = re.compile(r"(?<![^/])[^/*]+(?![^/])")
 """A chunk without wildcards."""
@@ -39,11 +38,11 @@ def canonical(chunks: Iterable[str]) -> str:
         while ANY_PART + ANY_PART in chunk:
             chunk = chunk.replace(ANY_PART + ANY_PART, ANY_PART)
         if chunk == ANY_PART:
-            chunk = _ANY_CHUNK
+            chunk = ANY_CHUNK
         if found and found[-1] == ANY_CHUNKS:
             if chunk == ANY_CHUNKS:
                 continue
-            if chunk == _ANY_CHUNK:
+            if chunk == ANY_CHUNK:
                 found.insert(-1, chunk)
                 continue
         found.append(chunk)
@@ -145,7 +144,7 @@ def _includes(wide: str, narrow: str) -> bool:
     some, others = _chunks(wide), _chunks(narrow)
     anywhere = some.count(ANY_CHUNKS)
     if anywhere > 1:
-        return _chunks_include(some, others)
+        return sequence_includes(some, others)
     if not anywhere:
         if len(some) != len(others):
             return False
@@ -164,7 +163,7 @@ def _includes(wide: str, narrow: str) -> bool:
     )
 
 
-def _chunks_include(wide: Sequence[str], narrow: Sequence[str]) -> bool:
+def sequence_includes(wide: Sequence[str], narrow: Sequence[str]) -> bool:
     """Return whether chunks include others: the set of reached places grows chunk by chunk."""
     reached = _onward({0}, wide)
     for chunk in narrow:
@@ -195,9 +194,9 @@ def _chunk_includes(wide: str, narrow: str) -> bool:
         return True
     if narrow == ANY_CHUNKS or "*" not in wide or narrow.startswith("@"):
         return False
-    if wide == _ANY_CHUNK:
+    if wide == ANY_CHUNK:
         return True
-    if narrow == _ANY_CHUNK:
+    if narrow == ANY_CHUNK:
         return False
     # "\0" is no character of a key: what only a wildcard includes.
     return has_parts(narrow.replace(ANY_PART, "\0"), wide.split(ANY_PART))
@@ -211,17 +210,24 @@ def widest(expression: str) -> str:
 
 def intersects(one: str, other: str) -> bool:
     """Return whether some key belongs to both expressions, as Zenoh decides."""
-    return _sequences_intersect(one.split("/"), other.split("/"), ANY_CHUNKS, _chunks_intersect)
+    return sequences_intersect(_chunks(one), _chunks(other))
 
 
-def _chunks_intersect(one: str, other: str) -> bool:
+@lru_cache(maxsize=_MANY)
+def sequences_intersect(one: tuple[str, ...], other: tuple[str, ...]) -> bool:
+    """Return whether some key belongs to both expressions, given as chunks."""
+    return _sequences_intersect(one, other, ANY_CHUNKS, chunks_intersect)
+
+
+def chunks_intersect(one: str, other: str) -> bool:
+    """Return whether some key belongs to both of two chunks."""
     if one == other:
         return True
     if ANY_CHUNKS in (one, other):
         return not (one + other).replace(ANY_CHUNKS, "").startswith("@")
     if one.startswith("@") or other.startswith("@"):
         return False
-    if _ANY_CHUNK in (one, other):
+    if ANY_CHUNK in (one, other):
         return True
     if "*" not in one and "*" not in other:
         return False
@@ -280,7 +286,7 @@ def common(one: str, other: str) -> list[str]:
         return [one]
     if not intersects(one, other):
         return []
-    found = _common(one.split("/"), other.split("/"), ANY_CHUNKS, _common_chunks)
+    found = _common(one.split("/"), other.split("/"), ANY_CHUNKS, common_chunks)
     return KeyExpressions(canonical(each) for each in found).needed()
 
 
@@ -289,16 +295,17 @@ _ANY_LETTERS = "\0"
 
 
 @lru_cache(maxsize=_MANY)
-def _common_chunks(one: str, other: str) -> tuple[str, ...]:
+def common_chunks(one: str, other: str) -> tuple[str, ...]:
+    """Return chunks that together match what both match: of ``**``, that is the other one."""
     if one == other:
         return (one,)
     if ANY_CHUNKS in (one, other):
         chunk = other if one == ANY_CHUNKS else one
         return () if chunk.startswith("@") else (chunk,)
-    if not _chunks_intersect(one, other):
+    if not chunks_intersect(one, other):
         return ()
-    if _ANY_CHUNK in (one, other):
-        return (other if one == _ANY_CHUNK else one,)
+    if ANY_CHUNK in (one, other):
+        return (other if one == ANY_CHUNK else one,)
     left, right = (each.replace(ANY_PART, _ANY_LETTERS) for each in (one, other))
     found = {
         "".join(each).replace(_ANY_LETTERS, ANY_PART)
@@ -350,93 +357,6 @@ def _common(
     return set(following(0, 0))
 
 
-class RuleKeys:
-    """The keys of a rule: what ``expressions`` include, with a fast search for what others share.
-
-    ``plain`` are those of one name: with wildcards only for the type and its hash, and for the
-    history below.
-    """
-
-    def __init__(self, expressions: frozenset[str]) -> None:
-        """Take the expressions; `keys_of` does it once for the same ones."""
-        self.plain = frozenset(each for each in expressions if "*" not in _PLAIN_ENDS.sub("", each))
-        self.wide = _searched(expressions - self.plain)
-
-    def common(self, other: RuleKeys) -> tuple[str, ...]:
-        """Return expressions that together include the keys of both, and no others, sorted.
-
-        Raises:
-            TooManyExpressions: there are too many.
-        """
-        found = self.plain & other.plain
-        if other.wide.all and self.plain:
-            found |= _plain_in(self.plain, other.wide)
-        if self.wide.all and other.plain:
-            found |= _plain_in(other.plain, self.wide)
-        if self.wide.all and other.wide.all:
-            wide = _common_of_wide(self.wide, other.wide)
-            if not found:
-                return wide
-            found |= {*wide}
-        return tuple(sorted(found))
-
-
-@lru_cache(maxsize=_MANY)
-def keys_of(expressions: frozenset[str]) -> RuleKeys:
-    """Return the keys that expressions include: the same value for the same ones."""
-    return RuleKeys(expressions)
-
-
-@lru_cache(maxsize=_MANY)
-def _searched(expressions: frozenset[str]) -> KeyExpressions:
-    return KeyExpressions(expressions)
-
-
-_PLAIN_ENDS = re.compile(r"/\$\*::\$\*/\*(?:/\*\*)?(?:/@adv/\*\*)?\Z")
-
-
-@lru_cache(maxsize=_MANY)
-def _plain_in(plain: frozenset[str], wide: KeyExpressions) -> frozenset[str]:
-    found: set[str] = set()
-    for key in plain:
-        found.update([key] if wide.include(key) else _common_with_all(key, wide))
-    return frozenset(found)
-
-
-@lru_cache(maxsize=_MANY)
-def _common_of_wide(one: KeyExpressions, other: KeyExpressions) -> tuple[str, ...]:
-    if one.all == other.all:
-        return tuple(sorted(one.all))
-    found = {each for each in one.all if other.include(each)}
-    left = [each for each in one.all if each not in found]
-    if not left:
-        return tuple(sorted(found))
-    for each in other.all:
-        if one.include(each):
-            found.add(each)
-        else:
-            # Of the others, those that are included as they are have been found.
-            found.update(*(common(each, wide) for wide in left if intersects(each, wide)))
-    if len(found) > _MOST_COMMON:
-        raise TooManyExpressions
-    return tuple(KeyExpressions(found).needed())
-
-
-@lru_cache(maxsize=_MANY)
-def _common_with_all(key: str, wide: KeyExpressions) -> tuple[str, ...]:
-    begin = _fixed_begin(key)
-    return tuple(
-        shared
-        for each in wide.all
-        if _may_meet(begin, _fixed_begin(each))
-        for shared in common(key, each)
-    )
-
-
-def _may_meet(one: str, other: str) -> bool:
-    return one.startswith(other) or other.startswith(one)
-
-
 # ── the keys as sets of names ──────────────────────────────────────────────────────────────
 
 _SLASH = Letters.of("/")
@@ -455,7 +375,7 @@ def _automaton(expression: str) -> Automaton | None:
     for chunk in _chunks(expression):
         begin = next(number)
         edges += [(each, _SLASH, begin) for each in between]
-        if chunk in (_ANY_CHUNK, ANY_CHUNKS):
+        if chunk in (ANY_CHUNK, ANY_CHUNKS):
             inside = next(number)
             edges += [(begin, _BEGINS_CHUNK, inside), (inside, _IN_CHUNK, inside)]
             if chunk == ANY_CHUNKS:
@@ -522,7 +442,7 @@ def expression_problem(text: str) -> str:
     if "#" in text or "?" in text:
         return "'#' and '?' are no characters of a key"
     for chunk in chunks:
-        if chunk in (_ANY_CHUNK, ANY_CHUNKS):
+        if chunk in (ANY_CHUNK, ANY_CHUNKS):
             continue
         rest = chunk.replace(ANY_PART, "")
         if "*" in rest or "$" in rest:

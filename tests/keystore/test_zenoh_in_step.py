@@ -24,7 +24,7 @@ FIRST = policy_text({"/a": publish("/x"), "/b": publish("/y")})
 MORE = policy_text({"/a": publish("/x", "/z")})
 NEW = policy_text({"/new": publish("/n")})
 HOLE = policy_text(
-    {"/hole": publish("/c*") + '\n<topics publish="DENY"><topic>/c?d</topic></topics>'}
+    {"/hole": publish("/c*") + '\n<topics publish="DENY"><topic>/*x*</topic></topics>'}
 )
 
 

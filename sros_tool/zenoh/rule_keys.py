@@ -1,0 +1,204 @@
+"""The keys of rules: what is left of names without denied ones, and what two rules share."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from functools import lru_cache
+from typing import NamedTuple
+
+from sros_tool.zenoh.key_expressions import (
+    ANY_CHUNKS,
+    KeyExpressions,
+    TooManyExpressions,
+    canonical,
+    common,
+    intersects,
+)
+from sros_tool.zenoh.subtraction import CannotSubtract, Chunks, covers, meet, subtract_all
+
+_MANY, _FEW = 65536, 1024
+
+
+class Difference(NamedTuple):
+    """The keys of names that expressions match and denied ones do not.
+
+    The chunk ``begin`` stands before each name, and ``end`` behind it: "" or "/" and more.
+    """
+
+    begin: str
+    end: str
+    allowed: frozenset[Chunks]
+    denied: frozenset[Chunks]
+
+    def names(self) -> frozenset[Chunks]:
+        """Return expressions for the names.
+
+        Raises:
+            CannotSubtract: there are none, or too many: see `subtract_all`.
+        """
+        return subtract_all(self.allowed, self.denied)
+
+    def below(self, end: str) -> Difference:
+        """Return the keys that have ``end`` below the keys of this difference."""
+        return self._replace(end=f"{self.end}/{end}")
+
+    def include(self, name: str) -> bool:
+        """Return whether a name without wildcards, with "/" between its chunks, is in it."""
+        return _searched(self.allowed).include(name) and not _searched(self.denied).include(name)
+
+    def include_all(self, begin: str, name: Chunks, end: str) -> bool:
+        """Return whether all keys of an expression are in it; False can be wrong, True never is."""
+        return (
+            begin == self.begin
+            and _common_end(end, self.end) == end
+            and any(covers(each, name) for each in self.allowed)
+            and not any(meet(each, name) for each in self.denied)
+        )
+
+    def common(self, other: Difference) -> list[str]:
+        """Return expressions for the keys of both.
+
+        Raises:
+            CannotSubtract: there are none, or too many: see `subtract_all`.
+            TooManyExpressions: what is allowed by both takes too many.
+        """
+        end = _common_end(self.end, other.end)
+        if self.begin != other.begin or end is None:
+            return []
+        names = subtract_all(_common(self.allowed, other.allowed), self.denied | other.denied)
+        return [canonical((self.begin, *each)) + end for each in names]
+
+
+def _common_end(one: str, other: str) -> str | None:
+    """Return what is behind the names of both, where one may have any keys below the other."""
+    end, longer = sorted((one, other), key=len)
+    return end if longer in (end, f"{end}/{ANY_CHUNKS}") else None
+
+
+@lru_cache(maxsize=_FEW)
+def _searched(expressions: frozenset[Chunks]) -> KeyExpressions:
+    return KeyExpressions("/".join(each) for each in expressions)
+
+
+@lru_cache(maxsize=_FEW)
+def _common(some: frozenset[Chunks], others: frozenset[Chunks]) -> frozenset[Chunks]:
+    """Return expressions for what some expressions and others match."""
+    if some == others:
+        return some
+    both = (common("/".join(one), "/".join(other)) for one in some for other in others)
+    return frozenset(tuple(each.split("/")) for found in both for each in found)
+
+
+class RuleKeys:
+    """The keys of a rule: what its expressions include.
+
+    ``plain`` are those of one name, with wildcards only for the type and its hash, and below;
+    ``tokens`` are graph tokens with wildcards; ``differences`` are all others.
+    """
+
+    def __init__(self, expressions: frozenset[str], made_of: tuple[Difference, ...]) -> None:
+        """Take the expressions, and what those with wildcards are made of, if that is known."""
+        wide = [each for each in expressions if "*" in _ENDS.sub("", each)]
+        self.plain = expressions.difference(wide)
+        self.tokens = KeyExpressions(each for each in wide if each.startswith("@"))
+        self.differences = made_of or _differences(wide)
+
+    def include(self, key: str) -> bool:
+        """Return whether all keys of an expression are keys of what the rule was made of."""
+        begin, name, end = _parted(key)
+        chunks = tuple(name.split("/"))
+        return any(each.include_all(begin, chunks, end) for each in self.differences)
+
+    def common(self, other: RuleKeys) -> tuple[str, ...]:
+        """Return expressions that together include the keys of both, and no others, sorted.
+
+        Raises:
+            TooManyExpressions: there are too many.
+        """
+        found = self.plain & other.plain
+        if self.plain and (other.differences or other.tokens.all):
+            found |= _plain_in(self.plain, other)
+        if other.plain and (self.differences or self.tokens.all):
+            found |= _plain_in(other.plain, self)
+        if self.tokens.all and other.tokens.all:
+            found |= _common_of_tokens(self.tokens, other.tokens)
+        if self.differences and other.differences:
+            found |= _common_of_differences(self.differences, other.differences)
+        return tuple(sorted(found))
+
+
+@lru_cache(maxsize=_MANY)
+def keys_of(expressions: frozenset[str], made_of: tuple[Difference, ...] = ()) -> RuleKeys:
+    """Return the keys that expressions include: the same value for the same ones."""
+    return RuleKeys(expressions, made_of)
+
+
+_TYPE = "/$*::$*/*"
+"""Any type and its hash, which stand behind each name."""
+_ENDS = re.compile(rf"{re.escape(_TYPE)}(?:/\*\*)?(?:/@adv/\*\*)?\Z")
+
+
+def _parted(expression: str) -> tuple[str, str, str]:
+    """Return what is before a name, the name and what is behind it."""
+    begin, _, rest = expression.partition("/")
+    name, of_type, below = rest.partition(_TYPE)
+    return begin, name, of_type + below
+
+
+def _differences(expressions: Iterable[str]) -> tuple[Difference, ...]:
+    """Return the keys of expressions that are not graph tokens."""
+    names: dict[tuple[str, str], set[Chunks]] = {}
+    for each in expressions:
+        if not each.startswith("@"):
+            begin, name, end = _parted(each)
+            names.setdefault((begin, end), set()).add(tuple(name.split("/")))
+    return tuple(
+        Difference(*place, frozenset(of), frozenset()) for place, of in sorted(names.items())
+    )
+
+
+@lru_cache(maxsize=_MANY)
+def _plain_in(plain: frozenset[str], wide: RuleKeys) -> frozenset[str]:
+    found: set[str] = set()
+    for key in plain:
+        begin, name, end = _parted(key)
+        if begin.startswith("@"):
+            found.update([key] if wide.tokens.include(key) else _common_with_all(key, wide.tokens))
+            continue
+        for difference in wide.differences:
+            shared = _common_end(end, difference.end)
+            if begin == difference.begin and shared is not None and difference.include(name):
+                found.add(f"{begin}/{name}{shared}")
+    return frozenset(found)
+
+
+@lru_cache(maxsize=_MANY)
+def _common_of_differences(
+    some: tuple[Difference, ...], others: tuple[Difference, ...]
+) -> frozenset[str]:
+    try:
+        both = [each for one in some for other in others for each in one.common(other)]
+    except CannotSubtract:
+        raise TooManyExpressions from None
+    return frozenset(both)
+
+
+@lru_cache(maxsize=_MANY)
+def _common_of_tokens(one: KeyExpressions, other: KeyExpressions) -> frozenset[str]:
+    if one.all == other.all:
+        return one.all
+    found = {each for each in one.all if other.include(each)}
+    left = [each for each in one.all if each not in found]
+    for each in other.all if left else ():
+        if one.include(each):
+            found.add(each)
+        else:
+            # Of the others, those that are included as they are have been found.
+            found.update(*(common(each, wide) for wide in left if intersects(each, wide)))
+    return frozenset(KeyExpressions(found).needed())
+
+
+@lru_cache(maxsize=_MANY)
+def _common_with_all(key: str, wide: KeyExpressions) -> tuple[str, ...]:
+    return tuple(shared for each in wide.all for shared in common(key, each))
