@@ -275,7 +275,9 @@ def _allowed_keys(
         difference = Difference(str(domain), end, _forms(wild), _forms(never))
         names = _with_what_is_below(exact | _names_of(difference, right, wild, never))
         keys = tuple([canonical((str(domain), *each)) + end for each in names])
-        yield right, keys, difference if wild else None
+        # Names of which one is now within a wildcard's expression are part of what makes that.
+        made_of = difference._replace(allowed=difference.allowed | exact.difference(names))
+        yield right, keys, made_of if wild else None
 
 
 def _forms(places: Mapping[str, Source]) -> frozenset[Chunks]:
