@@ -29,14 +29,14 @@ Chunks = tuple[str, ...]
 """A key expression, or a part of one."""
 
 MOST_EXPRESSIONS = 24576
-"""Most key expressions of a difference.
+"""Maximum number of key expressions of a difference.
 
-A right to publish 16,384 of them takes 190 MB in a process with Zenoh 1.10.2.
+A right to publish 16,384 of them takes 212 MB in a process with Zenoh 1.10.2.
 """
 _LETTERS = "_" + digits + ascii_letters
 _MANY, _FEW = 65536, 1024
 _MOST_CHARACTERS = 1_000_000
-"""Most characters that are compared for one chunk: about one second."""
+"""Maximum number of characters that are compared for one chunk: about one second."""
 
 
 class CannotSubtract(Exception):  # noqa: N818 - the caller makes an error of it
