@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import signal
@@ -181,6 +182,7 @@ def _become_program(
     read_from: Path = Path(os.devnull),
 ) -> NoReturn:
     status = 70
+    gc.freeze()  # files of the tests, collected here, would close those of the program by number
     try:
         for descriptor, source in ((0, os.open(read_from, os.O_RDONLY)), (1, out), (2, err)):
             os.dup2(source, descriptor)
