@@ -263,17 +263,20 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
         Condition.UNAUTHENTICATED_SEE: unauthenticated and not rule.enable_discovery_protection,
         Condition.UNCONTROLLED: uncontrolled,
         Condition.OPEN_JOIN: not domain.enable_join_access_control,
-        Condition.EXACT_SIGNER: backend.vendor is Condition.FAST and _checks_signers(backend.dds),
+        Condition.EXACT_SIGNER: _checks_signers(backend.dds),
     }
     vendor = {backend.vendor} if backend.vendor else set()
     return frozenset(name for name, holds in holding.items() if holds) | vendor
 
 
 def _checks_signers(dds: str) -> bool:
-    """Return whether this Fast DDS accepts only the permissions CA as signer of permissions.
+    """Return whether a DDS accepts only the permissions CA as signer of permissions.
 
-    ``dds`` is its name and version ("Fast DDS 2.14.5"); an unknown version counts as recent.
+    ``dds`` is its name and version ("Fast DDS 2.14.5"); an unknown version of Fast DDS counts as
+    recent.
     """
+    if not dds.startswith("Fast DDS"):
+        return dds.startswith("Cyclone DDS 11.")
     version = tuple(int(part) for part in dds.rpartition(" ")[2].split(".") if part.isdigit())
     if len(version) < 3 or version >= (2, 10):
         return True

@@ -118,3 +118,11 @@ def test_a_defence_that_a_vendor_has_in_another_form_is_removed_in_that_form() -
     assert twins["permissions borrowed, subjects not unique"].removed == "a unique subject name"
     for name, row in twins.items():
         assert row.expected in OPEN, name
+
+
+@pytest.mark.parametrize(
+    ("version", "exact"), [("0.10.2", False), ("0.10.5", False), ("11.0.1", True)]
+)
+def test_which_cyclone_dds_knows_its_signers(version: str, exact: bool) -> None:
+    cyclone = Backend("cyclone", f"Cyclone DDS {version}", "a test")
+    assert (C.EXACT_SIGNER in conditions(cyclone, load_template("sros2"), "rt/a")) is exact

@@ -807,7 +807,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Variant(
                 (Condition.EXACT_SIGNER,),
                 RowStatus.NOT_LET_IN,
-                mechanism="Fast DDS accepts only the permissions CA itself as signer",
+                mechanism="only the permissions CA itself is accepted as signer",
             ),
             _ONE_CA,
         ),
@@ -816,6 +816,11 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Identity(forger.permissions_and_governance_signed_by_itself, "guest"),
             RowStatus.NOT_HEARD,
             "the attacker changes the CA file for its DDS; its peers verify with the real CA",
+            Variant(
+                (Condition.EXACT_SIGNER, Condition.CYCLONE),
+                RowStatus.NOT_LET_IN,
+                mechanism="Cyclone DDS 11 reads the first CA of the file alone",
+            ),
             Variant(
                 (Condition.EXACT_SIGNER,),
                 RowStatus.NOT_HEARD,
@@ -829,6 +834,11 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Identity(Undefended(forger.permissions_signed_by_itself, forger.one_ca), "guest"),
             RowStatus.HEARD,
             "Cyclone DDS 0.10 accepts every signer whose certificate comes from the CA",
+            Variant(
+                (Condition.EXACT_SIGNER, Condition.CYCLONE),
+                RowStatus.NOT_LET_IN,
+                mechanism="Cyclone DDS 11 accepts only the permissions CA itself as signer",
+            ),
             Variant((Condition.EXACT_SIGNER,), RowStatus.HEARD, instead=_TRUSTED_AS_SIGNER),
             removed="a separate permissions CA",
         ),

@@ -245,7 +245,9 @@ class Condition(StrEnum):
     OPEN_JOIN = "joining the domain is not controlled"
     CYCLONE = "Cyclone DDS 0.10"
     FAST = "Fast DDS"
-    EXACT_SIGNER = "signers must be in the file of the permissions CA (Fast DDS since 2.10)"
+    EXACT_SIGNER = (
+        "signers must be in the file of the permissions CA (Fast DDS since 2.10, Cyclone DDS 11)"
+    )
 
 
 @dataclass(frozen=True)
