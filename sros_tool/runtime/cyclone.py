@@ -16,7 +16,7 @@ import functools
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, TypeVar
@@ -369,16 +369,23 @@ class CycloneLog:
     def __init__(self) -> None:
         """Redirect the stream.  libddsc keeps the stream that it sees at its first participant."""
         self._file = _memory_file()
+        self._made = os.fstat(self._file)
         libc = ctypes.CDLL(None)
         libc.fdopen.restype = ctypes.c_void_p
         ctypes.c_void_p.in_dll(libc, "stderr").value = libc.fdopen(self._file, b"a")
         os.register_at_fork(after_in_child=self._leave_parent)
 
     def _leave_parent(self) -> None:
-        """Write into a file of this process, which is a copy of the one that made the log."""
-        file = _memory_file()
-        os.dup2(file, self._file)
-        os.close(file)
+        """Write into a file of this process, which is a copy of the one that made the log.
+
+        If the process before it has closed the log's file, its number may be that of another one.
+        """
+        with suppress(OSError):
+            if os.path.samestat(os.fstat(self._file), self._made):
+                file = _memory_file()
+                os.dup2(file, self._file)
+                os.close(file)
+                self._made = os.fstat(self._file)
 
     def clear(self) -> None:
         """Forget the messages."""
