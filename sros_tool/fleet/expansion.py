@@ -302,7 +302,7 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
             raise PolicyError(
                 "the policy cannot be narrowed for all robots at once",
                 "A wildcard matches different names on different robots, so it is unclear which "
-                "enclaves may {wrong[0]}.",
+                f"enclaves may {wrong[0].describe()}.",
                 "Replace the wildcard by the names that the robots use.",
             )
 
@@ -368,7 +368,8 @@ def _likely(name: str, robot: Robot | None) -> Iterator[str]:
     if robot:
 
         def named(text: str) -> str:
-            return "/".join("{robot}" if part == robot.name else part for part in text.split("/"))
+            of_robot = "{robot}"  # noqa: RUF027 - a placeholder of policies
+            return "/".join(of_robot if part == robot.name else part for part in text.split("/"))
 
         inside = f"/{_NAMESPACE}}}{named(name.removeprefix(robot.namespace.rstrip('/')))}"
         if robot.namespace != "/" and name.startswith(f"{robot.namespace}/"):

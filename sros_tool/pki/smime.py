@@ -221,7 +221,7 @@ class SignedDocument(NamedTuple):
                     "its signature does not match its content",
                     "The document was changed after it was signed, or its signature is damaged.",
                 )
-            if isinstance(signature.digest, hashes.MD5):
+            if isinstance(signature.digest, hashes.MD5):  # noqa: S303 - it is refused
                 raise PkiError("it is signed with MD5", "Such a signature can be forged.")
 
     def weakness(self) -> str:
