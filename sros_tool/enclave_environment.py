@@ -102,6 +102,7 @@ def loadable_environment(
         RMW,
         chosen_rmw,
         rmw_implementations,
+        shipped_vendor,
         vendor_here,
         vendor_of,
     )
@@ -128,7 +129,8 @@ def loadable_environment(
     domain = choose_domain(domains, wanted, root) if domains else 0
     state = keystore.enclave(name, now=now, domain=domain)
     if not with_zenoh:
-        state = _check_joining(name, folder, state, used, JoinContext(domain, now, zone))
+        vendor = vendor_of(used) if target else shipped_vendor(used, environment)
+        state = _check_joining(name, folder, state, vendor, JoinContext(domain, now, zone))
     problems = state.problems_at_home if target else state.problems
     if problems:
         raise KeystoreError(
@@ -146,7 +148,7 @@ def loadable_environment(
         if not accept_key:
             _check_folders_closed(root, folder, name)
         if not zenoh:
-            vendor = vendor_of(used) or vendor_here(environment)[0]
+            vendor = shipped_vendor(used, environment) or vendor_here(environment)[0]
             _check_dates_here(name, keystore, vendor, JoinContext(domain, now, zone))
     variables = secured_environment(target or root, name, domain)
     if zenoh:
@@ -198,9 +200,9 @@ def _check_folders_closed(root: Path, folder: Path, name: str) -> None:
 
 
 def _check_joining(
-    name: str, folder: Path, state: OpenedEnclave, rmw: str, context: JoinContext
+    name: str, folder: Path, state: OpenedEnclave, vendor: Vendor | None, context: JoinContext
 ) -> OpenedEnclave:
-    """Return an enclave as it is for the vendor of a process of ``rmw``, or for all vendors.
+    """Return an enclave as it is for the vendor of a process, or for all vendors if it is None.
 
     Raises:
         KeystoreError: it has no fault that its reader names, and each of these vendors refuses it.
@@ -208,9 +210,7 @@ def _check_joining(
     from sros_tool.dds.decision.vendors import MEASURED
     from sros_tool.faults import Fault
     from sros_tool.keystore.participant import evaluated
-    from sros_tool.runtime.rmw import vendor_of
 
-    vendor = vendor_of(rmw)
     vendors = (vendor,) if vendor else MEASURED
     evaluation = evaluated(
         name, folder, state, at=context.at, domain=context.domain, vendors=vendors

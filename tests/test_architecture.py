@@ -32,7 +32,7 @@ LAYERS = {
     }
     | {"xml", "files", "folders", "parallel", "prometheus", "markdown", "terminal"},
     2: {"pki", "policy", "dds", "zenoh"},
-    3: {"fleet", "translate", "translate_zenoh"},
+    3: {"distributions", "fleet", "translate", "translate_zenoh"},
     4: {"reach", "keystore", "graph", "runtime"},
     5: {"checks", "explain", "demo"},
     6: {"proof", "enclave_environment"},

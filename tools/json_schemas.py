@@ -84,6 +84,7 @@ VERBS: Mapping[str, str | Shapes] = {
         {
             "a question": "sros_tool.explain.vendors:VendorExplanation",
             "--all-vendors": "sros_tool.explain.vendors:VendorComparison",
+            "--all-distros": "sros_tool.explain.vendors:DistributionComparison",
             "--vendor zenoh": "sros_tool.explain.zenoh:ZenohExplanation",
             "--who": "sros_tool.explain.vendors:WhoByVendor",
             "--who --vendor zenoh": "sros_tool.explain.zenoh:WhoOnZenoh",

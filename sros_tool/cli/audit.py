@@ -12,6 +12,7 @@ import click
 from sros_tool.cli.common import (
     PATH,
     check_output,
+    distro_option,
     dry_run_option,
     fleet_option,
     force_option,
@@ -39,6 +40,7 @@ from sros_tool.values import file_change
 from sros_tool.wording import counted
 
 if TYPE_CHECKING:
+    from sros_tool.distributions import Distribution
     from sros_tool.explain.audit import Audit, AuditedEnclaves
     from sros_tool.graph.observation import Observation
 
@@ -52,6 +54,10 @@ if TYPE_CHECKING:
     metavar="VENDOR",
     help=f"Decide as this DDS vendor does: {', '.join(vendor.value for vendor in Vendor)}. "
     "[default: the vendor of this machine's RMW]",
+)
+@distro_option(
+    "Decide as the DDS of this ROS 2 distribution does, such as lyrical: its default, or the one "
+    "of $RMW_IMPLEMENTATION or --vendor. [default: $ROS_DISTRO]"
 )
 @click.option(
     "--patch",
@@ -76,6 +82,7 @@ def audit(
     enclave: str | None,
     keystore: Path | None,
     vendor: str | None,
+    distro: Distribution | None,
     patch: Path | None,
     partial: bool,
     fleet_file: Path | None,
@@ -100,6 +107,7 @@ def audit(
       ...
       wrote 'missing.xml'; add it: sros merge_policy robot.xml missing.xml ...
       $ sros merge_policy robot.xml missing.xml --in-place
+      $ sros audit keystore --distro lyrical
 
     Exit status: 0 if nothing would be denied and every node of POLICY or KEYSTORE was seen; 1 if
     something would be denied or, without --partial, was not seen or not judged; 2 if the audit
@@ -108,7 +116,7 @@ def audit(
     from sros_tool.explain import audit as audits
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.participant import JoinContext
-    from sros_tool.runtime.rmw import vendor_here
+    from sros_tool.runtime.rmw import chosen_vendor
     from sros_tool.runtime.variables import ENCLAVE, domain_from
 
     check_duration(watch, spin_time)
@@ -121,7 +129,7 @@ def audit(
     everything = {**os.environ, **environment}
     enclaves = audits.audited_enclaves(
         source,
-        Vendor(vendor) if vendor else vendor_here(everything)[0],
+        chosen_vendor(vendor, distro, everything)[0],
         JoinContext(domain_from(everything) or 0, now(), local_zone(os.environ)),
         read_fleet(fleet_file) if fleet_file else None,
     )

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
     from sros_tool.checks.kind import Finding
+    from sros_tool.distributions import Distribution
     from sros_tool.enclave_environment import EnclaveEnvironment
     from sros_tool.errors import Note
     from sros_tool.fleet.expansion import FleetPolicy
@@ -128,6 +129,50 @@ def allow_refusal_option(function: Decorated) -> Decorated:
         help="Make the change even if this DDS vendor will then refuse enclaves that it "
         "accepts now.  Can be repeated.",
     )(function)
+
+
+def _complete_distribution(
+    _ctx: click.Context, _parameter: click.Parameter, incomplete: str
+) -> list[str]:
+    """Complete the supported distributions of ROS 2."""
+    from sros_tool.distributions import SUPPORTED
+
+    return [known.name for known in SUPPORTED if known.name.startswith(incomplete)]
+
+
+def _as_distribution(
+    _ctx: click.Context, _option: click.Parameter, name: str | None
+) -> Distribution | None:
+    if name is None:
+        return None
+    from sros_tool.distributions import distribution
+
+    return distribution(name)
+
+
+def distro_option(help_text: str, option: str = "--distro") -> Callable[[Decorated], Decorated]:
+    """Add ``--distro NAME``, or a similar option, to a verb that decides as a DDS vendor does."""
+    return click.option(
+        option,
+        metavar="NAME",
+        shell_complete=_complete_distribution,
+        callback=_as_distribution,
+        help=help_text,
+    )
+
+
+def all_distros_option(help_text: str) -> Callable[[Decorated], Decorated]:
+    """Add ``--all-distros`` to a verb that decides as a DDS vendor does."""
+    return click.option("--all-distros", is_flag=True, help=help_text)
+
+
+def check_one_decider() -> None:
+    """Raise `UsageError` if the verb that runs got --all-distros and another choice of vendors."""
+    given = click.get_current_context().params
+    for parameter in ("vendor", "all_vendors", "distro"):
+        if given["all_distros"] and given.get(parameter):
+            option = f"--{parameter.replace('_', '-')}"
+            raise UsageError(f"--all-distros and {option} exclude each other", "", "Choose one.")
 
 
 def robot_option(help_text: str) -> Callable[[Decorated], Decorated]:

@@ -13,7 +13,10 @@ import click
 from sros_tool.cli.common import (
     KEYSTORE_VARIABLE,
     PATH,
+    all_distros_option,
+    check_one_decider,
     complete_keystore_and_enclave,
+    distro_option,
     domain_of,
     fleet_option,
     json_option,
@@ -39,11 +42,12 @@ from sros_tool.wording import counted, first_few
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
+    from sros_tool.distributions import Distribution
     from sros_tool.explain.answer import Answer, PolicyChange
     from sros_tool.explain.asking import AskedEnclave, AskingContext
     from sros_tool.explain.log import LogFinding
     from sros_tool.explain.question import Question
-    from sros_tool.explain.vendors import VendorComparison, VendorExplanation, ZenohBeside
+    from sros_tool.explain.vendors import DdsExplanation, DistributionComparison, ZenohBeside
     from sros_tool.explain.who import Decider, Everybody, FollowedReach
     from sros_tool.explain.zenoh import CheckedLink, ZenohAnswer, ZenohExplanation
     from sros_tool.fleet.robots import Fleet
@@ -117,11 +121,14 @@ def _complete_enclave(
 
 _IGNORED = {
     "": ("infrastructure", "patterns", "robots"),
-    "--who": ("infrastructure", "policy", "fleet_file", "all_vendors"),
-    "--reach": ("patterns", "robots", "kind", "all_vendors", "moment", "domain", "time_zone"),
+    "--who": ("infrastructure", "policy", "fleet_file", "all_vendors", "all_distros"),
+    "--reach": (
+        *("patterns", "robots", "kind", "all_vendors", "distro", "all_distros"),
+        *("moment", "domain", "time_zone"),
+    ),
     "--log": (
         *("infrastructure", "patterns", "robots", "kind", "policy", "fleet_file"),
-        *("vendor", "all_vendors"),
+        *("vendor", "all_vendors", "distro", "all_distros"),
     ),
 }
 """The parameters that have no effect, for each of the options that choose a mode."""
@@ -169,6 +176,11 @@ def _refuse_ignored(mode: str) -> None:
     f"zenoh`. One of: {', '.join(_VENDORS)}. [default: the vendor of this machine's RMW]",
 )
 @click.option("--all-vendors", is_flag=True, help="Compare the decisions of all vendors.")
+@distro_option(
+    "Decide as the DDS of this ROS 2 distribution does, such as lyrical: its default, or the one "
+    "of $RMW_IMPLEMENTATION or --vendor. [default: $ROS_DISTRO]"
+)
+@all_distros_option("Compare the decisions of all supported distributions of ROS 2.")
 @click.option(
     "--at",
     "moment",
@@ -216,6 +228,8 @@ def explain(
     fleet_file: Path | None,
     vendor: str | None,
     all_vendors: bool,
+    distro: Distribution | None,
+    all_distros: bool,
     moment: str | None,
     domain: str | None,
     time_zone: str | None,
@@ -247,6 +261,7 @@ def explain(
         until     2036-11-18T09:00:00Z, when cert.pem expires
       $ sros explain keystore /talker call /add_two_ints --all-vendors
       $ sros explain keystore /talker publish /chatter --vendor zenoh
+      $ sros explain keystore /talker publish /chatter --all-distros
       $ sros explain keystore --who publish /cmd_vel
       $ sros explain keystore --reach /mobile_robot/teleop
       $ ros2 run demo_nodes_cpp talker 2>&1 | \
@@ -256,8 +271,11 @@ def explain(
         raise UsageError("--who, --reach and --log exclude each other")
     if len(logs) > 1:
         raise UsageError("--log takes one log", "", "Run the command once for each log.")
+    from sros_tool.runtime.rmw import chosen_vendor
+
     mode = "--who" if who else "--reach" if reach else "--log" if logs else ""
     _refuse_ignored(mode)
+    check_one_decider()
     if fleet_file and not policy:
         raise UsageError("--fleet goes with --policy only", "", "Leave it out.")
     root, rest = _split(words, keystore, verb=0 if who else 1)
@@ -271,15 +289,18 @@ def explain(
     asking = _circumstances(moment, domain, time_zone, fleet_file)
     if logs:
         return _show_log(logs[0], root, rest, asking, as_json)
-    why_zenoh = "" if all_vendors else _why_zenoh(vendor, root)
+    if vendor == _ZENOH and distro:
+        text = "Zenoh decides alike in every distribution."
+        raise UsageError("--vendor zenoh takes no --distro", text, "Leave it out.")
+    why_zenoh = "" if all_vendors or all_distros else _why_zenoh(vendor, root)
     if who:
-        chosen = None if why_zenoh else _vendor_of(vendor)
+        chosen = None if why_zenoh else chosen_vendor(vendor, distro, os.environ)
         only = patterns, robots
         return _show_who(root, rest, kind, chosen, why_zenoh, asking, only, as_json)
     question = _question(rest, kind)
     asked = _open(root, rest[0], policy, asking)
     context = asking.context(asked.enclave.joined_domains)
-    explanation: VendorExplanation | VendorComparison | ZenohExplanation
+    explanation: DdsExplanation | ZenohExplanation
     if why_zenoh:
         from sros_tool.explain.zenoh import explain_on_zenoh
 
@@ -287,10 +308,11 @@ def explain(
             explanation = explain_on_zenoh(asked, question, why_zenoh, context, kind=kind)
         lines = _zenoh_lines(explanation)
     else:
-        from sros_tool.explain.vendors import explain_on_dds
+        from sros_tool.explain.vendors import Compared, explain_on_dds
 
-        chosen = _vendor_of(None if vendor == _ZENOH else vendor)
-        explanation = explain_on_dds(asked, question, chosen, context, kind=kind, every=all_vendors)
+        chosen = chosen_vendor(None if vendor == _ZENOH else vendor, distro, os.environ)
+        every = Compared.VENDORS if all_vendors else Compared.DISTRIBUTIONS if all_distros else None
+        explanation = explain_on_dds(asked, question, chosen, context, kind=kind, every=every)
         lines = _vendor_lines(explanation)
     if as_json:
         print_json(explanation)
@@ -336,13 +358,6 @@ def _circumstances(
         domain=ros_domain() if domain is None else domain_of(domain),
         fleet_file=fleet_file,
     )
-
-
-def _vendor_of(name: str | None) -> tuple[Vendor, str]:
-    """Return the vendor given by --vendor, or this machine's, and the reason for the choice."""
-    from sros_tool.runtime.rmw import vendor_here
-
-    return (Vendor(name), "as asked") if name else vendor_here(os.environ)
 
 
 def _why_zenoh(vendor: str | None, root: Path | None) -> str:
@@ -419,12 +434,14 @@ def _row(label: str, text: str) -> str:
     return f"  {label:{_LABEL_WIDTH}}{text}"
 
 
-def _vendor_lines(explanation: VendorExplanation | VendorComparison) -> Iterator[str]:
-    """Yield the answer for one vendor, or the question with a line for each vendor."""
-    from sros_tool.explain.vendors import VendorExplanation
+def _vendor_lines(explanation: DdsExplanation) -> Iterator[str]:
+    """Yield the answer for one vendor, or the question with a line for each answer."""
+    from sros_tool.explain.vendors import DistributionComparison, VendorExplanation
 
     if isinstance(explanation, VendorExplanation):
         yield from _answer_lines(explanation.answer, explanation.vendor_why)
+    elif isinstance(explanation, DistributionComparison):
+        yield from _distribution_lines(explanation)
     else:
         yield from _table_lines(explanation.vendors)
     yield from _beside_lines(explanation.beside)
@@ -546,6 +563,21 @@ def _table_lines(answers: Sequence[Answer]) -> Iterator[str]:
         reason = answer.decision.clause
         yield f"  {answer.vendor.title:{width}}  {answer.outcome:11}  {reason}{remark}"
     yield differences(answers)
+
+
+def _distribution_lines(compared: DistributionComparison) -> Iterator[str]:
+    """Yield the question, one line for each DDS of each distribution, and those that differ."""
+    answers = compared.distributions
+    yield f"may {compared.asked.enclave} {compared.asked.question}?"
+    widths = (
+        max(len(answer.title) for answer in answers),
+        max(len(answer.release) for answer in answers),
+    )
+    for answer in answers:
+        remark = "" if answer.measured else f" (taken to decide as {answer.answer.vendor.title})"
+        row = f"{answer.title:{widths[0]}}  {answer.release:{widths[1]}}"
+        yield f"  {row}  {answer.outcome:11}  {answer.answer.decision.clause}{remark}"
+    yield compared.sentence
 
 
 # ── the answer of Zenoh as text ────────────────────────────────────────────────────────────

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from enum import Enum, auto
 from typing import NamedTuple
 
 from sros_tool.dds.decision.answers import Outcome, OutcomeWord, ReasonWord
 from sros_tool.dds.decision.vendors import NEWEST, Vendor
+from sros_tool.distributions import SUPPORTED, Shipped
 from sros_tool.errors import Note, SrosError
 from sros_tool.explain.answer import Answer, Evaluator, Provenance
 from sros_tool.explain.asking import Asked, AskedEnclave, AskingContext, ZenohInBrief, meant
@@ -74,6 +76,92 @@ class VendorComparison(NamedTuple):
         return len({vendor.outcome for vendor in self.vendors}) > 1
 
 
+@shows("distribution", "release", "measured", "decided_as", "outcome", "reason", "text")
+class DistributionAnswer(NamedTuple):
+    """The decision of a DDS that a distribution of ROS 2 ships."""
+
+    distribution: str
+    """Name of the distribution, such as ``jazzy``."""
+    shipped: Shipped
+    answer: Answer
+
+    @property
+    def title(self) -> str:
+        """Name of the distribution for messages."""
+        return self.distribution.capitalize()
+
+    @property
+    def release(self) -> str:
+        """DDS product and release that the distribution ships."""
+        return self.shipped.release
+
+    @property
+    def measured(self) -> bool:
+        """Whether the decision is by rules that were measured on this release."""
+        return self.shipped.measured
+
+    @property
+    def decided_as(self) -> Vendor:
+        """The DDS vendor by whose rules sros decides."""
+        return self.answer.vendor
+
+    @property
+    def outcome(self) -> OutcomeWord:
+        """Decision of the vendor."""
+        return self.answer.outcome
+
+    @property
+    def reason(self) -> ReasonWord:
+        """Id of the reason for the decision."""
+        return self.answer.reason
+
+    @property
+    def text(self) -> str:
+        """The decision and its reason as a sentence."""
+        return self.answer.text
+
+
+@shows("asked", "distributions", "differ", "beside", spread=("asked", "beside"))
+class DistributionComparison(NamedTuple):
+    """The decisions in all supported distributions of ROS 2.
+
+    ``allowed`` is the decision of the chosen vendor.
+    """
+
+    asked: Asked
+    distributions: Sequence[DistributionAnswer]
+    """The decision of each DDS of each distribution, the earliest distribution first."""
+    beside: ZenohBeside | None
+    allowed: bool
+    notes: tuple[Note, ...]
+
+    @property
+    def differ(self) -> bool:
+        """Whether the decisions differ."""
+        return len({answer.outcome for answer in self.distributions}) > 1
+
+    @property
+    def sentence(self) -> str:
+        """Which distributions decide differently than the earliest one, as a sentence."""
+        first = self.distributions[0]
+        others = [answer for answer in self.distributions if answer.outcome != first.outcome]
+        if not others:
+            return "all distributions decide alike"
+        texts = [f"{answer.title} with {answer.release} ({answer.outcome})" for answer in others]
+        begin = f"{first.title} with {first.release} ({first.outcome})"
+        return f"DISTRIBUTIONS DIFFER: {begin}, but {', '.join(texts)}"
+
+
+DdsExplanation = VendorExplanation | VendorComparison | DistributionComparison
+
+
+class Compared(Enum):
+    """Whose decisions are compared."""
+
+    VENDORS = auto()
+    DISTRIBUTIONS = auto()
+
+
 def explain_on_dds(
     asked: AskedEnclave,
     question: Question,
@@ -81,9 +169,9 @@ def explain_on_dds(
     context: JoinContext,
     *,
     kind: str | None = None,
-    every: bool = False,
-) -> VendorExplanation | VendorComparison:
-    """Return the decision of the chosen vendor, or with ``every`` the decisions of all vendors.
+    every: Compared | None = None,
+) -> DdsExplanation:
+    """Return the decision of the chosen vendor, or the decisions of all vendors or distributions.
 
     ``chosen`` is the vendor and the reason to choose it; ``kind`` is the type of the name if the
     user gave it.
@@ -102,10 +190,19 @@ def explain_on_dds(
         *_other_name(answer),
     )
     what = Asked(enclave.name, question, context)
-    if every:
+    if every is Compared.VENDORS:
         others = {v: Evaluator(v, enclave, context) for v in Vendor if v is not vendor}
         answers = [answer if v is vendor else explain(others[v], question) for v in Vendor]
         return VendorComparison(what, answers, beside, answer.allowed, notes)
+    if every is Compared.DISTRIBUTIONS:
+        deciding = {v for distribution in SUPPORTED for v in distribution.vendors}
+        by_vendor = {v: Evaluator(v, enclave, context).answer(question) for v in deciding}
+        by_distribution = [
+            DistributionAnswer(distribution.name, shipped, by_vendor[shipped.vendor])
+            for distribution in SUPPORTED
+            for shipped in distribution.shipped
+        ]
+        return DistributionComparison(what, by_distribution, beside, answer.allowed, notes)
     measured = [
         answer if v is vendor else Evaluator(v, enclave, context).answer(question) for v in NEWEST
     ]

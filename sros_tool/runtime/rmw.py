@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.distributions import ROS_DISTRO, Distribution, sourced
 from sros_tool.errors import SrosError
 
 RMW = "RMW_IMPLEMENTATION"
@@ -148,30 +149,55 @@ _NO_SECURITY = b"have the security libraries"
 _MOST_BYTES = 16 * 1024 * 1024
 
 
-def vendor_here(environment: Mapping[str, str]) -> tuple[Vendor, str]:
+def vendor_here(
+    environment: Mapping[str, str], distribution: Distribution | None = None
+) -> tuple[Vendor, str]:
     """Return the DDS vendor of this machine, and the reason as a short text.
 
-    It is the vendor of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS; the release is
-    that of $ROS_DISTRO.  The text says
-    so if that RMW was built without DDS Security.
+    It is the vendor of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS, in the release
+    that $ROS_DISTRO ships.  With a distribution, it is the vendor there, whatever is installed
+    here.  The text says so if the RMW was built without DDS Security, or if that release was not
+    measured.
     """
     named = environment.get(RMW, "")
-    if vendor := _shipped(named, environment):
-        return vendor, f"{RMW} is {named}{_without_security(named, environment)}"
-    for rmw in rmw_implementations(environment):
-        if vendor := _shipped(rmw, environment):
-            return vendor, f"{rmw} is installed here{_without_security(rmw, environment)}"
-    return Vendor.FAST, "the default of ROS 2 Jazzy"
+    rmw, why = "", ""
+    if vendor_of(named):
+        rmw, why = named, f"{RMW} is {named}"
+    elif distribution is None:  # the RMWs that are installed are those of this machine
+        rmw = next(filter(vendor_of, rmw_implementations(environment)), "")
+        why = f"{rmw} is installed here" if rmw else ""
+    why += _without_security(rmw, environment) if distribution is None else ""
+    vendor = vendor_of(rmw) or Vendor.FAST
+    distribution = distribution or sourced(environment.get(ROS_DISTRO))
+    shipped = distribution.of_product(vendor.traits.product) if distribution else None
+    if distribution is None or shipped is None:
+        return vendor, why or "the default of ROS 2 Jazzy"
+    return shipped.vendor, ", ".join(filter(None, (why, distribution.why(shipped.vendor))))
 
 
-_SHIPPED = {("lyrical", Vendor.CYCLONE): Vendor.CYCLONE_11}
-"""The release of a vendor in a ROS 2 distribution that has not the one of Jazzy (ros2.repos)."""
+def chosen_vendor(
+    named: str | None, distribution: Distribution | None, environment: Mapping[str, str]
+) -> tuple[Vendor, str]:
+    """Return the vendor of a name such as ``cyclonedds``, or else `vendor_here`, and the reason.
+
+    With a distribution, the vendor is in its release.
+
+    Raises:
+        UsageError: the distribution does not ship that vendor.
+    """
+    if not named:
+        return vendor_here(environment, distribution)
+    if not distribution:
+        return Vendor(named), "as asked"
+    vendor = distribution.of_vendor(Vendor(named)).vendor
+    return vendor, distribution.why(vendor)
 
 
-def _shipped(rmw: str, environment: Mapping[str, str]) -> Vendor | None:
-    """Return the vendor of an RMW in the release that the sourced distribution has, or None."""
-    vendor = vendor_of(rmw)
-    return _SHIPPED.get((environment.get("ROS_DISTRO", ""), vendor), vendor) if vendor else None
+def shipped_vendor(rmw: str, environment: Mapping[str, str]) -> Vendor | None:
+    """Return the vendor of an RMW as `vendor_of`, in the release that $ROS_DISTRO ships."""
+    vendor, distribution = vendor_of(rmw), sourced(environment.get(ROS_DISTRO))
+    shipped = distribution.of_product(vendor.traits.product) if vendor and distribution else None
+    return shipped.vendor if shipped else vendor
 
 
 def _without_security(rmw: str, environment: Mapping[str, str]) -> str:

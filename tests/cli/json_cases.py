@@ -308,6 +308,8 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks /a publish /nope --policy policy.xml --all-vendors", 1),
         Case("/a publish /x --policy denied.xml --all-vendors", 1),
         Case("broken /b publish /x --all-vendors", 1),
+        Case("ks /a publish /x --all-distros"),
+        Case("broken /b publish /x --all-distros", 1),
         Case("ks --who publish /x"),
         Case("closed /a publish /x"),
         Case("closed /a publish /x --all-vendors"),

@@ -219,6 +219,14 @@ def test_all_vendors_and_where_they_differ(tmp_path: Path) -> None:
         "opendds",
         "connext",
     }
+    asked = ("/a", "subscribe", "/status", "--policy", policy, "--all-distros")
+    assert {
+        each["distribution"]: each["outcome"]
+        for each in answer(*asked)["distributions"]
+        if each["release"].startswith("Cyclone DDS")
+    } == {"humble": "denied", "jazzy": "denied", "kilted": "denied", "lyrical": "allowed"}
+    differ = "DISTRIBUTIONS DIFFER: Humble with Fast DDS 2.6 (allowed), but Humble with Cyclone DDS"
+    assert differ in explain(*asked).out
     alike = explain("/a", "publish", "/other", "--policy", policy, "--all-vendors")
     assert alike.status == 1 and "all vendors decide alike" in alike.out
 
@@ -233,7 +241,28 @@ def test_the_vendor_of_this_machine(whole: Path) -> None:
         "ROS_DISTRO": "lyrical",
     }
     assert answer(*asked, env=lyrical)["vendor"] == "cyclonedds-11"
+    named = answer(*asked, "--distro", "lyrical", "--vendor", "cyclonedds")
+    assert (named["vendor"], named["vendor_why"]) == ("cyclonedds-11", "as in ROS 2 Lyrical")
+    jazzy = answer(*asked, "--distro", "jazzy", env=lyrical)
+    assert jazzy["vendor"] == "cyclonedds"
     assert answer(*asked, "--vendor", "opendds")["documented_only"] is True
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("--distro", "lunar"), "It knows ardent, bouncy"),
+        (("--distro", "jazzy", "--vendor", "fastdds-2.9"), "does not ship Fast DDS 2.9.1"),
+        (("--distro", "jazzy", "--vendor", "zenoh"), "Zenoh decides alike"),
+        (("--distro", "jazzy", "--all-distros"), "exclude each other"),
+        (("--vendor", "fastdds", "--all-distros"), "exclude each other"),
+    ],
+)
+def test_a_distribution_that_cannot_be_asked(words: tuple[str, ...], why: str, whole: Path) -> None:
+    asked = (whole, ENCLAVE, "publish", "/chatter")
+    refused = explain(*asked, *words)
+    assert refused.status == 2 and why in refused.err
+    explain(*asked, "--distro", "jazzy").ok()
 
 
 def test_a_vendor_that_was_never_measured_is_marked(whole: Path) -> None:

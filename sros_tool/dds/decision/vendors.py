@@ -311,6 +311,11 @@ class Vendor(StrEnum):
         return self.traits.title
 
     @property
+    def release(self) -> str:
+        """The version in the title, such as ``2.14``; only of a vendor that was measured."""
+        return self.title.removeprefix(self.traits.product).strip()
+
+    @property
     def documented_only(self) -> bool:
         """Whether the vendor was never measured, and is taken to follow the standard."""
         return not self.traits.measured and self is not Vendor.STANDARD

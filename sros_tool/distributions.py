@@ -1,0 +1,174 @@
+"""The distributions of ROS 2: the DDS and Zenoh that each one ships, and which sros decides for.
+
+Source: ``ros2.repos`` of the branches of ros2/ros2 and their release tags, November 2026; REP-2000.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.errors import UsageError
+from sros_tool.names import DISTRIBUTIONS
+from sros_tool.zenoh.releases import RELEASES, RmwZenohRelease
+
+ROS_DISTRO = "ROS_DISTRO"
+"""The variable with the name of the distribution that is sourced."""
+
+
+class Shipped(NamedTuple):
+    """A DDS that a distribution ships.
+
+    ``latest`` is its latest version; ``vendor`` has the rules that sros decides by, which are those
+    of another release if this one was not measured.
+    """
+
+    product: str
+    latest: str
+    vendor: Vendor
+
+    @property
+    def release(self) -> str:
+        """The product and the release, such as ``Fast DDS 3.6``."""
+        return f"{self.product} {_minor(self.latest)}"
+
+    @property
+    def measured(self) -> bool:
+        """Whether sros decides by rules that were measured on this release."""
+        return _minor(self.vendor.release) == _minor(self.latest)
+
+    def __str__(self) -> str:
+        """Return text such as ``Fast DDS 3.6, taken to decide as Fast DDS 2.14``."""
+        return self.release + ("" if self.measured else f", taken to decide as {self.vendor.title}")
+
+
+class Distribution(NamedTuple):
+    """A distribution of ROS 2.
+
+    ``until`` is the month in which its support ends.  ``stands_for`` says of which distribution
+    that is not supported this one has the rules, or is "".
+    """
+
+    name: str
+    until: str
+    fast: str
+    cyclone: str
+    stands_for: str = ""
+
+    @property
+    def title(self) -> str:
+        """The name for messages, such as ``Lyrical``."""
+        return (self.stands_for or self.name).capitalize()
+
+    @property
+    def shipped(self) -> tuple[Shipped, ...]:
+        """The DDS products that it ships, its default first."""
+        products = (("Fast DDS", self.fast), ("Cyclone DDS", self.cyclone))
+        return tuple(
+            Shipped(product, version, _decided_as(product, version))
+            for product, version in products
+        )
+
+    @property
+    def vendors(self) -> tuple[Vendor, ...]:
+        """The vendors that decide for its nodes, its default first."""
+        return tuple(shipped.vendor for shipped in self.shipped)
+
+    @property
+    def zenoh(self) -> RmwZenohRelease:
+        """The release of rmw_zenoh that it ships."""
+        return next(release for release in RELEASES if release.distribution.lower() == self.name)
+
+    @property
+    def assumption(self) -> str:
+        """A sentence on what is assumed of a distribution that is not supported, or ""."""
+        if not self.stands_for:
+            return ""
+        why = "has no releases" if self.stands_for == _ROLLING else "is not supported any more"
+        return f"ROS 2 {self.title} {why}: taken to decide as {self.name.capitalize()}."
+
+    def why(self, vendor: Vendor) -> str:
+        """Return why a vendor decides for its nodes: ``as in ROS 2 Jazzy``, and what is assumed."""
+        parts = [f"as in ROS 2 {self.title}"]
+        if self.stands_for:
+            parts.append(f"which is taken to be like {self.name.capitalize()}")
+        parts += (
+            f"whose {shipped.release} was not measured"
+            for shipped in self.shipped
+            if shipped.vendor is vendor and not shipped.measured
+        )
+        return ", ".join(parts)
+
+    def of_product(self, product: str) -> Shipped | None:
+        """Return what it ships of a product, or None."""
+        return next((shipped for shipped in self.shipped if shipped.product == product), None)
+
+    def of_vendor(self, vendor: Vendor) -> Shipped:
+        """Return what it ships of the product of a vendor, such as Cyclone DDS of ``cyclonedds``.
+
+        Raises:
+            UsageError: it ships another release than the vendor's name says, or sros knows none.
+        """
+        shipped = self.of_product(vendor.traits.product)
+        if shipped and (shipped.vendor is vendor or "-" not in vendor.value):
+            return shipped
+        raise UsageError(
+            f"ROS 2 {self.title} does not ship {vendor.title}",
+            f"It ships {' and '.join(known.release for known in self.shipped)}.",
+            "Name only one of them, or a vendor that it ships.",
+        )
+
+
+SUPPORTED = (
+    Distribution("humble", "May 2027", fast="2.6.12", cyclone="0.10.5"),
+    Distribution("jazzy", "May 2029", fast="2.14.6", cyclone="0.10.5"),
+    Distribution("kilted", "December 2026", fast="3.2.5", cyclone="0.10.5"),
+    Distribution("lyrical", "May 2031", fast="3.6.2", cyclone="11.0.1"),
+)
+"""The supported distributions, the earliest first."""
+_ROLLING = "rolling"
+
+
+def distribution(name: str) -> Distribution:
+    """Return a distribution by its name.
+
+    One that is not supported any more is taken to be like the next supported one, and Rolling like
+    the latest.
+
+    Raises:
+        UsageError: there is no distribution of this name.
+    """
+    if name not in DISTRIBUTIONS:
+        raise UsageError(
+            f"{name!r} is not a distribution of ROS 2 that sros knows",
+            f"It knows {', '.join(DISTRIBUTIONS)}.",
+            "Name one of them.",
+        )
+    later = DISTRIBUTIONS[DISTRIBUTIONS.index(name) :]
+    like = next((each for each in SUPPORTED if each.name in later), SUPPORTED[-1])
+    return like if like.name == name else like._replace(stands_for=name)
+
+
+def sourced(environment_value: str | None) -> Distribution | None:
+    """Return the distribution that $ROS_DISTRO names; None if sros does not know it."""
+    return distribution(environment_value) if environment_value in DISTRIBUTIONS else None
+
+
+def _decided_as(product: str, version: str) -> Vendor:
+    """Return the measured vendor for a version: of the same release, or the latest before it."""
+    vendors = sorted(
+        (vendor for vendor in MEASURED if vendor.traits.product == product),
+        key=lambda vendor: _numbers(vendor.release),
+    )
+    release = _numbers(_minor(version))
+    not_later = [vendor for vendor in vendors if _numbers(_minor(vendor.release)) <= release]
+    return not_later[-1] if not_later else vendors[0]
+
+
+def _minor(version: str) -> str:
+    """Return the first two numbers of a version: releases differ by them, patches do not."""
+    return ".".join(version.split(".")[:2])
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(map(int, version.split(".")))
