@@ -43,5 +43,5 @@ def test_an_unknown_distribution_is_refused_with_all_that_are_known() -> None:
 def test_a_vendor_without_a_release_means_what_the_distribution_ships() -> None:
     lyrical = distribution("lyrical")
     assert lyrical.of_vendor(Vendor.CYCLONE).vendor is Vendor.CYCLONE_11
-    with pytest.raises(UsageError, match="It ships Fast DDS 3.6 and Cyclone DDS 11.0"):
+    with pytest.raises(UsageError, match="It ships Fast DDS"):
         lyrical.of_vendor(Vendor.CONNEXT)
