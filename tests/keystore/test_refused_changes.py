@@ -274,6 +274,28 @@ def test_what_is_staged_is_evaluated(
         assert note.text.startswith(f"{MEASURED[0].title} refuses {stopped} from now on")
 
 
+def test_a_revoked_enclave_that_is_put_back_keeps_nobody_from_signing_a_list(
+    sound: Path, tmp_path: Path
+) -> None:
+    """Twin: enclaves that were not revoked stop a change that lets vendors refuse them."""
+    root, kept = tmp_path / "ks", tmp_path / "kept"
+    shutil.copytree(sound, root, symlinks=True)
+    shutil.copytree(enclave_path(root, "/a"), kept, symlinks=True)
+    sros("revoke", root, "/a").ok()
+    shutil.copytree(kept, enclave_path(root, "/a"), symlinks=True)
+    for file in root.glob("enclaves/**/crl.pem"):
+        file.unlink()
+    create_keystore(other := tmp_path / "other", template=load_template("production"), now=now())
+    create_enclaves(other, ["/b"], now=now())
+    with Transaction(root, dry_run=True) as transaction:
+        _break_list(transaction, other)
+        with pytest.raises(KeystoreError, match=r"start in /b, /b/c of"):
+            refuse_stopping(transaction, now())
+    ended = sros("crl", root, "--refresh").ok()
+    assert "note [keystore.revoked-put-back]: the folder of /a is in the keystore" in ended.err
+    assert (enclave_path(root, "/b") / "crl.pem").read_bytes() == (root / CRL).read_bytes()
+
+
 def test_a_dry_run_says_what_it_did_not_keep(
     sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

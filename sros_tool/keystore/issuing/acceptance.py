@@ -15,6 +15,7 @@ import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 
 from cryptography import x509
@@ -111,7 +112,8 @@ def refuse_stopping(
 ) -> tuple[Note, ...]:
     """Refuse a transaction after which vendors refuse enclaves that they accept today.
 
-    A new enclave is refused if no vendor would accept it.
+    A new enclave is refused if no vendor would accept it.  Enclaves whose certificates the ledger
+    has as revoked are meant to be refused: somebody put their files back.
 
     Args:
         transaction: the transaction, with all its files staged.
@@ -129,7 +131,7 @@ def refuse_stopping(
         KeystoreError: nodes of a vendor that is not ``allowed`` would stop.
     """
     files = _FilesOfChange(transaction, keystore or Keystore(transaction.root))
-    stopped = _stopped_enclaves(files, now)
+    stopped, revoked = _stopped_enclaves(files, now)
     if refused := {vendor: why for vendor, why in stopped.items() if vendor not in allowed}:
         raise _would_stop(transaction.root, refused, remedy())
     old = _authority_without_list(files)
@@ -143,15 +145,29 @@ def refuse_stopping(
         )
         for vendor, refusals in stopped.items()
     ]
+    if revoked:
+        text = (
+            f"the folder of {_some(revoked)} is in the keystore again with a certificate that "
+            "was revoked: whoever gets the new revocation list refuses it"
+        )
+        notes.append(Note("keystore.revoked-put-back", text))
     if unseen := transaction.not_kept():
         text = f"{_some(unseen)} not checked against vendors: this dry run makes too many files"
         notes.append(Note("vendor.not-asked", text))
     return tuple(notes)
 
 
-def _stopped_enclaves(files: _FilesOfChange, now: datetime) -> dict[Vendor, _Refusals]:
-    """Map vendors to the enclaves that they would refuse, and either accept today or are new."""
+def _stopped_enclaves(
+    files: _FilesOfChange, now: datetime
+) -> tuple[dict[Vendor, _Refusals], list[str]]:
+    """Return the enclaves that vendors would refuse, and either accept today or are new.
+
+    Returns:
+        a map from vendors to those enclaves, and the enclaves left out of it because their
+            certificates were revoked before.
+    """
     stopped: dict[Vendor, dict[str, list[str]]] = {}
+    put_back: list[str] = []
     for (_, own, _), names in _kinds(files, now).items():
         for tried, name in enumerate(names, 1):
             before, after = files.before(name), files.after(name)
@@ -164,13 +180,17 @@ def _stopped_enclaves(files: _FilesOfChange, now: datetime) -> dict[Vendor, _Ref
         if not before:
             all_new = {CERTIFICATE_FILE, PERMISSIONS_FILE} <= own
             accepted = set(MEASURED) if all_new and len(refused) == len(MEASURED) else set()
-        for vendor in MEASURED:
-            if vendor in accepted and vendor in refused:
-                stopped.setdefault(vendor, {}).setdefault(refused[vendor], []).extend(names)
-    return {
+        stopping = [vendor for vendor in MEASURED if vendor in accepted and vendor in refused]
+        revoked = [name for name in names if stopping and files.was_revoked(name)]
+        put_back += revoked
+        if others := [name for name in names if name not in revoked]:
+            for vendor in stopping:
+                stopped.setdefault(vendor, {}).setdefault(refused[vendor], []).extend(others)
+    refusals_by_vendor = {
         vendor: _Refusals(tuple(sorted(name for names in by.values() for name in names)), tuple(by))
         for vendor, by in stopped.items()
     }
+    return refusals_by_vendor, put_back
 
 
 def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
@@ -370,6 +390,20 @@ class _FilesOfChange:
         self._keystore = keystore
         self._after: dict[str, bytes] = {}
         self._places: dict[str, str] = {}
+
+    @cached_property
+    def _revoked_serials(self) -> frozenset[int]:
+        """The serial numbers that the ledger had as revoked before the transaction."""
+        entries = self._keystore.ledger_with("what", "revocation").entries
+        return frozenset(int(entry.serial, 16) for entry in entries if entry.what == "revocation")
+
+    def was_revoked(self, name: str) -> bool:
+        """Return whether the enclave's certificate, before and after, was revoked before."""
+        path = f"{enclave_folder(name)}/{CERTIFICATE_FILE}"
+        if not self._revoked_serials or self.transaction.is_staged(path):
+            return False
+        form = read_form(self.content(path))
+        return form is not None and form.serial in self._revoked_serials
 
     def places_after(self, name: str) -> dict[str, str]:
         """Map the file names of an enclave to the paths that their content will be read from."""
