@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations, islice, product
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -14,7 +14,7 @@ from sros_tool.translate_zenoh.rights import RightsBehindRules, is_self_limiting
 from sros_tool.values import DryRun, FileChange, Notes, Words
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
-from sros_tool.zenoh.access import PROPERTIES, AclRule, AclSubject, Enforcement, Message
+from sros_tool.zenoh.access import PROPERTIES, AclRule, AclSubject, Enforcement, Flow, Message
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.document import (
     ENCRYPTED,
@@ -249,8 +249,8 @@ def configuration_findings(path: Path) -> Iterator[Finding]:
 
 def document_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     """Yield the findings in a configuration."""
-    for each in document.unknown:
-        yield _at(document, UNKNOWN_SETTING, each, f"Zenoh up to 1.10 has no {each}")
+    for setting in document.unknown:
+        yield _at(document, UNKNOWN_SETTING, setting, f"Zenoh up to 1.10 has no {setting}")
     yield from _links(document)
     yield from _openness(document)
     if not document.access.enabled:
@@ -272,29 +272,31 @@ def _at(document: ConfigurationDocument, kind: FindingKind, path: str, text: str
 def _links(document: ConfigurationDocument) -> Iterator[Finding]:
     both = (("listen", document.listen), ("connect", document.connect))
     for what, endpoints in both:
-        for each in endpoints:
-            allowed = document.protocols is None or each.protocol in document.protocols
+        for endpoint in endpoints:
+            allowed = document.protocols is None or endpoint.protocol in document.protocols
             if not allowed:
-                text = f"{what} has {each.text}, and the protocols are {_listed(document)}"
+                text = f"{what} has {endpoint.text}, and the protocols are {_listed(document)}"
                 yield _at(document, ENDPOINT_REFUSED, f"{what}/endpoints", text)
-            elif not each.is_encrypted():
+            elif not endpoint.is_encrypted():
                 default = "" if f"{what}/endpoints" in document.lines else ", by default"
-                text = f"{what} has {each.text}{default}"
+                text = f"{what} has {endpoint.text}{default}"
                 yield _at(document, PLAIN_ENDPOINT, f"{what}/endpoints", text)
-    if not any(each.is_encrypted() for _, endpoints in both for each in endpoints):
+    if not any(endpoint.is_encrypted() for _, endpoints in both for endpoint in endpoints):
         return
     if document.protocols is None or set(document.protocols) - ENCRYPTED:
         text = f"the protocols are {_listed(document)}"
         yield _at(document, PROTOCOLS_OPEN, f"{_LINK}/protocols", text)
-    for each in document.listen:
-        if each.is_encrypted() and not each.option("enable_mtls", document.tls.mutual):
-            text = f"it listens at {each.text}, and enable_mtls is off"
+    for endpoint in document.listen:
+        if endpoint.is_encrypted() and not endpoint.option("enable_mtls", document.tls.mutual):
+            text = f"it listens at {endpoint.text}, and enable_mtls is off"
             yield _at(document, NO_MUTUAL_TLS, f"{_TLS}/enable_mtls", text)
     yield from _names(document)
     closing = "close_link_on_expiration"
-    for each in (each for _, endpoints in both for each in endpoints if each.is_encrypted()):
-        if not each.option(closing, document.tls.closes_on_expiration):
-            text = f"{closing} is off for {each.text}"
+    for endpoint in (*document.listen, *document.connect):
+        if endpoint.is_encrypted() and not endpoint.option(
+            closing, document.tls.closes_on_expiration
+        ):
+            text = f"{closing} is off for {endpoint.text}"
             yield _at(document, EXPIRED_STAYS, f"{_TLS}/{closing}", text)
             break
 
@@ -302,10 +304,10 @@ def _links(document: ConfigurationDocument) -> Iterator[Finding]:
 def _names(document: ConfigurationDocument) -> Iterator[Finding]:
     """Yield a finding if whoever has any accepted certificate can play the router."""
     unverified = [
-        each
-        for each in document.connect
-        if each.is_encrypted()
-        and not each.option("verify_name_on_connect", document.tls.verifies_name)
+        endpoint
+        for endpoint in document.connect
+        if endpoint.is_encrypted()
+        and not endpoint.option("verify_name_on_connect", document.tls.verifies_name)
     ]
     access = document.access
     if unverified and (not access.enabled or access.allows_by_default or _of_everybody(document)):
@@ -338,29 +340,29 @@ def _rules(document: ConfigurationDocument) -> Iterator[Finding]:
     if access.allows_by_default:
         text = "default_permission is allow"
         yield _at(document, DEFAULT_ALLOW, f"{_ACCESS}/default_permission", text)
-    elif not any(rule.allows for each in access.subjects for rule in access.rules_of(each.id)):
+    elif not any(rule.allows for s in access.subjects for rule in access.rules_of(s.id)):
         text = "no policy gives a subject a rule that allows"
         yield _at(document, NOTHING_ALLOWED, f"{_ACCESS}/policies", text)
         return
-    used = {rule.id for each in access.subjects for rule in access.rules_of(each.id)}
-    idle = [(f"rule {each.id}", each.line) for each in access.rules if each.id not in used]
-    idle += [
-        (f"subject {each.id}", each.line)
-        for each in access.subjects
-        if not access.rules_of(each.id)
+    used = {rule.id for subject in access.subjects for rule in access.rules_of(subject.id)}
+    unused = [(f"rule {rule.id}", rule.line) for rule in access.rules if rule.id not in used]
+    unused += [
+        (f"subject {subject.id}", subject.line)
+        for subject in access.subjects
+        if not access.rules_of(subject.id)
     ]
-    for what, line in idle:
-        yield UNUSED.found(what, f"no policy has {what}", document.name, line)
+    for name, line in unused:
+        yield UNUSED.found(name, f"no policy names {name}", document.name, line)
 
 
 def _of_everybody(document: ConfigurationDocument) -> list[AclSubject]:
     """Return the subjects without a name that have a rule that allows something."""
     access = document.access
     return [
-        each
-        for each in access.subjects
-        if not each.is_named()
-        and (access.allows_by_default or any(rule.allows for rule in access.rules_of(each.id)))
+        subject
+        for subject in access.subjects
+        if not subject.is_named()
+        and (access.allows_by_default or any(rule.allows for rule in access.rules_of(subject.id)))
     ]
 
 
@@ -371,9 +373,9 @@ def _subjects(document: ConfigurationDocument) -> Iterator[Finding]:
         text = f"no subject has a name: {_ids(open_to_all)}"
         yield SELF_LIMITING.found(document.mode.value, text, document.name, open_to_all[0].line)
     else:
-        for each in open_to_all:
-            text = f"subject {each.id} has {_described(each)}, and rules that allow"
-            yield EVERYBODY.found(f"subject {each.id}", text, document.name, each.line)
+        for subject in open_to_all:
+            text = f"subject {subject.id} has {_described(subject)}, and rules that allow"
+            yield EVERYBODY.found(f"subject {subject.id}", text, document.name, subject.line)
     pairs = list(islice(_overlapping(access.subjects), _MOST_PAIRS + 1))
     if pairs:
         first, second = pairs[0]
@@ -386,11 +388,11 @@ def _subjects(document: ConfigurationDocument) -> Iterator[Finding]:
 def _overlapping(subjects: Sequence[AclSubject]) -> Iterator[tuple[AclSubject, AclSubject]]:
     limit = ComparisonLimit()
     kinds: dict[tuple[str, ...], list[AclSubject]] = {}
-    for each in subjects:  # two that state the same properties match the same process as one
-        stated = tuple(name for name in PROPERTIES if getattr(each, name) is not None)
-        kinds.setdefault(stated, []).append(each)
-    for one, other in combinations(kinds.values(), 2):
-        for pair in product(one, other):
+    for subject in subjects:  # two that state the same properties match the same process as one
+        stated = tuple(name for name in PROPERTIES if getattr(subject, name) is not None)
+        kinds.setdefault(stated, []).append(subject)
+    for kind, other_kind in combinations(kinds.values(), 2):
+        for pair in product(kind, other_kind):
             if pair[0].overlaps(pair[1]):
                 yield pair
             else:
@@ -411,11 +413,11 @@ def _denials(document: ConfigurationDocument) -> Iterator[Finding]:
     access, limit = document.access, ComparisonLimit()
     reported: set[tuple[str, str]] = set()
     for subject in access.subjects:
-        denials = [each for each in access.rules_of(subject.id) if not each.allows]
+        denials = [rule for rule in access.rules_of(subject.id) if not rule.allows]
         if not denials:
             continue
         limit.spend(_COMPARISON * len(access.subjects))
-        others = [each for each in access.subjects if each.overlaps(subject)]
+        others = [other for other in access.subjects if other.overlaps(subject)]
         for rule in denials:
             for kind, text in (
                 (DENY_IN_WILDCARD, _wildcard_past(rule, subject, access, limit)),
@@ -434,21 +436,21 @@ def _wildcard_past(
     for flow, message in product(rule.flows, rule.messages):
         if message not in _WITH_WILDCARDS:
             continue
-        same = [each for each in rules if flow in each.flows and message in each.messages]
-        denied = [key for each in same if not each.allows for key in each.key_expressions]
+        same = _rules_for(rules, flow, message)
+        denied = _keys(same, allows=False)
         for key in rule.key_expressions:
             if access.allows_by_default:
                 passing = [(widest(key), "the default")]
             else:
                 passing = [
-                    (wide, f"rule {each.id}")
-                    for each in same
-                    if each.allows
-                    for wide in each.key_expressions
+                    (wide, f"rule {allowing.id}")
+                    for allowing in same
+                    if allowing.allows
+                    for wide in allowing.key_expressions
                     if _meet(wide, key, limit)
                 ]
             for wide, by in passing:
-                if not any(includes(each, wide) for each in denied):
+                if not any(includes(other, wide) for other in denied):
                     return f"{flow} {message} of {key} is denied, and {by} allows that of {wide}"
     return ""
 
@@ -458,13 +460,8 @@ def _overruled(
 ) -> str:
     """Return the subject among ``others`` that allows a message which ``rule`` denies, or ""."""
     for other, flow, message in product(others, rule.flows, rule.messages):
-        same = [
-            each
-            for each in access.rules_of(other.id)
-            if flow in each.flows and message in each.messages
-        ]
-        denied = [key for each in same if not each.allows for key in each.key_expressions]
-        allowed = [key for each in same if each.allows for key in each.key_expressions]
+        same = _rules_for(access.rules_of(other.id), flow, message)
+        denied, allowed = _keys(same, allows=False), _keys(same, allows=True)
         for key in rule.key_expressions:
             if access.allows_by_default:
                 passing = [key]
@@ -474,15 +471,23 @@ def _overruled(
                     for wide in allowed
                     if _meet(wide, key, limit)
                 ]
-            for each in passing:
-                if not any(includes(wide, each) for wide in denied):
-                    return f"subject {other.id} allows {flow} {message} of {each}"
+            for passed in passing:
+                if not any(includes(wide, passed) for wide in denied):
+                    return f"subject {other.id} allows {flow} {message} of {passed}"
     return ""
 
 
-def _meet(one: str, other: str, limit: ComparisonLimit) -> bool:
-    limit.spend(len(one) + len(other))
-    return intersects(one, other)
+def _rules_for(rules: Iterable[AclRule], flow: Flow, message: Message) -> list[AclRule]:
+    return [rule for rule in rules if flow in rule.flows and message in rule.messages]
+
+
+def _keys(rules: Iterable[AclRule], *, allows: bool) -> list[str]:
+    return [key for rule in rules if rule.allows is allows for key in rule.key_expressions]
+
+
+def _meet(first: str, second: str, limit: ComparisonLimit) -> bool:
+    limit.spend(len(first) + len(second))
+    return intersects(first, second)
 
 
 # ── what is printed of a configuration ──────────────────────────────────────────────────────
@@ -557,7 +562,7 @@ def subject_rights(behind: RightsBehindRules) -> SubjectRights:
         behind.subject or None,
         behind.names,
         behind.own,
-        [AllowedName(VERBS[it.right], it.name, it.domain, it.lacks) for it in behind.rights],
+        [AllowedName(VERBS[r.right], r.name, r.domain, r.lacks) for r in behind.rights],
         unsaid=[KeyRight(VERBS[right], key) for right, key in behind.unsaid],
         denied=[KeyRight(VERBS[right], key) for right, key in behind.denied],
     )

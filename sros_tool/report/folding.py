@@ -1,12 +1,13 @@
 """Draw equal robots, namespaces and enclaves of a picture as one.
 
-Units are the robots of a fleet; without one, namespaces or enclaves next to each other that hold
-the same enclaves, or nearly.  They are equal if all that is drawn of them is equal but for their
-own names: each right and denial of their enclaves, and of others to their names.  Of units that
-they name themselves, such as the robots whose poses each robot reads, the number has to be equal.
+Units are the robots of a fleet.  Without a fleet they are sibling namespaces or enclaves that
+contain nearly the same enclaves.  Two units are equal if their drawings differ in their own names
+alone.  The drawing of a unit has each right and denial of its enclaves, and those of other enclaves
+to its names.  Where a unit names other units, such as the robots whose poses a robot reads, only
+their number has to be equal.
 
-A label such as ``{r01…r50}`` stands for each of them: ``/{r01…r50}/base`` may publish
-``/{r01…r50}/odom``, each robot its own.
+A label such as ``{r01…r50}`` stands for each equal unit: ``/{r01…r50}/base`` may publish
+``/{r01…r50}/odom`` means that each robot may publish its own topic.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from collections.abc import (
 )
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import chain
 from typing import NamedTuple
 
 from sros_tool.fleet.robots import Robot
@@ -48,10 +50,10 @@ _MARKS = "{}…"
 """Characters of labels; no ROS name has them. A picture that has them is not folded."""
 _WORD = re.compile(r"[A-Za-z0-9_]+")
 _MOST_PIECES = 16
-"""Most pieces of a word (split at underscores) that are searched for names of units."""
+"""Maximum number of pieces of a word (split at underscores) that are compared with unit names."""
 _SELF = -1
 _TITLE_LETTERS = 30
-"""Longest title of a frame, in characters; a frame is as wide as a card of enclaves."""
+"""Maximum length of the title of a frame, in characters; a frame is as wide as a card."""
 _ENCLAVE = "enclave"
 
 
@@ -90,10 +92,10 @@ class Folding(NamedTuple):
         cards = []
         for card in scene.cards:
             if card.kind:
-                found = [self.names.get((card.kind, member), (member,)) for member in card.members]
+                real = [self.names.get((card.kind, member), (member,)) for member in card.members]
             else:
-                found = [self.enclaves.get(member, (member,)) for member in card.members]
-            members = tuple(dict.fromkeys(each for one in found for each in one))
+                real = [self.enclaves.get(member, (member,)) for member in card.members]
+            members = tuple(dict.fromkeys(chain.from_iterable(real)))
             cards.append(replace(card, members=members))
         return replace(
             scene,
@@ -146,19 +148,19 @@ class _Text:
 
     def fill(self, word: Callable[[int, int], str]) -> str:
         """Return the text with units replaced: ``word`` gets unit and value number."""
-        named = (word(*each) for each in self.named)
+        named = (word(*named_unit) for named_unit in self.named)
         first, *rest = self.parts
         return first + "".join(value + part for value, part in zip(named, rest, strict=True))
 
     def only(self, unit: int | None, word: Callable[[int, int], str]) -> _Text:
         """Return the text in which units other than ``unit`` are plain text."""
         parts, named = [self.parts[0]], []
-        for each, part in zip(self.named, self.parts[1:], strict=True):
-            if each[0] == unit:
-                named.append(each)
+        for named_unit, part in zip(self.named, self.parts[1:], strict=True):
+            if named_unit[0] == unit:
+                named.append(named_unit)
                 parts.append(part)
             else:
-                parts[-1] += word(*each) + part
+                parts[-1] += word(*named_unit) + part
         return _Text(tuple(parts), tuple(named))
 
 
@@ -174,8 +176,9 @@ class _Draft:
     def _find_words(self) -> None:
         """Find the words that name units, and the enclaves of all units.
 
-        An enclave belongs to the only unit that its path names, also outside of its namespace.  A
-        unit that is not named in the path of each of its enclaves cannot be folded.
+        An enclave belongs to the unit that its path names, also if it is outside of the unit's
+        namespace; if the path names several units, to none.  A unit can be folded only if the path
+        of each of its enclaves names the unit.
         """
         number = Counter(value for unit in self._units for value in unit.values)
         dropped: set[int] = set()
@@ -199,9 +202,9 @@ class _Draft:
             dropped |= unnamed
         for enclave in self._picture.enclaves:
             if enclave.path not in self._of:
-                found = set(self._text(enclave.path).units)
-                if len(found) == 1:
-                    self._of[enclave.path] = found.pop()
+                named_units = set(self._text(enclave.path).units)
+                if len(named_units) == 1:
+                    self._of[enclave.path] = named_units.pop()
 
     def folding(self) -> Folding:
         """Return the folding; its picture is unchanged if nothing can be folded."""
@@ -211,7 +214,7 @@ class _Draft:
             classes = self._find_classes()
             if self._picture.focus:
                 # What goes from one robot to another one is at two stages of the flow.
-                classes = {n: found for n, found in classes.items() if self._apart(found[0])}
+                classes = {n: units for n, units in classes.items() if self._apart(units[0])}
             if classes:
                 self._classes = classes
                 return self._folded()
@@ -228,10 +231,10 @@ class _Draft:
     # ── what is seen of each unit ──────────────────────────────────────────────────────────
 
     def _text(self, text: str) -> _Text:
-        found = self._texts.get(text)
-        if found is None:
-            found = self._texts[text] = self._read(text)
-        return found
+        split = self._texts.get(text)
+        if split is None:
+            split = self._texts[text] = self._read(text)
+        return split
 
     def _read(self, text: str) -> _Text:
         """Return a text split at the units that it names, as words or between underscores."""
@@ -257,9 +260,9 @@ class _Draft:
     def _longest(self, pieces: Sequence[str], at: int) -> tuple[tuple[int, int] | None, int]:
         """Return the unit with the longest name from piece ``at``, and its number of pieces."""
         for size in range(min(len(pieces) - at, _MOST_PIECES), 0, -1):
-            found = self._words.get("_".join(pieces[at : at + size]))
-            if found:
-                return found, size
+            unit = self._words.get("_".join(pieces[at : at + size]))
+            if unit:
+                return unit, size
         return None, 1
 
     def _word(self, unit: int, position: int) -> str:
@@ -270,16 +273,16 @@ class _Draft:
         return self._text(enclave).only(self._of.get(enclave), self._word)
 
     def _sightings(self) -> Iterator[tuple[int, tuple[int, ...], Edge | str]]:
-        """Yield everything drawn of units: a number for the kind, the units, the edge or enclave.
+        """Yield each drawn enclave or edge that names units: its kind, the units, and the thing.
 
-        Two that have the same kind are the same but for the units.
+        The kind is a number; things of the same kind differ in their units alone.
         """
         alarming = {
             finding.enclave for finding in self._picture.findings if finding.severity == "error"
-        } | {each.path for each in self._picture.enclaves if each.problems}
+        } | {enclave.path for enclave in self._picture.enclaves if enclave.problems}
         roles = _roles(self._picture)
-        targets = {(each.kind, each.name) for each in self._picture.focus}
-        owners = {each.path: self._owner(each.path) for each in self._picture.enclaves}
+        targets = {(focus.kind, focus.name) for focus in self._picture.focus}
+        owners = {e.path: self._owner(e.path) for e in self._picture.enclaves}
         for enclave in self._picture.enclaves:
             if enclave.path in self._of:
                 owner, group = owners[enclave.path], self._text(enclave.group)
@@ -291,13 +294,17 @@ class _Draft:
         for edge in self._picture.edges:
             owner, name = owners[edge.enclave], self._text(edge.name)
             by = tuple(map(self._text, edge.by))
-            units = (*owner.units, *name.units, *(unit for each in by for unit in each.units))
+            units = (
+                *owner.units,
+                *name.units,
+                *(unit for wildcard in by for unit in wildcard.units),
+            )
             if not units:
                 continue
             used = self._names_of.get((edge.kind, edge.name))
             drawn = (
                 *(owner.form, edge.kind, name.form, edge.right, edge.qualifier),
-                *(tuple(each.form for each in by), edge.parts, edge.mark, edge.common),
+                *(tuple(wildcard.form for wildcard in by), edge.parts, edge.mark, edge.common),
                 *(edge.violates, (edge.kind, edge.name) in targets),
                 *((used.protection, used.wildcard) if used else ()),
             )
@@ -309,17 +316,17 @@ class _Draft:
     def _find_classes(self) -> dict[int, list[int]]:
         """Return the classes of equal units, sorted by name.
 
-        First, units of a family are told apart only by what is their own.  Those that are unlike
-        the rest of their family, or that most of it names (such as a leader), are then told apart
-        wherever they are named.
+        First, units of a family are compared with the names of all other units ignored.  Some units
+        are then distinguished wherever they are named: those unlike the rest of their family, and
+        those that most of the family names, such as a leader.
         """
         self._symbols = [unit.family for unit in self._units]
         views = self._views()
         classes = _classes(views, [0] * len(views))
         usual: dict[int, int] = {}
-        for found in sorted(classes.values(), key=lambda each: (-len(each), each)):
-            if len(found) > 1:
-                usual.setdefault(self._units[found[0]].family, found[0])
+        for members in sorted(classes.values(), key=lambda members: (-len(members), members)):
+            if len(members) > 1:
+                usual.setdefault(self._units[members[0]].family, members[0])
         self._usual = usual
         sizes = Counter(unit.family for unit in self._units)
         named = self._named_by(usual)
@@ -329,8 +336,8 @@ class _Draft:
             if not others and not (near and 2 * named[unit] <= sizes[family]):
                 self._symbols[unit] = -unit - 2
         before = [0] * len(views)
-        for number, found in classes.items():
-            for unit in found:
+        for number, members in classes.items():
+            for unit in members:
                 before[unit] = number
         classes = _classes(self._views(), before)
         return {
@@ -348,18 +355,18 @@ class _Draft:
         )
 
     def _views(self) -> list[Counter[object]]:
-        """Return what is drawn of each unit, with other units of its family made the same."""
-        found: list[Counter[object]] = [Counter() for _ in self._units]
+        """Return the drawing of each unit, in which the other units of its family look the same."""
+        views: list[Counter[object]] = [Counter() for _ in self._units]
         for kind, units, _what in self._seen:
             for unit in set(units):
-                found[unit][kind, self._around(units, unit)] += 1
-        return found
+                views[unit][kind, self._around(units, unit)] += 1
+        return views
 
     def _around(self, units: Sequence[int], unit: int) -> tuple[int, ...]:
-        return tuple(_SELF if each == unit else self._symbols[each] for each in units)
+        return tuple(_SELF if other == unit else self._symbols[other] for other in units)
 
     def _named_by(self, families: Container[int]) -> Counter[int]:
-        """Return how many other units of its family name a unit."""
+        """Count, for each unit, the other units of its family that name it."""
         pairs = {
             (unit, owner)
             for _kind, units, what in self._seen
@@ -369,12 +376,12 @@ class _Draft:
             and self._units[unit].family == self._units[owner].family
             and self._units[unit].family in families
         }
-        return Counter(each for each, _ in pairs)
+        return Counter(named_unit for named_unit, _ in pairs)
 
     # ── the picture ────────────────────────────────────────────────────────────────────────
 
     def _folded(self) -> Folding:
-        self._inside = {n: number for number, found in self._classes.items() for n in found}
+        self._inside = {n: number for number, members in self._classes.items() for n in members}
         self._enclaves: dict[str, tuple[str, ...]] = {}
         self._names: dict[tuple[str, str], tuple[str, ...]] = {}
         self._alike: dict[object, list[str]] | None = None
@@ -389,11 +396,11 @@ class _Draft:
         )
         units = sorted(
             EqualUnits(
-                self._label(found[0]),
-                self._units[found[0]].what,
-                tuple(self._units[n].name for n in found),
+                self._label(members[0]),
+                self._units[members[0]].what,
+                tuple(self._units[n].name for n in members),
             )
-            for found in self._classes.values()
+            for members in self._classes.values()
         )
         return Folding(picture, tuple(units), different, self._enclaves, self._names)
 
@@ -401,7 +408,7 @@ class _Draft:
         """Return whether a unit may not be drawn together with others."""
         symbol = self._symbols[unit]
         return not any(
-            len({each for each in units if self._symbols[each] == symbol}) > 1
+            len({other for other in units if self._symbols[other] == symbol}) > 1
             for _kind, units, _what in self._seen
         )
 
@@ -425,11 +432,11 @@ class _Draft:
         return path
 
     def _each(self, text: _Text, colour: int) -> Iterator[str]:
-        """Yield a text once for each unit of the class that it names."""
+        """Yield the text once for each unit of a class, with the name of that unit."""
         for unit in self._classes[colour]:
             yield text.fill(partial(self._instead, unit))
 
-    def _instead(self, unit: int, _each: int, position: int) -> str:
+    def _instead(self, unit: int, _unit: int, position: int) -> str:
         return self._word(unit, position)
 
     def _edges(self, odd: Set[Edge | str]) -> Iterator[Edge]:
@@ -441,53 +448,53 @@ class _Draft:
                 continue
             name = self._text(edge.name)
 
-            def word(each: int, at: int, edge: Edge = edge, unit: int | None = unit) -> str:
-                if unit is None or not self._is_counted(unit, each):
-                    return self._label(each, at)
-                return others(edge, unit, each, at)
+            def word(named: int, at: int, edge: Edge = edge, unit: int | None = unit) -> str:
+                if unit is None or not self._is_counted(unit, named):
+                    return self._label(named, at)
+                return others(edge, unit, named, at)
 
             shown = name.fill(word)
             if shown != edge.name and (edge.kind, shown) not in self._names:
                 self._names[edge.kind, shown] = tuple(self._named(edge.kind, name))
-            by = tuple(dict.fromkeys(self._text(each).fill(word) for each in edge.by))
+            by = tuple(dict.fromkeys(self._text(wildcard).fill(word) for wildcard in edge.by))
             path = self._path(edge.enclave)
             yield replace(edge, enclave=path, name=shown, by=by, differs=edge in odd)
 
-    def _is_counted(self, unit: int, each: int) -> bool:
-        """Return whether other units that a unit names are drawn only as a number."""
-        if each == unit or self._symbols[each] < 0:
+    def _is_counted(self, unit: int, other: int) -> bool:
+        """Return whether ``other``, which a unit names, is drawn only as part of a number."""
+        if other == unit or self._symbols[other] < 0:
             return False
-        return each in self._inside or unit in self._inside
+        return other in self._inside or unit in self._inside
 
     def _others(self) -> Callable[[Edge, int, int, int], str]:
-        """Return the text for other units that a unit names: their number."""
-        number: dict[object, set[int]] = defaultdict(set)
+        """Return a function that gives the text for other units that a unit names: their number."""
+        others: dict[object, set[int]] = defaultdict(set)
         families: dict[int, list[int]] = defaultdict(list)
         for n in sorted(set(self._of.values()), key=self._by_name):
             families[self._units[n].family].append(n)
 
-        def key(edge: Edge, unit: int, each: int) -> object:
+        def key(edge: Edge, unit: int, other: int) -> object:
             name = self._text(edge.name)
             rest = replace(edge, name="", by=())
-            return rest, name.form, self._around(name.units, unit), self._units[each].family
+            return rest, name.form, self._around(name.units, unit), self._units[other].family
 
         for edge in self._picture.edges:
             unit = self._of.get(edge.enclave)
             if unit is not None and self._is_drawn(unit):
-                for each in self._text(edge.name).units:
-                    if self._is_counted(unit, each):
-                        number[key(edge, unit, each)].add(each)
+                for other in self._text(edge.name).units:
+                    if self._is_counted(unit, other):
+                        others[key(edge, unit, other)].add(other)
 
-        def several(edge: Edge, unit: int, each: int, position: int) -> str:
-            family = self._units[each].family
-            found, all_of = number[key(edge, unit, each)], families[family]
-            if not found or sorted(found) == sorted(
-                self._classes.get(self._inside.get(each, -1), ())
+        def several(edge: Edge, unit: int, other: int, position: int) -> str:
+            family = self._units[other].family
+            named, all_of = others[key(edge, unit, other)], families[family]
+            if not named or sorted(named) == sorted(
+                self._classes.get(self._inside.get(other, -1), ())
             ):
-                return self._label(each, position)
+                return self._label(other, position)
             ends = f"{self._word(all_of[0], position)}…{self._word(all_of[-1], position)}"
             kin = family == self._units[unit].family
-            return f"{{{counted(len(found), 'other') if kin else len(found)} of {ends}}}"
+            return f"{{{counted(len(named), 'other') if kin else len(named)} of {ends}}}"
 
         return several
 
@@ -497,9 +504,9 @@ class _Draft:
             return self._each(name, self._inside[name.units[0]])
         if self._alike is None:
             self._alike = defaultdict(list)
-            for each in self._picture.names:
-                if len((text := self._text(each.name)).named) > 1:
-                    self._alike[each.kind, self._form(text)].append(each.name)
+            for real in self._picture.names:
+                if len((text := self._text(real.name)).named) > 1:
+                    self._alike[real.kind, self._form(text)].append(real.name)
         return self._alike[kind, self._form(name)]
 
     def _form(self, text: _Text) -> object:
@@ -512,7 +519,7 @@ class _Draft:
                 yield replace(found, name=shown, namespace=namespace_of(shown))
 
     def _folded_enclaves(self, odd: Set[Edge | str]) -> Iterator[PicturedEnclave]:
-        differing = {each if isinstance(each, str) else each.enclave for each in odd}
+        differing = {what if isinstance(what, str) else what.enclave for what in odd}
         for enclave in self._picture.enclaves:
             unit = self._of.get(enclave.path)
             if unit is None:
@@ -525,12 +532,12 @@ class _Draft:
                 yield replace(enclave, path=path, group=group, note=note)
 
     def _focus(self, focus: Focus) -> Focus:
-        def paths(found: Iterable[str]) -> tuple[str, ...]:
-            return tuple(dict.fromkeys(map(self._path, found)))
+        def paths(enclaves: Iterable[str]) -> tuple[str, ...]:
+            return tuple(dict.fromkeys(map(self._path, enclaves)))
 
-        def influences(found: Iterable[Influence]) -> tuple[Influence, ...]:
-            one = {self._path(each.enclave): each for each in found}
-            return tuple(replace(each, enclave=path) for path, each in one.items())
+        def influences(stated: Iterable[Influence]) -> tuple[Influence, ...]:
+            by_path = {self._path(influence.enclave): influence for influence in stated}
+            return tuple(replace(influence, enclave=path) for path, influence in by_path.items())
 
         return replace(
             focus,
@@ -575,37 +582,37 @@ class _Draft:
         return tuple(different), odd
 
     def _said(
-        self, found: Sequence[Edge | str], unit: int, instead: int | None = None
+        self, drawn: Sequence[Edge | str], unit: int, instead: int | None = None
     ) -> Iterator[str]:
         """Yield enclaves and rights in words, as ``unit`` would have them."""
 
-        def word(each: int, position: int) -> str:
-            return self._label(unit if each == instead else each, position)
+        def word(named: int, position: int) -> str:
+            return self._label(unit if named == instead else named, position)
 
-        enclaves = {each for each in found if isinstance(each, str)}
-        for each in found:
-            if isinstance(each, str):
-                yield f"enclave {self._owner(each).fill(word)}"
-            elif each.enclave not in enclaves:
-                deny = "" if each.qualifier is ALLOW else "DENY "
-                enclave = self._owner(each.enclave).fill(word)
-                yield f"{enclave} {deny}{each.right} {self._text(each.name).fill(word)}"
+        enclaves = {what for what in drawn if isinstance(what, str)}
+        for what in drawn:
+            if isinstance(what, str):
+                yield f"enclave {self._owner(what).fill(word)}"
+            elif what.enclave not in enclaves:
+                deny = "" if what.qualifier is ALLOW else "DENY "
+                enclave = self._owner(what.enclave).fill(word)
+                yield f"{enclave} {deny}{what.right} {self._text(what.name).fill(word)}"
 
 
 def _classes(views: Sequence[Counter[object]], before: Sequence[int]) -> dict[int, list[int]]:
     """Return classes of units with equal views, as a subdivision of the earlier classes."""
     numbers: dict[object, int] = {}
-    found: dict[int, list[int]] = defaultdict(list)
+    classes: dict[int, list[int]] = defaultdict(list)
     for unit, view in enumerate(views):
         if view:
             key = before[unit], frozenset(view.items())
-            found[numbers.setdefault(key, len(numbers))].append(unit)
-    return found
+            classes[numbers.setdefault(key, len(numbers))].append(unit)
+    return classes
 
 
-def _alike(one: Collection[object], other: Collection[object]) -> bool:
+def _alike(view: Collection[object], other: Collection[object]) -> bool:
     """Return whether two views have at least half of their content in common."""
-    return 2 * len(set(one).intersection(other)) >= max(len(one), len(other))
+    return 2 * len(set(view).intersection(other)) >= max(len(view), len(other))
 
 
 def _as_it_is(picture: Picture) -> Folding:
@@ -636,7 +643,9 @@ def _guessed(picture: Picture) -> Iterator[_Unit]:
     while waiting:
         children = waiting.pop()
         number = Counter(frozenset(below) for below in children.values())
-        for usual, most in sorted(number.items(), key=lambda each: (-each[1], sorted(each[0]))):
+        for usual, most in sorted(
+            number.items(), key=lambda counted: (-counted[1], sorted(counted[0]))
+        ):
             if most < 2:
                 break
             family += 1
@@ -653,22 +662,22 @@ def _guessed(picture: Picture) -> Iterator[_Unit]:
 
 def _by_first(paths: Iterable[tuple[str, str]]) -> dict[str, dict[str, str]]:
     """Group paths by their first part: map it to the rest of the path and to the enclave."""
-    found: dict[str, dict[str, str]] = defaultdict(dict)
+    groups: dict[str, dict[str, str]] = defaultdict(dict)
     for path, enclave in paths:
         first, _, rest = path.partition("/")
-        found[first][rest] = enclave
-    return found
+        groups[first][rest] = enclave
+    return groups
 
 
 def _roles(picture: Picture) -> Mapping[str, tuple[object, ...]]:
     """Map enclaves to their roles in the focus of a picture."""
-    found: dict[str, list[object]] = defaultdict(list)
+    roles_of: dict[str, list[object]] = defaultdict(list)
     for number, focus in enumerate(picture.focus):
-        found[focus.name].append((number, "focus"))
+        roles_of[focus.name].append((number, "focus"))
         for role, paths in (("sends", focus.senders), ("receives", focus.receivers)):
             for path in paths:
-                found[path].append((number, role))
+                roles_of[path].append((number, role))
         for role, far in (("before", focus.influencing), ("after", focus.influenced)):
-            for each in far:
-                found[each.enclave].append((number, role, each.hops))
-    return {path: tuple(roles) for path, roles in found.items()}
+            for influence in far:
+                roles_of[influence.enclave].append((number, role, influence.hops))
+    return {path: tuple(roles) for path, roles in roles_of.items()}

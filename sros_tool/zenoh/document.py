@@ -48,7 +48,7 @@ _TLS_FILES = (
     "connect_certificate",
 )
 _TLS = frozenset(
-    {*_TLS_FILES, *(f"{each}_base64" for each in _TLS_FILES), "enable_mtls"}
+    {*_TLS_FILES, *(f"{name}_base64" for name in _TLS_FILES), "enable_mtls"}
     | {"verify_name_on_connect", "close_link_on_expiration", "so_sndbuf", "so_rcvbuf"}
 )
 _LISTEN: Mapping[Mode, tuple[str, ...]] = {
@@ -96,7 +96,8 @@ class ZenohEndpoint:
     @property
     def options(self) -> Mapping[str, str]:
         """Its own options, which count in place of those of the section ``tls``."""
-        pairs = (each.partition("=") for each in self.text.partition("#")[2].split(";") if each)
+        stated = self.text.partition("#")[2].split(";")
+        pairs = (option.partition("=") for option in stated if option)
         return {name: value for name, _, value in pairs}
 
     def option(self, name: str, otherwise: bool) -> bool:
@@ -151,14 +152,14 @@ class ConfigurationDocument:
 
     def open_link(self) -> str:
         """Return where a process without a certificate gets a connection, as a clause, or ""."""
-        for each in (*self.listen, *self.connect):
-            if self.protocols is not None and each.protocol not in self.protocols:
+        for endpoint in (*self.listen, *self.connect):
+            if self.protocols is not None and endpoint.protocol not in self.protocols:
                 continue  # it is refused
-            if not each.is_encrypted():
-                return f"it has the endpoint {each.text[:80]!r} without TLS"
-        for each in self.listen:
-            if each.is_encrypted() and not each.option("enable_mtls", self.tls.mutual):
-                return f"it asks for no certificate at {each.text[:80]!r}"
+            if not endpoint.is_encrypted():
+                return f"it has the endpoint {endpoint.text[:80]!r} without TLS"
+        for endpoint in self.listen:
+            if endpoint.is_encrypted() and not endpoint.option("enable_mtls", self.tls.mutual):
+                return f"it asks for no certificate at {endpoint.text[:80]!r}"
         return ""
 
     def line_of(self, path: str) -> int:
@@ -195,16 +196,16 @@ def parse_configuration(
 
 def _override(root: _Section, path: str, value: str) -> None:
     """Replace a setting; what Zenoh does not accept is an error, as it does not start with it."""
-    *parents, last = (each for each in path.split("/") if each) if path.strip("/") else [""]
+    *parents, last = (part for part in path.split("/") if part) if path.strip("/") else [""]
     inner = root.value
     try:
         if not last or len(parents) >= _MOST_PARTS:
             raise Json5Error("no setting has that name", 0)
-        for each in parents:
-            found = inner.setdefault(each, Json5Object(0))
-            if not isinstance(found, Json5Object) or each == "endpoints":
+        for part in parents:
+            section = inner.setdefault(part, Json5Object(0))
+            if not isinstance(section, Json5Object) or part == "endpoints":
                 raise Json5Error("no setting has that name", 0)
-            inner = found
+            inner = section
         inner[last] = parse_json5(value)
         inner.lines[last] = 0
     except Json5Error as error:
@@ -292,7 +293,7 @@ class _Section:
         self, member: str, problem: str, error: type[DocumentError] = DocumentError
     ) -> DocumentError:
         line = self.value.lines.get(member, self.value.line)
-        path = "/".join(each for each in (self.path, member) if each)
+        path = "/".join(part for part in (self.path, member) if part)
         reader = "that sros reads" if error is UnreadConfigurationError else "that Zenoh accepts"
         return error(
             f"the Zenoh configuration '{self.name}' is not one {reader}",
@@ -327,42 +328,44 @@ class _Section:
         try:
             return kind(text)
         except ValueError:
-            known = ", ".join(each.value for each in kind)
+            known = ", ".join(choice.value for choice in kind)
             raise self.refused(member, f"is {text[:40]!r}, and none of: {known}") from None
 
     def texts(self, member: str) -> tuple[str, ...] | None:
         value = self.value.get(member)
         if value is None:
             return None
-        if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
+        if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
             raise self.refused(member, "is not a list of texts")
         return tuple(value)
 
     def needed_texts(self, member: str) -> tuple[str, ...]:
-        found = self.texts(member)
-        if not found:
+        texts = self.texts(member)
+        if not texts:
             raise self.refused(member, "is missing or empty")
-        return found
+        return texts
 
     def choices(self, member: str, kind: type[_E]) -> tuple[_E, ...] | None:
-        found = self.texts(member)
-        if found is None:
+        texts = self.texts(member)
+        if texts is None:
             return None
-        if not found:
+        if not texts:
             raise self.refused(member, "is empty")
-        return tuple(dict.fromkeys(self._chosen(member, each, kind) for each in found))
+        return tuple(dict.fromkeys(self._chosen(member, text, kind) for text in texts))
 
     def sections(self, member: str) -> tuple[_Section, ...] | None:
         value = self.value.get(member)
         if value is None:
             return None
-        if not isinstance(value, list) or not all(isinstance(each, Json5Object) for each in value):
+        if not isinstance(value, list) or not all(
+            isinstance(element, Json5Object) for element in value
+        ):
             elements = value if isinstance(value, list) else ()
-            inner = next((each for each in elements if isinstance(each, list)), None)
+            inner = next((element for element in elements if isinstance(element, list)), None)
             raise self.refused(member, "is not a list of objects", _no_object(inner))
         return tuple(
-            _Section(self.name, f"{self.path}/{member}[{number}]", each)
-            for number, each in enumerate(value)
+            _Section(self.name, f"{self.path}/{member}[{number}]", element)
+            for number, element in enumerate(value)
         )
 
     def only(self, known: Collection[str]) -> None:
@@ -370,18 +373,19 @@ class _Section:
             raise self.refused(member[:40], "is not a setting that sros knows")
 
     def unknown(self, known: Collection[str]) -> Iterator[str]:
-        return (each for each in self.value if each not in known)
+        return (member for member in self.value if member not in known)
 
 
 def _configuration(root: _Section, name: str) -> ConfigurationDocument:
     mode = root.choice("mode", Mode) or Mode.PEER
     link = root.section("transport").section("link")
     tls = link.section("tls")
-    multicast, gossip = (root.section("scouting").section(each) for each in ("multicast", "gossip"))
+    scouting = root.section("scouting")
+    multicast, gossip = scouting.section("multicast"), scouting.section("gossip")
     admin = root.section("adminspace")
     permissions = admin.section("permissions")
     shared = root.section("transport").section("shared_memory")
-    unknown = [*root.unknown(_SECTIONS), *(f"{tls.path}/{each}" for each in tls.unknown(_TLS))]
+    unknown = [*root.unknown(_SECTIONS), *(f"{tls.path}/{name}" for name in tls.unknown(_TLS))]
     return ConfigurationDocument(
         name,
         mode,
@@ -392,7 +396,7 @@ def _configuration(root: _Section, name: str) -> ConfigurationDocument:
             tls.boolean("enable_mtls", False),
             tls.boolean("verify_name_on_connect", True),
             tls.boolean("close_link_on_expiration", False),
-            tuple(each for each in _TLS_FILES if tls.text(each) or tls.text(f"{each}_base64")),
+            tuple(name for name in _TLS_FILES if tls.text(name) or tls.text(f"{name}_base64")),
         ),
         shared.boolean("enabled", True, nullable=False),
         multicast.boolean("enabled", True),
@@ -414,19 +418,19 @@ def _endpoints(
     """Return the endpoints of a section, which may state others for each mode."""
     if isinstance(section.value.get("endpoints"), Json5Object):
         section = section.section("endpoints")
-        section.only([each.value for each in Mode])
-        found = section.texts(mode.value) or ()
+        section.only([mode.value for mode in Mode])
+        endpoints = section.texts(mode.value) or ()
     elif "endpoints" in section.value:
         stated = section.texts("endpoints")
         if stated is None:
             raise section.refused("endpoints", "is null")
-        found = stated
+        endpoints = stated
     else:
-        found = default
-    for each in found:
-        if not all(each.partition("/")):
-            raise section.refused("", f"has {each[:80]!r}, which is not PROTOCOL/ADDRESS")
-    return tuple(map(ZenohEndpoint, found))
+        endpoints = default
+    for endpoint in endpoints:
+        if not all(endpoint.partition("/")):
+            raise section.refused("", f"has {endpoint[:80]!r}, which is not PROTOCOL/ADDRESS")
+    return tuple(map(ZenohEndpoint, endpoints))
 
 
 class _Permission(StrEnum):
@@ -438,24 +442,24 @@ def _enforcement(section: _Section) -> Enforcement:
     section.only(("enabled", "default_permission", "rules", "subjects", "policies"))
     enabled = section.boolean("enabled", False, nullable=False)
     default = section.choice("default_permission", _Permission)
-    lists = {each: section.sections(each) for each in ("rules", "subjects", "policies")}
-    if enabled and (missing := [each for each, value in lists.items() if value is None]):
+    lists = {member: section.sections(member) for member in ("rules", "subjects", "policies")}
+    if enabled and (missing := [member for member, value in lists.items() if value is None]):
         raise section.refused("", f"is on without the list {missing[0]!r}")
     rules = tuple(map(_rule, lists["rules"] or ()))
     subjects = tuple(map(_subject, lists["subjects"] or ()))
     policies = tuple(map(_policy, lists["policies"] or ()))
-    found = Enforcement(enabled, default is _Permission.ALLOW, rules, subjects, policies)
+    enforcement = Enforcement(enabled, default is _Permission.ALLOW, rules, subjects, policies)
     if enabled:
-        _check_ids(section, found)
-    _check_size(section, found)
-    return found
+        _check_ids(section, enforcement)
+    _check_size(section, enforcement)
+    return enforcement
 
 
 def _id(section: _Section) -> str:
-    found = section.text("id")
-    if not found or not found.strip():
+    text = section.text("id")
+    if not text or not text.strip():
         raise section.refused("id", "is missing or empty")
-    return found
+    return text
 
 
 def _rule(section: _Section) -> AclRule:
@@ -465,9 +469,9 @@ def _rule(section: _Section) -> AclRule:
     if permission is None or messages is None:
         raise section.refused("", f"has no {'messages' if permission else 'permission'!r}")
     keys = section.needed_texts("key_exprs")
-    for each in keys:
-        if problem := expression_problem(each):
-            raise section.refused("key_exprs", f"has {each[:80]!r}: {problem}")
+    for key in keys:
+        if problem := expression_problem(key):
+            raise section.refused("key_exprs", f"has {key[:80]!r}: {problem}")
     return AclRule(
         _id(section),
         permission is _Permission.ALLOW,
@@ -480,16 +484,16 @@ def _rule(section: _Section) -> AclRule:
 
 def _subject(section: _Section) -> AclSubject:
     section.only(("id", *PROPERTIES))
-    values = {each: section.texts(each) for each in PROPERTIES}
+    values = {name: section.texts(name) for name in PROPERTIES}
     for member, value in values.items():
-        if value is not None and not all(each.strip() for each in value or ("",)):
+        if value is not None and not all(text.strip() for text in value or ("",)):
             raise section.refused(member, "is empty, or has an empty value")
-    for each in values["link_protocols"] or ():
-        if each not in _LINK_PROTOCOLS:
-            raise section.refused("link_protocols", f"has {each[:40]!r}, which is no protocol")
-    for each in values["zids"] or ():
-        if not _ZID.fullmatch(each):
-            raise section.refused("zids", f"has {each[:40]!r}, which is no id of a session")
+    for protocol in values["link_protocols"] or ():
+        if protocol not in _LINK_PROTOCOLS:
+            raise section.refused("link_protocols", f"has the unknown protocol {protocol[:40]!r}")
+    for zid in values["zids"] or ():
+        if not _ZID.fullmatch(zid):
+            raise section.refused("zids", f"has {zid[:40]!r}, which is not a session id")
     return AclSubject(_id(section), **values, line=section.value.line)
 
 
@@ -499,29 +503,30 @@ def _policy(section: _Section) -> AclPolicy:
     return AclPolicy(section.needed_texts("rules"), section.needed_texts("subjects"))
 
 
-def _check_ids(section: _Section, found: Enforcement) -> None:
+def _check_ids(section: _Section, enforcement: Enforcement) -> None:
     """Refuse ids that occur twice, and policies that name a rule or subject that there is not."""
-    for member, of in (("rules", found.rules), ("subjects", found.subjects)):
-        ids = [each.id for each in of]
-        if twice := next((each for each in _repeated(ids)), None):
+    for member, elements in (("rules", enforcement.rules), ("subjects", enforcement.subjects)):
+        ids = [element.id for element in elements]
+        if twice := next(_repeated(ids), None):
             raise section.refused(member, f"has the id {twice[:80]!r} twice")
-        for policy in found.policies:
+        for policy in enforcement.policies:
             named: tuple[str, ...] = getattr(policy, member)
-            for each in set(named) - set(ids):
-                raise section.refused("policies", f"names {each[:80]!r}, which {member} has not")
+            for missing in set(named) - set(ids):
+                text = f"names {missing[:80]!r}, which is not in {member}"
+                raise section.refused("policies", text)
 
 
-def _check_size(section: _Section, found: Enforcement) -> None:
+def _check_size(section: _Section, enforcement: Enforcement) -> None:
     """Refuse a file whose few lines mean many millions of decisions."""
     values = {
-        each.id: prod(len(getattr(each, name) or (None,)) for name in PROPERTIES)
-        for each in found.subjects
+        subject.id: prod(len(getattr(subject, name) or (None,)) for name in PROPERTIES)
+        for subject in enforcement.subjects
     }
-    places = {each.id: len(each.flows) * len(each.messages) for each in found.rules}
+    places = {rule.id: len(rule.flows) * len(rule.messages) for rule in enforcement.rules}
     meant = sum(values.values()) + sum(
-        sum(places.get(each, 0) for each in policy.rules)
-        * sum(values.get(each, 0) for each in policy.subjects)
-        for policy in found.policies
+        sum(places.get(rule, 0) for rule in policy.rules)
+        * sum(values.get(subject, 0) for subject in policy.subjects)
+        for policy in enforcement.policies
     )
     if meant > _MOST_MEANT:
         raise UnreadConfigurationError(
@@ -533,10 +538,10 @@ def _check_size(section: _Section, found: Enforcement) -> None:
 
 def _repeated(ids: Iterable[str]) -> Iterator[str]:
     seen: set[str] = set()
-    for each in ids:
-        if each in seen:
-            yield each
-        seen.add(each)
+    for name in ids:
+        if name in seen:
+            yield name
+        seen.add(name)
 
 
 def _settings(value: Json5Object, path: str) -> Iterator[tuple[str, str]]:

@@ -1,9 +1,9 @@
-"""Subtract key expressions from another one: the result is a union of key expressions.
+"""Subtract key expressions from a key expression; the result is a union of key expressions.
 
-For rules that only allow: a denial of data inside a wider permission does not hold in Zenoh.  All
-expressions are tuples of chunks.  The result is exact on keys whose chunks are names of ROS, whose
-letters are few: ``*`` without ``ab`` is every chunk with another letter than a and b, or that
-begins with another letter than a, and so on.
+Zenoh does not enforce a denial inside a wider permission, so rules may only allow.  All expressions
+are tuples of chunks.  The result is exact for keys whose chunks are ROS names.  Because ROS names
+use few letters, ``*`` without ``ab`` can be listed: every chunk that contains a letter other than a
+and b, that begins with a letter other than a, and so on.
 """
 
 from __future__ import annotations
@@ -40,7 +40,10 @@ _MOST_CHARACTERS = 1_000_000
 
 
 class CannotSubtract(Exception):  # noqa: N818 - the caller makes an error of it
-    """The difference is no union of expressions, or of too many; ``denied`` is why, if not ()."""
+    """The difference is not a union of expressions, or has too many; ``denied`` may say why.
+
+    ``denied`` is the expression that cannot be subtracted, or () if there are too many.
+    """
 
     def __init__(self, denied: Chunks = ()) -> None:
         """Record the expression that cannot be subtracted."""
@@ -50,60 +53,70 @@ class CannotSubtract(Exception):  # noqa: N818 - the caller makes an error of it
 
 @lru_cache(maxsize=_FEW)
 def subtract_all(allowed: frozenset[Chunks], denied: frozenset[Chunks]) -> frozenset[Chunks]:
-    """Return expressions for the keys that some expressions include, and none of ``denied``.
+    """Return expressions for the keys that ``allowed`` includes and ``denied`` does not.
 
     Raises:
-        CannotSubtract: there are more than `MOST_EXPRESSIONS`, or a denied expression has a chunk
-            or letters between two wildcards where an allowed one has a wildcard, too.
+        CannotSubtract: the result has more than `MOST_EXPRESSIONS`; or a denied expression has a
+            chunk or letters between two wildcards where an allowed expression has a wildcard.
     """
     without = _not_covered(denied)
-    found: set[Chunks] = set()
+    left: set[Chunks] = set()
     for wide in sorted(_not_covered(allowed)):
-        found |= _subtract(wide, without)
-        _check_number(len(found), MOST_EXPRESSIONS)
-    return frozenset(found)
+        left |= _subtract(wide, without)
+        _check_number(len(left), MOST_EXPRESSIONS)
+    return frozenset(left)
 
 
 def _not_covered(some: frozenset[Chunks]) -> list[Chunks]:
-    """Return the expressions that no other one covers, if they are not too many to compare."""
+    """Return the expressions that no other one covers; with many, not all are compared."""
     wide: list[Chunks] = []
     left: list[Chunks] = []
-    for each in sorted(some, key=lambda chunks: (-chunks.count(ANY_CHUNKS), len(chunks), chunks)):
-        if not any(covers(other, each) for other in wide):
-            left.append(each)
-            if "*" in "".join(each) and len(wide) < _MOST_COMPARED:
-                wide.append(each)
-    return [each for each in left if not any(o != each and covers(o, each) for o in wide)]
+    for expression in sorted(
+        some, key=lambda chunks: (-chunks.count(ANY_CHUNKS), len(chunks), chunks)
+    ):
+        if not any(covers(other, expression) for other in wide):
+            left.append(expression)
+            if "*" in "".join(expression) and len(wide) < _MOST_COMPARED:
+                wide.append(expression)
+    return [
+        expression
+        for expression in left
+        if not any(o != expression and covers(o, expression) for o in wide)
+    ]
 
 
 def _subtract(wide: Chunks, denied: Iterable[Chunks]) -> set[Chunks]:
-    """Return expressions for the keys that ``wide`` includes and none of ``denied``."""
-    without = frozenset(each for each in denied if meet(each, wide))
+    """Return expressions for the keys that ``wide`` includes and ``denied`` does not."""
+    without = frozenset(expression for expression in denied if meet(expression, wide))
     if not without:
         return {wide}
-    if any(covers(each, wide) for each in without):
+    if any(covers(expression, wide) for expression in without):
         return set()
-    found: set[Chunks] = set()
+    left: set[Chunks] = set()
     for part in _parts(wide, without):
-        found |= _less(part, frozenset(each for each in without if meet(each, part)))
-        _check_number(len(found))
-    return _joined(found)
+        left |= _less(
+            part, frozenset(expression for expression in without if meet(expression, part))
+        )
+        _check_number(len(left))
+    return _joined(left)
 
 
-def meet(one: Chunks, other: Chunks) -> bool:
-    """Return whether some key belongs to both expressions."""
-    for end in (0, -1) if one and other else ():
-        if one[end] != other[end] and "*" not in one[end] + other[end]:
+def meet(first: Chunks, second: Chunks) -> bool:
+    """Return whether both expressions include a common key."""
+    for end in (0, -1) if first and second else ():
+        if first[end] != second[end] and "*" not in first[end] + second[end]:
             return False
-    return sequences_intersect(one, other)
+    return sequences_intersect(first, second)
 
 
 _MOST_STEPS = 2 * MOST_EXPRESSIONS
-"""Most expressions before some are joined."""
+"""Maximum number of expressions before some are joined."""
 _MOST_COMPARED = 64
-"""Most expressions to compare with all others, to leave out those that they cover."""
-_MOST_WILD, _MOST_KINDS = 32, 1024
-"""Most chunks with wildcards that are denied at one place, and most kinds of chunks by these."""
+"""Maximum number of expressions that are compared with all others, to drop what they cover."""
+_MOST_WILD = 32
+"""Maximum number of denied chunks with wildcards at one position of an expression."""
+_MOST_KINDS = 1024
+"""Maximum number of kinds of chunks that these denied chunks distinguish."""
 
 
 def _check_number(number: int, most: int = _MOST_STEPS) -> None:
@@ -139,7 +152,7 @@ def _around(chunks: Chunks) -> tuple[Chunks, Chunks]:
 
 
 def _parts(wide: Chunks, denied: Iterable[Chunks]) -> Iterator[Chunks]:
-    """Yield expressions that together are ``wide``, whose ``**`` no denied beginning or end meets.
+    """Split ``wide`` so that its ``**`` meets no fixed beginning or end of a denied expression.
 
     So a denied expression can be compared from the start, and then from the end.
     """
@@ -147,8 +160,10 @@ def _parts(wide: Chunks, denied: Iterable[Chunks]) -> Iterator[Chunks]:
         yield wide
         return
     before, after = _around(wide)
-    wild = [_around(each) for each in denied if ANY_CHUNKS in each]
-    fixed = max((len(each) for each in denied if ANY_CHUNKS not in each), default=-1)
+    wild = [_around(expression) for expression in denied if ANY_CHUNKS in expression]
+    fixed = max(
+        (len(expression) for expression in denied if ANY_CHUNKS not in expression), default=-1
+    )
     if wide.count(ANY_CHUNKS) > 1:
         between = wide[len(before) + 1 : len(wide) - len(after)]
         begin = max(fixed, *(len(first) for first, _ in wild), 0) - len(before)
@@ -183,31 +198,33 @@ def _to_last_named(chunks: Chunks) -> int:
 
 @lru_cache(maxsize=_FEW)
 def _less(wide: Chunks, denied: frozenset[Chunks]) -> frozenset[Chunks]:
-    """Return expressions for the keys of ``wide`` without ``denied``, which all meet it."""
+    """Return expressions for the keys of ``wide`` without ``denied``; each denied one meets it."""
     if not denied:
         return frozenset((wide,))
-    if any(covers(each, wide) for each in denied):
+    if any(covers(expression, wide) for expression in denied):
         return frozenset()
     if wide[0] != ANY_CHUNKS:
         return _by_first_chunk(wide, denied)
     if wide[-1] != ANY_CHUNKS:
-        found = _by_first_chunk(wide[::-1], frozenset(each[::-1] for each in denied))
-        return frozenset(each[::-1] for each in found)
+        reversed_rest = _by_first_chunk(
+            wide[::-1], frozenset(expression[::-1] for expression in denied)
+        )
+        return frozenset(expression[::-1] for expression in reversed_rest)
     return _by_length(wide, denied)
 
 
 def _by_length(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
-    """Return the keys of ``**`` that are shorter than all denied ones, which have any chunks."""
-    named = [each for each in denied if {*each} - {ANY_CHUNK, ANY_CHUNKS}]
+    """Return the keys of ``**`` shorter than all denied ones, which consist of wildcards only."""
+    named = [expression for expression in denied if {*expression} - {ANY_CHUNK, ANY_CHUNKS}]
     if wide != (ANY_CHUNKS,) or named:
         raise CannotSubtract(min(named or denied))
-    least = min(len(each) - 1 for each in denied if ANY_CHUNKS in each)
-    lengths = {len(each) for each in denied if ANY_CHUNKS not in each}
+    least = min(len(expression) - 1 for expression in denied if ANY_CHUNKS in expression)
+    lengths = {len(expression) for expression in denied if ANY_CHUNKS not in expression}
     return frozenset(_any(number) for number in range(least) if number not in lengths)
 
 
 def _by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
-    """Compare the first chunk, which is not ``**``, with those of the denied expressions."""
+    """Subtract by the first chunk of ``wide``, which is not ``**``."""
     first, rest = wide[0], wide[1:]
     tails: dict[str, set[Chunks]] = {}
     for expression in denied:
@@ -216,21 +233,21 @@ def _by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]
                 tails.setdefault(chunk, set()).add(tail)
     always = {chunk for chunk in tails if _matches(chunk, first)}
     some = tuple(sorted(tails.keys() - always))
-    # What is left behind the first chunk, by which of the denied chunks match it.
+    # The remainders behind the first chunk, with the kinds of first chunks that allow them.
     kinds: dict[Chunks, set[frozenset[str]]] = {}
     for kind in _kinds(first, some):
         behind = frozenset(tail for chunk in kind | always for tail in tails[chunk])
-        for each in _less(rest, behind):
-            kinds.setdefault(each, set()).add(kind)
-    found = set()
-    for each, of in kinds.items():
-        found |= {(chunk, *each) for chunk in _chunks(first, some, frozenset(of))}
-        _check_number(len(found))
-    return frozenset(found)
+        for remainder in _less(rest, behind):
+            kinds.setdefault(remainder, set()).add(kind)
+    left = set()
+    for remainder, matched in kinds.items():
+        left |= {(chunk, *remainder) for chunk in _chunks(first, some, frozenset(matched))}
+        _check_number(len(left))
+    return frozenset(left)
 
 
 def _openings(expression: Chunks) -> Iterator[tuple[str, Chunks]]:
-    """Yield the first chunks that an expression may have, each with what follows."""
+    """Yield each first chunk that an expression may have, with the chunks after it."""
     if expression and expression[0] == ANY_CHUNKS:
         yield from _openings(expression[1:])
         yield ANY_CHUNK, expression
@@ -240,27 +257,33 @@ def _openings(expression: Chunks) -> Iterator[tuple[str, Chunks]]:
 
 @lru_cache(maxsize=_MANY)
 def _kinds(first: str, some: tuple[str, ...]) -> Mapping[frozenset[str], Chunks]:
-    """Return the kinds of chunks that ``first`` matches: which of ``some`` match them, too.
+    """Return the kinds of chunks that ``first`` matches, as a map to expressions for them.
 
-    Each with expressions for what ``first`` and these match together.
+    A kind is the set of chunks of ``some`` that match, too.
     """
     wild = [chunk for chunk in some if "*" in chunk]
     _check_number(len(wild), _MOST_WILD)
-    found: dict[frozenset[str], Chunks] = {frozenset(): (first,)}
+    shared_by_kind: dict[frozenset[str], Chunks] = {frozenset(): (first,)}
     for chunk in wild:
-        for kind, both in list(found.items()):
-            if shared := tuple(e for one in both for e in common_chunks(one, chunk)):
-                found[kind | {chunk}] = shared
-        _check_number(len(found), _MOST_KINDS)
+        for kind, both in list(shared_by_kind.items()):
+            if shared := tuple(c for other in both for c in common_chunks(other, chunk)):
+                shared_by_kind[kind | {chunk}] = shared
+        _check_number(len(shared_by_kind), _MOST_KINDS)
     kinds = {
         kind: both
-        for kind, both in found.items()
-        if not all(any(_matches(e, one) for e in wild if e not in kind) for one in both)
+        for kind, both in shared_by_kind.items()
+        if not all(_matches_any(chunk, wild, kind) for chunk in both)
     }
     for chunk in some:
         if "*" not in chunk:
-            kinds[frozenset((chunk, *(e for e in wild if _matches(e, chunk))))] = (chunk,)
+            matching = (wide for wide in wild if _matches(wide, chunk))
+            kinds[frozenset((chunk, *matching))] = (chunk,)
     return kinds
+
+
+def _matches_any(chunk: str, wild: Iterable[str], without: frozenset[str]) -> bool:
+    """Return whether a chunk of ``wild`` that is not in ``without`` includes ``chunk``."""
+    return any(_matches(wide, chunk) for wide in wild if wide not in without)
 
 
 @lru_cache(maxsize=_MANY)
@@ -270,9 +293,10 @@ def _matches(wide: str, narrow: str) -> bool:
 
 @lru_cache(maxsize=_MANY)
 def _chunks(first: str, some: tuple[str, ...], kinds: frozenset[frozenset[str]]) -> Chunks:
-    """Return few chunks that match all of ``first`` whose kind is in ``kinds``.
+    """Return few chunks that match all chunks of ``first`` whose kind is in ``kinds``.
 
-    What is left allowed behind a chunk is allowed behind those, too, that fewer of ``some`` match.
+    A remainder that is allowed behind a chunk is also allowed behind a chunk that fewer of ``some``
+    match.
     """
     every = _kinds(first, some)
 
@@ -285,14 +309,14 @@ def _chunks(first: str, some: tuple[str, ...], kinds: frozenset[frozenset[str]])
     outside = frozenset(some).difference(*kinds)
     if are_allowed(kind for kind in every if not kind & outside):
         choices.append(_chunks_less(first, outside))
-    found: dict[str, None] = {}
+    chosen: dict[str, None] = {}
     for kind in sorted(kinds, key=sorted):
         others = frozenset(some) - kind
         if are_allowed(other for other in every if kind <= other):
             others = frozenset()
-        found |= dict.fromkeys(e for one in every[kind] for e in _chunks_less(one, others))
-    choices.append(tuple(found))
-    wanted = [one for kind in kinds for one in every[kind]]
+        chosen |= dict.fromkeys(c for chunk in every[kind] for c in _chunks_less(chunk, others))
+    choices.append(tuple(chosen))
+    wanted = [chunk for kind in kinds for chunk in every[kind]]
     for letter in sorted({*wanted[0]}.intersection(*wanted[1:]).difference(ANY_PART)):
         both = common_chunks(first, f"{ANY_PART}{letter}{ANY_PART}")
         if len(both) == 1 and are_allowed(_kinds(both[0], some)):
@@ -305,24 +329,24 @@ def _chunks(first: str, some: tuple[str, ...], kinds: frozenset[frozenset[str]])
 
 @lru_cache(maxsize=_MANY)
 def _chunks_less(wide: str, denied: frozenset[str]) -> Chunks:
-    """Return chunks for what ``wide`` matches and none of ``denied``."""
+    """Return chunks for the names that ``wide`` matches and ``denied`` does not."""
     if not denied:
         return (wide,)
     search = _Letters()
-    without = tuple(sorted(each.replace(ANY_PART, "*") for each in denied))
+    without = tuple(sorted(chunk.replace(ANY_PART, "*") for chunk in denied))
     try:
         search.run(_Place("", wide.replace(ANY_PART, "*"), without, _LETTERS))
     except CannotSubtract as error:
         if error.denied:  # what is left of it after some letters
             raise CannotSubtract((min(denied),)) from None
         raise
-    return tuple(canonical((each.replace("*", ANY_PART),)) for each in search.found)
+    return tuple(canonical((chunk.replace("*", ANY_PART),)) for chunk in search.kept)
 
 
 class _Place(NamedTuple):
-    """The chunks that begin with ``read``, and go on as ``wide`` and none of ``denied`` matches.
+    """The chunks that start with ``read``, and whose rest ``wide`` matches and ``denied`` does not.
 
-    ``letters`` are those that the rest may have: chunks with others have been found already.
+    ``letters`` are the letters that the rest may have: chunks with other letters are already kept.
     """
 
     read: str
@@ -333,14 +357,13 @@ class _Place(NamedTuple):
 
 @dataclass
 class _Letters:
-    """The search: it reads chunks from their start until no denied one can match any more.
+    """The search, which reads chunks from their start until no denied chunk can match.
 
-    Where a denied chunk begins with a star, and none has one elsewhere, a second search reads
-    backwards from the end.
+    If all denied wildcards are stars at the start, a second search reads backwards from the end.
     """
 
     backwards: bool = False
-    found: dict[str, None] = field(default_factory=dict)
+    kept: dict[str, None] = field(default_factory=dict)
     effort: int = _MOST_CHARACTERS
 
     def run(self, start: _Place) -> None:
@@ -359,16 +382,16 @@ class _Letters:
         self.effort -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
         if self.effort < 0:
             raise CannotSubtract
-        denied = tuple(each for each in denied if _overlap(each, wide))
+        denied = tuple(chunk for chunk in denied if _overlap(chunk, wide))
         if not denied:
             self._keep(read + wide)
             return ()
-        if any(_matches(_chunk(each), _chunk(wide)) for each in denied):
+        if any(_matches(_chunk(chunk), _chunk(wide)) for chunk in denied):
             return ()
         if not wide.startswith("*"):
             return (_Place(read + wide[0], wide[1:], _after(wide[0], denied), _LETTERS),)
-        starred = [each for each in denied if each.startswith("*")]
-        if starred and all(each in starred or "*" not in each for each in denied):
+        starred = [chunk for chunk in denied if chunk.startswith("*")]
+        if starred and all(chunk in starred or "*" not in chunk for chunk in denied):
             self._keep_backwards(read, wide, denied)
             return ()
         return self._by_next_letter(place._replace(denied=denied))
@@ -376,13 +399,13 @@ class _Letters:
     def _by_next_letter(self, place: _Place) -> Iterator[_Place]:
         """Split the chunks of a place by their next letter; ``wide`` begins with a star."""
         read, wide, denied, letters = place
-        if wide == "*" and not any("*" in each for each in denied):
+        if wide == "*" and not any("*" in chunk for chunk in denied):
             # A chunk with a letter that no denied one has is allowed, whatever its other letters.
-            needed = {letter for each in denied for letter in each}
+            needed = {letter for chunk in denied for letter in chunk}
             for letter in letters:
                 if letter not in needed:
                     self._keep(f"{read}*{letter}*")
-            letters = "".join(each for each in letters if each in needed)
+            letters = "".join(letter for letter in letters if letter in needed)
         yield _Place(read, wide[1:], denied, letters)
         begins = not self.backwards and not read
         for letter in letters:
@@ -393,84 +416,87 @@ class _Letters:
         if self.backwards:
             raise CannotSubtract((wide,))
         ends = _Letters(backwards=True, effort=self.effort)
-        ends.run(_Place("", wide[::-1], tuple(each[::-1] for each in denied), _LETTERS))
-        for each in ends.found:
-            self._keep(read + each[::-1])
+        ends.run(_Place("", wide[::-1], tuple(chunk[::-1] for chunk in denied), _LETTERS))
+        for chunk in ends.kept:
+            self._keep(read + chunk[::-1])
 
     def _keep(self, chunk: str) -> None:
         if chunk or self.backwards:  # no chunk is empty, but the end of one may be
-            self.found[chunk] = None
-        _check_number(len(self.found))
+            self.kept[chunk] = None
+        _check_number(len(self.kept))
 
 
 def _chunk(text: str) -> str:
     return text.replace("*", ANY_PART)
 
 
-def _overlap(one: str, other: str) -> bool:
-    return chunks_intersect(_chunk(one), _chunk(other))
+def _overlap(first: str, second: str) -> bool:
+    return chunks_intersect(_chunk(first), _chunk(second))
 
 
 def _after(letter: str, chunks: Iterable[str]) -> tuple[str, ...]:
-    """Return the rests of chunks after one letter was read."""
-    found = []
+    """Return what remains of the chunks after a letter was read."""
+    rests = []
     for chunk in chunks:
         if chunk.startswith("*"):
-            found.append(chunk)
+            rests.append(chunk)
             if chunk[1:2] == letter:
-                found.append(chunk[2:])
+                rests.append(chunk[2:])
         elif chunk.startswith(letter):
-            found.append(chunk[1:])
-    return tuple(dict.fromkeys(found))
+            rests.append(chunk[1:])
+    return tuple(dict.fromkeys(rests))
 
 
 # ── fewer expressions ──────────────────────────────────────────────────────────────────────
 
 
-def _joined(found: set[Chunks]) -> set[Chunks]:
-    """Return expressions for the same keys: some of any length in place of one for each length."""
-    joined = {tuple(canonical(each).split("/")) if each else each for each in found}
-    while longer := [each for each in joined if _one_shorter(each) in joined]:
-        joined -= {_one_shorter(each) for each in longer}
+def _joined(expressions: set[Chunks]) -> set[Chunks]:
+    """Return fewer expressions for the same keys, with ``**`` in place of one for each length."""
+    joined = {
+        tuple(canonical(expression).split("/")) if expression else expression
+        for expression in expressions
+    }
+    while longer := [expression for expression in joined if _one_shorter(expression) in joined]:
+        joined -= {_one_shorter(expression) for expression in longer}
         joined.difference_update(longer)
-        joined |= {_or_shorter(each) for each in longer}
-    wild = {_around(each) for each in joined if each.count(ANY_CHUNKS) == 1}
+        joined |= {_or_shorter(expression) for expression in longer}
+    wild = {_around(expression) for expression in joined if expression.count(ANY_CHUNKS) == 1}
     begins = _Beginnings({before for before, _ in wild})
     ends = _Beginnings({after[::-1] for _, after in wild})
     return {
-        each
-        for each in joined
-        if ANY_CHUNKS in each
+        expression
+        for expression in joined
+        if ANY_CHUNKS in expression
         or not any(
             (before, after[::-1]) in wild
-            for before in begins.matching(each)
-            for after in ends.matching(each[::-1])
-            if len(before) + len(after) <= len(each)
+            for before in begins.matching(expression)
+            for after in ends.matching(expression[::-1])
+            if len(before) + len(after) <= len(expression)
         )
     }
 
 
 class _Beginnings:
-    """Beginnings of expressions, with a search for those that match the beginning of others."""
+    """Beginnings of expressions; finds those that match the beginning of an expression."""
 
     def __init__(self, beginnings: Iterable[Chunks]) -> None:
         self._by_first: dict[Chunks, list[Chunks]] = {}
-        for each in beginnings:
-            self._by_first.setdefault(each[:1], []).append(each)
+        for beginning in beginnings:
+            self._by_first.setdefault(beginning[:1], []).append(beginning)
         self._known: dict[Chunks, list[Chunks]] = {}
 
     def matching(self, chunks: Chunks) -> Iterator[Chunks]:
         first = chunks[:1]
         if first not in self._known:
-            firsts = (one for one in self._by_first if all(map(_matches, one, first)))
-            self._known[first] = [each for one in firsts for each in self._by_first[one]]
-        for each in self._known[first]:
-            if len(each) <= len(chunks) and all(map(_matches, each, chunks)):
-                yield each
+            known = (chunk for chunk in self._by_first if all(map(_matches, chunk, first)))
+            self._known[first] = [beginning for key in known for beginning in self._by_first[key]]
+        for beginning in self._known[first]:
+            if len(beginning) <= len(chunks) and all(map(_matches, beginning, chunks)):
+                yield beginning
 
 
 def _one_shorter(chunks: Chunks) -> Chunks | None:
-    """Return the expression for keys with one chunk less than those of a ``**`` after a ``*``."""
+    """Return ``a/b`` for ``a/*/**/b``, for keys that are one chunk shorter; None for others."""
     at = chunks.index(ANY_CHUNKS) if chunks.count(ANY_CHUNKS) == 1 else 0
     return (*chunks[: at - 1], *chunks[at + 1 :]) if at and chunks[at - 1] == ANY_CHUNK else None
 

@@ -141,11 +141,11 @@ REFUSED: dict[str, Any] = {
     "subjects has the id 's' twice": control(subjects=[SUBJECT, SUBJECT]),
     "cert_common_names is empty": control(subjects=[{"id": "s", "cert_common_names": []}]),
     "has an empty value": control(subjects=[{"id": "s", "usernames": [" "]}]),
-    "'TLS', which is no protocol": control(subjects=[{"id": "s", "link_protocols": ["TLS"]}]),
-    "'0A', which is no id": control(subjects=[{"id": "s", "zids": ["0A"]}]),
+    "unknown protocol 'TLS'": control(subjects=[{"id": "s", "link_protocols": ["TLS"]}]),
+    "'0A', which is not a session id": control(subjects=[{"id": "s", "zids": ["0A"]}]),
     "cert_names is not a setting": control(subjects=[{"id": "s", "cert_names": ["a"]}]),
-    "names 'q', which rules has not": control(policies=[{**POLICY, "rules": ["q"]}]),
-    "names 'q', which subjects has not": control(policies=[{**POLICY, "subjects": ["q"]}]),
+    "names 'q', which is not in rules": control(policies=[{**POLICY, "rules": ["q"]}]),
+    "names 'q', which is not in subjects": control(policies=[{**POLICY, "subjects": ["q"]}]),
     "subjects is missing or empty": control(policies=[{**POLICY, "subjects": []}]),
 }
 
