@@ -208,7 +208,8 @@ def generate(
         KeystoreError: The keystore does not exist, is busy or broken, or is not for ``domain``.
         PolicyError: Two policies differ on an enclave, or a policy file is malformed.
         InvalidNameError: An enclave's name is not valid.
-        UsageError: No policy and no enclave is given, or a policy that was read with a fleet.
+        UsageError: No policy and no enclave is given, or ``fleet`` is given with a policy that is
+            already read.
 
     Example:
         >>> sros_tool.generate(keystore, "policies/talker_listener.xml").created
@@ -218,7 +219,8 @@ def generate(
 
     names = tuple(_several("enclaves", enclaves))
     if not (policies or names):
-        raise UsageError("no policy and no enclave is given", "", "Pass at least one of them.")
+        text = "no policy and no enclave is given"
+        raise UsageError(text, "", "Pass at least one policy or enclave.")
     return create.generate_artifacts(
         Path(keystore),
         enclaves=names,
@@ -455,23 +457,23 @@ def check_requirements(
         path: A policy file or a keystore.
         requirements: The TOML file of the requirements, or several.
         fleet: The file with the robots that the placeholders of a policy stand for.
-        template: The keystore template, by name or file, whose protection a policy gets; without
-            one, that of the default template is assumed where the policy does not say it, and a
-            finding tells so.
+        template: The keystore template, by name or file, whose protection a policy gets. Without
+            it, the default template is assumed where the policy states no protection, and a finding
+            reports this.
         vendor: The only vendor of DDS to decide for, or "zenoh"; every measured one and Zenoh by
             default.
-        domain: The only ROS domain id to decide for; by default one of each kind that the
-            documents of a keystore tell apart.
+        domain: The only ROS domain id to decide for; by default one of each group of domains that
+            the keystore's documents treat alike.
         now: The time at which permissions have to be valid; the current time by default.
         zone: The time zone of the robot, in which some vendors read dates.
 
     Returns:
         Findings with ``subject``, ``text``, ``file`` and ``line``, and in ``related`` the other
-        lines of the policy and that of the requirement; () if all requirements hold.
+        lines of the policy and the line of the requirement; () if all requirements hold.
 
     Raises:
-        DocumentError: A file cannot be read, or a requirement cannot be decided with so many
-            wildcards.
+        DocumentError: A file cannot be read, or there are too many wildcards to decide a
+            requirement.
         UsageError: There is no such vendor, or ``domain`` is not a domain id.
 
     Example:
@@ -515,22 +517,22 @@ def new_access(
     """Return what ``head`` lets enclaves do that ``base`` does not, decided for all names.
 
     Args:
-        base: What is there before: a policy, a folder of policies, a keystore, an exported enclave,
-            permissions, a Zenoh configuration, or policies at a revision of git, such as
+        base: The state before the change: a policy, a folder of policies, a keystore, an exported
+            enclave, permissions, a Zenoh configuration, or policies at a revision of git, such as
             "git:main:policies/robot.xml".
-        head: What is there afterwards: any of these.
+        head: The state after the change: any of these.
         fleet: The file with the robots that the placeholders of policies stand for.
-        base_fleet: That of ``base``, if it is another one.
+        base_fleet: The fleet file for ``base``, if it differs from ``fleet``.
 
     Returns:
         What is ``added`` and ``removed``, whom enclaves can influence now (``reach``), and the
         protection that is ``lost`` and ``gained``; false if nothing is added and nothing lost.
-        ``assumed`` and ``left_out`` say on which terms: a policy counts as signed with access
-        control of everything, and as ``base`` also with the protection that is meant by default.
+        ``assumed`` and ``left_out`` state the assumptions: a policy counts as signed with access
+        control of everything, and a policy as ``base`` also with the default protection.
 
     Raises:
-        SrosError: A path cannot be read, or it cannot be decided, for instance because of a
-            signature that does not verify; then nothing is known of what is new.
+        SrosError: A path cannot be read, or the question cannot be decided, for instance because a
+            signature does not verify; the new access is then unknown.
 
     Example:
         >>> for gain in sros_tool.new_access("git:main:robot.xml", "robot.xml").added:
@@ -558,7 +560,7 @@ def _moment(now: datetime | None) -> datetime:
 
 
 def _domain(given: int | None) -> int | None:
-    """Return the ROS domain id; raise `UsageError` for a number that is none."""
+    """Return the ROS domain id; raise `UsageError` if it is not a valid id."""
     from sros_tool.dds.domains import DomainSet
 
     return None if given is None else DomainSet.parse(str(given), "domain").only()

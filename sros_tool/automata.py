@@ -1,9 +1,10 @@
-"""Exact sets of names: union, difference and first match of names and of expressions.
+"""Exact sets of names, from names and expressions: union, difference, first match.
 
-A set holds names as they are, and finite automata for expressions with wildcards, whose makers know
-the meaning of these: `sros_tool.policy.patterns`, `sros_tool.dds.decision` and `sros_tool.zenoh`.
-`NameSet.example` finds the shortest name of a set, or proves that there is none.  Nothing is
-sampled or approximated: a set that takes too many steps raises an error.
+A set holds exact names, and finite automata for expressions with wildcards.  The modules that
+create the automata define what wildcards mean: `sros_tool.policy.patterns`,
+`sros_tool.dds.decision` and `sros_tool.zenoh`. `NameSet.example` finds the shortest name of a set,
+or proves that there is none.  Nothing is sampled or approximated: a set that takes too many steps
+raises an error.
 
 Names are texts of any characters but NUL, which no DDS and no file can have in a name.
 """
@@ -214,7 +215,7 @@ class Automaton:
 
     @cached_property
     def levels(self) -> tuple[tuple[int, int], ...]:
-        """Lower bounds on the number of letters to an end, each with its positions as bits."""
+        """Lower bounds on the letters to an accepting position, each with its positions as bits."""
         before: dict[int, list[int]] = {}
         for at, letters, to in self.edges:
             if letters:
@@ -251,14 +252,14 @@ class Automaton:
         return self.prefix, self.suffix, repr(self.edges)
 
     def may_meet(self, other: Automaton) -> bool:
-        """Return False if both automata surely share no name, by their prefixes and suffixes."""
+        """Return False if the prefixes or suffixes show that both automata share no name."""
         return _agree(self.prefix, other.prefix) and _agree(self.suffix[::-1], other.suffix[::-1])
 
 
 def _only_way(
     edges: Mapping[int, Sequence[tuple[Letters, int]]], at: int, stops: frozenset[int]
 ) -> str:
-    """Return the text that must follow position ``at``: its edges have no alternative."""
+    """Return the text that must follow position ``at``, up to a fork or one of the ``stops``."""
     found = ""
     while at not in stops:
         ways = edges.get(at, ())
@@ -297,7 +298,7 @@ _Ask = Callable[["_Some"], _Truth]
 
 @dataclass(frozen=True)
 class _Some:
-    """The names of ``exact``, and all that one of the ``automata`` accepts."""
+    """The ``exact`` names, and all names that one of the ``automata`` accepts."""
 
     exact: frozenset[str] = frozenset()
     automata: frozenset[Automaton] = frozenset()
@@ -464,7 +465,7 @@ def _too_many() -> DocumentError:
 class NameSet:
     """An immutable set of names, perhaps endless.
 
-    ``|`` and ``&`` and ``-`` and ``~`` make other sets; a large set of exact names costs look-ups.
+    ``|``, ``&``, ``-`` and ``~`` return new sets.
     """
 
     __slots__ = ("_node",)
@@ -558,8 +559,8 @@ class NameSet:
     ) -> str | None:
         """Return a name of this set, always the same one, or None if there is none.
 
-        Names that were given as they are come first, then short ones.  ``longest`` is the length
-        of names, in bytes of UTF-8, above which they do not count.
+        Exact names come first, then short ones.  Names longer than ``longest``, in bytes of UTF-8,
+        do not count.
 
         Raises:
             DocumentError: the search takes more steps than ``limit`` allows.
@@ -663,9 +664,10 @@ def _leaves(node: _Node) -> Iterator[_Some]:
 def _reduced(
     node: _Node, sure: frozenset[Automaton], possible: frozenset[Automaton] | None
 ) -> _Node | bool:
-    """Return the part of a set that matters to names that are not ``exact`` in it.
+    """Return a set without the parts that do not matter to names other than its exact names.
 
-    The automata ``sure`` accept these names; of the others, only ``possible`` may, or all for None.
+    The automata ``sure`` accept these names.  Of the other automata, only ``possible`` may accept
+    them; None stands for all.
     """
     if isinstance(node, _Some):
         if not sure.isdisjoint(node.automata):
@@ -715,11 +717,11 @@ _MOST_AUTOMATA = 8192
 
 
 def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
-    """Yield searches that together find every name of a set but its exact names.
+    """Yield searches that together find every name of a set, except its exact names.
 
-    Each considers the names of one automaton, and only the other automata that may have names in
-    common with it.  If no few automata have all names of the set, the last one considers the names
-    that no automaton accepts.
+    A search considers the names of one automaton, and only those other automata that may share
+    names with it.  If no small group of automata covers the set, the last search considers the
+    names that no automaton accepts.
     """
     leaves = tuple(_leaves(node))
     automata = frozenset[Automaton]().union(*(leaf.automata for leaf in leaves))
@@ -794,10 +796,10 @@ def _order(automaton: Automaton) -> tuple[str, str, str]:
 
 
 class _Search:
-    """The search for the shortest name of a set without exact names, and not one of ``taken``.
+    """The search for the shortest name of a set without exact names, except ``taken`` names.
 
-    It goes through the sets of positions that all automata together can reach (A*): first those
-    from which the automata that must accept have the fewest letters to go.
+    It is an A* search.  A state is the set of positions that all automata reach together.  States
+    come first from which the automata that must accept need the fewest letters.
     """
 
     def __init__(self, node: _Node, taken: frozenset[str]) -> None:

@@ -40,7 +40,7 @@ class EnclaveEnvironment:
     """The environment variables of an enclave, and notes on them.
 
     ``enclave_notes`` are for nodes that are not started with ``--ros-args --enclave``.
-    ``needs_pin``: the key is on a token, and nothing but an environment variable has its PIN.
+    ``needs_pin``: the key is on a token, and only an environment variable can give its PIN.
     """
 
     variables: dict[str, str]
@@ -73,8 +73,8 @@ def loadable_environment(
         now: the current time.
         zone: the time zone of this machine.
         accept_key: accept a private key, or the PIN of its token, that other users can read.
-        target: the absolute path of the keystore where the process will run; None stands for here.
-            A key that was made there need not be here.
+        target: the absolute path of the keystore where the process will run; None stands for this
+            machine. A key that was made on the other machine need not be on this one.
 
     Raises:
         UsageError: the domain, the RMW or the enclave's name is invalid.
@@ -202,10 +202,11 @@ def _check_folders_closed(root: Path, folder: Path, name: str) -> None:
 def _check_joining(
     name: str, folder: Path, state: OpenedEnclave, vendor: Vendor | None, context: JoinContext
 ) -> OpenedEnclave:
-    """Return an enclave as it is for the vendor of a process, or for all vendors if it is None.
+    """Return an enclave with its faults for a DDS vendor, or for all vendors if it is None.
 
     Raises:
-        KeystoreError: it has no fault that its reader names, and each of these vendors refuses it.
+        KeystoreError: each of these vendors refuses the enclave, and none of its own faults says
+            why.
     """
     from sros_tool.dds.decision.vendors import MEASURED
     from sros_tool.faults import Fault
@@ -290,10 +291,10 @@ def _check_pin(place: TokenUri, name: str) -> None:
 
 
 def _uses_zenoh(named: str | None, rmw: str) -> bool:
-    """Return whether a process of ``rmw``, which the user may have ``named``, is on Zenoh.
+    """Return whether a process of ``rmw``, which the user may have ``named``, uses Zenoh.
 
     Raises:
-        UsageError: it would use an RMW of which sros knows no security.
+        UsageError: the process would use an RMW that sros does not know to enforce security.
     """
     from sros_tool.runtime.environment import RMW_ZENOH
     from sros_tool.runtime.rmw import RMW, middleware_of
@@ -336,8 +337,8 @@ def _opened_zenoh(
     """Return the Zenoh configurations of an enclave.
 
     Raises:
-        KeystoreError: it has none, or one that its permissions CA did not sign as it is, or that
-            does not state the rights of its permissions.
+        KeystoreError: the enclave has no configuration, or one whose signature is not valid, or
+            whose rights are not those of its permissions.
     """
     from sros_tool.keystore.layout import PUBLIC
     from sros_tool.keystore.zenoh_files import ZenohFault, open_zenoh
@@ -470,7 +471,8 @@ def _zenoh_environment(
 def _router_notes(session: Configuration | None) -> Iterator[Note]:
     """Yield a note if a session connects to a router of this machine that does not run.
 
-    A client waits for it without a word; a peer of rmw_zenoh starts, and says it itself.
+    A client waits for the router without any output.  A peer of rmw_zenoh starts, and reports it
+    itself.
     """
     from sros_tool.zenoh.configuration import Mode
 
@@ -496,7 +498,7 @@ _LISTENING = "0A"
 def _listens_here(port: int) -> bool:
     """Return whether a TCP port of this machine has a listener; True if that is unknown.
 
-    No connection is made: each one that is given up would pause the listener of a router.
+    No connection is made, because a dropped connection pauses the listener of a router.
     """
     listening: set[int] = set()
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):
@@ -556,7 +558,8 @@ def container_text(
         form: one of `sros_tool.runtime.environment.CONTAINER_FORMS`.
         target: the keystore in the container and, for Compose, on the machine that runs it.
         variables: the environment of the enclave there.
-        name: the name of the service or object; "" stands for one that no other enclave has.
+        name: the name of the service or object; "" stands for a name made from the enclave's, which
+            no other enclave gets.
         image: the image, or "".
         now: the current time.
 
@@ -653,7 +656,8 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
     """Return the enclave that a policy assigns to the node which a command starts.
 
     Raises:
-        UsageError: the command names no node, or the policy has it in none or several enclaves.
+        UsageError: the command names no node, or the policy has the node in no enclave or in
+            several.
         PolicyError: the policy cannot be read.
     """
     from sros_tool.policy.document import read_policy

@@ -456,7 +456,8 @@ def enforces_nothing(environment: Mapping[str, str], variable: str) -> str:
 def open_because(data: bytes, name: str, override: str) -> str:
     """Return why a configuration has no access control, as a clause; "" if it has access control.
 
-    ``name`` is the name of the configuration file, ``override`` that of ZENOH_CONFIG_OVERRIDE.
+    ``name`` is the name of the configuration file, ``override`` is the value of
+    ZENOH_CONFIG_OVERRIDE.
 
     Raises:
         SrosError: sros cannot read the configuration.

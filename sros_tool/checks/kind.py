@@ -61,8 +61,8 @@ class FindingKind(NamedTuple):
 
     ``id`` is stable and has the form ``family.name``.  ``title`` is a clause; ``why``, ``source``
     and ``remedy`` are sentences.  ``source`` is a section of a specification, a vendor and version,
-    or ROS.  ``group`` is an id that several kinds share.  A ``prominent`` note is shown where
-    warnings are, and counts as the note that it is.
+    or ROS.  ``group`` is an id that several kinds share.  A ``prominent`` note is shown among the
+    warnings, but counts as a note.
     """
 
     id: str

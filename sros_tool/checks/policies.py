@@ -201,7 +201,7 @@ NO_COUNTERPART = FindingKind(
 MISSPELT = FindingKind(
     "policy.name-misspelt",
     WARNING,
-    "a name that is nearly, but not, a name of the other side",
+    "a name that differs slightly from a name of the other side",
     "Neither of the two names has a counterpart, so the nodes do not communicate: one is perhaps "
     "a typing error, or of another kind, such as a service where an action is called.",
     "sros: the policy as a whole.",

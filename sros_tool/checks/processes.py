@@ -84,8 +84,8 @@ PROCESS_WITHOUT_FILES = FindingKind(
     "runtime.process-without-files",
     WARNING,
     "a process whose enclave is not there any more",
-    "It runs with files that were removed since it started, and does not start again. Where the "
-    "ledger is not, as on a robot, sros cannot tell whether the enclave was revoked.",
+    "It runs with files that were removed since it started, and does not start again. Without the "
+    "ledger, as on a robot, sros cannot tell whether the enclave was revoked.",
     "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy.",
     "Stop it if its enclave was revoked; otherwise bring the enclave back, and restart it.",
 )
@@ -121,8 +121,7 @@ PROCESS_NOT_SEEN = FindingKind(
     "runtime.process-not-seen",
     WARNING,
     "processes that could not be looked at",
-    "They may be nodes, also open or revoked ones. That nothing else is found says nothing about "
-    "them.",
+    "They may be nodes, even open or revoked ones. The other findings do not cover them.",
     "proc(5), ptrace(2) (PTRACE_MODE_READ_FSCREDS).",
     "Run it as root: `sudo sros check runtime`.",
 )
@@ -439,7 +438,7 @@ PROCESS_PERMISSIVE = FindingKind(
 PROCESS_OTHER_KEYSTORE = FindingKind(
     "runtime.process-other-keystore",
     WARNING,
-    "a secured process among those of another keystore",
+    "a secured process among processes of another keystore",
     "They trust other CAs, so they do not communicate, and do not report it.",
     "DDS-Security 1.1, 8.3.2.8; Fast DDS 2.14.5 and Cyclone DDS 0.10.2, measured.",
     "Start all processes of a domain with one keystore, or give each keystore its own domain.",
@@ -458,7 +457,8 @@ PROCESS_ELSEWHERE = FindingKind(
     "runtime.process-elsewhere",
     NOTE,
     "a node in another network namespace",
-    "It is not next to the nodes of this network, and is compared only with those next to it.",
+    "It cannot reach the nodes of this network, and is compared only with nodes of its own "
+    "network.",
     "network_namespaces(7).",
     "Run `sros check runtime` in that network, too, or look whether they are meant to be there.",
     prominent=True,

@@ -57,8 +57,8 @@ ROUTER_WITHOUT_RULES = FindingKind(
     "zenoh.router-without-rules",
     ERROR,
     "a router without access control",
-    "It passes on everything between everybody who gets a connection: whoever has any certificate "
-    "of the CA publishes, hears, calls and serves everything.",
+    "It forwards everything between all connected processes: anyone with a certificate of the CA "
+    "can publish, hear, call and serve everything.",
     _MEASURED,
     _BY_SROS,
 )
@@ -66,8 +66,9 @@ SESSION_WITHOUT_RULES = FindingKind(
     "zenoh.session-without-rules",
     ERROR,
     "a session without access control",
-    "Whoever plays the router, or in mode peer connects to it directly, reads everything that it "
-    "publishes and sends it anything, past the rules of the real router.",
+    "Anyone who impersonates the router, or in mode peer connects to the session directly, can "
+    "read everything that it publishes and send it anything. The rules of the real router do not "
+    "apply.",
     _MEASURED,
     _BY_SROS,
 )
@@ -75,7 +76,7 @@ DEFAULT_ALLOW = FindingKind(
     "zenoh.default-allow",
     ERROR,
     "access control that allows what no rule denies",
-    "A denial holds neither against a query nor against a put with a wildcard, and a process that "
+    "A query or a put with a wildcard passes a denial, and a process that "
     "matches two subjects is denied only what both deny.",
     _MEASURED,
     'Write "default_permission": "deny", and rules that allow.',
@@ -138,7 +139,7 @@ UNUSED = FindingKind(
     "zenoh.unused",
     WARNING,
     "a rule or a subject without effect",
-    "No policy connects it: a rule that nobody has neither allows nor denies anything.",
+    "No policy names it, so it neither allows nor denies anything.",
     "Zenoh 1.9 (authorization.rs).",
     "Name it in a policy, or remove it.",
 )
@@ -163,8 +164,8 @@ PROTOCOLS_OPEN = FindingKind(
     "zenoh.protocols-open",
     WARNING,
     "protocols without encryption are not excluded",
-    "An endpoint tcp/... that is added, for instance by ZENOH_CONFIG_OVERRIDE, or that another "
-    "process names, is used next to tls/... .",
+    "An endpoint tcp/... that is added (for instance by ZENOH_CONFIG_OVERRIDE) or that another "
+    "process names is used in addition to tls/... .",
     _MEASURED,
     'Write "protocols": ["tls"] in transport/link.',
 )
@@ -180,12 +181,12 @@ NAME_NOT_VERIFIED = FindingKind(
     "zenoh.name-not-verified",
     ERROR,
     "a session that accepts anybody as its router",
-    "It does not compare the name of the endpoint with the certificate there, and trusts the "
-    "public CAs of the web besides its own: without rules that ask for a name, the owner of any "
-    "such certificate can play the router.",
+    "It does not compare the endpoint's host with the certificate, and trusts the public CAs of "
+    "the web as well as its own CA. Without rules that require a name, the owner of any "
+    "certificate of these CAs can impersonate the router.",
     "Zenoh 1.9 (TLS link) and 1.10.2 (its log).",
-    "Name the router in the subjects of access control, or verify_name_on_connect with a "
-    "certificate for its host.",
+    "Name the router in the subjects of access control, or set verify_name_on_connect and give the "
+    "router a certificate for its host.",
 )
 EXPIRED_STAYS = FindingKind(
     "zenoh.expired-stays",

@@ -50,8 +50,8 @@ def print_changed(
         result: the change.
         form: what ``--json`` prints of it; None without ``--json``.
         lines: what was done; in place of it, a dry run prints the files that it would change.
-        told: what to say of it at once, on standard error.
-        after: what to say after the rights that change.
+        told: messages that come first on standard error.
+        after: messages that follow the rights that change.
         rights: say what enclaves lose and gain.
         exported: also say that exports are out of date.
         restart: say which processes have to be restarted.
@@ -105,9 +105,8 @@ def _print_closed(root: Path, changes: Sequence[Change]) -> None:
     if any(change.action == "adopt" for change in changes):
         echo(
             f"took over '{root}', which ros2/sros2 made: it has settings and a ledger from now on. "
-            "The certificates and permissions that were there, signed by its CA, are taken on "
-            "trust: nothing shows whether one of them was replaced or taken back before, and put "
-            "in again.",
+            "The existing certificates and permissions that its CA signed are trusted: nothing "
+            "shows whether somebody put back a file that had been replaced or withdrawn.",
             err=True,
         )
     closed = [str(root / change.path) for change in changes if change.action == "close"]
@@ -115,11 +114,10 @@ def _print_closed(root: Path, changes: Sequence[Change]) -> None:
         where = quote(str(root))
         echo(
             "closed to other users, who could open them until now: "
-            f"{first_few(closed, _CLOSED_SHOWN)}. "
-            "Run the nodes as the owner of the keystore, or from an export of that user (`sros "
-            "distribute_key`). Replace keys that somebody may have copied: `sros renew "
-            f"{where} NAME --new-key --revoke-old` those of enclaves, `sros rotate_ca {where} "
-            "--next` those of CAs.",
+            f"{first_few(closed, _CLOSED_SHOWN)}. Run the nodes as the owner of the keystore, or "
+            "from an export of that user (`sros distribute_key`). Replace keys that somebody may "
+            f"have copied: keys of enclaves with `sros renew {where} NAME --new-key --revoke-old`, "
+            f"keys of CAs with `sros rotate_ca {where} --next`.",
             err=True,
         )
 
@@ -146,7 +144,8 @@ def _print_restart(
 ) -> None:
     """Print on stderr that the processes of the enclaves ``names`` have to be restarted.
 
-    ``zenoh`` says which of them on Zenoh.  With ``exported`` also that exports are out of date.
+    ``zenoh`` has the enclaves whose Zenoh processes are affected.  With ``exported``, also print
+    that exports are out of date.
     """
     if not names:
         return

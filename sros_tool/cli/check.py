@@ -307,7 +307,7 @@ def _requirements(
 ) -> Callable[[Callable[[Path], System]], list[Finding]] | None:
     """Return a function that checks the requirements of files; None without files.
 
-    It gets a function that reads the policy or keystore at a path.
+    The returned function gets a function that reads the policy or keystore at a path.
     """
     if not files:
         return None
@@ -578,7 +578,7 @@ def _with_enclaves(fleet: Fleet, paths: Sequence[Path]) -> Fleet:
 def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Finding, str]]:
     """Merge findings that differ only in the robot; yield each with the other robots.
 
-    It is the same if it is about the same line of the policy, in the enclave of another robot.
+    Two findings are merged if they are about the same line of a policy, in enclaves of two robots.
     """
     from sros_tool.fleet.enclaves import path_of_robots
 

@@ -666,7 +666,7 @@ _KEY_PLACES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS
 def secrets_taken() -> Iterator[None]:
     """Remove secrets from this process's environment, so that child processes do not get them.
 
-    Neither do commands that replace this process, as of ``sros run``.
+    Commands that replace this process, as with ``sros run``, do not get them either.
     """
     for name in (_PASSPHRASE, _PASSPHRASE_FILE, _PIN):
         if name in os.environ:
@@ -785,7 +785,8 @@ def read_named(path: Path, what: str, *, most: int = 16 * 1024 * 1024) -> bytes:
     At most one byte more than ``most`` (16 MiB) is read from standard input.
 
     Raises:
-        DocumentError: the file cannot be read, is larger or not a regular file, or nothing comes.
+        DocumentError: the file cannot be read, is too large or is not a regular file, or standard
+            input is empty.
     """
     from sros_tool.xml import read_bytes
 
@@ -913,7 +914,7 @@ def _finding_lines(finding: Finding) -> list[str]:
 
 
 def _wrapped(text: str, indent: str) -> list[str]:
-    """Return lines of at most 80 characters; what is to be copied stays on one, however long."""
+    """Return lines of at most 80 characters; text to copy stays on one line, however long."""
     from textwrap import wrap
 
     whole = re.sub(r"`[^`]+`|<\w[^>]*/>", lambda m: m[0].replace(" ", "\0"), visible_line(text))
@@ -1017,7 +1018,7 @@ def progress(label: str, total: int = 0) -> Iterator[Callable[[str], None] | Non
         label: what is done, such as "signing".
         total: number of items, if the body counts them with the yielded function.
 
-    Yields None where nothing is shown: standard error is no terminal.
+    Yields None if nothing is shown because standard error is not a terminal.
     """
     on_terminal = sys.stderr is not None and sys.stderr.isatty()
     if not on_terminal or _lines or threading.current_thread() is not threading.main_thread():

@@ -583,10 +583,10 @@ def _distribution_lines(compared: DistributionComparison) -> Iterator[str]:
 # ── the answer of Zenoh as text ────────────────────────────────────────────────────────────
 
 _DOES = {
-    "publish": ("heard by", "a put on all of it is heard by"),
+    "publish": ("heard by", "a put to this wildcard is heard by"),
     "subscribe": ("hears", ""),
-    "call": ("served by", "a query on all of it is executed by"),
-    "request": ("served by", "a query on all of it is executed by"),
+    "call": ("served by", "a query on this wildcard is executed by"),
+    "request": ("served by", "a query on this wildcard is executed by"),
     "serve": ("serves", ""),
     "reply": ("serves", ""),
     "execute": ("serves", ""),

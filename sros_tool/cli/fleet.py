@@ -132,7 +132,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     """Store a robot's report of its files in the keystore ROOT.
 
     FILE is what `sros fleet report` or the Ansible collection made on the robot; - is standard
-    input. It replaces the last one of the robot, and proves nothing about it: `sros fleet status`
+    input. It replaces the last report of the robot. A report is no proof; `sros fleet status`
     compares it with what the robot should have.
 
     Example:
@@ -268,7 +268,7 @@ def _status(
 _WORDS = {
     "none": "no enclave",
     "missing": "files missing",
-    "broken": "broken at home",
+    "broken": "broken in the keystore",
     "never": "never confirmed",
     "unknown": "unknown files",
     "revoked": "revoked files",

@@ -896,7 +896,8 @@ def _replaced_lines(update: KeystoreUpdate) -> Iterator[str]:
             ends = f"add --revoke-old to the stage {update.left[-1]}, or {ends}"
         yield (
             "the replaced certificates and permissions, with the rights that they had, work until "
-            f"{iso(update.works_until)} for whoever kept them with the key. To end it, {ends}."
+            f"{iso(update.works_until)} for anyone who kept copies of them and of the key. To end "
+            f"this, {ends}."
         )
 
 

@@ -159,8 +159,8 @@ def _complete_reason(
 @click.option(
     "--until-retired",
     is_flag=True,
-    help="During a CA rotation: revoke although the old identity CA's key is gone. Its "
-    "certificates are refused only after the stage retire.",
+    help="During a CA rotation: revoke even if the key of the old identity CA is gone. The "
+    "certificates of that CA are then refused only after the stage retire.",
 )
 @allow_refusal_option
 @dry_run_option
@@ -561,9 +561,9 @@ def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_js
 
 
 def _new_keys(identity: str | None, permissions: str | None, encrypt: bool) -> Keyring:
-    """Return a keyring that has only the places given by options, where new keys are made.
+    """Return a keyring with the places for new keys, which only options give.
 
-    Places given by the environment are those of the current keys.
+    Places in environment variables are for the current keys.
     """
     from dataclasses import replace
 

@@ -213,7 +213,7 @@ def _until_signalled() -> Iterator[Callable[[], bool]]:
 
 
 def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
-    """Return the observer's failure as the error that its DDS output explains."""
+    """Return an error for the observer's failure, with the cause that its DDS output shows."""
     from sros_tool.runtime.variables import ENCLAVE
     from sros_tool.runtime.vendor_log import (
         endpoint_refusal,
@@ -462,7 +462,7 @@ def generate_policy(
     else:
         _show(plan, learned, written=not dry_run)
     if gone := sorted(node for node in snapshot.gone if not is_tool_name(node.rpartition("/")[2])):
-        text = f"left out, because these nodes went while the graph was observed: {listed(gone)}"
+        text = f"left out, because these nodes ended while the graph was observed: {listed(gone)}"
         echo(f"{text}; --watch keeps them.", err=True)
     if not snapshot.settled:
         echo(

@@ -135,7 +135,7 @@ def _print_added(merged: Merged) -> None:
 
 
 def _check_includes(policy: Path, output: Path, document: bytes) -> None:
-    """Raise `PolicyError` if the policy's relative includes lead elsewhere from ``output``."""
+    """Raise `PolicyError` if the policy's relative includes would not work from ``output``."""
     from sros_tool.policy.document import read_policy
 
     try:
@@ -191,10 +191,10 @@ def diff_policy(
 
     With --no-new-access, A and B can also be folders of policies, and policies at a revision of
     git, as git:REVISION:PATH. The exit status is 0 only if B gives no enclave any access that A
-    does not give, with no vendor, in no domain and for no name, and protects nothing less; it is
-    2 if that cannot be decided. A policy counts as signed with access control of everything: as
-    A, a keystore that protects less gives more; as B, it lowers no protection. The last line says
-    what is assumed and what is left out, such as dates.
+    does not give, with no vendor, in no domain and for no name, and protects nothing less; it is 2
+    if that cannot be decided. A policy counts as signed with access control of everything: if A is
+    a policy, a keystore B that protects less gives more; if B is a policy, it lowers no protection.
+    The last line says what is assumed and what is left out, such as dates.
 
     Example:
       $ sros diff_policy robot.xml keystore

@@ -96,7 +96,7 @@ _NAMES = {alias: name for name, verb in _VERBS.items() for alias in (name, *verb
 
 
 def _report_steps(ctx: click.Context, _parameter: click.Parameter, count: int) -> None:
-    """Log steps on standard error until the program ends: INFO for one -v in all, DEBUG for more.
+    """Log steps on standard error until the program ends: INFO for one -v, DEBUG for several.
 
     Only the logger of sros is configured, so that other libraries do not log.
     """
@@ -320,7 +320,7 @@ def _os_problem(error: OSError) -> str:
 def _outdated_dependency() -> str:
     """Return which package that sros needs is missing or too old, and what to do; else "".
 
-    colcon installs sros next to packages of the system, which nobody has compared.
+    colcon installs sros next to packages of the system without checking their versions.
     """
     from importlib.metadata import PackageNotFoundError, requires, version
 

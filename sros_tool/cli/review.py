@@ -39,7 +39,7 @@ _WORDS = {0: "nothing found", 1: "found", 2: "could not be decided"}
 _TITLES = {
     "new-access": "New access",
     "requirements": "Requirements",
-    "requirements-before": "Requirements of before",
+    "requirements-before": "Earlier requirements",
     "files": "Files",
     "keystore": "Keystore",
     "expiry": "Expiry",
@@ -82,9 +82,9 @@ def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorate
     "--base",
     required=True,
     metavar="COMMIT|none",
-    help="The commit with the access of before: its full id, or a full reference such as "
-    "refs/remotes/origin/main; for what a merge was made into, the full id of the merge with ^1. "
-    "Without a comparison: none.",
+    help="The commit to compare with: a full id, or a full reference such as "
+    "refs/remotes/origin/main. For the target branch of a merge, the full id of the merge "
+    "with ^1. `none`: no comparison.",
 )
 @click.option(
     "--head",
@@ -102,13 +102,13 @@ def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorate
     help="Fleet file whose robots replace the placeholders of the policies.",
 )
 @_paths_option("keystore", "PATH", "A keystore, or its public part.")
-@_paths_option("leave-out", "PATH", "A folder whose policies are not of the robot, such as tests.")
+@_paths_option("leave-out", "PATH", "A folder whose policies are not for the robot, such as tests.")
 @click.option(
     "--new-access",
     type=click.Choice(["fail", "allow"]),
     default="fail",
     show_default=True,
-    help="Whether new access, or access that a dropped requirement forbids, makes the review fail.",
+    help="Whether new access, or access that a dropped requirement forbade, makes the review fail.",
 )
 @click.option(
     "--renew-within",
@@ -163,8 +163,9 @@ def review(
 ) -> int:
     r"""Review a change of policies, requirements and keystores, as in a pull request.
 
-    Checks what the commit HEAD has, decides its requirements and those that it drops, and compares
-    all access with that of the commit BASE. PATHs are from the top of the repository.
+    Checks the policies and keystores of the commit HEAD, decides its requirements and the ones that
+    it drops, and compares all access with the commit BASE. PATHs are from the top of the
+    repository.
 
     Both commits are read from git itself: nothing is checked out, files of the work tree are read
     only to say that they differ, no link of a commit is followed, and nothing that the repository
@@ -440,7 +441,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
         case RightsChange(before=before, after=after):
             return rights_markdown(before, after)
         case DroppedRequirements(chosen=chosen):
-            title = "### The requirements change: these are decided as they were before"
+            title = "### The requirements changed: these are decided as they were before"
             return f"{title}\n\n{findings(chosen)}"
         case ExpiryCheck(due=due, unreadable=unreadable):
             lines = [describe_lifetime(lifetime, request.at) for lifetime in due]

@@ -112,7 +112,7 @@ class _FailingClosed(Verb):
 
 @contextmanager
 def _refusal_printed(form: str, as_json: bool) -> Iterator[None]:
-    """Print what starts no node if an error or a signal ends the context."""
+    """Print output that keeps nodes from starting if an error or a signal ends the context."""
     try:
         yield
     except click.exceptions.Exit:  # --help

@@ -236,7 +236,7 @@ def _format(form: str | None, output: Path | None, graphviz: bool) -> str:
 
 @contextmanager
 def _without_collection() -> Iterator[None]:
-    """Do not look for cycles of objects, which takes half of the time of a large picture.
+    """Disable garbage collection, which takes half of the time of a large picture.
 
     Pictures are values without cycles.
     """

@@ -58,7 +58,7 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     "endpoints",
     multiple=True,
     metavar="HOST:PORT",
-    help="Where sessions connect to the router; usually localhost:7447. May be repeated.",
+    help="Where sessions connect to the router; by default at localhost:7447. May be repeated.",
 )
 @click.option(
     "--listen",
@@ -71,16 +71,16 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     "crossing",
     multiple=True,
     metavar="NAME",
-    help="Let only these topics and services pass between routers, such as '/fleet/*'; usually "
-    "all that enclaves at both ends have rights to. May be repeated; '' is all again.",
+    help="Let only these topics and services pass between routers, such as '/fleet/*'; by default "
+    "all to which enclaves at both ends have rights. May be repeated; '' restores the default.",
 )
 @click.option(
     "--mode",
     type=click.Choice(["client", "peer"]),
-    help="client (usual): sessions connect to the router alone. peer: also to each other, on one "
+    help="client (default): sessions connect to the router alone. peer: also to each other, on one "
     "host.",
 )
-@click.option("--domain", metavar="IDS", help="ROS domains; usually those of the keystore.")
+@click.option("--domain", metavar="IDS", help="ROS domains; by default those of the keystore.")
 @click.option(
     "--off",
     is_flag=True,
@@ -99,7 +99,7 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     "existing",
     type=PATH,
     metavar="FILE",
-    help="Show whom an existing configuration of Zenoh allows what, and where it lets anybody in.",
+    help="Show what an existing Zenoh configuration allows to whom, and where it lets anybody in.",
 )
 @output_option("With --from: write what it allows as a policy to FILE.")
 @force_option
@@ -223,9 +223,9 @@ def _network(
     routers: Sequence[tuple[str, str]],
     crossing: Sequence[str],
 ) -> ZenohNetwork:
-    """Return the network of the settings, or the usual one, with the values that are ``given``.
+    """Return the network of the settings, or the default network, with the ``given`` values.
 
-    ``routers`` are further ones with their endpoints, "" for those to drop.
+    ``routers`` are further routers with their endpoints; an empty endpoint removes a router.
     """
     from sros_tool.keystore.template import with_values
     from sros_tool.zenoh.configuration import ZenohNetwork
@@ -256,8 +256,8 @@ def _with_router(network: ZenohNetwork, name: str, endpoint: str) -> ZenohNetwor
     if name not in known and not folder:
         raise UsageError(
             f"it is not known which enclaves connect to the router {name}",
-            "A router that is named with an endpoint is for the enclaves beside it, and not for "
-            "those of all hosts.",
+            "A router with an endpoint is for the enclaves next to it, such as /r1/* for "
+            "/r1/router, and not for those of all hosts.",
             "Name one such as /r1/router, or state its enclaves in sros.toml, at "
             f'[zenoh.routers."{name}"].',
         )
@@ -391,7 +391,7 @@ def _who(rights: RightsBehindRules) -> str:
 
 
 def _why_no_policy(subjects: Sequence[RightsBehindRules]) -> str:
-    """Say which subjects have rights, but are no enclaves."""
+    """Return a sentence on the subjects that have rights but are not enclaves."""
     strangers = [_who(rights) for rights in subjects if rights.rights]
     if not strangers:
         return "They allow no ROS name that anybody may publish, subscribe, call or serve."
@@ -421,9 +421,9 @@ def _left_out(subjects: Sequence[RightsBehindRules]) -> Iterator[Note]:
     if domains:
         yield Note(
             "zenoh.domains",
-            f"a policy names no domains, and has the rights of domains {', '.join(domains)}, too: "
-            "they hold in every domain of the keystore that is made from it. Make one for each "
-            "domain if they shall differ.",
+            f"a policy names no domains: the rights of domains {', '.join(domains)} hold in every "
+            "domain of a keystore that is made from it. Write one policy for each domain if their "
+            "rights differ.",
         )
     yield Note(
         "zenoh.node-names",

@@ -109,7 +109,7 @@ class DecidingWildcard(NamedTuple):
     expression: str
     """The key expression."""
     reaches: tuple[str, ...]
-    """The enclaves that a put or a query on all of it reaches."""
+    """The enclaves that a put or a query on the whole wildcard reaches."""
 
 
 class CheckedLink(NamedTuple):

@@ -76,7 +76,7 @@ def test_the_first_write_takes_it_over_and_says_so(words: tuple[str, ...], tmp_p
     words = tuple(each.format(root, policy=policy) for each in words)
     assert "adopt" in str(json.loads(sros(*words, "--dry-run", "--json").ok().out)["changes"])
     ended = sros(*words).ok()
-    assert "which ros2/sros2 made" in ended.err and "taken on trust" in ended.err
+    assert "which ros2/sros2 made" in ended.err and "are trusted" in ended.err
     assert Keystore(root).template.name == "sros2"
     found = {each["id"] for each in json.loads(sros("check", root, "--json").out)["findings"]}
     assert not found & {"keystore.settings-missing", "keystore.not-in-ledger"}

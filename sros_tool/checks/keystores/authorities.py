@@ -240,8 +240,8 @@ SETTINGS_EDITED = FindingKind(
     "keystore.settings-edited",
     WARNING,
     "settings that were edited by hand and not carried out",
-    "What is issued later may follow them, and what was issued does not: the edit takes effect in "
-    "part, and nobody was shown what it makes looser.",
+    "Files that are issued later may follow them, earlier files do not: the edit takes effect in "
+    "part, and nobody was shown which protection it weakens.",
     "sros: the ledger has the settings as sros wrote them.",
     edit_remedy("ROOT"),
 )
@@ -261,8 +261,8 @@ LEFT_ENCLAVES = FindingKind(
     "Whoever has their files has their rights until they expire, and `--robot` does not choose "
     "them any more.",
     "sros: their paths are those of a robot's enclaves, and they belong to no robot.",
-    "Revoke them by `sros revoke ROOT NAME...` if the robots are gone. Leave an enclave that was "
-    "never one of a robot.",
+    "Revoke them by `sros revoke ROOT NAME...` if the robots are gone. Keep an enclave that never "
+    "belonged to a robot.",
 )
 NOT_AS_SETTINGS = FindingKind(
     "governance.not-as-settings",
@@ -305,10 +305,10 @@ LEDGER_UNCHAINED = FindingKind(
 LEDGER_UNPROVEN = FindingKind(
     "keystore.ledger-unproven",
     WARNING,
-    "enclaves whose rights only lines of the ledger without a chain vouch for",
-    "Version 0.1 of sros wrote such lines. Whoever removes one of them can put back the "
-    "permissions from before, so `sros renew`, `sros zenoh` and `sros rotate_ca` leave these "
-    "enclaves out or refuse them.",
+    "enclaves whose rights are recorded only in ledger lines without a chain",
+    "Version 0.1 of sros wrote such lines. Whoever removes one of them can put earlier permissions "
+    "back, so `sros renew`, `sros zenoh` and `sros rotate_ca` leave these enclaves out or refuse "
+    "them.",
     "sros: each line of ledger.jsonl has the digest of the line before, ledger.p7s that of the "
     "last.",
     "If you know that nobody else could change the keystore, run `sros update_keystore ROOT "

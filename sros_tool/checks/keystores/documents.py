@@ -176,7 +176,7 @@ NO_EFFECT = FindingKind(
 UNREACHABLE = FindingKind(
     "permissions.unreachable-rule",
     WARNING,
-    "a rule that an earlier rule keeps from deciding",
+    "a rule that never decides, because an earlier rule matches first",
     "The first rule that matches decides, so this rule never decides on these topics.",
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Remove the topic, or put the narrower rule first.",
@@ -194,10 +194,10 @@ FEWER_DOMAINS = FindingKind(
     "enclave.fewer-domains",
     NOTE,
     "permissions for fewer domains than the governance",
-    "In the other domains no node of the enclave can communicate. A fleet file that gives a robot "
-    "its domain means just that.",
+    "In the other domains no node of the enclave can communicate. This is intended if a fleet file "
+    "gives the robot a domain.",
     "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; measured.",
-    "Nothing, if the robot is in this domain.",
+    "None is needed if the robot is in this domain.",
 )
 
 _MOMENT = re.compile(r"(\d{4})-\d\d-\d\dT\d\d:\d\d:\d\dZ\Z")
@@ -366,7 +366,7 @@ def _hidden(
         what = " and ".join(
             f"{direction} {some_names(topic)}" for direction, topic in topics.items()
         )
-        text = f"rule {index + 1} allows to {what} after one that denies {by}"
+        text = f"rule {index + 1} allows to {what} after a rule that denies {by}"
         yield UNREACHABLE.found(name, text, file)
 
 
@@ -392,7 +392,7 @@ class _Topics:
         return self._earlier(self._names.meeting(topic), index)
 
     def _earlier(self, topics: Iterable[str], index: int) -> str:
-        """Return the first topic in a rule before ``index`` that shares a domain with that rule."""
+        """Return the first of ``topics`` in an earlier rule that has a domain of rule ``index``."""
         for topic in topics:
             for place in self._places[topic]:
                 if place < index and _share_domains(self._rules[place], self._rules[index]):
@@ -450,7 +450,7 @@ UNAUTHENTICATED = FindingKind(
 UNAUTHENTICATED_KEPT_OUT = FindingKind(
     "governance.unauthenticated-kept-out",
     NOTE,
-    "participants without an identity may join, and the vendor keeps them out",
+    "participants without an identity are allowed, but the vendor keeps them out",
     "Fast DDS 2.9 ignores the attribute, and on Cyclone DDS messages that are protected as a whole "
     "keep them out. Another vendor may open topics to them, or refuse the document.",
     UNAUTHENTICATED.source,
@@ -530,7 +530,7 @@ NO_OTHER_TOPIC_RULE = FindingKind(
     "topic rules for the names of ROS alone",
     "A program that uses DDS without ROS can create no endpoint.",
     f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
-    "Nothing, if all programs are nodes of ROS 2. Otherwise add a rule for * at the end.",
+    "None is needed if all programs are nodes of ROS 2. Otherwise add a rule for * at the end.",
 )
 UNREACHABLE_TOPIC_RULE = FindingKind(
     "governance.unreachable-rule",

@@ -175,7 +175,7 @@ ONLY_DENIALS = FindingKind(
     NOTE,
     "an enclave that may do everything except what its deny rules name",
     "Its messages are authenticated and encrypted, but it can command every node whose topics and "
-    "services nobody thought of.",
+    "services no deny rule names.",
     EVERYTHING.source,
     EVERYTHING.remedy,
     prominent=True,
@@ -224,9 +224,9 @@ TOKEN_ON_ZENOH = FindingKind(
 PIN_FILE = FindingKind(
     "enclave.pin-file",
     WARNING,
-    "a PIN file that others can use, or that Fast DDS cannot",
-    "Whoever can read it can use the key while the token is there; a node that cannot does not "
-    "start.",
+    "a PIN file that other users can read, or that Fast DDS cannot read",
+    "Whoever can read it can use the key while the token is there; a node that cannot read it does "
+    "not start.",
     "RFC 7512, 2.4 and 4; libp11 0.4.12 (eng_parse.c), measured.",
     "Write the PIN alone into the file, with mode 0600, for the user that runs the node.",
 )
@@ -339,7 +339,7 @@ _EXPIRED = (Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED)
 
 
 def _expires_soon(window: Window, now: datetime) -> bool:
-    """Return whether ``window`` ends in 30 days, or has a third left if under 90 days long."""
+    """Return whether ``window`` ends within 30 days, or within a third of its length if shorter."""
     return window.not_after - now < min(_SOON, (window.not_after - window.not_before) / 3)
 
 

@@ -169,9 +169,9 @@ CA_KEY_ON_ROBOT = FindingKind(
 HOME_OR_ROBOT = FindingKind(
     "keystore.home-or-robot",
     ERROR,
-    "a keystore with the keys of CAs or of revoked enclaves, where an export may be meant",
-    "Where the keystore is kept, the keys belong. On a robot, an attacker who gets a CA key can "
-    "create any enclave, with any rights; and what is there cannot tell the two apart.",
+    "a keystore with keys of CAs or of revoked enclaves, which must not be on a robot",
+    "The keys belong where the keystore is kept. On a robot, an attacker who gets a CA key can "
+    "create any enclave, with any rights. The files do not show which of the two this is.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
     "Where the keystore is kept, keep the keys: `sros check ROOT` checks it, and `sros verify` is "
     "for robots. On a robot, put an export in its place (`sros distribute_key ROOT NAME TARGET` "

@@ -82,7 +82,8 @@ LESS_PROTECTED = FindingKind(
     "governance.less-than-policy",
     ERROR,
     "names that are protected less than the policy demands",
-    "The governance of the keystore decides, and was not made from this policy or changed since.",
+    "The governance of the keystore decides. It was not made from this policy, or was changed "
+    "since.",
     "DDS-Security 1.1, 9.4.1.2 (topic rules); sros: protect= in a policy.",
     "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`, which raises the protection; all "
     "processes have to be restarted with the new governance.",

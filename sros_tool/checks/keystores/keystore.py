@@ -194,7 +194,7 @@ def joined(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, bytes]:
-    """Return the keystore's signed governance, and the first enclave that has it.
+    """Return the first enclave with the keystore's signed governance, and this governance.
 
     In an export, the governance of the first enclave is returned.
     """

@@ -34,7 +34,7 @@ NOT_FOR_ROS = FindingKind(
     "No node of ROS 2 can run in this enclave: it needs ros_discovery_info, and the DDS name of a "
     "ROS topic begins with rt/, those of a service with rq/ and rr/.",
     _MAPPING,
-    "Nothing, if a program uses DDS without ROS. Otherwise give the enclave a policy: `sros "
+    "None is needed if a program uses DDS without ROS. Otherwise give the enclave a policy: `sros "
     "create_permission ROOT NAME POLICY_FILE`.",
     prominent=True,
 )
@@ -50,9 +50,9 @@ CAPITALS = FindingKind(
     "permissions.only-capitals-differ",
     WARNING,
     "two names that differ only in capitals",
-    "They are two topics: a node with the one neither hears nor reaches a node with the other.",
+    "They are two topics: nodes on one topic do not communicate with nodes on the other.",
     _MAPPING,
-    "If one topic is meant, write its name alike in the permissions of all enclaves.",
+    "If one topic is meant, write its name in the same way in the permissions of all enclaves.",
 )
 
 _PREFIXES = ("ra", "rp", "rq", "rr", "rs", "rt")

@@ -114,7 +114,7 @@ _NAMED_BY: Mapping[str, frozenset[str]] = {
         "unauthenticated-with-rtps-protection": ("governance.unauthenticated",),
     }.items()
 }
-"""By reason of a vendor's refusal: ids of other findings that already name this cause."""
+"""Reason of a vendor's refusal → ids of other findings that name the same cause."""
 
 _SAYS = {
     Outcome.CRASHES: ("crash on it", "crashes on it"),
@@ -360,8 +360,8 @@ NO_NODE = FindingKind(
     ERROR,
     "permissions with which no ordinary node of ROS 2 can start",
     "A node of rclpy or rclcpp creates these endpoints when it starts, and exits if one of them is "
-    "denied. The permissions say nothing of nodes that were created without them; "
-    "Every process needs ros_discovery_info.",
+    "denied. Nodes that were created without these endpoints do not need them, but every process "
+    "needs ros_discovery_info.",
     "ROS 2 Jazzy, rcl 9, rclcpp 28, rclpy 7 and rmw_dds_common; ~/get_type_description since Iron "
     "(REP-2016).",
     "Include common/node.xml in the profiles of its nodes (`sros check POLICY_FILE` says how), and "

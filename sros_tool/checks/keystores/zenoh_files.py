@@ -51,7 +51,7 @@ OUT_OF_DATE = FindingKind(
     "zenoh.out-of-date",
     ERROR,
     "a Zenoh configuration that does not state the rights of the signed permissions",
-    "DDS and Zenoh enforce different rights: one of them an earlier policy.",
+    "DDS and Zenoh enforce different rights: one of them enforces an earlier policy.",
     _SOURCE,
     _AGAIN,
 )
@@ -76,7 +76,7 @@ SHARED_NODE = FindingKind(
     "zenoh.shared-node",
     WARNING,
     "a node that several enclaves may announce in the graph",
-    "rmw_zenoh takes a node out of the graph without a look at its enclave: a process of one of "
+    "rmw_zenoh removes a node from the graph without checking its enclave: a process of one of "
     "these enclaves can remove or imitate the node of another one, whose topics and services are "
     "then not found, although its data pass.",
     "rmw_zenoh (graph_cache.cpp); sros (docs/zenoh.md).",
@@ -89,8 +89,8 @@ CANNOT_BE_MADE = FindingKind(
     "zenoh.cannot-be-made",
     ERROR,
     "a Zenoh network whose configurations cannot be made",
-    "The keystore's settings have one, and its permissions or its enclaves do not fit it, so "
-    "nothing keeps the files in step.",
+    "The keystore's settings define the network, but its permissions or its enclaves do not fit "
+    "it, so the files are not kept up to date.",
     _SOURCE,
     "Run `sros zenoh ROOT --dry-run` and do what it says.",
 )
@@ -108,9 +108,9 @@ _KINDS = {
 
 
 def check_own_zenoh(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """Yield findings about an enclave's Zenoh configurations, if it has any, by its own files.
+    """Yield findings about an enclave's Zenoh configurations, compared with its permissions.
 
-    For a keystore with settings of its network, `check_network` finds them, and more.
+    In a keystore with Zenoh settings, `check_network` reports these findings, and more.
     """
     settings = enclave.keystore.settings
     if settings and settings.zenoh:
