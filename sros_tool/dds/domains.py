@@ -111,8 +111,8 @@ class DomainSet:
     ) -> tuple[int, ...]:
         """Return one domain for every combination of sets that a domain can be in, sorted.
 
-        Only those in a ``listed`` set are returned, unless an end is open: vendors differ in which
-        domains these are.
+        Only domains in a ``listed`` set are returned, unless a range has an open end, which vendors
+        read differently.
         """
         sets = dict.fromkeys((*listed, *others))
         borders = {0}

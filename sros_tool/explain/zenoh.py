@@ -603,7 +603,7 @@ class ZenohEvaluator:
         checks: Sequence[Check],
         reached: Sequence[Reached],
     ) -> Iterator[DecidingWildcard]:
-        """Yield the wildcards that decide, with the enclaves that a message on all of it reaches.
+        """Yield the deciding wildcards, with the enclaves that a message on the wildcard reaches.
 
         Only a put or a query can have such a key; it arrives where every rule is as wide.
         """

@@ -129,7 +129,7 @@ class RuleVerdict(NamedTuple):
 
     @property
     def allowed(self) -> bool:
-        """Whether the rules allow it."""
+        """Whether the rules allow the access."""
         return self.outcome is Outcome.ALLOWED
 
 
@@ -254,7 +254,7 @@ class _GrantRules:
         return None
 
     def safe_names(self) -> NameSet:
-        """Return the topics over which there is no `crash`."""
+        """Return the topics for which `crash` returns None."""
         from sros_tool.automata import NameSet
 
         groups = groupby(self._entries, key=lambda entry: entry.criteria)
@@ -262,10 +262,10 @@ class _GrantRules:
         return _every_topic() - NameSet.union(filter(None, crashing))
 
     def _crashing(self, group: Sequence[_Entry]) -> NameSet | None:
-        """Return the topics over which a criteria crashes the process; None if it never does.
+        """Return the topics on which a criteria crashes the process; None if it never does.
 
-        Only the first matching topic of a criteria counts: one without text crashes the process if
-        no other one of the criteria stands before it and matches.
+        Only the first matching ``<topic>`` of a criteria counts: an empty ``<topic>`` crashes the
+        process unless an earlier one matches.
         """
         before = list(takewhile(lambda entry: entry.expression, group))
         return _every_topic() - self._names_of(before) if len(before) < len(group) else None
@@ -564,7 +564,7 @@ class Access:
         return self._endpoint(AccessVerb.SUBSCRIBE, topic, partitions)
 
     def governed(self, topic: str) -> Decision | None:
-        """Return why the governance lets no endpoint of ``topic`` be created; None if it may."""
+        """Return the decision by which the governance forbids endpoints of ``topic``, or None."""
         rule = self._governed.topic_rule(topic)
         if rule is None:
             return self._without_topic_rule(topic)
@@ -576,7 +576,7 @@ class Access:
     def topics(self, verb: AccessVerb) -> NameSet:
         """Return the topics without wildcard characters on which `decide` allows ``verb``.
 
-        That is in the default partition, and whatever the length of their names.
+        Topics are decided in the default partition, and names of any length count.
         """
         from sros_tool.automata import NameSet
 
@@ -735,8 +735,8 @@ class Access:
 
         Peers check only the direction of the refused participant: read access for its readers,
         write access for its writers.  With access control in the other direction, the refused
-        participant itself checks the rights of its peer, for which it needs the end of the
-        handshake: it finds those endpoints that either side opens later (Cyclone DDS 0.10.2,
+        participant itself checks the rights of its peer, which it knows only after the handshake.
+        So it matches endpoints that either side opens later (Cyclone DDS 0.10.2,
         `q_omg_security_check_remote_writer_permissions` and `.._reader_permissions`).
         """
         domain = self._governed.rule

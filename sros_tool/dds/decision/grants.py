@@ -36,7 +36,7 @@ def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
 def also_fitting(
     traits: VendorTraits, certified: Mapping[str, str], granted: Mapping[str, Collection[str]]
 ) -> dict[str, tuple[str, ...]]:
-    """Map enclaves to other enclaves whose permissions their certificate matches, too.
+    """Map each enclave to the other enclaves whose permissions fit its certificate.
 
     ``certified`` are the subjects of certificates, ``granted`` those of the grants.
     """

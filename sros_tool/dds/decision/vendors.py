@@ -133,7 +133,7 @@ class VendorTraits:
     reader: DocumentReader = DocumentReader.STANDARD
     style: Style = Style.FNMATCH
     governance_both_ways: bool = False
-    """A topic's name, taken as an expression, is also matched against governance expressions."""
+    """A topic rule also applies if the topic's name, used as a pattern, matches its expression."""
     trims_texts: bool = False
     """Spaces around the text of an element do not count."""
     subjects: Subjects = Subjects.EXACT
@@ -166,7 +166,7 @@ class VendorTraits:
     The first rule that names the topic, for either direction, decides.
     """
     asks_both_directions: bool = False
-    """A topic that is created has a right if one direction has it, each by its own first rule."""
+    """Creating a topic needs a right in one direction; each direction has its own first rule."""
     always_needs_allow_rule: bool = False
     """Without any allow rule the participant does not start, even without join control."""
     needs_domain_rule: bool = True
@@ -174,7 +174,7 @@ class VendorTraits:
     shares_open_topics: bool = False
     """A participant that peers refuse still exchanges unprotected topics with them (measured).
 
-    Only access control in its own direction stops that.
+    Access control in the direction of the participant prevents this.
     """
     refuses_open_rtps: bool = False
     """Unauthenticated participants together with RTPS protection are refused."""
@@ -186,7 +186,7 @@ class VendorTraits:
     verifies_authorities: bool = False
     """The first certificate of a CA file is verified, strictly, when it is loaded.
 
-    If its hash is one that the vendor does not take, the process crashes, because it was freed.
+    If the vendor does not accept its hash, the process crashes, because it uses freed memory.
     """
     verifies_policies: bool = False
     """Certificate policies and the root CA's own signature are verified, too (Fast DDS)."""
