@@ -175,7 +175,7 @@ class Fault(Enum):
     TOKEN_URI = (
         "token-uri",
         "a key.p11 that does not name a key on a token",
-        "No node of ROS 2 finds the key, or whoever can read the file has the PIN.",
+        "Either no node of ROS 2 finds the key, or whoever can read the file has the PIN.",
         "RFC 7512; rmw_dds_common of ROS 2 Jazzy (security.cpp); libp11 0.4.12 (eng_parse.c).",
         "Write one line into {path}: pkcs11:token=TOKEN;object=LABEL;type=private, and for a file "
         "with the PIN, ?pin-source=file:PATH after it.",
@@ -216,8 +216,8 @@ class Fault(Enum):
         "crl-partial",
         "a revocation list that is not the whole list of its CA",
         "No certificate can be verified with it, so every participant is refused. OpenSSL uses no "
-        "list of changes, of one place or of some certificates, and none with a critical extension "
-        "that it does not know.",
+        "delta list, no list for one distribution point or for some certificates, and no list with "
+        "an unknown critical extension.",
         "RFC 5280, 5.2; OpenSSL 3 (x_crl.c, x509_vfy.c); Fast DDS 2.9.1, Cyclone DDS 0.10.2; "
         "measured.",
         _CRL,
@@ -267,10 +267,10 @@ class Fault(Enum):
         "a document that no CA signed, and that vendors accept",
         "Cyclone DDS 0.10.2 and Fast DDS 2.9.1 accept every signer whose certificate the "
         "permissions CA issued. If that CA also issues identities, each enclave can sign rights "
-        "for itself: whoever has its key gave it these.",
+        "for itself: whoever has its key signed these.",
         "CVE-2023-24011; Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
         "Unless you signed it so on purpose, take the key of the signer for stolen: `sros revoke "
-        "{root} {enclave}`. If one CA is for both, give identities and documents a CA each, as "
+        "{root} {enclave}`. If one CA is for both, use separate CAs for identities and documents, as "
         "keystore.one-authority says.",
         {"governance.p7s": f"Find out who signed it. {_GOVERNANCE}"},
     )
@@ -349,8 +349,8 @@ class Fault(Enum):
     CERTIFICATE_CRASH = (
         "certificate-crash",
         "a certificate that crashes a vendor",
-        "Fast DDS ends at a certificate with an empty subject: its own, and that of a peer, before "
-        "it verifies it.",
+        "Fast DDS crashes on a certificate with an empty subject: its own, or that of a peer "
+        "before it is verified.",
         "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp); measured.",
         "Issue a certificate with the common name of the enclave.",
     )

@@ -209,8 +209,8 @@ class Folder:
     def close_to_others(self, path: str) -> None:
         """Remove all permissions of group and others from a file or folder (chmod go=).
 
-        It stays as it is if it belongs to somebody else than this folder, or has a second name,
-        which may be one elsewhere.
+        It stays as it is if it belongs to somebody else than this folder, or has another hard link,
+        which may be elsewhere.
         """
         parent, name = self._at(path)
         with self._naming(path):

@@ -1,8 +1,8 @@
 """A launch action of ROS 2 that starts each node in the enclave that its policy names.
 
 In Python ``SecuredNodes(keystore="keystore", policy="policy.xml")`` from this module, in XML
-``<secured_nodes keystore="keystore" policy="policy.xml"/>``, before the nodes: it holds for what
-follows in its launch file and group, also in included files.
+``<secured_nodes keystore="keystore" policy="policy.xml"/>``, before the nodes: it applies to the
+nodes that follow in its launch file and group, also in included files.
 
 This is the only module that imports ``launch``, and only ``launch`` imports it: by the entry point
 ``launch.frontend.launch_extension`` whenever it reads an XML or YAML file.
@@ -30,10 +30,10 @@ _PREFIX, _FILTER = "launch-prefix", "launch-prefix-filter"
 class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where it is missing
     """Launch action that starts every later process with ``sros run --policy``, in its enclave.
 
-    It sets the prefix of commands, in front of one that is already there, such as of a debugger.
-    Launch itself, and a process with a prefix of its own, get variables with which no node starts,
-    or those of ``enclave``: launch needs one where it talks to nodes, as with lifecycle nodes and
-    composable nodes.
+    It sets the prefix of commands, in front of an existing prefix such as a debugger's.  Launch
+    itself, and processes with a prefix of their own, get variables with which no node starts, or
+    the variables of ``enclave``.  Launch needs an enclave if it talks to nodes, such as lifecycle
+    nodes and composable nodes.
     """
 
     def __init__(

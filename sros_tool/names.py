@@ -215,7 +215,8 @@ def expand(name: str, ns: str, node: str) -> str:
 def has_parts(text: str, parts: Sequence[str]) -> bool:
     """Return whether ``text`` matches ``parts`` joined by ``*``: the first at its start, and so on.
 
-    Those are at least two, and do not overlap: what is between the ``*`` of an expression.
+    There are at least two parts, the texts between the ``*`` of an expression.  The matches of
+    parts do not overlap.
     """
     first, *middle, last = parts
     at, end = len(first), len(text) - len(last)

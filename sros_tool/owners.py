@@ -39,8 +39,8 @@ def other_writers(state: os.stat_result, trusted: frozenset[int]) -> str:
 def replaceable_on_the_way(path: Path, trusted: frozenset[int]) -> Iterator[tuple[Path, str]]:
     """Yield the folders and links above ``path`` through which others can replace it, and why.
 
-    A folder in which only the owner of a file can rename it (sticky, as ``/tmp``) counts only if
-    others own what is in it on the way.
+    A sticky folder such as ``/tmp``, in which only the owner of a file can rename it, counts only
+    if others own the next part of the path in it.
     """
     for step, state in _way(path):
         kept = state.st_mode & stat.S_ISVTX and state.st_uid in trusted

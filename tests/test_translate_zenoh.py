@@ -161,7 +161,7 @@ def test_a_right_is_exactly_these_messages(right: str, tmp_path: Path) -> None:
 
 def test_wildcards_whose_keys_double_with_each_are_refused_at_once(tmp_path: Path) -> None:
     """Forty wildcards in a part of a name are a million million key expressions."""
-    with pytest.raises(PolicyError, match="cannot be said to Zenoh"):
+    with pytest.raises(PolicyError, match="cannot be expressed in Zenoh"):
         remote_rights(enclave(tmp_path, publish("/" + "a*" * 40 + "a")), 0)
 
 
@@ -174,7 +174,7 @@ def test_a_name_that_is_no_key_of_zenoh_is_refused(name: str, qualifier: Qualifi
         for each, text in ((ALLOW, "/c"), (qualifier, name))
     ]
     assert remote_of("/n", {0: stated[:1]})
-    with pytest.raises(PolicyError, match="cannot be said to Zenoh"):
+    with pytest.raises(PolicyError, match="cannot be expressed in Zenoh"):
         remote_of("/n", {0: stated})
 
 
@@ -244,7 +244,7 @@ def test_denials_are_subtracted(
     [
         (
             publish("/*") + "\n" + DENY.format("publish", "/*image*"),
-            "policy.xml:2: DENY publish /*image* cannot be said to Zenoh, because line 1 of",
+            "policy.xml:2: DENY publish /*image* cannot be expressed in Zenoh, because line 1 of",
         ),
         (
             publish("/*")
@@ -253,7 +253,7 @@ def test_denials_are_subtracted(
                 DENY.format("publish", each)
                 for each in ("/front_camera/*", "/*/set_parameters", "/*/describe_parameters")
             ),
-            "policy.xml:2: DENY publish /front_camera/* cannot be said to Zenoh, because line 1 of",
+            "policy.xml:2: DENY publish /front_camera/* cannot be expressed in Zenoh, because line 1 of",
         ),
         ("\n" + publish("/a???"), "policy.xml:2: the name /a???"),
         (publish("/[!a][!b][!c]"), "policy.xml:1: the name /[!a][!b][!c]"),

@@ -1,10 +1,9 @@
 """Choose enclaves for the parts of a scenario, by their signed permissions.
 
-The choice depends on the files of all enclaves.  An enclave that may only do what a part needs
-shows best whether more is denied, so it is preferred; and the enclave that may do most without
-having been given a topic by its name gets a part of its own, so that one enclave with wide
-permissions among many narrow ones does not go unseen.  Enclaves with faulty or revoked files play
-no part, and get a row of their own.
+The choice depends on the files of all enclaves.  An enclave with only the rights that a part needs
+is preferred, because it shows best whether more is denied.  The enclave with the widest permissions
+gets a part of its own, so that one such enclave among many narrow ones is tried, too.  Enclaves
+with faulty or revoked files play no part, and get a row of their own.
 """
 
 from __future__ import annotations
@@ -93,11 +92,11 @@ class CastMember(NamedTuple):
 class UserKeystore(NamedTuple):
     """A user's keystore to attack, with its template, domains, and cast.
 
-    ``topic`` is the attacked ROS topic, ``service`` the attacked ROS service ("": none).
-    ``grants`` has the grant of each enclave of the cast, ``why`` the reason for the choice of some
-    parts.  ``rows`` are for the widest enclaves, and for those whose faulty or revoked files allow
-    them no part.  ``enclaves`` is the number of all enclaves, of which ``elsewhere`` have their key
-    elsewhere; ``not_tried`` says what would have to be tried for a proof, and cannot be.
+    ``topic`` is the attacked ROS topic, ``service`` the attacked ROS service ("": none). ``grants``
+    has the grant of each enclave of the cast, ``why`` the reason for the choice of some parts.
+    ``rows`` are for the widest enclaves, and for those whose faulty or revoked files allow them no
+    part.  ``enclaves`` is the number of all enclaves, of which ``elsewhere`` have their key
+    elsewhere; ``not_tried`` lists tests that a proof needs and that cannot run.
     """
 
     root: Path
@@ -146,8 +145,8 @@ class UserKeystore(NamedTuple):
     def opened(self, row: Row, topic: str) -> Row:
         """Return a row that expects success if the attacker's permissions allow the attack.
 
-        ``topic`` is the attacked ROS topic.  Nobody else takes part then: the success proves
-        itself, and a second server would answer in the attacker's place.
+        ``topic`` is the attacked ROS topic.  Then no other party takes part: success needs no
+        control, and another server could answer in place of the attacker.
         """
         attacker = next((party for party in row.parties if party.intruder), None)
         if row.expected is not RowStatus.REFUSED or attacker is None:
@@ -227,11 +226,12 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime
 class _Enclaves(NamedTuple):
     """The enclaves of a keystore, sorted by what their files allow the demo to do.
 
-    ``rights`` are the grants of sound enclaves.  ``faulty`` has the first fault of each enclave
-    that the others do not accept, ``revoked`` whether its own list names a revoked enclave.
-    ``unreadable`` have files that no process should be let read, as one of the kernel without end.
-    ``elsewhere`` are those whose key is not in the keystore.  ``without_list`` lack the newest
-    revocation list of their keystore; ``other_governance`` have another governance than the rest.
+    ``rights`` are the grants of sound enclaves.  ``faulty`` maps enclaves that the others do not
+    accept to their first fault; ``revoked`` maps revoked enclaves to whether their own list names
+    them.  ``unreadable`` have files that are not safe to read, such as an endless file of the
+    kernel. ``elsewhere`` are enclaves whose key is not in the keystore.  ``without_list`` lack the
+    newest revocation list of their keystore; ``other_governance`` have another governance than the
+    rest.
     """
 
     rights: Mapping[str, Grant]
@@ -440,8 +440,8 @@ def _widest(
 ) -> Iterator[tuple[str, tuple[str, str]]]:
     """Yield part, enclave and reason for the enclaves with the widest permissions.
 
-    An enclave that names the topic or service was given it, and counts only if it may also use what
-    nobody named.  No part is for an enclave that another row tries with the same attack.
+    An enclave whose permissions name the topic or service counts only if it may also use names that
+    no permissions state.  An enclave gets no part if another row tries it with the same attack.
     """
     for part, right, name, others in (
         (WIDEST_PUBLISHER, "publish", topic, ("talker", "listener", "guest")),
@@ -470,10 +470,7 @@ def _widest(
 
 
 def _width(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
-    """Return how wide a grant is, as a tuple to compare: the greatest tuple is the widest.
-
-    Tuples compare as the grants do: the greatest is the widest.
-    """
+    """Return how wide a grant is, as a sort key: the widest grant has the greatest key."""
     size = sum(
         len(criteria.topics)
         for rule in grant.rules

@@ -62,9 +62,7 @@ class Diagnosis(NamedTuple):
 
     @property
     def ros_enforces(self) -> bool | None:
-        """Whether the RMW of ROS nodes enforces security; null without an RMW or a result.
-        it could not be tried.
-        """
+        """Whether the RMW of ROS nodes enforces security; null without an RMW or a result."""
         return self.ros.enforces if self.ros else None
 
     @property

@@ -225,7 +225,7 @@ def create_keystores(
 
 
 def create_scenario_keystore(root: Path, scenario: Scenario, spec: KeystoreSpec) -> None:
-    """Create a keystore with the enclaves of a scenario, and return its path."""
+    """Create a keystore with the enclaves of a scenario."""
     create_keystore(root, template=spec.template, domains=spec.domains, now=spec.now)
     if scenario.policy is not None:
         generate_artifacts(root, policies=[scenario.policy(spec.topic)], now=spec.now)

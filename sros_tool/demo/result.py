@@ -149,8 +149,8 @@ class RowResult:
     def untried(self) -> bool:
         """Whether an attack that has to fail was not tried: it may succeed.
 
-        A row without its defence, or of an attack that is known to succeed or was accepted, proves
-        nothing of a keystore; and what does not apply to it cannot succeed.
+        Not counted are rows that prove nothing about a keystore (without the defence, or of an
+        attack that is known to succeed or was accepted), and rows that do not apply to it.
         """
         if self.observed is not RowStatus.SKIPPED or not self.applies or self.removed:
             return False
@@ -236,7 +236,7 @@ class _Case:
         self.talker = record.parties.get(claim.talker, self.subject)
 
     def result(self, holds: bool, detail: str) -> _Finding:
-        """Return the status for the claim's relation being observed, or not."""
+        """Return the finding that the claim's relation ``holds``, or that it does not."""
         return _Finding(STATUS_OF[self.claim.relation, holds], detail)
 
     def sent(self, party: PartyRecord) -> list[Event]:
@@ -545,7 +545,7 @@ class ScenarioResult:
     def not_tried(self) -> tuple[str, ...]:
         """Tests that a proof of the user's keystore needs and the demo did not run.
 
-        The demo's own keystores are to show what works, and prove nothing of other ones.
+        The demo's own keystores only show what works, and prove nothing about others.
         """
         if self.attacked is None:
             return ()
@@ -595,9 +595,7 @@ class DemoResult:
 
     @property
     def as_expected(self) -> bool:
-        """Whether all rows are as expected, and a user's keystore is proved: then exit status is 0.
-        0.
-        """
+        """Whether all rows are as expected, and a user's keystore is proved (exit status 0)."""
         return all(scenario.as_expected for scenario in self.scenarios)
 
     @property

@@ -68,8 +68,8 @@ _GRACE = 0.3
 class _Patience(NamedTuple):
     """Time limits in seconds for slow machines; an undecided row is tried again with more.
 
-    ``lifetime`` is that of a short-lived certificate, ``connect`` how long a process tries to
-    connect that is expected to be refused.
+    ``lifetime`` is the lifetime of a short-lived certificate.  A process that should be refused
+    tries to connect for ``connect`` seconds.
     """
 
     lifetime: int
@@ -459,8 +459,8 @@ async def _replay_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
 async def _forge_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
     """Suspend a talker, then send changed copies of its last packet of every length.
 
-    Which of them has a message, and where, an attacker need not know: every sequence number comes
-    with a bit changed in each place, since a reader drops what the change made malformed.
+    An attacker need not know which packet has a message, or where.  For every sequence number,
+    there are copies with a bit changed in each place, because a reader drops malformed copies.
     """
     talker.hold()
     await asyncio.sleep(_GRACE)

@@ -242,8 +242,7 @@ def with_changed_bit(packet: bytes, later: int, place: int, places: int) -> byte
 
     The change does not depend on what can be read: an attacker without keys can do as much to an
     encrypted packet.  The sequence number of a readable DATA submessage is raised by ``later``, so
-    that a DataReader takes it for a later message of the writer (RTPS 2.3 §9.4.5.3).  Returns None
-    if the packet has no content.
+    that a DataReader takes it for a later message of the writer (RTPS 2.3 §9.4.5.3).
     """
     begin = (packet[0] & 0x0F) * 4 + 8 + _RTPS_HEADER
     if len(packet) <= begin:

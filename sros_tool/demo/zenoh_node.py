@@ -58,7 +58,7 @@ _ACTION_TYPES = {
     "status": ("action_msgs::msg::dds_::GoalStatusArray_", _NO_HASH),
 }
 _QOS = "::,7:,:,:,,"
-"""The QoS in a graph token: keep the last 7, and all else as rmw_zenoh has it by default."""
+"""The QoS in a graph token: keep the last 7, else the defaults of rmw_zenoh."""
 _CDR_HEADER = b"\0\1\0\0"
 _DEFAULTS: Mapping[bool, Mapping[str, Any]] = {
     True: {"mode": "router", "listen": {"endpoints": ["tcp/localhost:7447"]}},
@@ -68,7 +68,7 @@ _DEFAULTS: Mapping[bool, Mapping[str, Any]] = {
         "connect": {"endpoints": ["tcp/localhost:7447"]},
     },
 }
-"""What matters here of the defaults of rmw_zenoh, for a router and for a session."""
+"""The defaults of rmw_zenoh that matter here, for a router (True) and a session (False)."""
 
 
 def _configuration(variables: Mapping[str, str], *, router: bool) -> zenoh.Config:
@@ -216,9 +216,10 @@ class _ZenohNode:
         return [token.split("/")[9] for token in tokens]
 
     def erase(self, name: str) -> int:
-        """Take nodes of this name out of the graph, and return of how many it was tried.
+        """Try to remove the nodes of this name from the graph, and return their number.
 
-        The token of a node ends, under the enclave of this process, as if the node did.
+        Withdraws the token of each node, with the enclave of this process, as if the node had
+        ended.
         """
         others = [
             chunks
@@ -252,7 +253,7 @@ def _kind_of(token: str) -> str:
 
 
 def _node_of(token: str) -> tuple[str, ...]:
-    """Return what names a node in its tokens: session, number, namespace and name."""
+    """Return the parts of a token that identify its node: session, number, namespace and name."""
     chunks = token.split("/")
     return (*chunks[2:4], *chunks[7:9])
 

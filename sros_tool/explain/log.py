@@ -425,8 +425,8 @@ def _dropped(lines: Iterable[str], root: str) -> Iterator[LogFinding]:
             f"{first.message} ({'ingress' if first.ingress else 'egress'}) on {first.key}",
             process,
             first.name,
-            f"{'' if first.name else 'the process with the zid '}{who} may not {what}, by the "
-            "rules of the process that logged it: it drops the message, and nobody else learns it",
+            f"{'' if first.name else 'the process with the zid '}{who} may not {what}: the process "
+            "that logged this drops the message by its rules, and reports it nowhere else",
             _of_dropped(first, what, root),
             zenoh=True,
         )
@@ -435,8 +435,8 @@ def _dropped(lines: Iterable[str], root: str) -> Iterator[LogFinding]:
 def _of_dropped(dropped: DroppedMessage, what: str, root: str) -> str:
     if not dropped.name:
         return (
-            "The line that says `on Interface(...)+CertCommonName(...)` of this zid has its name; "
-            "without one, no rule is for it."
+            "The log line with `on Interface(...)+CertCommonName(...)` and this zid has the name "
+            "of the process. No rule applies to a process without a name."
         )
     asked = what if name_of_key(dropped.key)[1] else ""
     if not asked:

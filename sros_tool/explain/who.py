@@ -221,9 +221,10 @@ def follow_reach(source: RightsSource, enclave: str, *, infrastructure: bool) ->
 
 
 def _rights_of_router(source: RightsSource, router: str) -> Iterator[Right]:
-    """Yield what a router may say and hear.
+    """Yield the rights of a router, as rights to send and receive.
 
-    That is the other end of the rights of its enclaves, and what other routers let it say and hear.
+    They are the opposite of the rights of its enclaves, and what other routers let it send and
+    receive.
     """
     links = source.links
     for right in source.rights:

@@ -1,7 +1,8 @@
-"""What Zenoh decides in a keystore: by the configurations in it as they are, link by link.
+"""Decide as Zenoh does, by the configurations in a keystore as they are, link by link.
 
-Zenoh refuses nothing with an error: whoever denies a message drops it.  In client mode the router
-and the session itself decide on a right, in peer mode the sessions of all other enclaves.
+Zenoh reports no denial as an error: a process that denies a message drops it.  In client mode, the
+router and the session itself decide on a right; in peer mode, the sessions of all other enclaves
+decide.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ from sros_tool.zenoh.document import ZenohEndpoint, parse_configuration
 from sros_tool.zenoh.key_expressions import includes
 
 _OF_TLS = (CERTIFICATE_FILE, KEY_FILE, IDENTITY_CA_FILE)
-"""The files of an enclave that a process on Zenoh needs; those of DDS do not count."""
+"""The files of an enclave that a process on Zenoh needs, without the files for DDS."""
 
 
 class _Outcome(StrEnum):
@@ -67,7 +68,7 @@ class _Outcome(StrEnum):
 
     ALLOWED = "allowed"
     DROPPED = "dropped"
-    """They vanish on a link, without an error for anybody."""
+    """The messages vanish on a link, and no process gets an error."""
     REFUSED = "refused"
     """The process opens no session, or gets no link."""
 
@@ -94,7 +95,7 @@ class ZenohFile(NamedTuple):
 
 @shows("enclave", "problem", null_if_empty=("problem",))
 class Reached(NamedTuple):
-    """An enclave."""
+    """An enclave at the other end of a right."""
 
     enclave: str
     """The enclave."""
@@ -104,7 +105,7 @@ class Reached(NamedTuple):
 
 
 class DecidingWildcard(NamedTuple):
-    """A key expression."""
+    """A key expression with a wildcard that decides."""
 
     expression: str
     """The key expression."""
@@ -113,7 +114,7 @@ class DecidingWildcard(NamedTuple):
 
 
 class CheckedLink(NamedTuple):
-    """A link."""
+    """A link on which a right is decided."""
 
     enclaves: tuple[str, str]
     """The enclaves at both ends."""
@@ -178,17 +179,17 @@ class ZenohAnswer:
 
     @property
     def of_router(self) -> bool:
-        """Whether the enclave is that of the router."""
+        """Whether the enclave is a router's."""
         return self.mode is Mode.ROUTER
 
     @property
     def dropped(self) -> Check | None:
-        """The check that drops a message, or None; that of data if there are several."""
+        """The check that drops a message, or None; of several checks, the one that drops data."""
         return _first((check for check in self.checks if not check.allowed), self.enclave)
 
     @property
     def deciding(self) -> Check | None:
-        """The check whose rule is the answer; None if nothing was checked."""
+        """The check whose rule decides the answer; None if nothing was checked."""
         return self.dropped or _first(self.checks, self.enclave)
 
     @property
@@ -210,7 +211,7 @@ class ZenohAnswer:
     spread=("in_brief",),
 )
 class ZenohEnclaveOutcome(NamedTuple):
-    """An enclave."""
+    """The decision of Zenoh for one enclave."""
 
     enclave: str
     """The enclave."""
@@ -221,7 +222,7 @@ class ZenohEnclaveOutcome(NamedTuple):
 
 
 class WhoOnZenoh(NamedTuple):
-    """The enclaves that Zenoh lets do it."""
+    """The decision of Zenoh for every enclave of a keystore."""
 
     question: str
     """The question."""
@@ -232,14 +233,14 @@ class WhoOnZenoh(NamedTuple):
     domain: int
     """The ROS domain."""
     enclaves: Sequence[ZenohEnclaveOutcome]
-    """All enclaves; the router's may do what passes through it."""
+    """All enclaves; the enclave of the router may do whatever passes through the router."""
 
 
 class ZenohEvaluator:
     """An evaluator of questions about the enclaves of one keystore, reusable for many questions.
 
-    Raises `KeystoreError` if the keystore has no configurations of Zenoh, none of a router, or
-    those of routers that do not know each other: what they enforce cannot be known then.
+    Raises `KeystoreError` if the keystore has no configurations of Zenoh, no configuration of a
+    router, or routers that are not connected to each other: what they enforce is then unknown.
     """
 
     def __init__(self, keystore: Keystore, *, at: datetime, domain: int) -> None:
@@ -255,7 +256,7 @@ class ZenohEvaluator:
         self.routers = self._routers()
 
     def _routers(self) -> dict[str, ZenohFile]:
-        """Return the routers' files by their enclaves: of one router, or of connected ones."""
+        """Map the enclaves of routers to their files: one router, or several connected routers."""
         routers = {
             name: self._file(name, ROUTER_FILE)
             for name in self.names
@@ -291,11 +292,11 @@ class ZenohEvaluator:
     def answer(
         self, enclave: str, question: Question, *, reach: bool = True, brief: bool = False
     ) -> ZenohAnswer:
-        """Return the answer for one enclave; ``reach`` says whether to look at all others.
+        """Return the answer for one enclave; with ``reach``, also the enclaves that it reaches.
 
-        A ``brief`` answer says neither which files are unsigned, nor asks peers: for these the
-        router's file has the same rights.  If the router drops the message, it reads no more of the
-        enclave than how its file begins.
+        A ``brief`` answer does not list unsigned files.  It reads the router's file in place of the
+        peers' files, which have the same rights.  If the router drops the message, it reads only
+        the beginning of the enclave's file.
         """
         if enclave not in self.names:
             raise no_such_enclave(self.keystore, enclave, self.names)
@@ -339,9 +340,10 @@ class ZenohEvaluator:
         )
 
     def _dropped_by_router(self, enclave: str, question: Question) -> ZenohAnswer | None:
-        """Return the answer if the router drops the message itself, whatever the enclave's files.
+        """Return the answer if the router drops the message, whatever the enclave's files state.
 
-        Return None if it does not, or if the enclave's file does not begin as sros writes it.
+        Return None if the router does not drop it, or if the enclave's file does not begin as sros
+        writes it.
         """
         router = self._router_of(enclave)
         path = enclave_path(self.root, enclave) / SESSION_FILE
@@ -362,15 +364,15 @@ class ZenohEvaluator:
         return ZenohAnswer(enclave, question, begun.mode, outcome, text, checks)
 
     def _why(self, check: Check | None) -> str:
-        """Return the check that decides, its reason, and the file that has it, as a clause."""
+        """Return a clause with the deciding check, its reason, and the file with its rule."""
         assert check
         file = self._file_of(check.enforcer)
         return f"{check}: {check.decision.why}, in {file} of {check.enforcer}"
 
     def out_of_date(self, answer: ZenohAnswer) -> tuple[str, ...] | None:
-        """Return the files that decide an answer and are not what the permissions ask for.
+        """Return the files that decide an answer and do not match the permissions.
 
-        Return None if that cannot be told, such as in an export.
+        Return None if that is unknown, as in an export.
         """
         try:
             network = self.keystore.template.zenoh
@@ -398,7 +400,7 @@ class ZenohEvaluator:
         )
 
     def _other_ends(self, answer: ZenohAnswer) -> set[str]:
-        """Return the enclaves with which a peer may communicate about the question by its file."""
+        """Return the enclaves with which a peer may communicate for the question, by its file."""
         own = self._file(answer.enclave, self._file_of(answer.enclave)).process
         wanted = self._rights(answer.enclave, answer.question)
         if own is None or not wanted:
@@ -466,10 +468,10 @@ class ZenohEvaluator:
     # ── decisions ──────────────────────────────────────────────────────────────────────────
 
     def _of_router(self, answer: ZenohAnswer, own: ZenohProcess, *, brief: bool) -> ZenohAnswer:
-        """Return the answer for the router's key: its process may do what passes through it.
+        """Return the answer for a router's enclave, which may do what passes through the router.
 
-        Every session that may hear what is asked for believes it, and beside the router a second
-        process with its key.
+        Every session that may receive the message accepts it from the router, and from a second
+        process with the router's key.
         """
         wanted = self._rights(answer.enclave, answer.question)
         believing: list[Reached] = []
@@ -487,7 +489,7 @@ class ZenohEvaluator:
                 if brief:
                     break
         if not believing:
-            text = "it passes on what others say, and no session lets it do that"
+            text = "it forwards the messages of others, and no session allows it to do that"
             return replace(answer, outcome=_Outcome.DROPPED, text=text)
         checks = tuple(
             check
@@ -512,10 +514,10 @@ class ZenohEvaluator:
     def _deciding(
         self, own: ZenohProcess, router: ZenohProcess, wanted: Sequence[Right], *, brief: bool
     ) -> tuple[Check, ...]:
-        """Return the checks that decide on an enclave's rights: on the link with the router.
+        """Return the checks that decide on an enclave's rights on the link with the router.
 
-        The sessions of peers state the rights that both ends have.  So where the router denies
-        something, it is looked for a peer whose file allows it all the same.
+        The files of peers state the rights that both ends have.  So if the router denies a right,
+        the peers are searched for one whose file allows it.
         """
         checks = tuple(self._decided(own, router, wanted))
         if own.mode is not Mode.PEER or brief or all(each.allowed for each in checks):
@@ -546,7 +548,7 @@ class ZenohEvaluator:
             yield from (*delivery.checks, *delivery.replies)
 
     def _delivery(self, way: Route, right: Right, key: str = "") -> Delivery:
-        """Return the delivery for a right of the first process of a way, on its key or another."""
+        """Return the delivery for a right of a route's first process, on its own key or ``key``."""
         key = key or f"{self.domain}{right.name}/{ANY_TYPE}"
         match right.right:
             case "publish":
@@ -559,7 +561,7 @@ class ZenohEvaluator:
                 return call(way[::-1], key)
 
     def _graph(self, own: ZenohProcess, other: ZenohProcess) -> tuple[Delivery, Delivery]:
-        """Return how a node is announced in the graph, and how it sees all others."""
+        """Return the deliveries by which a node is announced in the graph, and sees all others."""
         everything = f"@ros2_lv/{self.domain}/**"
         router = self._router_of(own.name).process
         assert router
@@ -605,7 +607,7 @@ class ZenohEvaluator:
     ) -> Iterator[DecidingWildcard]:
         """Yield the deciding wildcards, with the enclaves that a message on the wildcard reaches.
 
-        Only a put or a query can have such a key; it arrives where every rule is as wide.
+        Only a put or a query can have such a key; it arrives where every rule includes all of it.
         """
         asked = [each for each in wanted if each.right in ("publish", "request")]
         for wide in dict.fromkeys(filter(None, map(self._wildcard, checks))):
@@ -634,11 +636,11 @@ def _unrestricted(name: str, mode: Mode) -> ZenohProcess:
 
 
 _DATA = (Message.PUT, Message.QUERY, Message.LIVELINESS_TOKEN)
-"""The messages that are the use of a right; the others prepare them."""
+"""The messages that use a right; all other messages prepare for them."""
 
 
 def _first(checks: Iterable[Check], enclave: str) -> Check | None:
-    """Return the check to name: on data before others, by others before by the enclave itself."""
+    """Return the check to report: on data first, then by another enclave than ``enclave``."""
     return min(
         checks, key=lambda each: (each.message not in _DATA, each.enforcer == enclave), default=None
     )
@@ -665,14 +667,15 @@ def _closed(enclave: str, file: str, problem: str) -> ZenohFile:
 
 _ROUTERS_KEY = Note(
     "explain.zenoh-router",
-    "whoever has the router's key may say and hear what passes through the router, whatever its "
-    "permissions say: that is how it passes things on. In peer mode every session also believes a "
-    "second process with that key, beside the router. Keep it from all other processes.",
+    "whoever has the router's key may send and receive whatever passes through the router, "
+    "whatever its permissions say, because forwarding needs that. In peer mode every session also "
+    "believes a second process with that key, next to the router. Keep the key from all other "
+    "processes.",
 )
 
 
 class ZenohOfKeystore:
-    """Zenoh, asked about the enclaves of a keystore: all without ``names``, also the router's."""
+    """Zenoh as decider for enclaves of a keystore: for ``names``, or for all and the router."""
 
     def __init__(
         self,
@@ -689,11 +692,11 @@ class ZenohOfKeystore:
 
     @property
     def title(self) -> str:
-        """Its name, and the reason to ask it."""
+        """The name Zenoh, and the reason to ask it."""
         return f"Zenoh ({self._why})"
 
     def outcomes(self, question: Question) -> tuple[ZenohAnswer, ...]:
-        """Return the answer for each enclave, without whom it reaches; brief for peers."""
+        """Return the answer for each enclave, without the enclaves it reaches; brief for peers."""
         from sros_tool.explain.who import of_each  # a question about one enclave needs none
 
         def answer(name: str) -> ZenohAnswer:
@@ -712,14 +715,14 @@ class ZenohOfKeystore:
         return WhoOnZenoh(str(question), "zenoh", self._why, self._evaluator.domain, shown)
 
     def notes(self, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
-        """Yield a note on the router's key, and one if peers were asked by the router's file."""
+        """Yield a note on the router's key, and a note if the router's file decided for peers."""
         if any(outcome.of_router and outcome.allowed for outcome in outcomes):
             yield _ROUTERS_KEY
         if any(outcome.mode is Mode.PEER for outcome in outcomes):
             text = (
-                "peers decide by their own files, and this is by that of the router, which has the "
-                "same rights if `sros zenoh --check` says so; a question about one enclave also "
-                "reads those of the other end."
+                "peers decide by their own files, but this answer is by the router's file, which "
+                "has the same rights if `sros zenoh --check` says so; a question about one enclave "
+                "also reads the files of the other end."
             )
             yield Note("explain.zenoh-by-router", text)
 
@@ -744,7 +747,7 @@ class ZenohExplanation(NamedTuple):
     """Why Zenoh was asked."""
     answer: ZenohAnswer
     out_of_date: tuple[str, ...] | None
-    """The files that decide and are not what the permissions ask for; null if that is not known."""
+    """The deciding files that do not match the permissions; null if that is not known."""
     stated: Answer
     root: Path
     notes: tuple[Note, ...]
@@ -756,12 +759,12 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def vendor_title(self) -> str:
-        """Its name."""
+        """The name of Zenoh."""
         return "Zenoh"
 
     @property
     def allowed(self) -> bool:
-        """Whether Zenoh lets it through."""
+        """Whether Zenoh lets the messages through."""
         return self.answer.allowed
 
     @property
@@ -776,7 +779,7 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def wants_rights(self) -> bool:
-        """Whether more rights would help: the router's enclave shall have none."""
+        """Whether more rights would help; they never do for the router, whose enclave has none."""
         return not self.allowed and not self.permitted and not self.answer.of_router
 
     @property
@@ -786,7 +789,7 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def written(self) -> str:
-        """What to do if the files of Zenoh do not say what the permissions say, or ""."""
+        """What to do if the files of Zenoh do not match the permissions, or ""."""
         if self.answer.of_router:
             return "" if self.allowed else "Give the node an enclave of its own."
         if self.allowed is self.permitted and not self.out_of_date:
@@ -816,9 +819,9 @@ def explain_on_zenoh(
     *,
     kind: str | None = None,
 ) -> ZenohExplanation:
-    """Return what Zenoh decides, and what the permissions say, by which the files are made.
+    """Return Zenoh's decision by the files, and the decision by the signed permissions.
 
-    ``why`` is the reason to ask Zenoh; ``kind`` is the type of the name if the user said it.
+    ``why`` is the reason to ask Zenoh; ``kind`` is the type of the name if the user gave it.
     """
     enclave, keystore = asked.enclave, asked.enclave.keystore
     if keystore is None or enclave.state is None or not is_keystore(keystore.root):

@@ -257,8 +257,8 @@ def _renamed(policy: Policy, change: Callable[[str], str]) -> Policy:
 def with_placeholders(policy: FleetPolicy, observed: Iterable[Right]) -> frozenset[Right]:
     """Return observed rights with placeholders for names of robots, in the form of `absolute`.
 
-    A right that the policy does not state keeps its name; one of no enclave of the policy also its
-    enclave.
+    A right that the policy does not state keeps its name.  A right of an enclave that is not in the
+    policy also keeps its enclave.
     """
     expanded: set[Right] = set()
     for path, rights in _by_enclave(observed).items():

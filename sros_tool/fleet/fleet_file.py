@@ -339,11 +339,11 @@ def _fleet_table(data: bytes, what: str, *, is_json: bool) -> dict[str, Any]:
 
 
 def _connections(data: bytes, what: str, *, is_json: bool) -> dict[str, str]:
-    """Map the inventory's settings of how Ansible connects and delivers keys to their values.
+    """Return the settings of an inventory that decide how Ansible connects and delivers, by key.
 
-    Left out is what a fleet has (`_fleet_table`).  The variables of groups count together with who
-    is in them; beside a template, every value counts.  Parameters and errors are those of
-    `_fleet_table`.
+    The settings of the fleet itself are left out (`_fleet_table`).  If a group has variables, its
+    members are added, too.  If a value is a template, all values are returned.  Parameters and
+    errors are those of `_fleet_table`.
     """
     values = dict(_values_below(_loaded(data, what, is_json=is_json)))
     known = {*_VARIABLES.values(), _ROBOT}
@@ -360,7 +360,10 @@ def _connections(data: bytes, what: str, *, is_json: bool) -> dict[str, str]:
 
 
 def _values_below(top: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield every leaf of an inventory (no mapping, or an empty one) with the keys to it."""
+    """Yield every leaf of an inventory: the keys that lead to it, and its text.
+
+    A leaf is any value that is not a mapping, or an empty mapping.
+    """
     left: list[tuple[tuple[str, ...], Any]] = [((), top)]
     while left:
         path, value = left.pop()

@@ -39,8 +39,8 @@ class Robot(NamedTuple):
     """A robot: its ROS namespace, and its network address.
 
     ``domain`` is its ROS_DOMAIN_ID, or None for every domain of the keystore.  ``address`` is a
-    host name or IP address, ``user`` the account there, or "" for that of ssh.  ``groups`` are
-    sorted.  ``router`` is where sessions and other routers connect to its Zenoh router, as
+    host name or IP address, ``user`` the account there, or "" for the default of ssh.  ``groups``
+    are sorted.  ``router`` is where sessions and other routers connect to its Zenoh router, as
     ``HOST:PORT``, or "" if it has none of its own; ``crossing`` are the names that may pass between
     that router and others, if not all.
     """
@@ -116,7 +116,7 @@ class Fleet:
         return tuple(self.robots[name] for name in self.groups[group])
 
     def with_enclaves(self, enclaves: Sequence[str]) -> Fleet:
-        """Return the fleet with other paths of enclaves, and that of routers if robots have any."""
+        """Return the fleet with these enclave paths, and the path of routers if robots have any."""
         of_routers = [self.routers] if any(robot.router for robot in self.robots.values()) else []
         return replace(self, enclaves=tuple(dict.fromkeys((*enclaves, *of_routers))))
 

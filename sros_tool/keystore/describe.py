@@ -263,15 +263,15 @@ class RouterFacts(NamedTuple):
     """A router of a robot or a host."""
 
     router: str
-    """Its enclave."""
+    """Enclave of the router."""
     endpoints: Sequence[str]
-    """Where sessions and other routers connect to it, as HOST:PORT."""
+    """Where sessions and other routers connect to the router, as HOST:PORT."""
     listen: Sequence[str]
-    """Where it listens, as HOST:PORT."""
+    """Where the router listens, as HOST:PORT."""
     enclaves: Sequence[str]
-    """The enclaves whose sessions connect to it, perhaps with wildcards."""
+    """The enclaves whose sessions connect to the router, perhaps with wildcards."""
     crossing: Sequence[str]
-    """Names that may pass between it and other routers, if not all that may pass in the network."""
+    """Names that may pass between this router and others; empty for all that may in the network."""
 
 
 def router_facts(router: ZenohRouter) -> RouterFacts:

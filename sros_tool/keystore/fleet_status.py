@@ -51,7 +51,7 @@ from sros_tool.values import NamedKeystore, Words, shows
 
 
 class State(StrEnum):
-    """State of a robot's file, compared with the keystore; for a robot, that of its worst file.
+    """State of a robot's file, compared with the keystore; a robot has the state of its worst file.
 
     The order is from good to bad.
     """

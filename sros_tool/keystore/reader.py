@@ -302,7 +302,7 @@ class Keystore:
 
         if not self.has(SETTINGS):
             return load_template("sros2")
-        remedy = "Correct the file, or write the settings of before again with `sros "
+        remedy = "Correct the file, or restore the earlier settings with `sros "
         return decode_template(
             self.read(SETTINGS, "settings file"),
             self.root / SETTINGS,

@@ -150,8 +150,8 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
     ``hidden`` is as in `load_rights`.
 
     Raises:
-        KeystoreError: there is no configuration of a router, or there are several that do not
-            know each other.
+        KeystoreError: there is no configuration of a router, or there are several routers that are
+            not connected.
         DocumentError: Zenoh would not accept a configuration.
     """
     from sros_tool.zenoh.configuration import Mode
@@ -231,8 +231,8 @@ def _links(
 def check_routers(root: Path, known: Mapping[str, Collection[str]]) -> None:
     """Raise `KeystoreError` if a router has no rules for another router of the keystore.
 
-    ``known`` maps the enclave of each router to the names for which its configuration has rules.
-    A router that has none for any enclave has nothing to pass on.
+    ``known`` maps the enclave of each router to the names for which its configuration has rules. A
+    router without rules for any enclave forwards nothing.
     """
     routing = [name for name, names in known.items() if not known.keys() >= {*names}]
     for name in routing:

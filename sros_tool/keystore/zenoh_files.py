@@ -113,7 +113,7 @@ class ZenohProblem:
 class OpenedZenoh:
     """The Zenoh configurations of an enclave by file name, and their problems.
 
-    ``files`` are those that exist; ``configurations`` those that could be read and verified.
+    ``files`` are the existing files; ``configurations`` has the files that were read and verified.
     """
 
     files: tuple[str, ...]
@@ -165,7 +165,7 @@ def is_signed(
     authority: x509.Certificate,
     files: FilesReadOnce | None = None,
 ) -> bool:
-    """Return whether the permissions CA signed a document next to its file ``path``."""
+    """Return whether the permissions CA signed ``document``, in the file next to ``path``."""
     files = files or FilesReadOnce()
     try:
         message = files.read(path.with_name(ZENOH_SIGNED[path.name]), "signed document")
@@ -209,7 +209,7 @@ def _read(folder: Path, file: str, state: OpenedEnclave) -> Configuration | Zeno
 
 
 def _before_revocation(configuration: Configuration, state: OpenedEnclave) -> str:
-    """Return that a configuration with the rights of others is older than a revocation, or ""."""
+    """Return a clause if a configuration with others' rights is older than a revocation, or ""."""
     data = state.files.get(CRL_FILE)
     if configuration.mode is Mode.CLIENT or data is None:
         return ""
@@ -223,7 +223,7 @@ def _before_revocation(configuration: Configuration, state: OpenedEnclave) -> st
 
 
 def _out_of_date(configuration: Configuration, file: str, name: str, state: OpenedEnclave) -> str:
-    """Return how a configuration differs from the permissions of its enclave, or ""."""
+    """Return a clause on how a configuration differs from its enclave's permissions, or ""."""
     is_session = file == SESSION_FILE
     if is_session is (configuration.mode is Mode.ROUTER):
         return f"it is the configuration of a {'router' if is_session else 'session'}"
@@ -258,12 +258,13 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
 
 
 _ANY_PORT_HERE = "tls/localhost:0"
-"""Where sessions listen for direct connections, as those of rmw_zenoh do: on their own host."""
+"""Where sessions listen for direct connections: on their own host, as in rmw_zenoh."""
 _MOST_BYTES = 512 << 20
 _IN_A_ROW = 50
-"""So many enclaves are read step by step: the code of a step stays in the caches of the processor.
+"""Number of enclaves that are read together, one step at a time.
 
-That takes a third less time than to read one enclave after the other, and little memory.
+The code of a step then stays in the caches of the processor.  This takes a third less time than
+reading one enclave after the other, and little memory.
 """
 _MOST_DOMAINS = 16
 """Maximum number of ROS domains in a network: every right is written once per domain."""
@@ -274,12 +275,12 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, slots=True)
 class ZenohDocuments:
-    """The configurations that a keystore shall have.
+    """The configurations that a keystore should have.
 
-    ``files`` maps their paths in the keystore to their content, ``enclaves`` to their enclaves.
-    ``left_out`` maps enclaves that get none, and no rights at the others, to the reason: a clause.
-    ``nodes`` maps all others to the nodes that they may announce in the graph.
-    ``existing`` are the enclaves of the keystore, ``ledger`` is its ledger.
+    ``files`` maps the paths of configurations to their content, ``enclaves`` maps the paths to the
+    enclaves.  ``left_out`` maps enclaves that get no configuration, and no rights elsewhere, to the
+    reason, a clause.  ``nodes`` maps all other enclaves to the nodes that they may announce in the
+    graph. ``existing`` are the enclaves of the keystore, ``ledger`` is its ledger.
     """
 
     files: Mapping[str, bytes]
@@ -294,9 +295,10 @@ class ZenohDocuments:
 class ZenohChange:
     """What a transaction changes in the enclaves of a keystore, as far as Zenoh depends on it.
 
-    ``issued`` are the new permissions of enclaves, ``gone`` the enclaves that are revoked,
-    ``replaced`` those whose earlier certificates are; ``recorded`` are the entries that it adds to
-    the ledger.  ``stated`` are the policies of the enclaves, by whose lines errors are told.
+    ``issued`` are the new permissions of enclaves.  ``gone`` are the revoked enclaves, ``replaced``
+    the enclaves whose earlier certificates are revoked.  ``recorded`` are the entries that the
+    transaction adds to the ledger.  ``stated`` are the policies of the enclaves, whose lines errors
+    name.
     """
 
     issued: Mapping[str, SignedRights] = field(default_factory=dict)
@@ -310,19 +312,19 @@ NO_CHANGE = ZenohChange()
 
 
 class Drift(StrEnum):
-    """How a configuration is not what the keystore shall have."""
+    """How a configuration differs from what the keystore should have."""
 
     MISSING = "missing"
     DIFFERS = "differs"
     UNSIGNED = "unsigned"
-    """The permissions CA has not signed it next to it."""
+    """The permissions CA has not signed the document next to it."""
     STALE = "stale"
-    """There should be none."""
+    """The enclave should not have the configuration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drifted:
-    """A configuration that is not what the keystore shall have; ``path`` is in the keystore."""
+    """A configuration that is not as it should be; ``path`` is relative to the keystore."""
 
     enclave: str
     path: str
@@ -337,7 +339,7 @@ def drifted(
 ) -> tuple[Drifted, ...]:
     """Return the configurations that are not as ``wanted`` or not signed by ``authority``.
 
-    Those of enclaves that are ``gone`` do not count.
+    Configurations of enclaves in ``gone`` do not count.
     """
 
     def compare(paths: Sequence[str]) -> list[Drifted]:
@@ -362,10 +364,10 @@ def drifted(
 
 
 class ZenohDrift(NamedTuple):
-    """The configurations of a keystore that are not as they shall be.
+    """The configurations of a keystore that are not as they should be.
 
-    ``left_out`` maps enclaves that get none to the reason, a clause; ``nodes`` maps all others to
-    the nodes that they may announce in the graph.
+    ``left_out`` maps enclaves that get no configuration to the reason, a clause; ``nodes`` maps all
+    other enclaves to the nodes that they may announce in the graph.
     """
 
     files: tuple[Drifted, ...]
@@ -382,10 +384,10 @@ def zenoh_drift(
     *,
     only: Collection[str] = (),
 ) -> ZenohDrift:
-    """Return the configurations that are not as they shall be, and who gets none with the reason.
+    """Return the configurations that are not as they should be, and the enclaves without one.
 
-    Without ``now``, permissions that have expired count, too.  ``only`` are the enclaves that are
-    looked at, all if there are none.
+    Without ``now``, permissions that have expired count, too.  ``only`` are the enclaves to
+    examine; empty for all.
 
     Raises:
         SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.
@@ -407,9 +409,9 @@ def zenoh_documents(
 ) -> ZenohDocuments:
     """Return the configurations that the enclaves of a keystore need; arguments as `keep_zenoh`.
 
-    Without ``now``, permissions that have expired count, too.  ``existing`` are the enclaves of
-    the keystore, which are looked for if they are not given.  ``only`` are the enclaves whose
-    configurations are made, and that count as existing; all if there are none.
+    Without ``now``, permissions that have expired count, too.  ``existing`` are the enclaves of the
+    keystore; None searches for them.  ``only`` are the enclaves whose configurations are made, and
+    that count as existing; empty for all.
     """
     root = keystore.root
     of_network = _domains(network, domains, root)
@@ -447,9 +449,9 @@ def zenoh_documents(
     except TooManyExpressions:
         raise PolicyError(
             "the rules of a Zenoh router for another router would have too many key expressions",
-            "Between routers passes what an enclave on one side may send and an enclave on the "
-            "other side may get. The wildcards in the rights of these enclaves combine in too many "
-            "ways.",
+            "A message passes between routers if an enclave on one side may send it and an enclave "
+            "on the other side may receive it. The wildcards in the rights of these enclaves "
+            "combine in too many ways.",
             "Use fewer wildcards in the policies, or list what may pass between routers: `sros "
             "zenoh --cross NAME`.",
         ) from None
@@ -481,8 +483,8 @@ def zenoh_documents(
     if direct and size > _MOST_BYTES:
         raise UsageError(
             f"the files of {len(rules)} enclaves would be larger than {_MOST_BYTES >> 20} MB",
-            "In peer mode each has the rights of all enclaves that it may communicate with.",
-            f"Take client mode: `sros zenoh {quote(str(root))} --mode client`.",
+            "In peer mode each file has the rights of all enclaves that its own enclave may reach.",
+            f"Use client mode: `sros zenoh {quote(str(root))} --mode client`.",
         )
     enclaves = {_router_path(name): name for name in network.router_names()}
     enclaves |= {_session_path(name): name for name in chosen}
@@ -511,19 +513,19 @@ def _last_revocation(entries: Iterable[Entry] = (), lists: Iterable[RevocationLi
 
 
 def _peers(name: str, router: RenderedRights, between: RightsBetween) -> list[RenderedRights]:
-    """Return what a session of an enclave allows to the router and to all other sessions, in order.
+    """Return the rights that a session gives to the router and to all other sessions, in order.
 
     Raises:
-        PolicyError: what both may do takes too many key expressions.
+        PolicyError: the common rights of two enclaves take too many key expressions.
     """
     try:
         # Zenoh takes no policy without rules.
         rendered = [render_rights(rights) for rights in between.of_all(name) if rights.rules]
     except TooManyExpressions:
         raise PolicyError(
-            f"what {name} and another enclave may send each other cannot be said to Zenoh",
-            "In peer mode each session has the rights that both ends have, and with the wildcards "
-            "of these that takes too many key expressions.",
+            f"the common rights of {name} and another enclave cannot be expressed in Zenoh",
+            "In peer mode each session has the rights that both ends have. Their wildcards combine "
+            "into too many key expressions.",
             "Use fewer wildcards, or client mode: `sros zenoh --mode client`.",
         ) from None
     rendered.append(router)
@@ -542,10 +544,10 @@ def _router_files(
 ) -> dict[str, bytes]:
     """Return the configurations of all routers, by their paths; ``revoked`` is as in the files.
 
-    A router trusts the name of another one for what the enclaves at both ends may do.
+    A router gives another router the rights that the enclaves at both ends have.
 
     Raises:
-        TooManyExpressions: that takes too many key expressions.
+        TooManyExpressions: these rights take too many key expressions.
     """
     routers, connects = network.every_router(), network.connects()
     sides: dict[str, list[str]] = {router.name: [] for router in routers}
@@ -601,9 +603,10 @@ def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int
 class _RulesOfEnclave(NamedTuple):
     """What other processes allow to an enclave, and what the enclave allows to the router.
 
-    The latter is None if the enclave's own file is not asked for.  ``rights`` are the former as a
-    value, if they are needed for more than one file; ``nodes`` are the nodes that they let it
-    announce.
+    ``remote`` are the rights that other processes give to the enclave; ``rights`` are the same
+    rights as a value, if more than one file needs them.  ``router`` are the rights that the enclave
+    gives to the router; None if its own file is not needed.  ``nodes`` are the nodes that the
+    enclave may announce.
     """
 
     remote: RenderedRights
@@ -761,16 +764,16 @@ _PROOF = {
     "request": (Flow.INGRESS, Message.QUERY),
     "reply": (Flow.EGRESS, Message.QUERY),
 }
-"""The message that is the use of each right; on purpose not taken from the translation."""
+"""Right → the message that uses it; not from the translation, so that its errors show."""
 _ANNOUNCED = {"NN": "", "MP": "publish", "MS": "subscribe", "SC": "request", "SS": "reply"}
 """What each kind of graph token announces: a node, or the use of a right to a name."""
 _TOKEN = re.compile(r"@ros2_lv/([0-9]+)/\*/\*/\*/(..)/([^/]+)/[^/]+/[^/]+(?:/([^/]+)/\*\*)?")
 
 
 def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[StatedRight]]) -> None:
-    """Raise `PkiError` if rules decide otherwise than the rights about a name that these have.
+    """Raise `PkiError` if rules and rights decide differently on a name in the rights.
 
-    For names with wildcards, some are asked that they match.
+    For a name with wildcards, example names that it matches are tried.
     """
     control = AccessControl((remote,))
     passing = {right: control.passing(enclave, *use) for right, use in _PROOF.items()}
@@ -812,9 +815,9 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
 def _are_exactly(
     passing: Mapping[str, KeyExpressions], stated: Mapping[int, Sequence[StatedRight]]
 ) -> bool:
-    """Return whether rights are names alone, and rules have the keys of these and no others.
+    """Return whether rights have no wildcards, and rules have exactly the keys of the rights.
 
-    What is below a topic with history is no key of a name.
+    A key below a topic with history is not the key of a name.
     """
     keys: dict[str, set[str]] = {right: set() for right in _PROOF}
     for domain, rights in stated.items():
@@ -860,9 +863,9 @@ def _to_announce(stated: Mapping[int, Sequence[StatedRight]]) -> set[tuple[str, 
 
 
 def _some_nodes(enclave: str, control: AccessControl) -> set[tuple[str, ...]]:
-    """Return nodes that rules let an enclave announce, for each wildcard one, as tokens have them.
+    """Return the nodes, as in tokens, that rules let an enclave announce; one per wildcard.
 
-    There are none if its rights deny all of its nodes.
+    The result is empty if the rights of the enclave deny all of its nodes.
     """
     announcing = (enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN)
     nodes = [
@@ -901,7 +904,7 @@ def _present(keystore: Keystore, path: str) -> bytes | None:
 def stale_files(root: Path, wanted: Collection[str], names: Iterable[str]) -> Iterable[Drifted]:
     """Yield the configurations that the enclaves ``names`` should not have.
 
-    What nobody ever signed may be a file of somebody's own.
+    A file without a signed document is left out, because it may be a user's own file.
     """
     for name in names:
         for path in (_router_path(name), _session_path(name)):
@@ -933,18 +936,18 @@ def _recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
     """Return the ROS rights that signed permissions give an enclave in a ROS domain.
 
     A topic ``*`` without a ROS name, as ros2/sros2 grants it, stands for all topics and services if
-    it may be published and subscribed.  Of other topics without a ROS name, those whose wildcard
-    begins right behind the prefix of ROS topics are said exactly; those with no ROS topic are not
-    on Zenoh.
+    it may be published and subscribed.  Another topic without a ROS name is translated exactly if
+    its wildcard begins right after the prefix of ROS topics.  A topic that matches no ROS topic is
+    left out, because it is not on Zenoh.
 
     Raises:
-        PolicyError: it is uncertain which ROS names a right or a denial is about, or what no rule
-            names is allowed.
+        PolicyError: it is uncertain which ROS names a right or a denial is about, or the default is
+            ALLOW.
     """
     source = Source(f"the permissions of {enclave}", 0)
     if grant.default_allow:
         raise PolicyError(
-            f"{source}: <default>ALLOW</default> cannot be said to Zenoh",
+            f"{source}: <default>ALLOW</default> cannot be expressed in Zenoh",
             "It allows what no rule names, on some vendors of DDS and not on others.",
             "State the rights of the enclave in a policy, with `sros create_permission`.",
         )
@@ -965,8 +968,8 @@ def _recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
             rights |= {right._replace(name=right.name.removeprefix(_TOPICS))}
         elif right.qualifier is not ALLOW or _meets_ros_names(right.name):
             raise PolicyError(
-                f"{source}: {right.describe()} cannot be said to Zenoh",
-                "It is a name of DDS, and not certainly one of ROS.",
+                f"{source}: {right.describe()} cannot be expressed in Zenoh",
+                "It is a DDS name, and it is uncertain which ROS names it means.",
                 "State the rights of the enclave in a policy, with `sros create_permission`.",
             )
     parted = (part for right in rights for part in parts(right))

@@ -1,8 +1,8 @@
 """Write files of a commit to a private folder without a checkout.
 
-Only files that are asked for are written, as the commit has them: without filters, conversions of
-line ends or anything else that a repository configures.  No symbolic link of the commit is followed
-or made, but those of a keystore that stay in the keystore.
+Only requested files are written, with the content that the commit has: filters, conversions of line
+ends and other settings of the repository do not apply.  Symbolic links of the commit are neither
+followed nor created, except links inside a keystore that stay in the keystore.
 """
 
 from __future__ import annotations

@@ -233,7 +233,7 @@ class Validity:
     not_before: str
     """Start of the validity, in UTC."""
     kind: str
-    """Kind of what is valid, such as ``permissions`` or ``revocation list``."""
+    """Kind of the document that is valid, such as ``permissions`` or ``revocation list``."""
     title: str
     """Title of the document."""
     enclave: str = ""
@@ -310,11 +310,9 @@ class Influence:
 
 @dataclass(frozen=True, slots=True)
 class Focus:
-    """The answer about one name or enclave; it is true for all names, known or not.
+    """The answer to a question about one name or enclave.
 
-    ``kind`` is the kind of the name, or enclave.  ``senders`` and ``receivers`` may use the name.
-    ``influencing`` influence the senders, or the enclave: with two hops, a sender directly.
-    ``influenced`` are influenced by the enclave; empty for a name.
+    The answer holds for all names that rights allow, also for names that the picture does not have.
     """
 
     kind: Annotated[str, Words((*_KINDS, "enclave"))]

@@ -322,7 +322,7 @@ def _cannot_deny(
 ) -> PolicyError:
     allows = f"line {allowing.line} of '{allowing.file}' allows" if allowing.line else "they allow"
     return PolicyError(
-        f"{denying}: DENY {right} {denied} cannot be said to Zenoh, because {allows} {wide}",
+        f"{denying}: DENY {right} {denied} cannot be expressed in Zenoh, because {allows} {wide}",
         "A denial inside a wildcard does not hold in Zenoh against whoever asks or publishes with "
         f"a wildcard. So sros lists what is left allowed, and {why}.",
         f"List the names to {right} in place of {wide}.",
@@ -357,7 +357,7 @@ def _listed(name: str, place: Source) -> list[str]:
 
 def _no_key(name: str, place: Source) -> PolicyError:
     return PolicyError(
-        f"{place}: the name {name} cannot be said to Zenoh",
+        f"{place}: the name {name} cannot be expressed in Zenoh",
         "A key of Zenoh has no '#' and no '$', and no empty part.",
         "Name it as ROS does.",
     )
@@ -365,7 +365,7 @@ def _no_key(name: str, place: Source) -> PolicyError:
 
 def _too_many(name: str, place: Source) -> PolicyError:
     return PolicyError(
-        f"{place}: the name {name} cannot be said to Zenoh",
+        f"{place}: the name {name} cannot be expressed in Zenoh",
         "A key expression of Zenoh has no '?' and no set of characters, and a list of all names "
         f"takes more than {MOST_EXPRESSIONS} key expressions.",
         "List the names, or use '*'.",

@@ -144,7 +144,7 @@ def test_a_policy_that_zenoh_cannot_carry_out(folder: Path, tmp_path: Path) -> N
     assert sros(*asked, "--vendor", "fastdds", "--severity", "note").ok().out == ""
     ended = sros(*asked, "--vendor", "zenoh")
     assert ended.status == 2
-    assert "cannot be said to Zenoh" in ended.err
+    assert "cannot be expressed in Zenoh" in ended.err
 
 
 def test_a_suggestion_holds(folder: Path, tmp_path: Path) -> None:

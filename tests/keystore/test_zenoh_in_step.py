@@ -257,7 +257,7 @@ def test_a_wildcard_of_dds_is_said_exactly_or_refused(
     rules = (Rule(allow=True, domains=domain, publish=(Criteria(tuple(topics)),)),)
     grant = Grant("/n", "CN=/n", "", "", rules)
     if names is None:
-        with pytest.raises(PolicyError, match="cannot be said to Zenoh"):
+        with pytest.raises(PolicyError, match="cannot be expressed in Zenoh"):
             _recorded_rights("/n", grant, 0)
     else:
         stated = _recorded_rights("/n", grant, 0)

@@ -366,7 +366,7 @@ ALL = "all"
 def choose_scenarios(names: Sequence[str], *, on_zenoh: bool = False) -> tuple[Scenario, ...]:
     """Return the scenarios with these names, or in these TOML files, in order.
 
-    Without names, it is the default scenario on DDS, and all of them ``on_zenoh``.
+    Without names: the default scenario on DDS, or all scenarios ``on_zenoh``.
 
     Raises:
         UsageError: no scenario has a given name.

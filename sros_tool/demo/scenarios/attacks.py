@@ -158,8 +158,8 @@ def _discovering(
 ) -> Row:
     """Return a row that shows whether the attacker discovers a publisher of the topic.
 
-    The control is that an unsecured attacker discovers another publisher, or if a secured one has
-    to fail, that an enclave which may listen discovers this one.
+    The control: an unsecured attacker discovers another publisher; or, if a secured attacker has to
+    fail, an enclave that may listen discovers this publisher.
     """
     others: tuple[Party, ...] = ()
     controls: tuple[Claim, ...] = ()
@@ -618,7 +618,7 @@ WIDEST: dict[str, Row] = {
 def joining(enclave: str, fault: str) -> Row:
     """Return a row that shows whether an enclave with faulty files can join the others.
 
-    Endpoints are announced to whom the talker's DDS has authenticated, and to nobody else.
+    The talker's DDS announces endpoints only to participants that it has authenticated.
     """
     name = f"{enclave} joins the other enclaves"
     return _discovering(name, Identity(OWN, enclave), RowStatus.VISIBLE, fault)

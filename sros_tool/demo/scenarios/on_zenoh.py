@@ -625,7 +625,7 @@ def _rogue(
 ) -> Row:
     """Return a row in which a talker and a listener are connected to a router that attacks.
 
-    It succeeds without a defence, and in the enclave of the router.
+    The attack succeeds without the defence, and for an attacker with the router's enclave.
     """
     rogue = Party("attacking router", Role.RELAY, Identity(keystore, part), intruder=True)
     succeeds = bool(removed) or part == "router"
@@ -935,7 +935,7 @@ _EARLIER_ROWS = (
 
 
 def _open(row: Row, because: str, remedy: str) -> Row:
-    """Return the row of an attack that has only this row, and succeeds."""
+    """Return the only row of an attack that is known to succeed."""
     return known_open(replace(row, attack=row.name), because, remedy)
 
 

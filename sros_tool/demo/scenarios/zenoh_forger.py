@@ -240,7 +240,7 @@ def earlier_session_file_of_one_that_limits_itself(copy: KeystoreCopy) -> None:
 
 
 def _of_earlier_policy(copy: KeystoreCopy) -> bytes:
-    """Return the guest's session file of a policy that gave it the topic, and then change that."""
+    """Give the guest the topic, take it away again, and return the session file from before."""
     through_the_router(copy)
     _change_rights(copy, zenoh_policy(copy.topic, guest_talks=True))
     earlier = (copy.folder("guest") / SESSION_FILE).read_bytes()

@@ -116,8 +116,7 @@ class Issued:
     short_lived: bool = False
 
     def notes(self) -> Iterator[Note]:
-        """Yield notes on short-lived enclaves, and on permissions that ros2/sros2 treats
-        otherwise."""
+        """Yield notes on short-lived enclaves, and on rights that ros2/sros2 would not join."""
         name, rights = self.issuance.name, self.issuance.rights
         if isinstance(rights, StatedRights) and len(rights.enclave.profiles) > 1:
             yield Note(
@@ -236,8 +235,8 @@ class EnclaveWriter:
     ) -> bool:
         """Return whether `write` would only change dates that are still far enough away.
 
-        ``text`` is the present document, with LF line ends, and ``validity`` its validity, which is
-        long enough until two thirds of a new validity are over (`Window.lasts`).
+        ``text`` is the present document, with LF line ends.  Its ``validity`` is long enough until
+        two thirds of a new validity are over (`Window.lasts`).
 
         Raises:
             KeystoreError: the permissions would not decide as the policy does.

@@ -99,7 +99,7 @@ class ExpressionSets:
     def says(self, stated: ExpressionSets) -> bool:
         """Return whether these sets match the same names as ``stated``.
 
-        They have to be subsets of ``stated``, without only such names that a wildcard matches
+        They have to be subsets of ``stated``, and may lack only names that a wildcard matches
         anyway.
         """
         return all(

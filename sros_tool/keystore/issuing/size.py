@@ -97,7 +97,7 @@ class PermissionsBytes(NamedTuple):
 
 @shows(spread=("use",))
 class MinimizedEnclave(NamedTuple):
-    """An enclave."""
+    """An enclave of a minimized policy."""
 
     use: EnclaveUse
     """The enclave's rights, and the rights that were observed."""

@@ -272,7 +272,7 @@ def creation(change: KeystoreChange, rights: tuple[ReplacedRights, ...]) -> Crea
 
 
 def _protecting(policies: Sequence[Policy | FleetPolicy]) -> Iterator[Enclave]:
-    """Yield the enclaves of the policies, of fleet policies only if they state protection."""
+    """Yield the enclaves of the policies; fleet policies count only if they state protection."""
     for policy in policies:
         if not isinstance(policy, FleetPolicy):
             yield from policy.enclaves

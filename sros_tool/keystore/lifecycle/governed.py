@@ -110,7 +110,7 @@ def refuse_less_protected(
 ) -> None:
     """Raise `KeystoreError` if a policy demands more protection than the governance gives.
 
-    For the signing of requests, which does not change the governance: all robots would need it.
+    Used when requests are signed, because all robots would need a changed governance.
     """
     for name, level in less_protected(governance, stated):
         kinds = "data=ENCRYPT" if name.level is Level.ENCRYPT else "metadata=SIGN"

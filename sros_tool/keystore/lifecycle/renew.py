@@ -178,8 +178,7 @@ class _Renewer:
         return Superseded.by(name, state.certificate, issued.certificate, now)
 
     def _issuance(self, state: Credentials) -> Issuance:
-        """Return the new certificate and permissions to issue, after verifying the present
-        files."""
+        """Return what to issue for an enclave, after verifying its present files."""
         name = state.name
         rights = checked_rights(state, self._change.authorities, self._change.recorded)
         # Once earlier permissions were cut off by a unique subject, they stay cut off.

@@ -642,9 +642,9 @@ class _Updater:
         which = "these enclaves" if len(self._kept_open) > 1 else "this enclave"
         text = (
             f"Still open: {', '.join(self._kept_open)} may do everything as before, because the "
-            "new default is for enclaves without a policy, and the rights of "
-            f"{which} are not those of the old default. State them with `sros create_permission "
-            f"{quote(str(self._root))} {' '.join(map(quote, self._kept_open))} POLICY_FILE`."
+            f"new default is for enclaves without a policy, and the rights of {which} differ from "
+            f"the old default. State them with `sros create_permission {quote(str(self._root))} "
+            f"{' '.join(map(quote, self._kept_open))} POLICY_FILE`."
         )
         return [Note("keystore.kept-open", text)]
 
@@ -661,7 +661,7 @@ class _Updater:
         if any(e.effect is Effect.TIGHTER and e.key.startswith("protection") for e in changes):
             role = "" if shared else f" --{PERMISSIONS}"
             text = (
-                "The governance of before is still validly signed: whoever changes the files of a "
+                "The previous governance is still validly signed: whoever changes the files of a "
                 "robot can put it back there. That ends when the CA that signed it is replaced: "
                 f"{self._rotation(role)}."
             )
@@ -687,7 +687,7 @@ def trust_records(
 ) -> KeystoreUpdate:
     """Record permissions again that sros 0.1 recorded without a chain of ledger lines.
 
-    Only permissions are recorded that the permissions CA signed, and that are the last ones of
+    Permissions are recorded only if the permissions CA signed them, and they are the last ones of
     their enclave in the ledger.  If any enclave has other permissions, nothing is written.
 
     Raises:
@@ -706,7 +706,7 @@ def trust_records(
         names = [name for name in change.names if name in last]
         if not names:
             raise KeystoreError(
-                f"no enclave of '{root}' has rights that a record without a chain states"
+                f"no enclave of '{root}' has rights that only ledger lines without a chain record"
             )
         entries: list[Entry] = []
         others: list[str] = []
@@ -789,7 +789,7 @@ def _with_routers_of_robots(change: KeystoreChange, network: ZenohNetwork) -> Ze
     """Return a network with the routers of the fleet's robots.
 
     Raises:
-        UsageError: another endpoint is asked for one of them, or none.
+        UsageError: ``network`` has another endpoint, or none, for the router of a robot.
     """
     complete = change.with_routers_of_robots(network)
     asked, before = (
@@ -812,7 +812,7 @@ def _router_moved(old: str, new: str) -> Note:
     return Note(
         "zenoh.router-moved",
         f"the router is now in enclave {new}: stop the one that runs in {old}, and start it in "
-        f"{new}. Sessions that were not restarted believe {old} still; nobody else does.",
+        f"{new}. Only sessions that were not restarted still accept {old} as the router.",
     )
 
 
