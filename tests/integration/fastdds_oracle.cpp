@@ -20,18 +20,7 @@
 
 #include "fastdds_probe.hpp"
 
-#include <fastdds/dds/domain/DomainParticipant.hpp>
-#include <fastdds/dds/domain/DomainParticipantFactory.hpp>
 #include <fastdds/dds/log/Log.hpp>
-#include <fastdds/dds/publisher/DataWriter.hpp>
-#include <fastdds/dds/publisher/Publisher.hpp>
-#include <fastdds/dds/subscriber/DataReader.hpp>
-#include <fastdds/dds/subscriber/Subscriber.hpp>
-#include <fastdds/dds/topic/Topic.hpp>
-#include <fastdds/dds/topic/TopicDataType.hpp>
-#include <fastdds/dds/topic/TypeSupport.hpp>
-#include <fastdds/rtps/transport/UDPv4TransportDescriptor.h>
-#include <fastrtps/xmlparser/XMLProfileManager.h>
 
 #include <stdio.h>
 #include <unistd.h>
@@ -50,27 +39,6 @@
 #include <string>
 #include <thread>
 #include <vector>
-
-// A type of which nothing is ever written.
-class EmptyType : public fast::TopicDataType
-{
-public:
-    EmptyType()
-    {
-        setName("sros::Empty");
-        m_typeSize = 4;
-        m_isGetKeyDefined = false;
-        auto_fill_type_information(false);
-        auto_fill_type_object(false);
-    }
-
-    bool serialize(void*, rtps::SerializedPayload_t*) override { return false; }
-    bool deserialize(rtps::SerializedPayload_t*, void*) override { return false; }
-    std::function<uint32_t()> getSerializedSizeProvider(void*) override { return [] { return 4u; }; }
-    void* createData() override { return new char; }
-    void deleteData(void* value) override { delete static_cast<char*>(value); }
-    bool getKey(void*, rtps::InstanceHandle_t*, bool) override { return false; }
-};
 
 // Keeps what Fast DDS logs; it is called in a thread of Fast DDS.
 class Lines : public fast::LogConsumer
@@ -120,54 +88,6 @@ std::vector<std::string> split(const std::string& text, char mark)
     return parts;
 }
 
-struct Party
-{
-    fast::DomainParticipant* participant = nullptr;
-
-    Party(std::uint32_t domain, const std::string& identity, const std::string& documents)
-    {
-        fast::DomainParticipantQos qos;
-        qos.transport().use_builtin_transports = false;
-        qos.transport().user_transports.push_back(
-            std::make_shared<eprosima::fastdds::rtps::UDPv4TransportDescriptor>());
-        auto set = [&qos](const std::string& name, const std::string& value)
-        {
-            qos.properties().properties().emplace_back(name, value);
-        };
-        const std::string mine = "file://" + identity + "/", signed_ones = "file://" + documents + "/";
-        const std::string authentication = "dds.sec.auth.builtin.PKI-DH.";
-        const std::string access = "dds.sec.access.builtin.Access-Permissions.";
-        set("dds.sec.auth.plugin", "builtin.PKI-DH");
-        set("dds.sec.access.plugin", "builtin.Access-Permissions");
-        set("dds.sec.crypto.plugin", "builtin.AES-GCM-GMAC");
-        set(authentication + "identity_ca", mine + "identity_ca.cert.pem");
-        set(authentication + "identity_certificate", mine + "cert.pem");
-        set(authentication + "private_key", private_key(identity));
-        if (std::filesystem::exists(identity + "/crl.pem"))
-        {
-            set(authentication + "identity_crl", mine + "crl.pem");
-        }
-        set(access + "permissions_ca", mine + "permissions_ca.cert.pem");
-        set(access + "governance", signed_ones + "governance.p7s");
-        set(access + "permissions", signed_ones + "permissions.p7s");
-        auto* factory = fast::DomainParticipantFactory::get_instance();
-        participant = factory->create_participant(domain, qos);
-        if (participant)
-        {
-            fast::TypeSupport(new EmptyType).register_type(participant);
-        }
-    }
-
-    ~Party()
-    {
-        if (participant)
-        {
-            participant->delete_contained_entities();
-            fast::DomainParticipantFactory::get_instance()->delete_participant(participant);
-        }
-    }
-};
-
 using Names = std::vector<std::string>;
 
 // One end of a topic, a writer or a reader.
@@ -196,7 +116,7 @@ fast::Topic* topic_of(fast::DomainParticipant* participant, const std::string& n
 {
     auto* known = participant->lookup_topicdescription(name);
     return known ? static_cast<fast::Topic*>(known)
-                 : participant->create_topic(name, "sros::Empty", fast::TOPIC_QOS_DEFAULT);
+                 : participant->create_topic(name, "sros::Number", fast::TOPIC_QOS_DEFAULT);
 }
 
 End open(fast::DomainParticipant* participant, bool writes, const std::string& name, const Names& partitions)
@@ -304,9 +224,7 @@ std::string answer(const std::vector<std::string>& fields)
 int main(int count, char** arguments)
 {
     fast::Log::ClearConsumers();  // it writes to standard output
-    eprosima::fastrtps::LibrarySettingsAttributes settings;
-    settings.intraprocess_delivery = eprosima::fastrtps::INTRAPROCESS_OFF;
-    eprosima::fastrtps::xmlparser::XMLProfileManager::library_settings(settings);
+    use_sockets();
     if (count > 1)
     {
         return probing::probe(static_cast<std::uint32_t>(std::stoul(arguments[1])));
