@@ -550,13 +550,13 @@ DOCUMENT_SIZE = FindingKind(
     WARNING,
     "signed permissions of 60 KB or more",
     "Participants send them in the handshake, with their certificate. If both do not fit into one "
-    "message of 64 KB, Fast DDS 2.9 never finishes the handshake, or aborts; Fast DDS 2.14 and "
-    "Cyclone DDS accept them.",
-    "ros2/sros2 issue 228; Fast DDS 2.9.1 (SecurityManager.cpp) and 2.14.5, Cyclone DDS 0.10.2; "
-    "measured.",
+    "message of 64 KB, Fast DDS 2.6 and 2.9 never finish the handshake, or abort; later "
+    "releases and Cyclone DDS accept them.",
+    "ros2/sros2 issue 228; Fast DDS 2.6.12, 2.9.1 (SecurityManager.cpp), 2.14.5, 3.2.5 and "
+    "3.6.2, Cyclone DDS 0.10.2; measured.",
     "Remove rights that are never used, or use wildcards (`sros minimize_policy POLICY --observed "
     "OBSERVED` shows both), or split the enclave.",
-    vendors=(Vendor.FAST_2_9,),
+    vendors=tuple(vendor for vendor in FAST_DDS if vendor.traits.largest_document),
 )
 LONG_NAME = FindingKind(
     "portable.long-name",

@@ -72,6 +72,9 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
     return [kind_id for kind_id in all_kinds() if kind_id.startswith(incomplete)]
 
 
+_VENDORS = (*(vendor.value for vendor in MEASURED), "zenoh")
+
+
 @verb("check")
 @click.argument("targets", metavar="[policy|keystore|runtime] [PATH]...", nargs=-1, type=PATH)
 @click.option("--list", "as_list", is_flag=True, help="List all kinds of findings.")
@@ -145,8 +148,9 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
 )
 @click.option(
     "--vendor",
-    type=click.Choice([*(vendor.value for vendor in MEASURED), "zenoh"]),
-    help="Report only findings for this DDS vendor, or for Zenoh.",
+    type=click.Choice(_VENDORS),
+    metavar="VENDOR",
+    help=f"Report only findings for this DDS vendor, or for Zenoh. One of: {', '.join(_VENDORS)}.",
 )
 @click.option(
     "--domain", metavar="ID", help="The ROS domain that the enclaves must be able to join."

@@ -125,9 +125,10 @@ def allow_refusal_option(function: Decorated) -> Decorated:
         "--allow-refusal",
         multiple=True,
         type=_MeasuredVendors(),
+        metavar="VENDOR",
         callback=_as_vendors,
-        help="Make the change even if this DDS vendor will then refuse enclaves that it "
-        "accepts now.  Can be repeated.",
+        help="Make the change even if this DDS vendor, such as fastdds-2.6, will then refuse "
+        "enclaves that it accepts now.  Can be repeated.",
     )(function)
 
 

@@ -428,7 +428,7 @@ def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
         yield "  observed, and not allowed"
         yield from (f"    {right.describe()}" for right in use.not_allowed)
     then = f", then {sizes.after}" if sizes.after != sizes.before else ""
-    too_large = "" if sizes.after < sizes.limit else ": TOO LARGE for Fast DDS 2.9"
+    too_large = "" if sizes.after < sizes.limit else ": TOO LARGE for Fast DDS 2.6 and 2.9"
     yield f"  permissions.p7s: {sizes.before} bytes{then}, of at most {sizes.limit - 1}{too_large}"
     for proposal in enclave.proposals:
         names = [right.describe() for right in proposal.adds]
@@ -685,6 +685,8 @@ def _folded(side: AccessSource, sign: str, gains: Iterable[Gain], growth: Growth
 
 
 def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
+    from sros_tool.dds.decision.vendors import together
+
     who, other = first_few(gain.enclaves, _MOST_NEW_LINES), "BASE" if sign == "+" else "HEAD"
     if gain.action == "join":
         text = f"{who} join the domain"
@@ -702,7 +704,7 @@ def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
         at = f" at {gain.denied_at}" if gain.denied_at else ""
         text += f", which {other} denies by {gain.denied.name}{at}"
     if gain.worlds != growth.worlds:
-        text += f"; with {', '.join(gain.worlds)}"
+        text += f"; with {', '.join(together(gain.worlds))}"
     if gain.domains != (0,) or len(growth.domains) > 1:
         text += f"; in domain {', '.join(map(str, gain.domains))}"
     return text
@@ -728,7 +730,9 @@ def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
 
 def access_summary(growth: Growth) -> str:
     """Return the added access and reach of a change in one sentence."""
-    worlds = ", ".join(growth.worlds)
+    from sros_tool.dds.decision.vendors import together
+
+    worlds = ", ".join(together(growth.worlds))
     basis = "".join(
         f"; {title}: {', '.join(clauses)}"
         for title, clauses in (

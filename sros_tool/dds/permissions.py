@@ -22,7 +22,7 @@ from sros_tool.xml import escape, parse, quoted, require_child, tag_of
 _SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_permissions.xsd"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
 MAX_SIGNED_BYTES = 60 * 1024
-"""Size limit, in bytes, of signed permissions: Fast DDS 2.9 may not finish a larger handshake.
+"""Size limit, in bytes, of signed permissions: with more, Fast DDS 2.6 and 2.9 may not finish.
 
 A message of the handshake must fit into one UDP datagram of 64 KB, with the certificate, the
 signature and the participant's data.  Measured on Fast DDS 2.9.1 with one network interface:
@@ -335,8 +335,8 @@ def document_notes(what: str, permissions: Permissions, signed_bytes: int) -> It
 
 
 _CONSEQUENCES = {
-    "portable.document-size": f"; with {MAX_SIGNED_BYTES} or more, Fast DDS 2.9 may never "
-    "finish the handshake. Remove rights that are never used, or use wildcards (`sros "
+    "portable.document-size": f"; with {MAX_SIGNED_BYTES} or more, Fast DDS 2.6 and 2.9 may "
+    "never finish the handshake. Remove rights that are never used, or use wildcards (`sros "
     "minimize_policy POLICY --observed OBSERVED` shows both), or split the enclave.",
     "portable.long-name": f"; on Fast DDS no peer matches a topic of more than "
     f"{_LONGEST_TOPIC} bytes. Use shorter namespaces and names.",

@@ -7,7 +7,7 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from sros_tool.dds.decision.answers import Outcome, OutcomeWord, ReasonWord
-from sros_tool.dds.decision.vendors import NEWEST, Vendor
+from sros_tool.dds.decision.vendors import PRINCIPAL, Vendor
 from sros_tool.distributions import SUPPORTED, Shipped
 from sros_tool.errors import Note, SrosError
 from sros_tool.explain.answer import Answer, Evaluator, Provenance
@@ -204,7 +204,8 @@ def explain_on_dds(
         ]
         return DistributionComparison(what, by_distribution, beside, answer.allowed, notes)
     measured = [
-        answer if v is vendor else Evaluator(v, enclave, context).answer(question) for v in NEWEST
+        answer if v is vendor else Evaluator(v, enclave, context).answer(question)
+        for v in PRINCIPAL
     ]
     if len({each.outcome for each in measured}) > 1:
         notes = (*notes, Note("explain.vendors-differ", f"{differences(measured)}."))

@@ -16,7 +16,15 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import dsa, ec, rsa
 from cryptography.x509.oid import SignatureAlgorithmOID
 
-from sros_tool.dds.decision.vendors import MEASURED, Hashes, Keys, Signers, Vendor, VendorTraits
+from sros_tool.dds.decision.vendors import (
+    MEASURED,
+    Hashes,
+    Keys,
+    Signers,
+    Vendor,
+    VendorTraits,
+    together,
+)
 from sros_tool.errors import PkiError
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
@@ -317,12 +325,14 @@ def refusals_text(refusals: Mapping[Vendor, str]) -> str:
     by_text: dict[str, list[str]] = {}
     for vendor, text in refusals.items():
         by_text.setdefault(text, []).append(vendor.title)
-    clauses = [
-        f"{' and '.join(titles)} {'refuses' if len(titles) == 1 else 'refuse'} the certificates "
-        f"or documents of this CA: {text}"
-        for text, titles in by_text.items()
-    ]
-    accepts = [vendor.title for vendor in MEASURED if vendor not in refusals]
+    clauses = []
+    for text, named in by_text.items():
+        titles = together(named)
+        verb = "refuses" if len(titles) == 1 else "refuse"
+        clauses.append(
+            f"{' and '.join(titles)} {verb} the certificates or documents of this CA: {text}"
+        )
+    accepts = together(vendor.title for vendor in MEASURED if vendor not in refusals)
     if accepts:
         verb = "accepts" if len(accepts) == 1 else "accept"
         clauses.append(f"{' and '.join(accepts)} {verb} it")

@@ -26,7 +26,14 @@ from sros_tool.dds.decision.documents import (
     read_governance_as,
     read_permissions_as,
 )
-from sros_tool.dds.decision.vendors import MEASURED, Vendor, VendorTraits
+from sros_tool.dds.decision.vendors import (
+    CYCLONE_DDS,
+    FAST_DDS,
+    MEASURED,
+    Vendor,
+    VendorTraits,
+    together,
+)
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.dds.permissions import Permissions, render_permissions
@@ -220,11 +227,9 @@ def _expiries(state: OpenedEnclave, folder: Path) -> Iterator[tuple[str, datetim
 # ── what a vendor makes of it ──────────────────────────────────────────────────────────────
 
 _ONLY_PEERS_NOTICE = {
-    (Vendor.CYCLONE, Fault.KEY_MISMATCH),
-    (Vendor.CYCLONE_11, Fault.KEY_MISMATCH),
-    (Vendor.FAST, Fault.KEY_ALGORITHM),
-    (Vendor.FAST_2_9, Fault.KEY_ALGORITHM),
-    (Vendor.FAST_2_9, Fault.DOCUMENT_SIZE),
+    *((vendor, Fault.KEY_MISMATCH) for vendor in CYCLONE_DDS),
+    *((vendor, Fault.KEY_ALGORITHM) for vendor in FAST_DDS),
+    *((vendor, Fault.DOCUMENT_SIZE) for vendor in FAST_DDS),
 }
 """Faults that a vendor does not notice in its own process, but all peers do."""
 
@@ -393,7 +398,7 @@ class EvaluatedEnclave(NamedTuple):
                 if any(cause.file == problem.file for cause in participant.causes())
             ]
             if titles and problem not in self.state.problems:
-                clauses.append(f"{problem} (refused by {' and '.join(titles)})")
+                clauses.append(f"{problem} (refused by {' and '.join(together(titles))})")
         return clauses
 
     @property
@@ -466,7 +471,7 @@ def _with_acceptance(
     titles: dict[bool, list[str]] = {True: [], False: []}
     for participant in made:
         titles[problem not in participant.problems].append(participant.vendor.title)
-    accepting, refusing = (", ".join(titles[each]) for each in (True, False))
+    accepting, refusing = (", ".join(together(titles[accepts])) for accepts in (True, False))
     if problem.fault is not Fault.SIGNATURE or not accepting:
         return problem
     text = f"{problem.text}; accepted by {accepting}"

@@ -11,6 +11,7 @@ from itertools import islice
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import ASSUMED, NOT_ON_ZENOH, VACUOUS, VIOLATED
+from sros_tool.dds.decision.vendors import together
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import (
     READING_SERVICES,
@@ -195,7 +196,7 @@ def _text(violation: Violation) -> str:
     requirement = violation.requirement
     text = f"{_fact(violation)}, but {demand(requirement)}"
     if violation.worlds:
-        text += f"; with {', '.join(violation.worlds)} only"
+        text += f"; with {', '.join(together(violation.worlds))} only"
     if requirement.why:
         text += f": {requirement.why}"
     return text

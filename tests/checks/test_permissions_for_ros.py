@@ -117,7 +117,7 @@ def test_only_vendors_that_let_the_enclave_in_are_named(bench: Bench) -> None:
     }
     assert texts["fastdds"] == []
     (alone,), (among,) = texts["cyclonedds"], texts[""]
-    assert among == f"on Cyclone DDS 0.10 and Cyclone DDS 11.0 {alone}"
+    assert among == f"on Cyclone DDS {alone}"
 
 
 def test_a_program_of_dds_alone_is_no_error(bench: Bench) -> None:

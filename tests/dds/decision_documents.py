@@ -8,7 +8,7 @@ from functools import lru_cache
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.answers import Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.vendors import DocumentReader, Vendor
+from sros_tool.dds.decision.vendors import Vendor, VendorTraits
 from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Permissions
 
@@ -91,13 +91,13 @@ def permissions(*grants: str) -> bytes:
 
 
 @lru_cache(1000)
-def _governance(vendor: Vendor, _: DocumentReader, xml: bytes) -> Governance | Refusal:
+def _governance(vendor: Vendor, _: VendorTraits, xml: bytes) -> Governance | Refusal:
     """What a vendor reads: the same texts are asked about again and again."""
     return read_governance_as(vendor, xml)
 
 
 @lru_cache(1000)
-def _permissions(vendor: Vendor, _: DocumentReader, xml: bytes) -> Permissions | Refusal:
+def _permissions(vendor: Vendor, _: VendorTraits, xml: bytes) -> Permissions | Refusal:
     return read_permissions_as(vendor, xml)
 
 
@@ -112,11 +112,10 @@ def access_of(
     zone: tzinfo = UTC,
 ) -> Access | Refusal:
     """Return the access control by two documents as ``vendor`` reads them, or its refusal."""
-    reader = vendor.traits.reader
-    read = _governance(vendor, reader, governance_xml)
+    read = _governance(vendor, vendor.traits, governance_xml)
     if isinstance(read, Refusal):
         return read
-    permissions_read = _permissions(vendor, reader, permissions_xml)
+    permissions_read = _permissions(vendor, vendor.traits, permissions_xml)
     if isinstance(permissions_read, Refusal):
         return permissions_read
     governed = GovernedDomain(vendor, read, domain)

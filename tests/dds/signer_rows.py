@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from cryptography.x509.name import _ASN1Type
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.decision.vendors import CYCLONE_DDS, Vendor
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, parse_subject, pem
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
@@ -159,7 +159,7 @@ class Made:
 
 @dataclass(frozen=True)
 class Row:
-    """What Fast DDS 2.9.1, Fast DDS 2.14.5 and Cyclone DDS 0.10 do with one."""
+    """What Fast DDS 2.9.1, its other releases, and Cyclone DDS 0.10 do with one."""
 
     name: str
     made: Made
@@ -169,13 +169,10 @@ class Row:
 
     def answer(self, vendor: Vendor) -> str:
         """Return what a vendor does."""
-        answers = {
-            Vendor.FAST_2_9: self.fast,
-            Vendor.FAST: self.later,
-            Vendor.CYCLONE: self.cyclone,
-            Vendor.CYCLONE_11: ON_CYCLONE_11.get(self.name, self.cyclone),
-        }
-        return answers[vendor]
+        if vendor in CYCLONE_DDS:
+            others = ON_CYCLONE_11 if vendor is Vendor.CYCLONE_11 else {}
+            return others.get(self.name, self.cyclone)
+        return self.fast if vendor is Vendor.FAST_2_9 else self.later
 
 
 ON_CYCLONE_11 = {

@@ -2,13 +2,13 @@
 
 import pytest
 
-from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, MEASURED, NEWEST, Vendor
+from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, MEASURED, PRINCIPAL, Vendor
 
 
 def test_the_measured_vendors() -> None:
-    assert MEASURED == (Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE, Vendor.CYCLONE_11)
-    assert NEWEST == (Vendor.FAST, Vendor.CYCLONE)
-    assert FAST_DDS == (Vendor.FAST, Vendor.FAST_2_9)
+    assert MEASURED == FAST_DDS + CYCLONE_DDS
+    assert PRINCIPAL == (Vendor.FAST, Vendor.CYCLONE)
+    assert {each.release for each in FAST_DDS} == {"2.6", "2.9.1", "2.14", "3.2", "3.6"}
     assert CYCLONE_DDS == (Vendor.CYCLONE, Vendor.CYCLONE_11)
 
 

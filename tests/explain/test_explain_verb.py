@@ -209,7 +209,10 @@ def test_all_vendors_and_where_they_differ(tmp_path: Path) -> None:
     assert {each["vendor"]: each["outcome"] for each in told["vendors"]} == {
         "standard": "allowed",
         "fastdds": "allowed",
+        "fastdds-2.6": "allowed",
         "fastdds-2.9": "allowed",
+        "fastdds-3.2": "allowed",
+        "fastdds-3.6": "allowed",
         "cyclonedds": "denied",
         "cyclonedds-11": "allowed",
         "opendds": "allowed",

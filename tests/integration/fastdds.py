@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import os
-import re
 import shutil
 from functools import cache
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.runtime.netns import enter_isolation
 from tests.support.children import Done, has_isolation, run
 
@@ -23,22 +22,36 @@ OWN_FASTDDS = os.environ.get("SROS_FASTDDS_PREFIX", "")
 
 
 @cache
+def fastdds_library() -> Path:
+    """Return the library that is asked, under its full name, such as ``libfastdds.so.3.6.2``."""
+    skip_without_fastdds()
+    folders = [Path(OWN_FASTDDS, "lib")] if OWN_FASTDDS else [*Path("/usr/lib").glob("*-linux-gnu")]
+    names = ("libfastdds.so", "libfastrtps.so")
+    (library, *_) = (
+        folder / name for folder in folders for name in names if (folder / name).exists()
+    )
+    return library.resolve()
+
+
+def fastdds_version() -> str:
+    """Return the version of the Fast DDS that is asked; skip the test without one."""
+    return ".".join(fastdds_library().name.partition(".so.")[2].split(".")[:3])
+
+
+@cache
 def fastdds_vendor() -> Vendor:
-    """Which of the two versions that sros knows the Fast DDS is that is asked."""
+    """Return the vendor that has the decisions of the Fast DDS that is asked."""
     if not OWN_FASTDDS:
         return Vendor.FAST_2_9
-    config = Path(OWN_FASTDDS, "include/fastrtps/config.h").read_text()
-    minor = re.search(r"FASTRTPS_VERSION_MINOR (\d+)", config)
-    return Vendor.FAST if minor and int(minor[1]) >= 14 else Vendor.FAST_2_9
+    series = fastdds_version().rpartition(".")[0]
+    (vendor,) = (each for each in FAST_DDS if f"{each.release}.".startswith(f"{series}."))
+    return vendor
 
 
 @cache
 def fastdds_stack() -> str:
     """The name under which the replies of this Fast DDS are kept; skips the test without it."""
-    skip_without_fastdds()
-    folders = [Path(OWN_FASTDDS, "lib")] if OWN_FASTDDS else Path("/usr/lib").glob("*-linux-gnu")
-    (library, *_) = (each for folder in folders for each in folder.glob("libfastrtps.so"))
-    return f"fast-{library.resolve().name.partition('.so.')[2]}-{openssl()}"
+    return f"fast-{fastdds_version()}-{openssl()}"
 
 
 @cache
@@ -73,12 +86,13 @@ def build(source: str, folder: Path) -> Path:
 
 
 def _libraries() -> list[str]:
+    library = f"-l{fastdds_library().name.partition('.so')[0].removeprefix('lib')}"
     if not OWN_FASTDDS:
-        return ["-lfastrtps"]
+        return [library]
     include, lib = f"{OWN_FASTDDS}/include", f"{OWN_FASTDDS}/lib"
     # These tags come before $LD_LIBRARY_PATH, which may name another Fast DDS of that version.
     found = f"-Wl,-rpath,{lib},--disable-new-dtags"
-    return [f"-I{include}", f"-L{lib}", found, "-lfastrtps", "-lfastcdr"]
+    return [f"-I{include}", f"-L{lib}", found, library, "-lfastcdr"]
 
 
 def run_isolated_program(*command: object, **more: Any) -> Done:

@@ -13,7 +13,7 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from sros_tool.dds.decision.vendors import CYCLONE_DDS, Vendor
+from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, Vendor
 from sros_tool.explain.answer import Evaluator
 from sros_tool.explain.question import ask as question
 from sros_tool.keystore.participant import JoinContext, load_enclave
@@ -94,9 +94,11 @@ def test_what_fast_dds_does(
     def ask(some: Sequence[Pair], seconds: float) -> list[Reply]:
         return ask_fastdds_folders(some, TOPIC, program_folder, seconds=seconds)
 
-    expected = [({each.fast, each.race or each.fast}, (each.fast_says,)) for each in ALL]
-    if fastdds_vendor() is Vendor.FAST:
-        expected = [({each.later or each.fast}, ("",)) for each in ALL]
+    expected = []
+    for each in ALL:
+        answer, says = each.on_fast(fastdds_vendor())
+        race = each.race if answer == each.fast else ""
+        expected.append(({answer, race or answer}, (says,)))
     compare(ask, pairs(sound, broken), expected)
 
 
@@ -162,8 +164,7 @@ def test_explain_says_what_each_vendor_does(each: Breakage, broken: dict[str, Be
     material = load_enclave("/base", bench.path("enclaves/base"), at=bench.now)
     setting = JoinContext(0, bench.now, ZoneInfo(each.zone))
     does = {
-        Vendor.FAST: each.later or each.fast,
-        Vendor.FAST_2_9: each.fast,
+        **{vendor: each.on_fast(vendor)[0] for vendor in FAST_DDS},
         **{vendor: each.on_cyclone(vendor)[0] for vendor in CYCLONE_DDS},
     }
     for vendor, word in does.items():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import MEASURED, Signers, Vendor
 from sros_tool.errors import PkiError
 from sros_tool.keystore.participant import load_enclave
 from sros_tool.pki import smime
@@ -82,7 +82,7 @@ def enclave(workshop: Workshop, name: str, subject: str, document: bytes) -> Pat
 
 
 def takes(vendor: Vendor, form: str) -> bool:
-    later = vendor in (Vendor.FAST, Vendor.CYCLONE_11)
+    later = vendor.traits.signers is Signers.LISTED
     return FORMS[form][1] or (later and form in TAKEN_LATER)
 
 

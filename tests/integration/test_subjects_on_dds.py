@@ -15,7 +15,7 @@ from cryptography.x509.name import _ASN1Type
 from cryptography.x509.oid import NameOID
 
 from sros_tool.dds.decision.answers import AccessVerb, Outcome, Refusal
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import MEASURED, Subjects, Vendor
 from sros_tool.pki.certificates import subject_text
 from tests.dds.decision_documents import access_of, allow, grant, permissions, publish, subscribe
 from tests.dds.signer_rows import NOW, REFUSED, YES, Made, write_enclave
@@ -156,4 +156,4 @@ def answer_of(row: Row, vendor: Vendor) -> str:
         return row.cyclone_11 or row.cyclone
     if vendor is Vendor.CYCLONE:
         return row.cyclone
-    return row.later if vendor is Vendor.FAST else row.fast
+    return row.later if vendor.traits.subjects is Subjects.ANY_ORDER else row.fast

@@ -2,7 +2,8 @@
 
 ``YES`` is created and matched with a peer that may do everything.  The answers are those of Fast
 DDS 2.9.1 and Cyclone DDS 0.10; what Fast DDS 2.14.5 and Cyclone DDS 11.0 do otherwise stands in
-``later`` and ``cyclone_11``.
+``later`` and ``cyclone_11``, what Fast DDS 3 does otherwise than
+2.14.5 in ``fast_3``, and 2.6.12 otherwise than 2.9.1 in ``fast_2_6``.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ class Row:
     cyclone: str
     later: str = ""
     cyclone_11: str = ""
+    fast_3: str = ""
+    fast_2_6: str = ""
 
 
 # ── governance ─────────────────────────────────────────────────────────────────────────────
@@ -383,6 +386,32 @@ def subjects() -> list[Row]:
     ]
 
 
+def missing() -> list[Row]:
+    """Documents that lack what the vendors' parsers take for granted."""
+    granted = permissions(grant(allow(criteria("publish", "rt/a"))))
+    nameless = governance(domain_rule(topic_rule(expression="")))
+    endless = permissions(grant(allow(criteria("publish", "rt/a")), end=""))
+    return [
+        Row(
+            "a topic rule without text",
+            ask(granted, governed=nameless),
+            CRASHES,
+            CRASHES,
+            fast_3=REFUSED,
+            fast_2_6=REFUSED,
+        ),
+        Row("no end of validity", ask(endless), CRASHES, REFUSED, fast_3=REFUSED, fast_2_6=REFUSED),
+        Row(
+            "nothing in permissions",
+            ask(b"<dds></dds>"),
+            CRASHES,
+            REFUSED,
+            fast_3=REFUSED,
+            fast_2_6=REFUSED,
+        ),
+    ]
+
+
 def names() -> list[Row]:
     """Names of topics at the limit."""
     everything = permissions(grant(allow(criteria("publish", "*"))))
@@ -581,6 +610,7 @@ def governances() -> list[Row]:
             YES,
             YES,
             REFUSED,
+            fast_2_6=REFUSED,
         ),
         Row(
             "joining free, no allow rule",
@@ -606,6 +636,6 @@ def governances() -> list[Row]:
 def rows() -> list[Row]:
     """All rows; those about time are made for this moment."""
     made: list[Callable[[], list[Row]]] = [
-        matching, rules, domains, governances, subjects, names, forms,
+        matching, rules, domains, governances, subjects, missing, names, forms,
     ]  # fmt: skip
     return [row for part in made for row in part()] + grants(datetime.now(UTC))

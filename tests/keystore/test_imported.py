@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import MEASURED, Signers, Vendor, together
 from sros_tool.errors import UsageError
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem
@@ -148,7 +148,7 @@ def test_a_ca_that_some_vendors_refuse_gets_a_note(
     assert "note [" not in sros("create_keystore", tmp_path / "plain", *plain).ok().err
 
 
-LATER = {Vendor.FAST, Vendor.CYCLONE_11}
+LATER = {vendor for vendor in MEASURED if vendor.traits.signers is Signers.LISTED}
 """The vendors that do not ask what the permissions CA may sign."""
 
 
@@ -188,15 +188,18 @@ def test_vendors_that_refuse_a_permissions_ca_are_named(
 
 
 ALL = {*MEASURED}
+STRICT = {vendor for vendor in MEASURED if vendor.traits.verifies_authorities}
+"""The vendors that verify a CA file when they load it."""
+(STRICT_TITLE,) = together(vendor.title for vendor in MEASURED if vendor in STRICT)
 
 
 @pytest.mark.parametrize(
     ("role", "usage", "takes", "words"),
     [
-        ("identity", f"{SIGNS} {CERTIFIES}", ALL - {Vendor.FAST}, "Fast DDS 2.14 refuses the encl"),
+        ("identity", f"{SIGNS} {CERTIFIES}", ALL - STRICT, f"{STRICT_TITLE} refuses the encl"),
         ("identity", None, set(), "no DDS vendor would accept an enclave"),
         ("identity", SIGNS, set(), "does not allow it to issue certificates"),
-        ("permissions", f"{SIGNS} {CERTIFIES}", ALL - {Vendor.FAST}, "Fast DDS 2.14 refuses the e"),
+        ("permissions", f"{SIGNS} {CERTIFIES}", ALL - STRICT, f"{STRICT_TITLE} refuses the e"),
         ("permissions", None, ALL, ""),
         ("permissions", SIGNS, set(), "does not allow it to issue certificates"),
     ],

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import FAST_DDS, MEASURED, Vendor, together
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.issuing.acceptance import refusals, refuse_stopping
 from sros_tool.keystore.layout import CRL, enclave_path, list_enclaves
@@ -117,7 +117,8 @@ def test_a_list_that_every_vendor_refuses_is_not_signed(
     ended = sros(*(word.format(corporate) for word in words))
     assert ended.status == 2, ended
     assert "no node could start in /a, /b" in ended.err
-    assert f"{enumerated([vendor.title for vendor in MEASURED])} refuse their files" in ended.err
+    titles = enumerated(together(vendor.title for vendor in MEASURED))
+    assert f"{titles} refuse their files" in ended.err
     assert "cRLSign" in ended.err and "Nothing was changed." in ended.err
     remedy = f"sros rotate_ca {corporate} --identity --identity-key URI --finish"
     assert remedy in ended.err
@@ -154,7 +155,7 @@ def test_a_first_list_shuts_out_nobody_who_has_a_certificate_of_the_old_ca(
     assert ended.status == 2 and "cRLSign" in ended.err and "would be refused" in ended.err, ended
     assert f"sros rotate_ca {corporate} --finish" in ended.err
     assert contents(corporate) == before
-    allowed = ("--allow-refusal", "fastdds", "--allow-refusal", "fastdds-2.9")
+    allowed = [word for vendor in FAST_DDS for word in ("--allow-refusal", vendor)]
     sros("revoke", corporate, "/lost", *allowed).ok()
     sros("crl", corporate, "--refresh").ok()
 
@@ -195,8 +196,8 @@ def test_a_ca_signed_with_pss_is_said_for_the_vendors_that_refuse_it(
     role: str, pki: Path, tmp_path: Path
 ) -> None:
     said = created(pki, "PSS", tmp_path / "ks", role).ok().err
-    assert "Fast DDS 2.14 and Fast DDS 2.9.1 refuse" in said and "PSS" in said
-    assert "Cyclone DDS 0.10 and Cyclone DDS 11.0 accept" in said
+    assert "Fast DDS refuses" in said and "PSS" in said
+    assert "Cyclone DDS accepts" in said
 
 
 # ── the evaluation itself ──────────────────────────────────────────────────────────────────

@@ -184,8 +184,7 @@ def test_permissions_that_a_vendor_takes_for_ones_own_count() -> None:
     """Cyclone DDS takes the permissions of ``/robot/mux`` for those of ``/mux``, too."""
     assert texts(SHARED, ONLY_MUX) == [
         "/mux: may publish /cmd_vel by /cmd* with the permissions of /robot/mux, but only "
-        "/robot/mux may publish /cmd_vel; with Cyclone DDS 0.10, Cyclone DDS 11.0 "
-        "only"
+        "/robot/mux may publish /cmd_vel; with Cyclone DDS only"
     ]
     # Able to do something it has to be by its own permissions.
     must = '[[must]]\nenclave = "/mux"\npublish = ["/cmd_vel"]\n'

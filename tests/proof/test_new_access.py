@@ -626,7 +626,7 @@ def test_an_enclave_whose_subject_fits_the_permissions_of_another_one(tmp_path: 
     (line,) = [each for each in ended.out.splitlines() if "/robot/mux" in each]
     assert line == (
         "+ /mux publish topic /cmd_vel  (head.xml:2) by the permissions of /robot/mux, which fit "
-        "its certificate; with Cyclone DDS 0.10, Cyclone DDS 11.0"
+        "its certificate; with Cyclone DDS"
     )
     back = compare_access(*(load_side(tmp_path / each) for each in ("head.xml", "base.xml")))
     assert not back.added
@@ -657,7 +657,7 @@ def test_a_certificate_that_fits_the_permissions_of_another_one(lent: Bench) -> 
     assert ended.status == 1
     assert (
         "+ /mux publish topic /cmd_vel by the permissions of /robot/mux, which fit its "
-        "certificate; with Cyclone DDS 0.10, Cyclone DDS 11.0\n" in ended.out
+        "certificate; with Cyclone DDS\n" in ended.out
     )
     reach = json.loads(sros(*words, "--json", cwd=head.root.parent).out)["reach"]
     assert [(each["source"], each["target"]) for each in reach] == [("/mux", "/wheels")]

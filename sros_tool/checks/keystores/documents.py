@@ -19,7 +19,14 @@ from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.keystores.topic_names import check_topic_names
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
 from sros_tool.dds.decision.grants import read_moment
-from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, MEASURED, Moments, Vendor
+from sros_tool.dds.decision.vendors import (
+    CYCLONE_DDS,
+    FAST_DDS,
+    MEASURED,
+    Moments,
+    Vendor,
+    together,
+)
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Grant, Rule, outside
@@ -104,7 +111,8 @@ SUBJECT = FindingKind(
     WARNING,
     "a subject that vendors compare differently",
     "Cyclone DDS splits subjects at commas, slashes and vertical bars, and compares characters "
-    "beyond ASCII in their escaped form; Fast DDS 2.9 treats spaces around = as part of the name.",
+    "beyond ASCII in their escaped form; Fast DDS 2.6 and 2.9 treat spaces around = as part of the "
+    "name.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write it in the form of RFC 4514, CN=/name, without , | and quotes in the name.",
 )
@@ -440,9 +448,9 @@ UNAUTHENTICATED = FindingKind(
     "governance.unauthenticated",
     ERROR,
     "participants without an identity may join",
-    "On Fast DDS 2.14 they can read and write every topic without access control and protection, "
+    "On Fast DDS they can read and write every topic without access control and protection, "
     "on Cyclone DDS every topic without protection, whatever its access control. With RTPS "
-    "protection too, Fast DDS 2.14 refuses the document. Fast DDS 2.9 ignores the attribute.",
+    "protection too, Fast DDS refuses the document; only 2.9 ignores the attribute.",
     f"{_GOVERNANCE} (allow_unauthenticated_participants); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS "
     "0.10.2; measured.",
     "Run `sros update_keystore ROOT --set protection.allow_unauthenticated_participants=false`.",
@@ -658,7 +666,7 @@ def _unauthenticated(rule: DomainRule, asked: Sequence[Vendor]) -> tuple[Finding
     kind = UNAUTHENTICATED_KEPT_OUT
     clauses: dict[str, list[str]] = {}
     for vendor in asked or MEASURED:
-        if vendor is Vendor.FAST_2_9:
+        if vendor.traits.ignores_unauthenticated:
             clause = "they are refused all the same"
         elif rule.rtps_protection_kind is ProtectionKind.NONE:
             kind, clause = UNAUTHENTICATED, _reach_of_strangers(rule, vendor)
@@ -670,7 +678,9 @@ def _unauthenticated(rule: DomainRule, asked: Sequence[Vendor]) -> tuple[Finding
         else:
             clause = "they are kept out, as RTPS messages are protected"
         clauses.setdefault(clause, []).append(vendor.title)
-    return kind, "; ".join(f"on {' and '.join(some)} {clause}" for clause, some in clauses.items())
+    return kind, "; ".join(
+        f"on {' and '.join(together(titles))} {clause}" for clause, titles in clauses.items()
+    )
 
 
 def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:

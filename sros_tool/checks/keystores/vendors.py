@@ -18,7 +18,7 @@ from sros_tool.checks.keystores.topic_names import NO_ROS_NAME, has_foreign_lett
 from sros_tool.checks.kind import ERROR, WARNING, Cause, Finding, FindingKind, some_names
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb, Outcome
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import MEASURED, Vendor, together
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError
@@ -242,7 +242,7 @@ def _refusals(
         if not by_cause:
             return
     clauses = [_clause(cause, vendors) for cause, vendors in by_cause.items()]
-    accepting = [vendor.title for vendor, cause in causes.items() if not cause]
+    accepting = together(vendor.title for vendor, cause in causes.items() if not cause)
     if accepting:
         clauses.append(
             f"{enumerated(accepting)} {'accepts' if len(accepting) == 1 else 'accept'} it"
@@ -274,8 +274,8 @@ def _file(finding: Finding) -> str:
 
 def _clause(cause: RefusalCause, vendors: Sequence[Vendor]) -> str:
     several, one = _HIT_PEERS if cause.hits_peers else _SAYS.get(cause.outcome, _REFUSES)
-    says = one if len(vendors) == 1 else several
-    return f"{enumerated([vendor.title for vendor in vendors])} {says} ({cause.text})"
+    titles = together(vendor.title for vendor in vendors)
+    return f"{enumerated(titles)} {one if len(titles) == 1 else several} ({cause.text})"
 
 
 # ── what they decide differently ───────────────────────────────────────────────────────────
@@ -311,10 +311,13 @@ def _differences(answers: Mapping[Vendor, Access], topics: list[str]) -> Iterato
         (verb, topic) for topic in topics for verb in (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
     ]
     for verb, topic in questions:
-        said = {vendor.title: answer.decide(verb, topic) for vendor, answer in answers.items()}
-        if len({decision.outcome.ok for decision in said.values()}) > 1:
+        said: dict[Outcome, list[str]] = {}
+        for vendor, answer in answers.items():
+            said.setdefault(answer.decide(verb, topic).outcome, []).append(vendor.title)
+        if len({outcome.ok for outcome in said}) > 1:
             answers_text = ", ".join(
-                f"{title}: {decision.outcome.value}" for title, decision in said.items()
+                f"{', '.join(together(titles))}: {outcome.value}"
+                for outcome, titles in said.items()
             )
             yield f"{verb.value} {topic} ({answers_text})"
 
@@ -430,7 +433,8 @@ def check_starting(evaluation: EnclaveEvaluation, known: Sequence[Finding]) -> l
         worst = max(filter(None, denials), key=lambda denial: len(denial.text))
         where = f"on domain {domain}, " if len(evaluation.by_domain) > 1 else ""
         if len(running) < len(made):
-            where += f"on {' and '.join(participant.vendor.title for participant in running)} "
+            titles = together(participant.vendor.title for participant in running)
+            where += f"on {' and '.join(titles)} "
         finding = NO_NODE.found(enclave.name, f"{where}{worst}", enclave.file(PERMISSIONS_FILE))
         return [*(each for each in known if not worst.explains(each)), finding]
     return [*known]

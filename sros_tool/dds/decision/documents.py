@@ -60,7 +60,7 @@ def _read(
     try:
         return read(xml)
     except UnreadableError as error:
-        return error.refusal(vendor.title, what)
+        return error.refusal(vendor.traits, what)
     except DocumentError as error:
         return Refusal("malformed", f"{vendor.title}: {error}")
 

@@ -13,6 +13,7 @@ from enum import Enum, auto
 from lxml import etree
 
 from sros_tool.dds.decision.answers import Outcome, Refusal
+from sros_tool.dds.decision.vendors import VendorTraits
 from sros_tool.dds.governance import (
     DomainRule,
     Governance,
@@ -25,16 +26,21 @@ from sros_tool.xml import tag_of
 
 
 class UnreadableError(Exception):
-    """A document that the vendor does not accept; ``outcome`` says whether the vendor crashes."""
+    """A document that a vendor does not accept.
 
-    def __init__(self, text: str, outcome: Outcome = Outcome.REFUSED) -> None:
+    ``missing`` says that it lacks content on which some releases crash
+    (`VendorTraits.crashes_on_missing_content`).
+    """
+
+    def __init__(self, text: str, *, missing: bool = False) -> None:
         super().__init__(text)
-        self.outcome = outcome
+        self.missing = missing
 
-    def refusal(self, title: str, document: str) -> Refusal:
-        """Return this error as a `Refusal`; ``title`` names the vendor."""
-        how = "crashes on" if self.outcome is Outcome.CRASHES else "refuses"
-        return Refusal("malformed", f"{title} {how} the {document}: {self}.", self.outcome)
+    def refusal(self, traits: VendorTraits, document: str) -> Refusal:
+        """Return this error as a `Refusal` of the vendor with these traits."""
+        crashes = self.missing and traits.crashes_on_missing_content
+        how, outcome = ("crashes on", Outcome.CRASHES) if crashes else ("refuses", Outcome.REFUSED)
+        return Refusal("malformed", f"{traits.title} {how} the {document}: {self}.", outcome)
 
 
 class NodeMark(Enum):

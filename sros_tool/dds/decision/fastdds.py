@@ -13,7 +13,6 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from sros_tool.dds.decision.answers import Outcome
 from sros_tool.dds.decision.elements import NodeMark, UnreadableError, XmlElement
 from sros_tool.dds.domains import DomainRange, DomainSet
 from sros_tool.dds.governance import (
@@ -214,8 +213,7 @@ def _first(root: XmlElement, name: str) -> XmlElement:
         raise UnreadableError("its root is not <dds>")
     children = root.elements
     if not children:
-        outcome = Outcome.CRASHES if name == "permissions" else Outcome.REFUSED
-        raise UnreadableError("<dds> is empty", outcome)
+        raise UnreadableError("<dds> is empty", missing=name == "permissions")
     if children[0].name != name:
         raise UnreadableError(f"<dds> does not begin with <{name}>")
     return children[0]
@@ -376,7 +374,7 @@ def _topic_rule(element: XmlElement) -> TopicRule:
     take = _Sequence(element)
     expression = _text(take.next("topic_expression"))
     if expression is None:
-        raise UnreadableError("<topic_expression> is empty", Outcome.CRASHES)
+        raise UnreadableError("<topic_expression> is empty", missing=True)
     rule = TopicRule(topic_expression=expression, **_values(take, TopicRule))
     take.end()
     return rule
@@ -414,7 +412,7 @@ def _validity(element: XmlElement) -> tuple[str, str]:
     begin = _required(take.next("not_before"))
     end = _text(take.next("not_after"))
     if end is None:
-        raise UnreadableError("<not_after> is empty", Outcome.CRASHES)
+        raise UnreadableError("<not_after> is empty", missing=True)
     return begin, end
 
 

@@ -1,12 +1,14 @@
 """The vendors of DDS Security, and the differences of their decisions, as data.
 
-Fast DDS 2.9.1 and 2.14.5 and Cyclone DDS 0.10.2, 0.10.5 and 11.0.1 were measured on the real
-libraries; Cyclone DDS 0.10.2 and 0.10.5 decide alike.  Vendors that were never measured, such as
-OpenDDS and Connext, are taken to follow the standard, as their manuals say.
+Fast DDS 2.6.12, 2.9.1, 2.14.5, 2.14.6, 3.2.5 and 3.6.2 and Cyclone DDS 0.10.2, 0.10.5 and 11.0.1
+were measured on the real libraries; Fast DDS 2.14.5 and 2.14.6 decide alike, and so do Cyclone DDS
+0.10.2 and 0.10.5.  Vendors that were never measured, such as OpenDDS and Connext, are taken to
+follow the standard, as their manuals say.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum, StrEnum, auto
 
@@ -26,7 +28,7 @@ class Subjects(Enum):
     EXACT = auto()
     """The same attributes in the same order; spaces around them do not count."""
     WHOLE_ATTRIBUTES = auto()
-    """The same texts between commas, escaped or not, without blanks (Fast DDS 2.9)."""
+    """The same texts between commas, escaped or not, without blanks (Fast DDS 2.6 and 2.9)."""
     ANY_ORDER = auto()
     """The same attributes in any order (Fast DDS 2.14)."""
     SUBSET = auto()
@@ -155,6 +157,9 @@ class VendorTraits:
     """The first rule whose topic matches decides, even if its partitions then do not match."""
     deny_partitions: DenyPartitions = DenyPartitions.ANY_OR_ALL
     honours_default: bool = True
+    crashes_on_missing_content: bool = False
+    """An empty ``<topic_expression>``, ``<not_after>`` or document of permissions is a crash, and
+    otherwise refused (Fast DDS before 3)."""
     crashes_on_empty_texts: bool = False
     """An expression or a default without text crashes the process when a decision reaches it."""
     topic_names: TopicNames = TopicNames.ANY
@@ -176,6 +181,8 @@ class VendorTraits:
 
     Access control in the direction of the participant prevents this.
     """
+    ignores_unauthenticated: bool = False
+    """Participants without an identity are kept out, whatever the governance says (2.9)."""
     refuses_open_rtps: bool = False
     """Unauthenticated participants together with RTPS protection are refused."""
     signers: Signers = Signers.AUTHORITY
@@ -221,6 +228,7 @@ _FAST_2_14 = VendorTraits(
     topic_decides=True,
     deny_partitions=DenyPartitions.IGNORED,
     honours_default=False,
+    crashes_on_missing_content=True,
     always_needs_allow_rule=True,
     needs_domain_rule=False,
     refuses_open_rtps=True,
@@ -260,8 +268,8 @@ class Vendor(StrEnum):
     """A DDS implementation, or the specification itself.
 
     To add a vendor that decides by the standard, add an entry: options, texts and comparisons
-    follow.  `sros_tool.runtime.rmw` maps RMWs to vendors.  Put the newest release of a product
-    first.
+    follow.  `sros_tool.runtime.rmw` maps RMWs to vendors.  The first release of a
+    product is the one that options name without a version.
     """
 
     traits: VendorTraits
@@ -275,17 +283,36 @@ class Vendor(StrEnum):
 
     STANDARD = "standard"
     FAST = "fastdds", _FAST_2_14
+    FAST_2_6 = (
+        "fastdds-2.6",
+        replace(
+            _FAST_2_14,
+            title="Fast DDS 2.6",
+            subjects=Subjects.WHOLE_ATTRIBUTES,
+            crashes_on_missing_content=False,
+            largest_document=60 * 1024 - 1,
+        ),
+    )
     FAST_2_9 = (
         "fastdds-2.9",
         replace(
             _FAST_2_14,
             title="Fast DDS 2.9.1",
             subjects=Subjects.WHOLE_ATTRIBUTES,
+            ignores_unauthenticated=True,
             refuses_open_rtps=False,
             signers=Signers.CHAIN,
             verifies_authorities=False,
             largest_document=60 * 1024 - 1,
         ),
+    )
+    FAST_3_2 = (
+        "fastdds-3.2",
+        replace(_FAST_2_14, title="Fast DDS 3.2", crashes_on_missing_content=False),
+    )
+    FAST_3_6 = (
+        "fastdds-3.6",
+        replace(_FAST_2_14, title="Fast DDS 3.6", crashes_on_missing_content=False),
     )
     CYCLONE = "cyclonedds", _CYCLONE_0_10
     CYCLONE_11 = (
@@ -324,8 +351,8 @@ class Vendor(StrEnum):
 MEASURED = tuple(vendor for vendor in Vendor if vendor.traits.measured)
 """The vendors whose decisions were compared with the real library."""
 
-NEWEST = tuple({vendor.traits.product: vendor for vendor in reversed(MEASURED)}.values())[::-1]
-"""The newest measured release of each implementation."""
+PRINCIPAL = tuple({vendor.traits.product: vendor for vendor in reversed(MEASURED)}.values())[::-1]
+"""The release of each measured implementation that options name without a version."""
 
 
 def _releases(product: str) -> tuple[Vendor, ...]:
@@ -337,3 +364,31 @@ FAST_DDS = _releases("Fast DDS")
 
 CYCLONE_DDS = _releases("Cyclone DDS")
 """All releases of Cyclone DDS."""
+
+
+def together(titles: Iterable[str]) -> list[str]:
+    """Return titles of vendors with the releases of each product together, for messages.
+
+    All measured releases of a product are the product itself, and some are ``Fast DDS 2.14/3.6``.
+    Other texts, such as ``Zenoh``, stay as they are.
+    """
+    of_title = {vendor.title: vendor for vendor in MEASURED}
+    releases: dict[str, list[Vendor]] = {}
+    for title in titles:
+        vendor = of_title.get(title)
+        named = releases.setdefault(vendor.traits.product if vendor else title, [])
+        named += [vendor] if vendor else []
+    return [
+        product if set(named) == _measured(product) else f"{product} {_releases_text(named)}"
+        for product, named in releases.items()
+    ]
+
+
+def _measured(product: str) -> set[Vendor]:
+    return {vendor for vendor in MEASURED if vendor.traits.product == product}
+
+
+def _releases_text(vendors: Iterable[Vendor]) -> str:
+    """Return the releases, the earliest first, such as ``2.9.1/2.14``."""
+    releases = (vendor.release for vendor in vendors)
+    return "/".join(sorted(releases, key=lambda release: [*map(int, release.split("."))]))

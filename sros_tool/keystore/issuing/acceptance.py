@@ -21,7 +21,7 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.dds.decision.answers import Decision
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import MEASURED, Vendor, together
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import render_permissions
 from sros_tool.errors import KeystoreError, Note, SrosError
@@ -231,7 +231,7 @@ def _would_stop(root: Path, refused: Mapping[Vendor, _Refusals], remedy: str) ->
         f"no node could start in {_some(names)} of '{root}'",
         f"{_clauses(why, f'{whose} files after the change')}. Nothing was changed.",
         f"{remedy or 'Replace the file that the error names.'} If no node runs on "
-        f"{enumerated([vendor.title for vendor in refused])}, add {options}.",
+        f"{enumerated(together(vendor.title for vendor in refused))}, add {options}.",
     )
 
 
@@ -262,11 +262,13 @@ def _authority_without_list(files: _FilesOfChange) -> x509.Certificate | None:
 def _would_be_shut_out(
     root: Path, old: x509.Certificate, vendors: Sequence[Vendor], remedy: str
 ) -> KeystoreError:
-    name, titles = subject_text(old.subject), enumerated([vendor.title for vendor in vendors])
+    titles = together(vendor.title for vendor in vendors)
+    demand = f"{enumerated(titles)} {'demands' if len(titles) == 1 else 'demand'}"
+    name = subject_text(old.subject)
     options = " ".join(f"--allow-refusal {vendor.value}" for vendor in vendors)
     return KeystoreError(
         f"processes that still have certificates of {name} would be refused in '{root}'",
-        f"With any revocation list, {titles} demand a list of each CA, and the keyUsage of "
+        f"With any revocation list, {demand} a list of each CA, and the keyUsage of "
         f"{name} lacks cRLSign. Nothing was changed.",
         f"{remedy} If no process runs with such a certificate, add {options}.",
     )
@@ -279,7 +281,7 @@ def _clauses(refused: Mapping[Vendor, str], what: str) -> str:
         by_reason.setdefault(reason, []).append(vendor.title)
     return "; ".join(
         f"{enumerated(titles)} {'refuses' if len(titles) == 1 else 'refuse'} {what} ({reason})"
-        for reason, titles in by_reason.items()
+        for reason, titles in ((reason, together(named)) for reason, named in by_reason.items())
     )
 
 
@@ -316,7 +318,7 @@ def imported_notes(
     known = " ".join(note.text for note in authorities.notes)
     notes = []
     if new := {vendor: why for vendor, why in refused.items() if vendor.title not in known}:
-        others = [vendor.title for vendor in MEASURED if vendor not in refused]
+        others = together(vendor.title for vendor in MEASURED if vendor not in refused)
         verb = "accepts" if len(others) == 1 else "accept"
         text = (
             f"{_clauses(new, 'the enclaves of this keystore')}; {enumerated(others)} {verb} them."

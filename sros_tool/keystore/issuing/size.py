@@ -92,7 +92,7 @@ class PermissionsBytes(NamedTuple):
     after: int
     """Size after the policy was minimized."""
     limit: int = MAX_SIGNED_BYTES
-    """Size from which Fast DDS 2.9 refuses permissions."""
+    """Size from which Fast DDS 2.6 and 2.9 refuse permissions."""
 
 
 @shows(spread=("use",))
