@@ -78,9 +78,9 @@ def enclave_subject(name: str, *, unique: bool) -> x509.Name:
     """Return the subject of an enclave's certificate: the CN ``name``; if ``unique``, a random OU.
 
     The OU keeps other permissions from matching: the permissions of an enclave whose name contains
-    this name (Cyclone DDS compares parts), and the permissions for an earlier certificate.  The
-    RFC 4514 text has the CN first; that of the root enclave has it last, because Cyclone DDS takes
-    its slash for the end of a part, and refuses a subject with an empty part before another one.
+    this name (Cyclone DDS compares parts), and the permissions for an earlier certificate.  The RFC
+    4514 text has the CN first.  For the root enclave it has the CN last, because Cyclone DDS takes
+    the slash for the end of a part, and refuses a subject with an empty part before another part.
     """
     if not unique:
         return common_name(name)
@@ -444,9 +444,10 @@ def has_explicit_curve(certificate: x509.Certificate) -> bool:
 
 @lru_cache(maxsize=256)
 def _algorithms(certificate: x509.Certificate) -> tuple[der.Value, der.Value]:
-    """Return the algorithm in the signed part and that of the signature (RFC 5280, 4.1.1.2).
+    """Return the algorithms in the signed part and at the signature (RFC 5280, 4.1.1.2).
 
-    OpenSSL compares them when it verifies the signature, which it does not of a self-signed CA.
+    OpenSSL compares them when it verifies the signature, but does not verify the signature of a
+    self-signed CA.
     """
     whole = der.first(_in_der(certificate, certificate.public_bytes(serialization.Encoding.DER)))
     signed, outer, _ = der.children(whole.content)

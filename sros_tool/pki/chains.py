@@ -1,7 +1,7 @@
 """Verification of certificate chains as OpenSSL 3.0 does it for the DDS vendors (x509_vfy.c).
 
-It is not OpenSSL itself that is asked: the one that Python brings may be a newer one, which accepts
-chains that the vendors' refuses.  tests/integration/test_forged_chains.py compares both.
+OpenSSL itself is not used, because Python's version may be newer, and accept chains that the
+vendors' version refuses.  tests/integration/test_forged_chains.py compares both.
 """
 
 from __future__ import annotations
@@ -265,8 +265,8 @@ def _unread_faults(certificate: x509.Certificate) -> list[str]:
 def _network_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     """Yield why the network extensions make OpenSSL, or sros, refuse a chain (v3_addr.c).
 
-    Those of its CA restrict nothing, but where the first certificate has some, a trusted CA cannot
-    have those of another one.
+    These extensions restrict nothing if they are inherited from the CA.  But if the first
+    certificate has one, the trusted CA must not inherit it from another CA.
     """
     for oid, title in _NETWORKS.items():
         values = [
@@ -454,7 +454,8 @@ _ALWAYS_ASKED = {ExtensionOID.CERTIFICATE_POLICIES, ExtensionOID.POLICY_CONSTRAI
 def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     """Yield a fault if a demanded policy is not valid for the whole chain (pcy_tree.c).
 
-    Also where a certificate has a policy twice, or translates policies, which sros does not follow.
+    Also yield a fault if a certificate has a policy twice, or maps policies, which sros does not
+    support.
     """
     if not any(_OF_POLICIES & {each.oid for each in below.extensions} for below in chain[:-1]):
         return

@@ -458,9 +458,10 @@ class _Content:
 
 
 class _Entries(NamedTuple):
-    """Whether a list has a critical extension that OpenSSL does not know, also in an entry.
+    """Facts about the extensions of a list and of its entries.
 
-    ``name_issuers`` says whether its entries name the CAs whose certificates they revoke.
+    ``has_unknown`` says whether the list or an entry has a critical extension that OpenSSL does not
+    know, ``name_issuers`` whether entries name the CAs whose certificates they revoke.
     """
 
     has_unknown: bool

@@ -84,7 +84,7 @@ def split_all(data: bytes) -> list[bytes]:
 def normalized(data: bytes) -> bytes:
     """Return the first value in BER ``data`` (X.690, 8), re-encoded with DER lengths.
 
-    Also the values inside it, if it is constructed; OpenSSL reads both alike.
+    The values inside a constructed value are re-encoded, too.  OpenSSL reads both forms alike.
 
     Raises:
         PkiError: the value is truncated, too deep, or has a form that this reader does not support.
@@ -110,7 +110,7 @@ _END_OF_CONTENTS = b"\0\0"
 def _header(data: bytes, start: int) -> tuple[int, int, int | None]:
     """Return the tag of the value at ``start``, and the offsets of the content's start and end.
 
-    The end is None if a mark of two bytes ends it.
+    The end is None if two zero bytes mark the end of the content.
     """
     if len(data) - start < 2:
         raise PkiError("a DER value is cut short")

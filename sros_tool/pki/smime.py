@@ -155,8 +155,8 @@ class Signature:
     def _verify(self, content: bytes, signer: x509.Certificate) -> bool:
         """Verify the signature without the cache of `is_intact`; return the same.
 
-        The kind of the key says how: OpenSSL ignores the algorithm that the message names, and so
-        accepts RSA-PSS of keys for nothing else only, and no Ed25519 (pk7_doit.c,
+        The kind of the key decides how.  OpenSSL ignores the algorithm that the message names, so
+        it accepts RSA-PSS only from keys for RSA-PSS alone, and never Ed25519 (pk7_doit.c,
         PKCS7_signatureVerify).
         """
         if self._signed_attributes and not self.digest_matches(content):
@@ -405,8 +405,8 @@ def _digest_of(identifier: der.Value) -> hashes.HashAlgorithm | None:
 def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     """Parse a ContentInfo with SignedData (RFC 2315, 7 and 9; RFC 5652, 3, 5.1 and 5.3).
 
-    Only DER is read: of anything else, OpenSSL and sros might think differently.  Versions do not
-    count, as for OpenSSL.  Without ``content``, the signed part is taken from the SignedData.
+    Only DER is read, because OpenSSL and sros might read other encodings differently.  Versions do
+    not count, as for OpenSSL.  Without ``content``, the signed part is taken from the SignedData.
     """
     (message,) = der.children(signature)
     content_type, wrapped = _parts(message, der.OID, der.CONTEXT_0)

@@ -1,9 +1,9 @@
 """Certificates and revocation lists that OpenSSL 3.0 reads, and `cryptography` does not.
 
-OpenSSL takes BER, versions that there are not, unknown keys and signatures, odd strings and dates;
-it asks about most of that when it verifies a chain.  It decodes an extension by its ASN.1 template
-alone (X509V3_EXT_d2i): BER will do, what follows is ignored, and values that contradict each other
-are no error.  The values here have of `cryptography`'s classes, which cannot be derived from, the
+OpenSSL reads BER, invalid versions, unknown keys and signatures, and odd strings and dates; it
+checks most of them only when it verifies a chain.  It decodes an extension by its ASN.1 template
+alone (X509V3_EXT_d2i): BER is accepted, trailing data is ignored, and contradicting values are no
+error.  The classes of `cryptography` cannot be subclassed, so the classes here have those of their
 members that sros uses.
 """
 
@@ -39,7 +39,7 @@ _UNIQUE_IDENTIFIERS = (0x81, _CONTEXT_2)
 class UnknownKey:
     """A public key (SubjectPublicKeyInfo in DER) whose algorithm or parameters are unknown.
 
-    Two are equal if they are written alike.
+    Two keys are equal if their encodings are equal.
     """
 
     data: bytes

@@ -10,7 +10,7 @@ Includes (``xi:include``) are read only from the folder of the policy and the fo
 give what the XInclude of libxml2 gives, or are refused.  Nodes of included documents are never
 moved into another document: a moved lxml node can crash Python.
 
-How messages of a name have to be protected is said by a processing instruction behind the name:
+A processing instruction behind a name states how its messages have to be protected:
 ``<topic>scan<?sros protect="encrypt"?></topic>``.  The schema of ros2/sros2 allows no attribute and
 no element there, but processing instructions everywhere; its XSLT does not translate them, and
 writes them again.
@@ -102,7 +102,7 @@ It raises `MissingFileError` if there is none, and `DocumentError` if that is no
 class Includer:
     """A reader of the policy files in ``root`` and below; it reads every file once.
 
-    What is included counts each time: a few small files can stand for gigabytes.
+    An included file counts each time, because a few small files could expand to gigabytes.
     """
 
     root: Path

@@ -129,7 +129,8 @@ def minimize(
 def _protected_as_before(before: Policy, after: Policy) -> Policy:
     """Return ``after`` with the protection levels that only removed names stated.
 
-    One enclave states it for all: those that keep a right to the name need it, too.
+    The statement of one enclave applies to all, so enclaves that keep a right to the name need it,
+    too.
     """
     known = {(e.kind, e.name, e.level) for e in stated_protections(after.enclaves)}
     gone = {(e.kind, e.name, e.level) for e in stated_protections(before.enclaves)} - known

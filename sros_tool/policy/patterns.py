@@ -239,8 +239,8 @@ _GRAM = 4
 class Names:
     """An ordered set of names and expressions with a fast search for covering and overlapping ones.
 
-    Only those are compared that have the same beginning, end or letters.  ``limit`` limits the
-    comparisons: sets that are asked for one purpose share it.
+    Only expressions with the same beginning, end or letters are compared.  ``limit`` limits the
+    comparisons; sets that are used for one purpose share it.
     """
 
     def __init__(self, names: Iterable[str], limit: ComparisonLimit | None = None) -> None:
@@ -299,7 +299,7 @@ class Names:
     def _by_letters(self) -> dict[str, list[int]]:
         """Map letters that every matching name has to the numbers of the expressions.
 
-        Of the letters of an expression, those are taken that the fewest others have.
+        For each expression, the letters that the fewest other expressions have are used.
         """
         grams = [
             {gram for run in _RUN.findall(_letters_of(expression)) for gram in _grams(run)}

@@ -370,10 +370,10 @@ def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
 
 
 def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
-    """Return the nodes of which the rights allow standard services, and deny all of these again.
+    """Return the nodes whose standard services are allowed, and then all denied again.
 
-    A node with another standard service that it may offer is none of them.  A denial that matches a
-    part of what a wildcard allows counts for all nodes that the denial matches.
+    A node that may offer any standard service is not returned.  If a denial matches a part of what
+    a wildcard allows, it counts for all nodes that the denial matches.
     """
     allowed: dict[str, None] = {}
     denied: dict[str, None] = {}
@@ -409,7 +409,7 @@ def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
 def _full_names(name: str, service: str = "") -> Iterator[str]:
     """Yield the full names of nodes, perhaps with wildcards, whose standard services match a name.
 
-    Only those that offer ``service`` by that name, if it is given.
+    With ``service``, only nodes that offer this service by that name.
     """
     node, _, last = name.rpartition("/")
     if last in OWN_SERVICES and service in ("", last):
@@ -434,7 +434,7 @@ def _before(name: str, end: str) -> Iterator[str]:
 def _nodes(name: str) -> Iterator[NodeName]:
     """Yield the nodes whose full name matches ``name``.
 
-    A star may stand for the "/" between both, too.
+    A ``*`` may also stand for the "/" between namespace and node name.
     """
     ns, _, last = name.rpartition("/")
     if last:

@@ -1,7 +1,7 @@
 """The assumptions of a comparison of two sides, and the parts that it leaves out on purpose.
 
-A policy says neither which governance it is signed with, nor, but for robots of a fleet, for which
-domains.  Permissions do not say the first.
+A policy does not state its governance and, except for robots of a fleet, not its domains.
+Permissions do not state their governance.
 """
 
 from __future__ import annotations
@@ -47,9 +47,10 @@ def completed(side: AccessSource, other: AccessSource) -> AccessSource:
 
 
 def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permissions]:
-    """Return the permissions of a side; a policy's for the subjects that the other side has.
+    """Return a side's permissions; permissions of a policy get the subjects of the other side.
 
-    Where the other side is a keystore that gives unique subjects, further enclaves get one, too.
+    If the other side is a keystore with unique subjects, further enclaves get a unique subject,
+    too.
     """
     if side.kind != "policy" or other.kind == "policy":
         return side.permissions
@@ -145,8 +146,8 @@ def _assumed(base: AccessSource, head: AccessSource) -> Iterator[str]:
             yield "both are signed with the same governance, which controls all access"
         elif base.governance is None:
             yield (
-                "BASE means access control of everything, and encryption of what it demands no "
-                "other protection of"
+                "BASE means access control of everything, and encryption unless it demands another "
+                "protection"
             )
         elif head.governance is None:
             yield (
@@ -160,7 +161,7 @@ def _assumed(base: AccessSource, head: AccessSource) -> Iterator[str]:
             whose = "its enclaves without a robot" if side.fleet else "it"
             yield f"{name} does not say the domains, and {whose} is for those of {other}"
         if against.zenoh is not None:
-            yield f"{name} means the settings of Zenoh that sros writes"
+            yield f"{name} counts as having the settings of Zenoh that sros writes"
 
 
 def left_out(base: AccessSource, head: AccessSource) -> tuple[str, ...]:

@@ -84,9 +84,10 @@ class Witness:
 class Verdict:
     """The decision on a requirement in one world.
 
-    ``witness`` is None if the requirement holds.  ``empty`` are names and enclaves in it that
-    nothing has, for which it cannot fail.  ``always`` says why it cannot fail whatever rights the
-    enclaves get, or is "".  ``assumed`` is a name whose protection nobody has said, or "".
+    ``witness`` is None if the requirement holds.  ``empty`` are names and enclaves in the
+    requirement that do not occur in the world, so that it cannot fail for them.  ``always`` says
+    why it cannot fail whatever rights the enclaves get, or is "".  ``assumed`` is a name whose
+    protection is not stated but assumed, or "".
     """
 
     requirement: Requirement
@@ -130,7 +131,7 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
     """Return the decision on a requirement; decisions for one question share ``limit``.
 
     Raises:
-        DocumentError: it cannot be decided with so many wildcards.
+        DocumentError: there are too many wildcards to decide it.
     """
     limit = limit or SearchLimit()
     match requirement:
@@ -208,7 +209,7 @@ def _parts_of(right: str) -> tuple[_Part, ...]:
 
 @lru_cache(maxsize=16)
 def _doing(right: str) -> tuple[_Part, ...]:
-    """Return the DDS topics of a right of which a single one is enough to act."""
+    """Return the DDS topics of a right; access to a single one of them is enough to act."""
     return tuple(part for part in _parts_of(right) if part.writes or right == "subscribe")
 
 
@@ -300,8 +301,8 @@ def _own(world: World, enclave: str, writes: bool) -> NameSet:
 def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with a name that too many enclaves may use, and enough of them.
 
-    Whoever may write one topic of an action can do a part of what the right to it is for, and
-    counts as one who has it.
+    An enclave that may write one topic of an action can do a part of the action, and counts as
+    having the right.
     """
     most = requirement.most
     best: tuple[Use, ...] = ()
@@ -540,7 +541,7 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
 def _always(requirement: Requirement, world: World) -> str:
     """Return why a requirement cannot fail with the present enclaves, as a clause, or "".
 
-    A list of all enclaves by their names is no such reason: it names those that may come.
+    A list with the names of all present enclaves is no such reason: enclaves may be added.
     """
     count = len(world.enclaves)
     match requirement:

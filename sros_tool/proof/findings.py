@@ -88,8 +88,8 @@ class Violation:
     """A broken requirement, the steps of its witness, and the worlds in which it does not hold.
 
     ``worlds`` is empty if it holds in none of those that were decided.  ``missing`` is an enclave
-    of the witness that does not exist, or "".  ``idle`` says that it is no process that could start
-    with the files of its enclave, whatever its rights are.
+    of the witness that does not exist, or "".  ``idle`` says that no process could start with the
+    files of the enclave, whatever its rights are.
     """
 
     requirement: Requirement
@@ -104,8 +104,8 @@ class Violation:
 class Decided:
     """All decisions: broken requirements, and why (parts of) requirements cannot fail.
 
-    ``assumed`` are those that hold only with the protection of the default template, which nobody
-    has chosen, each with a name of which the policy does not say it.
+    ``assumed`` are requirements that hold only with the protection of the default template, which
+    is assumed, each with a name whose protection the policy does not state.
     """
 
     violations: tuple[Violation, ...]
@@ -121,7 +121,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
     """Return the decisions on requirements in all worlds.
 
     Raises:
-        DocumentError: one cannot be decided with so many wildcards.
+        DocumentError: there are too many wildcards to decide a requirement.
     """
     violations, vacuous, assumed = [], [], []
     limit = SearchLimit(_MOST_STEPS)
@@ -175,7 +175,7 @@ def requirement_findings(requirements: Sequence[Requirement], system: System) ->
     """Return a finding for each requirement that does not hold, or that cannot fail.
 
     Raises:
-        DocumentError: one cannot be decided with so many wildcards.
+        DocumentError: there are too many wildcards to decide a requirement.
     """
     return decided_findings(decide_all(requirements, system), system)
 
@@ -315,7 +315,7 @@ def suggest(rights: Iterable[Right], worlds: Sequence[World]) -> tuple[Requireme
     """Propose requirements that hold in all worlds; ``rights`` are the allowed rights.
 
     Raises:
-        DocumentError: one cannot be decided with so many wildcards.
+        DocumentError: there are too many wildcards to decide a requirement.
     """
     requirements: list[Requirement] = []
     limit = SearchLimit(_MOST_STEPS)
@@ -422,7 +422,8 @@ _HEAD = """\
 def render_requirements(requirements: Iterable[Requirement], of: str) -> str:
     """Return requirements as TOML with their demands as comments; ``of`` names the source on top.
 
-    `sros_tool.proof.requirements.parse_requirements` returns equal ones but for their places.
+    `sros_tool.proof.requirements.parse_requirements` returns equal requirements, except for their
+    places.
     """
     lines = [_HEAD.format(of=json.dumps(of))]
     for requirement in requirements:

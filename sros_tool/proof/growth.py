@@ -1,7 +1,7 @@
 """Find access that HEAD grants and BASE does not, and the reverse, for all names.
 
 Each vendor's rules are compared as sets of topics, and each name that is reported was confirmed by
-the decision of that vendor on this name.  Nothing is reported only if no name at all is added.
+the decision of that vendor on this name.  An empty result means that no name at all is added.
 
 This module reads no files.
 """
@@ -220,15 +220,15 @@ class NewAccess(NamedTuple):
 def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     """Compare the access of two sides, in both directions.
 
-    A policy counts as signed with access control of everything.  As BASE, it means encryption of
-    all that it demands no other protection of, and a keystore that protects less has lost it; as
-    HEAD, it lowers no protection that a keystore has.  It is for the domains of the other side, and
-    enclaves of robots of a fleet for that of their robot.
+    A policy counts as signed with access control of everything.  As BASE, it stands for encryption
+    wherever it demands no other protection, so a keystore that protects less has lost protection.
+    As HEAD, it lowers no protection of a keystore.  A policy is for the domains of the other side;
+    enclaves of a fleet's robots are for the domain of their robot.
 
     Raises:
-        DocumentError: it cannot be decided: for too many wildcards, permissions that a vendor does
-            not accept, contradicting protection, or settings of Zenoh that are not known; for the
-            last two only if nothing else is new.
+        DocumentError: it cannot be decided, because of too many wildcards, permissions that a
+            vendor does not accept, contradicting protection or unknown settings of Zenoh; the last
+            two only if nothing else is new.
     """
     limit = SearchLimit()
     scope = None
@@ -347,7 +347,7 @@ def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
 
 
 def _zenoh_domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
-    """Return one domain of each kind: by rules of Zenoh, and by the domains of what has none."""
+    """Return one domain of each kind, by rules of Zenoh, and domains of sides without rules."""
     domains: set[DomainSet] = set()
     for side, other in ((base, head), (head, base)):
         domains.update(DomainSet.of((e, e)) for e in domains_of_robots(side, other).values())
@@ -357,7 +357,7 @@ def _zenoh_domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
 
 
 def _domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
-    """Return one domain of each kind: between two of them, all have the same rules as the first."""
+    """Return one domain for each group of domains with the same rules."""
     governances = (source.governance for source in (base, head) if source.governance)
     listed = {rule.domains for governance in governances for rule in governance.domain_access_rules}
     return DomainSet.one_of_each_kind(listed, _granted(base) | _granted(head))
@@ -392,7 +392,8 @@ def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
     ) -> Access:
         """Return the access that an enclave's permissions give to a certificate.
 
-        Those that do not fit it count as if they did: `_not_compared` says so.
+        Permissions that do not fit the certificate count as if they did; `_not_compared` reports
+        them.
         """
         granted = (grant.subject for grant in side.permissions[name].grants[:1])
         subject = subject if _fits(vendor, side, name, subject) else next(granted, "")
@@ -454,7 +455,7 @@ def _on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
 def _of_rights(side: AccessSource, robots: Mapping[str, int]) -> Callable[[str, int], _Access]:
     """Return the access that rights in ROS terms give in a domain.
 
-    ``robots`` are the domains of enclaves of a policy that have one of their own.
+    ``robots`` maps a policy's enclaves to the domain of their robot, if it has one.
     """
     by_enclave = _by_enclave(side.rights)
 
@@ -693,7 +694,7 @@ class _Stated:
     def _example(
         self, names: NameSet, key: tuple[str, AccessVerb, str], world: _World, limit: SearchLimit
     ) -> str | None:
-        """Return an example, the same one as in another world if it is one here, too."""
+        """Return an example name; if possible, the example of another world."""
         for topic in self._examples[key]:
             if topic in names and (world.longest is None or len(topic.encode()) <= world.longest):
                 return topic
@@ -745,7 +746,7 @@ def _source(known: _Sources, side: AccessSource, right: Right | None) -> Source 
 
 
 def _example(names: NameSet, expression: str, world: _World, limit: SearchLimit) -> str | None:
-    """Return a topic of a set that an expression covers: one of a ROS name if there is any."""
+    """Return a topic of a set that an expression covers, if possible one with a ROS name."""
     if not is_expression(expression):
         return expression if expression in names else None
     example = names.example(limit, longest=world.longest)
@@ -788,7 +789,7 @@ def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach
 
 
 def _borrowed(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tuple[str, str]]:
-    """Yield the enclaves that can use the permissions of another one in a world, with that one."""
+    """Yield pairs of an enclave and another one whose permissions it can use in a world."""
     worlds = tuple(worlds)
     for enclave in side.permissions:
         lenders = (lender for world in worlds for lender in world.lenders(side, enclave))
@@ -798,8 +799,8 @@ def _borrowed(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tuple[st
 def _edges(side: AccessSource, borrowed: Iterable[tuple[str, str]]) -> _Edges | None:
     """Return all hops, or None if there are too many to follow them.
 
-    Who uses the permissions of another enclave in place of its own counts as one more enclave, to
-    which its own denials do not apply.
+    An enclave that uses the permissions of another enclave counts as one more enclave, to which its
+    own denials do not apply.
     """
     rights = side.zenoh if side.kind == "zenoh" and side.zenoh is not None else side.rights
     by_enclave = _by_enclave(rights)

@@ -1,7 +1,7 @@
 """Find weaker protection of one side of a comparison: messages, trust, and protect= values.
 
-A side without a governance of its own, such as a policy, means a strict one: a keystore with a
-looser one protects less.  A policy never lowers what a keystore protects.
+A side without a governance, such as a policy, stands for a strict governance, so a keystore with a
+looser governance protects less.  A policy never lowers the protection of a keystore.
 
 This module reads no files.
 """
@@ -37,8 +37,8 @@ from sros_tool.translate import governance_for, protected_topics
 def strict_protection() -> DomainProtection:
     """Return the protection of a side without a governance: that of the template production.
 
-    Whole messages need only be signed, as in the template development: what is in them is encrypted
-    without it.
+    Whole messages need only be signed, as in the template development, because their content is
+    encrypted separately.
     """
     return replace(load_template("production").protection, rtps=Level.SIGN)
 
@@ -46,7 +46,7 @@ def strict_protection() -> DomainProtection:
 def _demanded_governance(stated: Sequence[StatedProtection], domains: DomainSet) -> Governance:
     """Return the least governance that a policy means: strict, except where it demands a level.
 
-    Of a name for which it demands both levels, the higher one counts.
+    If it demands both levels for a name, the higher level counts.
     """
     (rule,) = governance_for(strict_protection(), domains).domain_access_rules
     (every,) = rule.topic_access_rules

@@ -147,8 +147,8 @@ class Repository:
         """Return all references that a short name can stand for, with their ids.
 
         Raises:
-            DocumentError: it is the name of a branch of a remote repository, but here a tag or a
-                branch of its own.
+            DocumentError: the name is that of a remote's branch, but stands for a local tag or
+                branch.
         """
         if name.startswith("refs/"):
             found = self._target(name)
@@ -388,7 +388,8 @@ class Repository:
     def fetch_missing(self, digits: str, remote: str) -> None:
         """Fetch a missing commit from a remote, without its history.
 
-        Those of the clone, the user and the machine count, because they have the credentials.
+        The git settings of the clone, the user and the machine apply, because they have the
+        credentials.
 
         Raises:
             UsageError: ``digits`` is no full id, ``remote`` no remote of the repository, or git
@@ -502,11 +503,12 @@ def walk(
 ) -> Iterator[tuple[str, TreeEntry]]:
     """Yield path and entry of all files, links and submodules below a folder, level by level.
 
-    With ``other``, only what this folder does not have with the same content at the same path.
+    With ``other``, entries are left out that this folder has at the same path with the same
+    content.
 
     Raises:
-        DocumentError: there are more than ``most`` entries, of which a few objects can stand for
-            millions, or too many folders in each other, each of which takes a question to git.
+        DocumentError: there are more than ``most`` entries (a few objects can stand for millions),
+            or folders are nested too deeply (each level takes a question to git).
     """
     level = [("", tree, other)]
     count = depth = 0

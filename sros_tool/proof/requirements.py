@@ -8,8 +8,8 @@ A requirement is a table of the file, such as::
     why = "Commands meet in one place."
 
 Names are absolute ROS names, with the wildcards of policies; enclaves are names or patterns, as for
-``--match``, and those that a list excepts have ``!`` before them.  What each kind demands is said
-by its class.
+``--match``, and those that a list excepts have ``!`` before them.  The class of a kind says what it
+demands.
 """
 
 from __future__ import annotations

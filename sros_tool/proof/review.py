@@ -70,10 +70,10 @@ _OK, _FOUND, _UNDECIDED = 0, 1, 2
 class ReviewRequest:
     """The request for a review; paths are relative to the top of the repository.
 
-    ``base`` is the commit with the access of before, or "" to compare with nothing; ``head`` the
-    one that is reviewed.  With ``allow_new_access``, more access is shown, and does not fail.
-    ``renew_within`` is the time before the expiry of an enclave from which on the review fails.
-    ``left_out`` are folders whose policies are not reviewed.
+    ``base`` is the commit to compare with, or "" for none; ``head`` is the commit to review. With
+    ``allow_new_access``, new access is shown, but does not make the review fail. ``renew_within``
+    is the time before the expiry of an enclave from which on the review fails. ``left_out`` are
+    folders whose policies are not reviewed.
     """
 
     repository: Repository
@@ -165,7 +165,8 @@ class Review:
     """All steps of a review, and clauses on the parts that were not reviewed.
 
     ``base`` and ``head`` are full ids of commits; ``base`` is "" if nothing was compared.
-    ``head_folder`` and ``base_folder`` are where the files were read, which nobody has to see.
+    ``head_folder`` and ``base_folder`` are the folders where the files were read, which `shown`
+    leaves out.
     """
 
     base: str

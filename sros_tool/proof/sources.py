@@ -70,7 +70,7 @@ UNCERTAIN = {
     "rights.zenoh-no-name",
     "rights.zenoh-strangers",
 }
-"""Notes of which one means that rights are unknown, so that new access cannot be excluded."""
+"""Ids of notes that mean that rights are unknown, so that new access cannot be excluded."""
 
 
 KEYSTORE_ITSELF = "the keystore"
@@ -102,15 +102,15 @@ class AccessSource:
     """The access that a file, a folder or a revision gives to enclaves.
 
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh"; ``shown`` is its name.
-    ``permissions`` are what DDS would load for each enclave, or would if it were signed; ``rights``
-    are in ROS terms, ``zenoh`` those that rules of Zenoh give, or None without any; ``enforcers``
-    are these rules, ``routers`` are those of routers.  ``scope`` are the enclaves that it is
-    for; None for all.  ``governance`` is None if it has none of its own.  ``authorities`` are the
-    CAs that its enclaves trust, pairs of role and fingerprint, and ``trusts`` whom each of them
-    trusts, and `KEYSTORE_ITSELF`; None if it does not say.  ``later`` are the settings for enclaves
-    that are created later, None without any.  ``certified`` has what the certificate of each
-    enclave says, as far as there is one.  ``zenoh_files`` are the configurations of Zenoh, by
-    enclave and file name.
+    ``permissions`` are what DDS loads for each enclave, or would load after signing.  ``rights``
+    are the rights in ROS terms.  ``zenoh`` are the rights that rules of Zenoh give, None without
+    rules; ``enforcers`` are these rules, ``routers`` the rules of routers.  ``scope`` are the
+    enclaves that the source is for; None for all.  ``governance`` is None if the source has none.
+    ``authorities`` are the CAs that its enclaves trust, as pairs of role and fingerprint.
+    ``trusts`` maps enclaves and `KEYSTORE_ITSELF` to their trust; None if it is not known.
+    ``later`` are the settings for enclaves that are created later, or None.  ``certified`` has the
+    facts about the certificate of each enclave that has one.  ``zenoh_files`` are the
+    configurations of Zenoh, by enclave and file name.
     """
 
     shown: str

@@ -85,8 +85,8 @@ _OF_EVERY_NODE = ((True, ROS_DISCOVERY_TOPIC), (False, ROS_DISCOVERY_TOPIC))
 class System:
     """The worlds of a policy or a keystore, which is ``file``.
 
-    ``rights`` are those that are allowed, as they are stated; ``places`` say where.  ``left_out``
-    says why Zenoh was left out, if it cannot carry out the policy.
+    ``rights`` are the allowed rights as they are stated, ``places`` say where.  ``left_out`` says
+    why Zenoh was left out, if it cannot enforce the policy.
     """
 
     file: str
@@ -109,8 +109,8 @@ def load_system(
 ) -> System:
     """Return the worlds of a policy file, or of a keystore as it is signed.
 
-    ``template`` is the one of the keystore that a policy is for.  ``world`` is the only one that is
-    wanted, of `WORLDS`; "" stands for all.  A keystore without configurations of Zenoh has no world
+    ``template`` is the template of the keystore that a policy is for.  ``world`` is the only wanted
+    world of `WORLDS`; "" stands for all.  A keystore without configurations of Zenoh has no world
     of Zenoh.  ``opened`` is the keystore at the path, if it was opened before.
 
     Raises:
@@ -144,8 +144,8 @@ def policy_system(
     """Return the worlds of a policy as it would be signed at ``at``.
 
     The governance is that of the template, raised as the policy says.  Without a template, a name
-    for which the policy says its protection has just that one, and for all others that of the
-    default template is assumed.
+    has exactly the protection that the policy states for it; for all other names, the protection of
+    the default template is assumed.
 
     Raises:
         PolicyError: a fallback of an include is used, or only Zenoh is wanted, and it cannot carry
@@ -196,9 +196,9 @@ def policy_system(
 def _planned_zenoh(
     policy: Policy, control: AccessControl, domain: int, stated: Mapping[str, TopicAccess]
 ) -> World:
-    """Return the world of Zenoh with the rules for a policy, which say exactly its rights.
+    """Return the world of Zenoh with the rules for a policy, which state exactly its rights.
 
-    The names are those of ROS: only for them are the rules those of the policy.
+    Only ROS names are considered, because the rules match the policy only for them.
     """
     rules = {remote.common_name: AccessControl((remote,)) for remote in control.remotes}
 
@@ -223,7 +223,8 @@ def _dds_world(
 ) -> World:
     """Return the world of a vendor; an enclave may do what one of its accesses gives.
 
-    ``demanded`` maps levels to the topics for which a policy says just that, and no keystore yet.
+    ``demanded`` maps levels to the topics for which a policy, not yet a keystore, states this
+    level.
     """
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
@@ -270,7 +271,7 @@ def _weak(access: Iterable[Access]) -> dict[Level, NameSet]:
 
 
 def _demanded(protections: Iterable[StatedProtection]) -> dict[Level, NameSet]:
-    """Map levels to the topics for which a policy says them."""
+    """Map levels to the topics for which a policy states them."""
     topics: dict[Level, list[str]] = {level: [] for level in PROTECT.values()}
     for protection in protections:
         topics[protection.level] += protected_topics(protection.kind, protection.name)
@@ -315,9 +316,9 @@ def _keystore_system(
 ) -> System:
     """Return the worlds of a keystore: one of each vendor for each kind of domain.
 
-    Its documents decide what an enclave may do, whether or not its key is here and its files would
-    be loaded now: the robot may have others.  Permissions that become valid later count as well,
-    and the governance of each enclave for all.  Enclaves in hidden folders are among them.
+    The documents of an enclave decide, even if its key is not here or its files could not be loaded
+    now: the robot may have other files.  Permissions that become valid later count, too, and the
+    governance of each enclave counts for all.  Enclaves in hidden folders are included.
     """
     root = keystore.root
     names = enclave_names(root, hidden=True)

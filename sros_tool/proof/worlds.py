@@ -256,12 +256,12 @@ class World:
         rights of an enclave name without wildcards.
 
         ``weak`` are the topics that are protected less than a level demands; without a level, there
-        are none.  ``demanded`` are the topics whose protection is known, because a policy demands
-        it, while that of all others is assumed; None if nothing is.  ``needed`` are topics that
+        are none.  ``demanded`` are the topics whose protection a policy demands, while the
+        protection of all others is assumed; None if nothing is assumed.  ``needed`` are topics that
         every node has to write (True) and read (False).  ``idle`` are enclaves in which no process
-        starts with their files as they are: they may do what their rights give, and are able to do
-        nothing.  ``lenders`` are the enclaves whose permissions an enclave can use as well, so that
-        it may do what they may do; what it must be able to do, it has to be by its own.
+        starts with their files as they are: they may do what their rights give, but are able to do
+        nothing.  ``lenders`` maps an enclave to others whose permissions it can use as well.  These
+        count for what it may do, but not for what it must be able to do.
         """
         self.title = title
         self.confirm_own = confirm
@@ -415,7 +415,7 @@ _USES: dict[tuple[bool, str], tuple[tuple[Flow, Message], ...]] = {
 Each has to pass: replies without the offer to reply belong to the history of topics.
 """
 _TYPE = f"/{ANY_TYPE}"
-"""Type and hash at the end of a key: rules that sros writes hold for all of them."""
+"""Type and hash at the end of a key: rules that sros writes apply to all of them."""
 _UNTYPED = "/*/*"
 
 
@@ -444,7 +444,8 @@ def ros_access(stated: Iterable[StatedRight]) -> TopicAccess:
 def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int) -> TopicAccess:
     """Return the topics that stand for the keys that an enclave may write and read on Zenoh.
 
-    ``enforcers`` are the access control of the processes it has links to: each one passes on alone.
+    ``enforcers`` are the access control of the processes that the enclave has links to: it is
+    enough that one of them passes a message.
     """
     remote = Remote(enclave)
 
@@ -483,10 +484,10 @@ def is_enforced(
 def domains_of(
     enforcers: Iterable[Enforcement], others: Collection[DomainSet] = ()
 ) -> tuple[int, ...]:
-    """Return the ROS domains of the keys in rules: of those with the same rules the first one.
+    """Return the ROS domains of the keys in rules; of domains with the same rules, the first.
 
-    Where keys have a wildcard in place of the domain, one is added that no key names.  Domains in
-    ``others`` are added, too; which of these sets they are in tells domains apart as rules do.
+    If keys have a wildcard in place of the domain, a domain is added that no key names.  Domains in
+    ``others`` are added, too; domains in different sets count as having different rules.
     """
     rules: dict[int, set[object]] = {}
     wild = False

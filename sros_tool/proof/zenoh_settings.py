@@ -1,7 +1,7 @@
-"""What the settings of Zenoh processes open on one side of a comparison, next to their rules.
+"""Find settings of Zenoh processes, apart from their rules, that open more on one side.
 
-A setting of which it is not known what it gives is never passed over: it is not compared, and then
-nobody can say that nothing is new.  Source of the settings: DEFAULT_CONFIG.json5 of zenoh 1.9.
+A setting with an unknown effect is never ignored: it counts as not compared, so that the result
+cannot be "nothing new".  Source of the settings: DEFAULT_CONFIG.json5 of zenoh 1.9.
 
 This module reads no files.
 """
@@ -98,14 +98,14 @@ _COMPARED = re.compile(
     r"|transport/link/tls/(?:enable_mtls|verify_name_on_connect|close_link_on_expiration)"
     r"|transport/shared_memory/enabled|scouting/(?:multicast|gossip)/enabled"
 )
-"""Settings that `_OPEN`, the endpoints or the rules themselves stand for."""
+"""Settings that are compared by `_OPEN`, as endpoints, or as rules."""
 _HARMLESS = re.compile(
     r"metadata(?:/.*)?|timestamping/.*|queries_default_timeout|open/.*|stats/.*"
     r"|transport/unicast/.*|transport/link/[tr]x/.*|transport/link/tls/so_(?:snd|rcv)buf"
     r"|(?:listen|connect)/(?:timeout_ms|exit_on_failure|retry)(?:/.*)?|scouting/(?:timeout|delay)"
     r"|scouting/gossip/autoconnect_strategy/.*|routing/router/peers_failover_brokering"
 )
-"""Settings that give nobody anything: times, sizes, words, and who of two peers connects first."""
+"""Settings that give nobody access: times, sizes, words, and which of two peers connects first."""
 _GIVING = (
     (re.compile(r"plugins(?:/.*)?"), "a plugin answers others by its own rules"),
     (re.compile(r"plugins_loading(?:/.*)?"), "it loads plugins, which answer others"),
@@ -118,14 +118,14 @@ _GIVING = (
         "whoever has a certificate of that CA is let in",
     ),
 )
-"""Settings of which any other value gives access, and what they mean as a clause."""
+"""Settings whose change may give access, with their meaning as a clause."""
 
 
 def looser_settings(old: _Files, new: _Files) -> Iterator[SettingChange]:
     """Yield what the settings in ``new`` open that those in ``old`` do not.
 
-    A file that ``old`` has not is compared with what sros writes; where it connects and listens,
-    with all other files of ``old``.
+    A file that ``old`` does not have is compared with a file as sros writes it; its endpoints are
+    compared with the endpoints of all files of ``old``.
     """
     files: dict[tuple[str, str, str, str], list[str]] = defaultdict(list)
     for place, file in sorted(new.items()):
@@ -137,7 +137,7 @@ def looser_settings(old: _Files, new: _Files) -> Iterator[SettingChange]:
 
 
 def unknown_settings(old: _Files, new: _Files) -> Iterator[str]:
-    """Yield the settings that differ and of which it is not known what they give, as clauses."""
+    """Yield clauses on the settings that differ and whose effect is not known."""
     files: dict[str, list[str]] = defaultdict(list)
     for place, file in sorted(new.items()):
         before = old[place].document if place in old else _usual(file.document.mode)
@@ -149,7 +149,7 @@ def unknown_settings(old: _Files, new: _Files) -> Iterator[str]:
                 files[path].append(place)
     for path, places in files.items():
         of = places[0] if len(places) == 1 else f"{len(places)} files of Zenoh"
-        yield f"the setting {path[:80]} of {of}, of which sros does not know what it gives"
+        yield f"the setting {path[:80]} of {of}, whose effect sros does not know"
 
 
 def _changes(
