@@ -270,8 +270,8 @@ class Fault(Enum):
         "for itself: whoever has its key signed these.",
         "CVE-2023-24011; Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
         "Unless you signed it so on purpose, take the key of the signer for stolen: `sros revoke "
-        "{root} {enclave}`. If one CA is for both, use separate CAs for identities and documents, as "
-        "keystore.one-authority says.",
+        "{root} {enclave}`. If one CA is for both, use separate CAs for identities and documents, "
+        "as keystore.one-authority says.",
         {"governance.p7s": f"Find out who signed it. {_GOVERNANCE}"},
     )
     GOVERNANCE_MALFORMED = (
