@@ -37,7 +37,13 @@ from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import check_routers
 from sros_tool.keystore.selection import no_such_enclave
-from sros_tool.keystore.zenoh_files import Drift, is_signed, signed_path, zenoh_drift
+from sros_tool.keystore.zenoh_files import (
+    Drift,
+    enclaves_with_rights,
+    is_signed,
+    signed_path,
+    zenoh_drift,
+)
 from sros_tool.pki.certificates import common_name_of, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, parts
@@ -372,7 +378,8 @@ class ZenohEvaluator:
     def out_of_date(self, answer: ZenohAnswer) -> tuple[str, ...] | None:
         """Return the files that decide an answer and do not match the permissions.
 
-        Return None if that is unknown, as in an export.
+        Only the rules that concern the question are compared.  Return None if the files cannot be
+        compared, as in an export.
         """
         try:
             network = self.keystore.template.zenoh
@@ -382,10 +389,19 @@ class ZenohEvaluator:
             authority = self.keystore.ca_certificate(PERMISSIONS)
             ours = {answer.enclave, *self.routers}
             deciding = ours | {check.enforcer for check in answer.checks}
+            ends = self._other_ends(answer)
             if answer.mode is not Mode.CLIENT:
-                deciding |= self._other_ends(answer)
+                deciding |= ends
             drifts = zenoh_drift(
-                self.keystore, network, domains, authority, self._at, only=deciding
+                self.keystore,
+                network,
+                domains,
+                authority,
+                self._at,
+                only=deciding,
+                # What passes between routers is what all enclaves on their sides may say together.
+                among=() if network.routers else deciding | self._concerned(answer, ends),
+                reader=self._rendered,
             ).files
         except SrosError:
             return None
@@ -400,7 +416,10 @@ class ZenohEvaluator:
         )
 
     def _other_ends(self, answer: ZenohAnswer) -> set[str]:
-        """Return the enclaves with which a peer may communicate for the question, by its file."""
+        """Return the enclaves with which an enclave may communicate for the question, by its file.
+
+        For a client, the file of its router decides.
+        """
         own = self._file(answer.enclave, self._file_of(answer.enclave)).process
         wanted = self._rights(answer.enclave, answer.question)
         if own is None or not wanted:
@@ -408,8 +427,26 @@ class ZenohEvaluator:
         return {
             name
             for name in self.names
-            if all(e.arrives for e in self._direct(own, _unrestricted(name, Mode.PEER), wanted))
+            if all(
+                delivery.arrives
+                for delivery in (
+                    self._between(own, _unrestricted(name, Mode.CLIENT), wanted)
+                    if own.mode is Mode.CLIENT
+                    else self._direct(own, _unrestricted(name, Mode.PEER), wanted)
+                )
+            )
         }
+
+    def _concerned(self, answer: ZenohAnswer, ends: set[str]) -> set[str]:
+        """Return the enclaves whose rights an answer is about, by the files or the permissions.
+
+        The answer that the enclave itself may not is about its own rights alone: those that the
+        files of peers state are part of them.
+        """
+        if not answer.allowed and not answer.of_router:
+            return set()
+        wanted = self._rights(answer.enclave, answer.question)
+        return ends | enclaves_with_rights(self.keystore, {right.name for right in wanted})
 
     # ── files ──────────────────────────────────────────────────────────────────────────────
 

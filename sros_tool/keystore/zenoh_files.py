@@ -11,7 +11,7 @@ import hashlib
 import os
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import Enum, StrEnum
 from pathlib import Path
@@ -75,7 +75,9 @@ from sros_tool.zenoh.access import (
 from sros_tool.zenoh.configuration import (
     Configuration,
     Mode,
+    RenderedReader,
     RenderedRights,
+    SettingsEdition,
     ZenohNetwork,
     parse_rendered,
     render_configuration,
@@ -280,7 +282,8 @@ class ZenohDocuments:
     ``files`` maps the paths of configurations to their content, ``enclaves`` maps the paths to the
     enclaves.  ``left_out`` maps enclaves that get no configuration, and no rights elsewhere, to the
     reason, a clause.  ``nodes`` maps all other enclaves to the nodes that they may announce in the
-    graph. ``existing`` are the enclaves of the keystore, ``ledger`` is its ledger.
+    graph. ``existing`` are the enclaves of the keystore, ``ledger`` is its ledger.  ``unread`` are
+    enclaves whose rights were not read, so that the files have no rules for them.
     """
 
     files: Mapping[str, bytes]
@@ -289,6 +292,7 @@ class ZenohDocuments:
     nodes: Mapping[str, AnnouncedNodes]
     existing: tuple[str, ...]
     ledger: Ledger
+    unread: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,11 +340,14 @@ def drifted(
     wanted: ZenohDocuments,
     authority: x509.Certificate,
     gone: Collection[str] = (),
+    reader: RenderedReader | None = None,
 ) -> tuple[Drifted, ...]:
     """Return the configurations that are not as ``wanted`` or not signed by ``authority``.
 
-    Configurations of enclaves in ``gone`` do not count.
+    Configurations of enclaves in ``gone`` do not count, nor do rules for unread enclaves.
+    ``reader`` may have read the files already.
     """
+    reader = reader or RenderedReader()
 
     def compare(paths: Sequence[str]) -> list[Drifted]:
         differing = []
@@ -349,9 +356,9 @@ def drifted(
             kind = None
             if present is None:
                 kind = Drift.MISSING
-            elif present != document:
+            elif _without(present, wanted.unread, reader) != document:
                 kind = Drift.DIFFERS
-            elif not is_signed(keystore.root / path, document, authority, keystore.files):
+            elif not is_signed(keystore.root / path, present, authority, keystore.files):
                 kind = Drift.UNSIGNED
             if kind:
                 differing.append(Drifted(wanted.enclaves[path], path, kind))
@@ -361,6 +368,21 @@ def drifted(
     stale = stale_files(keystore.root, wanted.files, wanted.existing)
     files += (file for file in stale if file.enclave not in gone)
     return tuple(files)
+
+
+def _without(document: bytes, names: Collection[str], reader: RenderedReader) -> bytes | None:
+    """Return a configuration without the rules for some enclaves.
+
+    Return None if there are such enclaves, and the file is not as this version of sros writes it.
+    """
+    if not names:
+        return document
+    configuration = reader.read(document)
+    if configuration is None or configuration.settings is not SettingsEdition.RULES_ONCE:
+        return None
+    remotes = configuration.access_control.remotes
+    kept = tuple(rights for rights in remotes if rights.common_name not in names)
+    return replace(configuration, access_control=AccessControl(kept)).render()
 
 
 class ZenohDrift(NamedTuple):
@@ -383,17 +405,21 @@ def zenoh_drift(
     now: datetime | None,
     *,
     only: Collection[str] = (),
+    among: Collection[str] = (),
+    reader: RenderedReader | None = None,
 ) -> ZenohDrift:
     """Return the configurations that are not as they should be, and the enclaves without one.
 
-    Without ``now``, permissions that have expired count, too.  ``only`` are the enclaves to
-    examine; empty for all.
+    Without ``now``, permissions that have expired count, too.  ``only`` are the enclaves whose
+    files are examined, ``among`` the enclaves whose rights are compared in these files; empty for
+    all.  ``reader`` may have read the files already.
 
     Raises:
         SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.
     """
-    wanted = zenoh_documents(keystore, network, domains, authority, now, only=only)
-    return ZenohDrift(drifted(keystore, wanted, authority), wanted.left_out, wanted.nodes)
+    wanted = zenoh_documents(keystore, network, domains, authority, now, only=only, among=among)
+    files = drifted(keystore, wanted, authority, reader=reader)
+    return ZenohDrift(files, wanted.left_out, wanted.nodes)
 
 
 def zenoh_documents(
@@ -406,12 +432,14 @@ def zenoh_documents(
     *,
     existing: tuple[str, ...] | None = None,
     only: Collection[str] = (),
+    among: Collection[str] = (),
 ) -> ZenohDocuments:
     """Return the configurations that the enclaves of a keystore need; arguments as `keep_zenoh`.
 
     Without ``now``, permissions that have expired count, too.  ``existing`` are the enclaves of the
     keystore; None searches for them.  ``only`` are the enclaves whose configurations are made, and
-    that count as existing; empty for all.
+    that count as existing, ``among`` the enclaves whose rights these configurations have; empty for
+    all.
     """
     root = keystore.root
     of_network = _domains(network, domains, root)
@@ -434,6 +462,8 @@ def zenoh_documents(
                 "Give the node an enclave of its own.",
             )
         names.remove(router)
+    unread = frozenset(names).difference(among) if among else frozenset[str]()
+    names = [name for name in names if name not in unread]
     reader = _RightsReader(keystore, authority, of_network, network, now, change, only)
     read: dict[str, _RulesOfEnclave | str] = {}
     for _, of_enclaves in map_slices(names, reader.read):
@@ -491,7 +521,7 @@ def zenoh_documents(
     if only:
         existing = tuple(name for name in existing if name in only)
     nodes = {name: of_enclave.nodes for name, of_enclave in rules.items()}
-    return ZenohDocuments(files, enclaves, left_out, nodes, existing, reader.ledger)
+    return ZenohDocuments(files, enclaves, left_out, nodes, existing, reader.ledger, unread)
 
 
 def _last_revocation(entries: Iterable[Entry] = (), lists: Iterable[RevocationList] = ()) -> str:
@@ -598,6 +628,34 @@ def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int
 
 
 # ── the rights of each enclave ─────────────────────────────────────────────────────────────
+
+
+_UNCERTAIN = re.compile(rb"[\x00\x80-\xff*?\[&]|<!|ALLOW")
+"""What may let permissions have a right to a name that is not written in them.
+
+These are wildcards, XML that writes a name in another way, and what no rule names.
+"""
+_XML_DECLARATION = b'<?xml version="1.0" encoding="UTF-8"?>'
+
+
+def enclaves_with_rights(keystore: Keystore, names: Collection[str]) -> set[str]:
+    """Return the enclaves whose signed permissions may have a right to one of some ROS names.
+
+    Some of them have none, since nothing is verified, and hardly anything read.
+    """
+    texts = [name.encode() for name in names]
+
+    def may_have_rights(enclave: str) -> bool:
+        path = keystore.folder(enclave) / PERMISSIONS_FILE
+        try:
+            message = keystore.read(path, "permissions document")
+        except SrosError:
+            return True
+        if any(text in message for text in texts):
+            return True
+        return bool(_UNCERTAIN.search(message.replace(_XML_DECLARATION, b"", 1)))
+
+    return {enclave for enclave in keystore.names if may_have_rights(enclave)}
 
 
 class _RulesOfEnclave(NamedTuple):

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum
 from fnmatch import fnmatchcase
 from functools import lru_cache
+from hashlib import sha256
 from itertools import combinations
 from json.encoder import encode_basestring_ascii
 from typing import Any, NamedTuple
@@ -341,16 +342,23 @@ _SECTIONS = re.compile(
 class RenderedReader:
     """Reader of many configurations as `Configuration.render` writes them.
 
-    A rule that several of them have in the same words is read once.
+    A rule that several of them have in the same words is read once, and so is a file.
     """
 
     def __init__(self) -> None:
+        self._read: dict[bytes, Configuration | None] = {}
         self._beginnings: dict[str, Configuration] = {}
         self._policies: dict[str, tuple[str, list[str]]] = {}
         self._rules: dict[str, AccessRule] = {}
 
     def read(self, data: bytes) -> Configuration | None:
         """Return a configuration, or None if it is not exactly as sros writes it."""
+        digest = sha256(data).digest()
+        if digest not in self._read:
+            self._read[digest] = self._read_in_full(data)
+        return self._read[digest]
+
+    def _read_in_full(self, data: bytes) -> Configuration | None:
         try:
             beginning, mark, control = data.decode().partition(_CONTROL)
             sections = _SECTIONS.fullmatch(control)
