@@ -399,7 +399,7 @@ class ZenohEvaluator:
                 authority,
                 self._at,
                 only=deciding,
-                # What passes between routers is what all enclaves on their sides may say together.
+                # What may pass between routers depends on all enclaves on both sides.
                 among=() if network.routers else deciding | self._concerned(answer, ends),
                 reader=self._rendered,
             ).files
@@ -422,7 +422,7 @@ class ZenohEvaluator:
         """
         own = self._file(answer.enclave, self._file_of(answer.enclave)).process
         wanted = self._rights(answer.enclave, answer.question)
-        if own is None or not wanted:
+        if own is None or not wanted or (own.mode is Mode.CLIENT and not answer.allowed):
             return set()
         return {
             name
@@ -438,10 +438,10 @@ class ZenohEvaluator:
         }
 
     def _concerned(self, answer: ZenohAnswer, ends: set[str]) -> set[str]:
-        """Return the enclaves whose rights an answer is about, by the files or the permissions.
+        """Return the enclaves whose rights an answer depends on, by the files or the permissions.
 
-        The answer that the enclave itself may not is about its own rights alone: those that the
-        files of peers state are part of them.
+        A denial depends on the enclave's own rights alone: what it shares with peers is part of
+        them.
         """
         if not answer.allowed and not answer.of_router:
             return set()
@@ -784,7 +784,7 @@ class ZenohExplanation(NamedTuple):
     """Why Zenoh was asked."""
     answer: ZenohAnswer
     out_of_date: tuple[str, ...] | None
-    """The deciding files that do not match the permissions; null if that is not known."""
+    """The deciding files that do not match the permissions for the question; null if not known."""
     stated: Answer
     root: Path
     notes: tuple[Note, ...]

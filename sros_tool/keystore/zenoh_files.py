@@ -371,9 +371,9 @@ def drifted(
 
 
 def _without(document: bytes, names: Collection[str], reader: RenderedReader) -> bytes | None:
-    """Return a configuration without the rules for some enclaves.
+    """Return a configuration without the rules for the enclaves ``names``.
 
-    Return None if there are such enclaves, and the file is not as this version of sros writes it.
+    Return None if ``names`` is not empty and this version of sros would write the file differently.
     """
     if not names:
         return document
@@ -631,17 +631,18 @@ def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int
 
 
 _UNCERTAIN = re.compile(rb"[\x00\x80-\xff*?\[&]|<!|ALLOW")
-"""What may let permissions have a right to a name that is not written in them.
+"""Text in permissions that may give a right to a name that they do not contain.
 
-These are wildcards, XML that writes a name in another way, and what no rule names.
+It may be a wildcard, markup that splits or encodes a name, or a default that allows.
 """
 _XML_DECLARATION = b'<?xml version="1.0" encoding="UTF-8"?>'
 
 
 def enclaves_with_rights(keystore: Keystore, names: Collection[str]) -> set[str]:
-    """Return the enclaves whose signed permissions may have a right to one of some ROS names.
+    """Return the enclaves whose permissions may have a right to one of ``names``, and maybe others.
 
-    Some of them have none, since nothing is verified, and hardly anything read.
+    No signature is verified and no XML parsed: the bytes of the permissions are searched for the
+    names.
     """
     texts = [name.encode() for name in names]
 

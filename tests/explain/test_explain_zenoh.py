@@ -385,3 +385,81 @@ def test_random_policies_are_answered_as_their_permissions_say(
         assert [each.enclave for each in answer.reached] == expected, (enclave, right, name)
         allowed, denied = allowed + answer.outcome.ok, denied + (not answer.outcome.ok)
     assert min(allowed, denied) > 5
+
+
+# ── files of earlier permissions ───────────────────────────────────────────────────────────
+
+
+def asked_in(root: Path) -> dict[tuple[str, str, str], tuple[tuple[Any, ...], Any]]:
+    """Return the answer to each question in a keystore, and the files that are out of date."""
+    evaluator = ZenohEvaluator(Keystore(root), at=now(), domain=0)
+    found = {}
+    for enclave, right, name in product(evaluator.names, OTHER_END, NAMES[: None if LONG else 2]):
+        answer = evaluator.answer(enclave, ask(WORD[right], name))
+        reached = tuple(each.enclave for each in answer.reached)
+        wide = tuple((each.expression, each.reaches) for each in answer.wildcards)
+        told = (answer.outcome, reached, wide)
+        found[enclave, right, name] = told, evaluator.out_of_date(answer)
+    return found
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("seed", range(12 if LONG else 1))
+def test_files_of_other_rights_are_out_of_date_or_answer_the_same(
+    tmp_path: Path, mode: str, seed: int
+) -> None:
+    """With files of an earlier policy, each answer is that of the current files, or it says so."""
+    draw = random.Random(f"earlier {mode} {seed}")
+    policy, current = tmp_path / "policy.xml", tmp_path / "ks"
+    policy.write_text(drawn_policy(draw))
+    sros("create_keystore", current, "--template", "production").ok()
+    sros("generate_artifacts", "-k", current, "-p", policy).ok()
+    sros("zenoh", current, "--mode", mode).ok()
+    earlier = {path: path.read_bytes() for path in current.rglob("*.json5")}
+    earlier |= {path.with_suffix(".p7s"): path.with_suffix(".p7s").read_bytes() for path in earlier}
+    # Other rights of one enclave, to names without wildcards.
+    rights = publish(*draw.sample(NAMES, 2)) + publish(*draw.sample(NAMES, 2)).replace(
+        "publish", "subscribe"
+    )
+    policy.write_text(policy_text({"/e0": rights}))
+    sros("generate_artifacts", "-k", current, "-p", policy).ok()
+    fresh = asked_in(current)
+    assert all(out_of_date == () for _, out_of_date in fresh.values())
+    for path, data in earlier.items():
+        path.unlink()
+        path.write_bytes(data)
+    noticed = unnoticed = 0
+    for question, (answer, out_of_date) in asked_in(current).items():
+        if answer != fresh[question][0]:
+            assert out_of_date, question
+            noticed += 1
+        unnoticed += not out_of_date
+    assert min(noticed, unnoticed) > 5
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_rules_of_others_that_do_not_concern_the_question_are_not_compared(
+    made: Path, tmp_path: Path, mode: str
+) -> None:
+    changed = Path(shutil.copytree(made / mode, tmp_path / "ks", symlinks=True))
+    router = changed / "enclaves/router/router.json5"
+    signed = router.with_suffix(".p7s")
+    earlier = [(file, file.read_bytes()) for file in (router, signed)]
+    policy = tmp_path / "policy.xml"
+    policy.write_text(POLICY.replace("/go<", "/come<"))
+    sros("generate_artifacts", "-k", changed, "-p", policy).ok()
+    for file, data in earlier:
+        file.unlink()
+        file.write_bytes(data)
+    assert zenoh(changed, "/talker", "publish", "/chatter")["out_of_date"] == []
+    for name in ("/go", "/come"):
+        assert zenoh(changed, "/client", "call", name)["out_of_date"] == [
+            "enclaves/router/router.json5"
+        ]
+
+
+def test_a_rule_for_an_unknown_enclave_is_out_of_date(keystore: Path) -> None:
+    router = keystore / "enclaves/router/router.json5"
+    router.write_text(router.read_text().replace("/recorder", "/unknown"))
+    found = zenoh(keystore, "/client", "call", "/go")
+    assert found["out_of_date"] == ["enclaves/router/router.json5"]
