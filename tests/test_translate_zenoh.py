@@ -253,7 +253,8 @@ def test_denials_are_subtracted(
                 DENY.format("publish", each)
                 for each in ("/front_camera/*", "/*/set_parameters", "/*/describe_parameters")
             ),
-            "policy.xml:2: DENY publish /front_camera/* cannot be expressed in Zenoh, because line 1",
+            "policy.xml:2: DENY publish /front_camera/* cannot be expressed in Zenoh, because line "
+            "1",
         ),
         ("\n" + publish("/a???"), "policy.xml:2: the name /a???"),
         (publish("/[!a][!b][!c]"), "policy.xml:1: the name /[!a][!b][!c]"),
