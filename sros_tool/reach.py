@@ -223,7 +223,7 @@ class Network:
         return tuple(sorted({name for side in self._sides.values() for name in side.of}))
 
     def hops(self, enclave: str) -> Iterator[Hop]:
-        """Yield every hop from an enclave to another one."""
+        """Yield every hop from an enclave to another enclave."""
         return self._steps(enclave, True, set(), {enclave})
 
     def users(self, direction: str, topic: str) -> frozenset[str]:

@@ -1,8 +1,9 @@
 """The picture of one name or enclave with the enclaves that influence it, or that it influences.
 
 Who may use a name, and who influences whom, is decided by `sros_tool.reach` for all names that
-rights and governance allow, known or not.  What is drawn between two enclaves are the known names
-by which information goes from one to the other, or one example where there is none.
+rights and governance allow, known or not.  Between two enclaves, the picture has the known names by
+which information goes from the first enclave to the second; without a known name, it has one
+example.
 
 The layout has a column for each hop, and names between two columns.  Information goes from left to
 right: names in the focus have the enclaves that may send to the left of them, and those that may
@@ -108,11 +109,14 @@ def focused(picture: Picture, sources: Sequence[PictureSource], words: Sequence[
 class FocusFlow:
     """The flow of information to and from the names in a focus, in stages.
 
-    ``own`` are the enclaves and ``targets`` the names (kind and name) in the focus.  ``before``
-    maps enclaves to their number of hops to these names, 1 for one that may send, and for one in
-    the focus; ``after`` from them, 1 for one that may receive.  ``stages`` maps names to the number
-    of hops of the enclaves that read them: 0 for names in the focus, and for those that an enclave
-    in it writes; for names after these, to the negative number of hops of those that write them.
+    ``own`` are the enclaves in the focus, and ``targets`` its names (kind and name).  ``before``
+    maps an enclave to its number of hops to the focus: 1 if it is in the focus, or may send to a
+    target.  ``after`` maps an enclave to the number of hops from the focus: 1 if it may receive
+    from a target.
+
+    ``stages`` maps a name to its columns.  A target has column 0, and so has a name that an enclave
+    in the focus writes.  Columns to the left count the hops of the reading enclaves; columns to the
+    right count the hops of the writing enclaves, as negative numbers.
     """
 
     own: frozenset[str]
@@ -237,7 +241,7 @@ class _System:
     def meant(self, word: str) -> Iterator[tuple[str, str]]:
         """Yield kind and name of every name or enclave that ``word`` can mean.
 
-        An exact name that no right states can be meant if a wildcard matches it.
+        An exact name counts if a right states it, or if the wildcard of a right matches it.
         """
         enclaves = [enclave.path for enclave in self._picture.enclaves]
         kinds = [_ENCLAVE] * (word in enclaves)

@@ -93,8 +93,8 @@ class Scene:
     """Cards and the links between them.
 
     ``shown`` is the number of names that are drawn, or counted on the card of their only enclave;
-    ``hidden`` is the number of names that this scene leaves out, because enclaves have only such
-    rights for them as every node needs.
+    ``hidden`` is the number of names that this scene leaves out, because the only rights for them
+    are rights that every node needs.
     """
 
     id: str

@@ -80,10 +80,10 @@ UNKNOWN = Protection(WireLevel.UNKNOWN)
 class Edge:
     """A right or denial of one enclave for one name.
 
-    ``by`` are the expressions that match the name, empty if the right has the exact name.
-    ``parts`` are the parts of an action, such as feedback, if the right is not for the whole
-    action.  ``common`` marks rights that every node needs to start, ``violates`` those by which a
-    requirement does not hold, ``differs`` those that units like this one do not have.
+    ``by`` are the expressions that match the name, empty if the right has the exact name. ``parts``
+    are the parts of an action, such as feedback, if the right is not for the whole action.
+    ``common``: every node needs the right to start.  ``violates``: the right breaks a requirement.
+    ``differs``: equal units do not have the right.
     """
 
     enclave: str
@@ -131,7 +131,7 @@ class Lack(StrEnum):
 class Name:
     """A topic, service or action; or a ``wildcard`` without any known name.
 
-    ``lacks`` is the side that nobody may take: of a service, who serves it is the receiver.
+    ``lacks`` is the side that nobody may take.  The server of a service is its receiver.
     """
 
     kind: str
@@ -145,8 +145,7 @@ class Name:
     wildcard: bool = False
     """Whether it is a wildcard that matches no known name."""
     lacks: Lack = Lack.NOTHING
-    """The side (sending or receiving) that no enclave may take; the server of a service receives.
-    serves a service is its receiver."""
+    """The side that no enclave may take; the server of a service is its receiver."""
 
 
 _LACKING = {
@@ -362,7 +361,7 @@ _SHOWN = 2  # rights that they say of one unit
 class Requirements(NamedTuple):
     """The results of requirements: how many hold, and which do not.
 
-    ``assumed`` are those that hold by an assumption, in words.
+    ``assumed`` are the requirements that hold only under an assumption, in words.
     """
 
     hold: int
@@ -406,9 +405,10 @@ class EqualUnits(NamedTuple):
 
 
 class DifferentUnit(NamedTuple):
-    """A unit, or the label of several units, that is nearly equal to the units of ``usual``.
+    """A unit that differs slightly from several equal units, whose label is ``usual``.
 
-    ``more`` and ``fewer`` are the enclaves and rights that it has and lacks, in words.
+    ``unit`` may be the label of several units.  ``more`` and ``fewer`` are the enclaves and rights
+    that only this unit has, and that it lacks, in words.
     """
 
     unit: str
@@ -433,7 +433,7 @@ class DifferentUnit(NamedTuple):
 class Picture:
     """The rights in a system, with protection, validity and findings.
 
-    With a ``focus``, only what leads to it and from it.
+    With a ``focus``, the picture has only the names and enclaves that lead to it or from it.
     """
 
     title: str
@@ -504,8 +504,8 @@ def is_plain(tie: Tie) -> bool:
 class Bundle:
     """Sorted names of the same kind and protection, with the same ties.
 
-    In a ``partial`` bundle, each tie is for only some of the names.  ``asks`` are services whose
-    requests change nothing.  ``lacks`` is the side that nobody may take.
+    In a ``partial`` bundle, each tie is for only some of the names.  ``asks``: the names are
+    services whose requests change nothing.  ``lacks`` is the side that nobody may take.
     """
 
     kind: str

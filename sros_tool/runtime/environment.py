@@ -363,9 +363,9 @@ def replaced_notes(environment: Mapping[str, str], variables: Mapping[str, str])
         if any(key.partition("/")[0] == "access_control" for key in keys):
             yield Note(
                 "zenoh.access-control-override",
-                f"WARNING: the replaced {OVERRIDE} changed access_control: with it, this process "
-                "would not enforce the rules of its file. Find out what sets it, and remove it "
-                "there: nodes that are started without sros still get it.",
+                f"WARNING: the replaced {OVERRIDE} changed access_control, so that a process does "
+                "not enforce the rules of its file. Nodes that are started without sros still get "
+                f"it: find out what sets {OVERRIDE}, and remove it there.",
             )
 
 

@@ -154,10 +154,10 @@ def vendor_here(
 ) -> tuple[Vendor, str]:
     """Return the DDS vendor of this machine, and the reason as a short text.
 
-    It is the vendor of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS, in the release
-    that $ROS_DISTRO ships.  With a distribution, it is the vendor there, whatever is installed
-    here.  The text says so if the RMW was built without DDS Security, or if that release was not
-    measured.
+    The vendor is that of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS, in the
+    release that $ROS_DISTRO ships.  With ``distribution``, its release counts instead, and
+    installed RMWs do not.  The text also warns if the RMW was built without DDS Security, or if the
+    release was not measured.
     """
     named = environment.get(RMW, "")
     rmw, why = "", ""

@@ -2,12 +2,12 @@
 
 A node, publisher, subscription, server or client is announced by a liveliness token
 ``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/ENCLAVE/NAMESPACE/NAME[/TOPIC/TYPE/HASH/QOS]``, each name
-with ``%`` for ``/`` (ros2/rmw_zenoh, docs/design.md).  The graph of a process removes what is
-undeclared by session, node, namespace and name, and never looks at the enclave (graph_cache.cpp):
-so a token has to be bound to all names in it.
+with ``%`` for ``/`` (ros2/rmw_zenoh, docs/design.md).  A process removes an undeclared entity from
+its graph by session, node, namespace and name, and ignores the enclave (graph_cache.cpp).  So a
+rule has to check all names in a token.
 
-A name is one part of a token, so ``$*`` means there what ``*`` means to ROS, and a denial is exact:
-a process reads a token with wildcards as it is written, as the name of nobody's node or topic.
+A name is one chunk of a token, so ``$*`` means there what ``*`` means in ROS.  A denial is exact,
+too: a process takes wildcards in a token literally, as a name that no node or topic has.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from sros_tool.zenoh.key_expressions import (
 GRAPH = "@ros2_lv"
 _NODE = "NN"
 _KINDS = {"publish": "MP", "subscribe": "MS", "reply": "SS", "request": "SC"}
-"""The kind of what a right lets a node announce."""
+"""The kind of entity that a right lets a node announce, as tokens write it."""
 _MOST_TOKENS = 4096
-"""Most key expressions for the tokens of one right of an enclave."""
+"""Maximum number of key expressions for the tokens of one right of an enclave."""
 _EVERY_KIND = "*"
 _ANNOUNCING = (Message.LIVELINESS_TOKEN,)
 _ASKING = (Message.LIVELINESS_QUERY, Message.DECLARE_LIVELINESS_SUBSCRIBER)
@@ -79,7 +79,7 @@ def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes
 
 
 def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName, ...]:
-    """Return the nodes that rules of `graph_rules` allow an enclave, whatever they deny of them."""
+    """Return the nodes that rules of `graph_rules` allow an enclave; denials are ignored."""
     nodes = map(_node_of, announced_nodes(rules, enclave).allowed)
     return tuple(dict.fromkeys(nodes))
 
@@ -93,13 +93,12 @@ def _node_of(place: str) -> NodeName:
 def graph_rules(
     enclave: str, domain: int, rights: Iterable[Right], nodes: Iterable[NodeName]
 ) -> Iterator[AccessRule]:
-    """Yield what a process allows to processes of an enclave, as far as the graph is concerned.
+    """Yield the rules of a process for the graph tokens of processes of an enclave.
 
-    They may announce ``nodes`` and those whose own services they may offer, or any if there are
-    none, with what ``rights`` allow, in the name of their own enclave; and see everything.  Denials
-    of all own services of a node take it out of those that they may offer services of.  The right
-    to ask has to be for exactly the expression that rmw_zenoh asks for.  ``rights`` are to topics
-    and services.
+    The processes may see everything.  In the name of their enclave they may announce ``nodes``, the
+    nodes whose own services they may offer, and the topics and services in ``rights``.  Without any
+    such node, they may announce any node.  A node does not count if all its own services are
+    denied.  The right to ask has to have exactly the expression that rmw_zenoh asks for.
     """
     rights, nodes = tuple(rights), tuple(nodes)
     offering, without = nodes_of_rights(rights), denied_nodes(rights)
@@ -135,7 +134,7 @@ class _Tokens:
         }
 
     def of(self, rights: Iterable[Right]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return the key expressions that are allowed, and those of them that are denied."""
+        """Return the allowed key expressions, and the denied exceptions."""
         sides: dict[bool, dict[str, dict[str, None]]] = {True: {}, False: {}}
         for _, qualifier, right, name in rights:
             sides[qualifier is ALLOW].setdefault(right, {})[name] = None
@@ -160,7 +159,7 @@ class _Tokens:
         return tuple(allowed), tuple(denied)
 
     def of_every_kind(self, nodes: Sequence[NodeName]) -> tuple[str, ...]:
-        """Return the key expressions of nodes, and of everything that they could have."""
+        """Return the key expressions of nodes and of all entities that they could have."""
         named = (
             # "$*" may stand for nothing: "/*" must not become the namespace "/", too.
             NodeName(f"/{_LETTER}*", node.name)
@@ -171,7 +170,7 @@ class _Tokens:
         return tuple(self._key(_EVERY_KIND, place, ANY_CHUNKS) for place in _places(named))
 
     def _announced(self, right: str, names: Mapping[str, None]) -> list[str]:
-        """Return the tokens of names, each of every node that may have it."""
+        """Return the tokens of names, for every node that may have the name."""
         parts = [part for name in names for part in _parts(name)]
         owners = {part: self._owner(right, part) for part in parts}
         everybody = self._nodes
@@ -184,7 +183,7 @@ class _Tokens:
         ]
 
     def _owner(self, right: str, part: str) -> str:
-        """Return the node that alone offers a service, because it is its own; "" if it is not."""
+        """Return the node of a node's own service, such as set_parameters; "" for other names."""
         node, _, service = part.rpartition("%")
         return self._of_names.get(node, "") if right == "reply" and service in OWN_SERVICES else ""
 
@@ -193,7 +192,7 @@ class _Tokens:
 
 
 def _listed(name: str) -> list[str]:
-    """Return expressions with ``*`` alone; more than can be listed become wider ones."""
+    """Return expressions whose only wildcard is ``*``; if too many, a wider expression."""
     try:
         return listed(name, _MOST_TOKENS)
     except TooManyNames:  # the keys of the name cannot be listed either, and are refused
@@ -201,7 +200,7 @@ def _listed(name: str) -> list[str]:
 
 
 def _parts(name: str) -> tuple[str, ...]:
-    """Return a name as tokens have it: a star at its beginning may also stand for nothing."""
+    """Return a name as chunks of tokens: a star at its beginning may also stand for nothing."""
     if name.startswith("*"):
         rest = name.lstrip("*")
         return (*([_part(rest)] if rest.startswith("/") else []), _part(f"/*{rest}"))
@@ -300,7 +299,7 @@ def _is_wide(node: str) -> bool:
 
 
 def _included(nodes: AnnouncedNodes, in_order: Sequence[str]) -> Iterator[str]:
-    """Yield the nodes without wildcards, of those ``in_order``, that ``nodes`` include."""
+    """Yield the nodes of ``in_order``, without wildcards, that ``nodes`` include."""
     never = KeyExpressions(nodes.denied)
     for wide in nodes.allowed:
         begin = _begin(wide)
@@ -312,7 +311,7 @@ def _included(nodes: AnnouncedNodes, in_order: Sequence[str]) -> Iterator[str]:
 
 
 def _with_the_same_beginning(groups: Sequence[AnnouncedNodes]) -> Mapping[int, set[int]]:
-    """Map positions to the later ones with nodes that may begin with the same text."""
+    """Map the position of a group to later groups with nodes that may begin with the same text."""
     begins = sorted(
         {(_begin(node), at) for at, nodes in enumerate(groups) for node in nodes.allowed}
     )
@@ -333,7 +332,7 @@ def _have_common(one: AnnouncedNodes, other: AnnouncedNodes) -> bool:
 
 
 def _begin(node: str) -> str:
-    """Return what every node begins with that a wildcard includes."""
+    """Return the text before the first wildcard, with which every included node begins."""
     return node.partition("*")[0].rstrip("$")
 
 
@@ -355,9 +354,9 @@ def example_token(
     key_expressions: Iterable[str],
     passes: Callable[[str], bool] = lambda _: True,
 ) -> str:
-    """Return the token of a node of an enclave: if there is one, of those that are allowed.
+    """Return an example of a token for a node of an enclave, if possible an allowed one.
 
-    Of the tokens that ``key_expressions`` include, it is one that ``passes`` the denials.
+    An allowed token is included in ``key_expressions`` and ``passes`` the denials.
     """
     begin = f"{GRAPH}/{domain}/"
     places = [
@@ -374,5 +373,5 @@ def example_token(
 
 
 def _any_as(name: str, part: str) -> str:
-    """Return a part of a token with a name in place of a wildcard for all of it."""
+    """Return a chunk of a token, or ``name`` if the chunk is only a wildcard."""
     return name if part == "*" else part.replace(ANY_PART, "")

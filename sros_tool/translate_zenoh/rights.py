@@ -71,19 +71,19 @@ from sros_tool.zenoh.subtraction import (
 _TYPE = ("$*::$*", "*")
 """The type and its hash, with which the keys of topics and services end: rules do not check them.
 
-Every type has "::" and no part of a ROS name has it, so wherever a wildcard of the name ends, what
-stands below the key of another name is no key of this one.
+Every type has "::" and no part of a ROS name does.  So a wildcard in a name never matches into the
+type: keys below the key of another name are not keys of this name.
 """
 _IN_TYPES = "::"
 _UNTYPED = ("*", "*")
-"""What rules that others wrote have in place of `_TYPE`."""
+"""Type and hash in rules that sros did not write."""
 ANY_TYPE = "any::type/hash"
-"""A type and its hash for which rules that sros writes decide as for every other."""
+"""An example of a type and its hash: the rules of sros decide the same for every type."""
 _BELOW_TOPICS = (ANY_CHUNKS,) if any(each.below_topics for each in RELEASES) else ()
 _BELOW = {"publish": _BELOW_TOPICS, "subscribe": _BELOW_TOPICS}
-"""What belongs to a right below its keys, whatever the release of rmw_zenoh."""
+"""Further keys of a right, below its keys, in any release of rmw_zenoh."""
 _ADVANCED = f"@adv/{ANY_CHUNKS}"
-"""What belongs to a topic with history (TRANSIENT_LOCAL), below its key."""
+"""Further keys of a topic with history (TRANSIENT_LOCAL), below its key."""
 _M = Message
 _IN, _OUT = Flow.INGRESS, Flow.EGRESS
 _DATA, _HISTORY = False, True
@@ -111,9 +111,9 @@ _MESSAGES: dict[str, tuple[tuple[Flow, tuple[Message, ...], bool], ...]] = {
         (_OUT, (_M.QUERY,), _DATA),
     ),
 }
-"""The messages of each right, as seen from a process to which the enclave that has it connects.
+"""The messages of each right, from the view of the process that enforces it.
 
-Each on the key of the name, or on the keys of its history below.
+The messages are on the key of the name, or (`_HISTORY`) on the keys of its history.
 """
 
 
@@ -143,14 +143,13 @@ def remote_of(
     stated: Mapping[int, Sequence[StatedRight]],
     nodes: Collection[NodeName] = (),
 ) -> RemoteRights:
-    """Return what a process allows to processes of an enclave with rights ``stated`` by ROS domain.
+    """Return the rights that a process gives an enclave; ``stated`` maps ROS domains to rights.
 
-    That includes the graph, which every node needs: to announce ``nodes`` of the enclave, and those
-    whose own services it may offer, with the topics and services that it has rights to, and to see
-    those of all others.  If no node is known at all, it may be any.
+    This includes the tokens of the graph, which every node needs: see `graph_rules` for the nodes
+    that the enclave may announce.
 
     Raises:
-        PolicyError: a right is one that rules of Zenoh cannot state; the text names the place.
+        PolicyError: rules of Zenoh cannot express a right; the text names the place.
     """
     rules: list[AccessRule] = []
     made_of: dict[tuple[Flow, tuple[Message, ...]], list[Difference]] = {}
@@ -182,7 +181,7 @@ def domains_of(control: AccessControl) -> set[int]:
 def stated_names(rules: Iterable[AccessRule]) -> list[tuple[str, str]]:
     """Return the rights that rules of `remote_of` state, each with its name, sorted.
 
-    A name with wildcards is shown as Zenoh writes it.
+    A name with wildcards is returned as Zenoh writes it.
     """
     marks = {of[0][:2]: right for right, of in _MESSAGES.items()}
     return sorted(
@@ -204,7 +203,7 @@ def _name_in(key: str) -> str:
 
 
 def untyped(key: str) -> str:
-    """Return the key expression of a right as others write it: any type, and nothing below it."""
+    """Return a right's key expression as other tools write it: any type, and nothing below."""
     for below in ((), (ANY_CHUNKS,)):
         end = "/".join(("", *_TYPE, *below))
         if key.endswith(end):
@@ -215,7 +214,8 @@ def untyped(key: str) -> str:
 def as_router(router: str, own: RemoteRights) -> RemoteRights:
     """Return what a process whose rights are ``own`` allows to its router.
 
-    It may send and get what the process itself may get and send: it passes on what others said.
+    The router passes on messages, so it may send what the process may get, and get what the process
+    may send.
     """
     return own.mirrored(router)
 
@@ -236,20 +236,20 @@ def crossing_rules(names: Iterable[str], domains: Iterable[int]) -> tuple[Access
 
 
 _EXACT_NAMES = re.compile(r"(?:/[^/#$*?\[]+)+")
-"""Names in a row, none with a wildcard, and all of them keys of Zenoh."""
+"""One or several names, joined: none has a wildcard, and all are valid keys of Zenoh."""
 _NO_KEY = re.compile(r"[#$]|//|/\Z")
-"""What only names have that others than sros wrote."""
+"""Text that no key of Zenoh may have."""
 
 
 def _allowed_keys(
     domain: int, stated: Iterable[StatedRight]
 ) -> Iterator[tuple[str, tuple[str, ...], Difference | None]]:
-    """Yield each right with the key expressions of all names that are allowed and not denied.
+    """Yield each right, its key expressions without denied names, and the difference.
 
-    The third is what those of names with wildcards are made of, if there are some.
+    The difference is for names with wildcards; it is None for other names.
 
     Raises:
-        PolicyError: a name, or what a denial leaves of it, cannot be said.
+        PolicyError: a name, or a name without the denied part, cannot be expressed.
     """
     allowed: dict[str, dict[str, Source]] = {}
     denied: dict[str, dict[str, Source]] = {}
@@ -296,7 +296,7 @@ def _names_of(
     """Return the chunks of the names of a difference, as ``allowed`` and ``denied`` state it.
 
     Raises:
-        PolicyError: they cannot be said, or take more than `MOST_EXPRESSIONS`.
+        PolicyError: the names cannot be expressed, or take more than `MOST_EXPRESSIONS`.
     """
     try:
         return difference.names()
@@ -373,7 +373,7 @@ def _too_many(name: str, place: Source) -> PolicyError:
 
 
 def _number_of_chunks(name: str) -> int:
-    """Return at least how many key expressions `chunks_of` makes: they double with each ``*``."""
+    """Return a lower bound of the result of `chunks_of`, which doubles with each ``*``."""
     stars_within = len(re.findall(r"(?<=[^/*])\*+(?=[^/*])", name))
     return 1 << stars_within
 
@@ -426,19 +426,19 @@ _USE = {
     (Flow.INGRESS, Message.QUERY): "request",
     (Flow.EGRESS, Message.QUERY): "reply",
 }
-"""The right that a message from or to an enclave is the use of."""
+"""The right that a message uses, by its direction and kind."""
 _WILD = ("*", ANY_CHUNKS)
 _TYPE_AND_HASH = 2
 _MOST_ANY_CHUNKS = 6
-"""Each ``**`` may stand for no chunk, which makes two names of one."""
+"""Maximum number of ``**`` in a key expression: each doubles the number of names."""
 
 
 @dataclass(frozen=True, slots=True)
 class RightsInRules:
     """The rights that rules give to processes by the common name of their certificate.
 
-    ``enclaves`` are the common names that rules name.  ``left_out`` are key expressions that are no
-    names of ROS topics or services, sorted.
+    ``enclaves`` are the common names that rules name.  ``left_out`` are key expressions that do not
+    stand for ROS topics or services, sorted.
     """
 
     rights: frozenset[Right]
@@ -478,7 +478,7 @@ def rights_in_rules(access: Enforcement) -> RightsInRules:
 
 
 def _uses(rule: AclRule) -> Iterator[tuple[str, str]]:
-    """Yield the rights that a rule is about, each with each of its key expressions."""
+    """Yield pairs of a right and a key expression, for all rights and key expressions of a rule."""
     for (flow, message), right in _USE.items():
         if flow in rule.flows and message in rule.messages:
             # Below @adv is the history of a topic, which belongs to the same right.
@@ -486,7 +486,7 @@ def _uses(rule: AclRule) -> Iterator[tuple[str, str]]:
 
 
 def ros_names(key: str) -> tuple[str, ...]:
-    """Return the ROS names and expressions for which a key expression stands; none if it is none.
+    """Return the ROS names and expressions for which a key expression stands; () if there are none.
 
     The first chunk is the ROS domain, and the last two are the type and its hash.
     """
@@ -551,7 +551,7 @@ def name_of_key(key: str) -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class _DecidingMessage:
-    """A message that a right stands or falls with, and those without which it is of no use."""
+    """A message that decides whether a remote process has a right, and further needed messages."""
 
     flow: Flow
     message: Message
@@ -564,7 +564,7 @@ _DECIDING_MESSAGES = {
     "request": _DecidingMessage(_IN, _M.QUERY, ((_OUT, _M.REPLY),)),
     "reply": _DecidingMessage(_OUT, _M.QUERY, ((_IN, _M.DECLARE_QUERYABLE), (_IN, _M.REPLY))),
 }
-"""The message of each right of a remote process, as the process sees it that has the rules."""
+"""The deciding message of each right, from the view of the process that has the rules."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -582,8 +582,8 @@ class RightsBehindRules:
     """What the rules allow to the processes that match a subject.
 
     ``names`` are the common names of their certificates, None for processes of any name.  With
-    ``own`` it is what the process that has the rules may do itself, as long as it obeys them.
-    ``unsaid`` are rights and keys that no ROS name states exactly, ``denied`` are denied ones.
+    ``own``, these are rights of the process that has the rules, which it can ignore.  ``unsaid``
+    are rights and keys that no ROS name states exactly; ``denied`` are denied rights and keys.
     """
 
     subject: str
@@ -595,7 +595,7 @@ class RightsBehindRules:
 
 
 def rights_behind(document: ConfigurationDocument) -> tuple[RightsBehindRules, ...]:
-    """Return what a configuration allows to whom, in ROS terms, in the order of its subjects.
+    """Return the ROS rights that a configuration gives its subjects, in the order of the file.
 
     Raises:
         DocumentError: there are too many wildcards to compare.
@@ -681,7 +681,7 @@ def _keys_of(domain: str, name: str) -> tuple[str, ...]:
 
 
 class _ByPrefix:
-    """Expressions by their text before the first wildcard, with which what they match begins."""
+    """Expressions by their text before the first wildcard, for a fast search."""
 
     def __init__(self, expressions: Iterable[str], limit: ComparisonLimit) -> None:
         self._limit = limit
@@ -691,7 +691,7 @@ class _ByPrefix:
             self._found.setdefault(expression.partition("*")[0].rstrip("$/"), []).append(expression)
 
     def any(self, text: str, holds: Callable[[str, str], bool]) -> bool:
-        """Return whether ``holds`` of an expression and ``text``, for one that may match it."""
+        """Return whether ``holds(expression, text)`` for any expression that may match the text."""
         for end in range(len(text) + 1):
             for each in self._found.get(text[:end], ()):
                 if holds(each, text):
@@ -701,7 +701,7 @@ class _ByPrefix:
 
 
 class _Names:
-    """The ROS names of key expressions that are allowed, without those that are denied."""
+    """The ROS names of allowed key expressions, without the denied names."""
 
     def __init__(
         self, allowed: Sequence[str], denied: Sequence[str], limit: ComparisonLimit
@@ -713,7 +713,7 @@ class _Names:
         self._said: list[str] = []
 
     def stated(self) -> list[tuple[str, str]]:
-        """Return the domains and names, without those that others of the same domain cover."""
+        """Return domains and names, without names that another name of the same domain covers."""
         sound = dict.fromkeys(
             (domain, name)
             for key in self._allowed
@@ -739,7 +739,7 @@ class _Names:
         )
 
     def unsaid(self) -> list[str]:
-        """Return the key expressions that the names leave out a part of."""
+        """Return the key expressions that the names do not cover completely."""
         said = _ByPrefix(dict.fromkeys(self._said), self._limit)
         return [
             key
@@ -768,7 +768,7 @@ def _candidates(key: str) -> Iterator[tuple[str, str]]:
 
 
 def _texts(chunks: Sequence[str]) -> list[str]:
-    """Return the names that chunks may be a part of: a wildcard of ROS also matches "/"."""
+    """Return names for chunks; a wildcard of ROS also matches "/", so there can be several."""
     if not chunks:
         return []
     text = "/".join(chunks)
@@ -796,10 +796,10 @@ def _pieces(key: str) -> list[str]:
 
 
 def enclave_of(rights: RightsBehindRules) -> tuple[str, ...]:
-    """Return the names of enclaves that a subject stands for: () if it has none.
+    """Return the names of the enclaves of a subject, or ().
 
-    For a session that limits itself that is the id of the subject: zenoh_security_tools takes the
-    name of the node, and the enclave of that name.
+    For a session that limits itself, the name is the id of the subject: zenoh_security_tools writes
+    the node's name there, and uses the enclave of that name.
     """
     named = rights.names or ((f"/{rights.subject}",) if rights.own else ())
     return tuple(each for each in named if _is_enclave(each))
@@ -813,7 +813,7 @@ def _is_enclave(name: str) -> bool:
 
 
 def policy_of(found: Iterable[RightsBehindRules]) -> Policy:
-    """Return the policy that states the rights of subjects with names: all of them, or fewer.
+    """Return a policy with the rights of subjects with names; it never has more rights.
 
     The node of each profile is the last part of the enclave's name, as rules name no nodes; all
     names are absolute.

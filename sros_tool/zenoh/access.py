@@ -1,11 +1,10 @@
 """Access control of Zenoh: rules for remote processes, and what they decide.
 
-`AccessControl` is what sros writes: only by certificate; what no rule allows is denied.  A denial
-inside a wider permission holds neither against a query nor against a put with a wildcard key, but
-for the tokens of the graph, which nobody reads as wildcards (measured with 1.10.2).
-`Enforcement` is what any configuration may state.
-Sources: zenoh.io "Access Control"; zenoh 1.9, access_control.rs and authorization.rs; compared
-with the wheel 1.10.2.
+`AccessControl` is what sros writes: its subjects are certificates, and its default is to deny.  A
+denial inside a wider permission stops neither queries nor puts with a wildcard key (measured with
+1.10.2).  It does stop graph tokens, because nobody reads them as wildcards.  `Enforcement` is what
+any configuration may state. Sources: zenoh.io "Access Control"; zenoh 1.9, access_control.rs and
+authorization.rs; compared with the wheel 1.10.2.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ class Message(StrEnum):
 
 
 class Flow(StrEnum):
-    """The direction of a message, as the process sees it that has the rule."""
+    """The direction of a message, from the view of the process that has the rule."""
 
     INGRESS = "ingress"
     """From the remote process."""
@@ -51,10 +50,10 @@ class Flow(StrEnum):
 
 
 class AccessRule(NamedTuple):
-    """Messages that are allowed in one direction, on keys that ``key_expressions`` include.
+    """Messages that are allowed or denied in one direction, on keys in ``key_expressions``.
 
-    Only graph tokens are ever denied (not ``allows``): a token has no wildcards for anybody who
-    reads it, so that the denial of some within others holds.
+    Only rules for graph tokens deny.  Nobody reads a token as a wildcard, so a denial inside a
+    wider permission holds for tokens.
     """
 
     flow: Flow
@@ -69,10 +68,10 @@ class AccessRule(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RemoteRights:
-    """What processes may send and get whose certificate has the common name ``common_name``.
+    """What a remote process may send and get, if its certificate has this common name.
 
-    ``made_of`` is what the keys with wildcards are, by direction and messages of their rule, where
-    denials made lists of them.
+    A denial can turn one key with wildcards into a list of keys.  ``made_of`` has the original keys
+    and what was subtracted, by direction and messages of the rule.
     """
 
     common_name: str
@@ -80,7 +79,7 @@ class RemoteRights:
     made_of: Mapping[_Use, tuple[Difference, ...]] = field(default_factory=dict, compare=False)
 
     def mirrored(self, common_name: str) -> RemoteRights:
-        """Return what the remote process has to allow to this one, whose name is given."""
+        """Return the rights that the remote process must give to this process, ``common_name``."""
         return RemoteRights(
             common_name,
             in_order(rule.mirrored() for rule in self.rules),
@@ -101,8 +100,8 @@ _Use = tuple[Flow, tuple[Message, ...]]
 class AccessControl:
     """The access control of a process: each common name occurs once, everybody else is denied.
 
-    A name that matched two subjects of Zenoh would have the rights of both; and in zenoh up to
-    1.5.1, those of one of them by chance.
+    A name that occurs twice would have the rights of both subjects; in Zenoh up to 1.5.1, it would
+    have the rights of a random one.
     """
 
     remotes: tuple[RemoteRights, ...]
@@ -110,8 +109,8 @@ class AccessControl:
     def allows(self, common_name: str, flow: Flow, message: Message, key: str) -> bool:
         """Return whether a message to or from a remote process passes.
 
-        ``key`` is the key or the key expression that the message names: a rule applies to it only
-        as a whole, so that a wider subscription, query or put is dropped and not cut down.
+        ``key`` is the key or key expression of the message.  A rule applies only if it includes all
+        of ``key``: Zenoh drops a wider subscription, query or put, and does not narrow it.
         """
         rules = [
             rule.allows
@@ -199,9 +198,9 @@ class AccessControl:
 def rule_ids(
     rules: Sequence[Sequence[Hashable]], names: Sequence[str], *, once: bool = True
 ) -> list[list[str]]:
-    """Return the ids that the rules of remote processes, by their common names, have in a file.
+    """Return the ids of rules in a file: a list for each remote process, in the order of ``names``.
 
-    A rule that several have is there once, with an id of its own; before, it had one for each.
+    With ``once``, a rule of several processes has one shared id; older files have one for each.
     """
     uses = Counter(rule for of in rules for rule in of if once)
     number = count()
@@ -227,7 +226,7 @@ def _decided(applying: Sequence[tuple[bool, str]], subjects: tuple[str, ...]) ->
 
 
 _FEW = 16
-"""So many key expressions are compared one by one, without an index."""
+"""Up to this number, key expressions are compared one by one, without an index."""
 
 
 def _include(expressions: tuple[str, ...], key: str) -> bool:
@@ -242,10 +241,10 @@ def _search(expressions: tuple[str, ...]) -> KeyExpressions:
 
 
 def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
-    """Return rules that allow the same, in an order that does not depend on theirs.
+    """Return fewer rules with the same meaning, in an order that does not depend on the input.
 
-    Rules of the same direction and messages become one; key expressions that others of the same
-    rule include are left out.
+    Rules of the same direction and messages become one rule.  It has no key expression that another
+    of its key expressions includes.
     """
     found: dict[tuple[Flow, tuple[Message, ...], bool], list[tuple[str, ...]]] = {}
     for flow, messages, keys, allows in rules:
@@ -288,10 +287,10 @@ def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
 
 
 class RightsBetween:
-    """What processes of two enclaves may send each other directly: what both may by their rights.
+    """What processes of two enclaves may send each other directly: only what both have rights for.
 
     So a process that obeys its own rules never sends or gets more than its rights, whatever the
-    other one does.
+    other process does.
     """
 
     def __init__(self, rights: Iterable[RemoteRights]) -> None:
@@ -381,7 +380,7 @@ def narrowed(rights: RemoteRights, most: Iterable[AccessRule], kept: str) -> Rem
 
 
 def is_within(remote: RemoteRights, own: RemoteRights) -> bool:
-    """Return whether a process whose rights are ``own`` lets a remote one do no more than that."""
+    """Return whether rights of a remote process allow nothing beyond the rights ``own``."""
     mine, theirs = AccessControl((own,)), AccessControl((remote,))
     return all(
         mine.allows(own.common_name, rule.flow.opposite(), message, key)
@@ -408,10 +407,10 @@ def _place(flow: Flow, messages: tuple[Message, ...]) -> tuple[bool, list[int]]:
 
 @dataclass(frozen=True, slots=True)
 class Remote:
-    """A remote process as access control sees it; None is what it does not have.
+    """A remote process as access control sees it; None for a property that it does not have.
 
     ``common_name`` is the first one of its certificate, ``link_protocol`` such as "tls", and
-    ``interfaces`` are the network interfaces of the own host that the connection uses.
+    ``interfaces`` are the network interfaces of this host that the connection uses.
     """
 
     common_name: str | None = None
@@ -453,9 +452,9 @@ class AclSubject:
         return self.cert_common_names is not None or self.usernames is not None
 
     def overlaps(self, other: AclSubject) -> bool:
-        """Return whether a process can match both as two subjects: with the rights of either.
+        """Return whether a process can match both subjects, and so has the rights of both.
 
-        Where both state the same properties, what matches both is one subject to Zenoh.
+        Two subjects with the same properties do not count: Zenoh joins their common values to one.
         """
         pairs = [(getattr(self, name), getattr(other, name)) for name in PROPERTIES]
         return any((one is None) is not (two is None) for one, two in pairs) and all(
@@ -540,7 +539,7 @@ class Enforcement:
         return tuple(subject for subject in self.subjects if subject.id in ids)
 
     def names(self) -> frozenset[str]:
-        """Return the common names that subjects state: those of enclaves that rules are for."""
+        """Return the common names in subjects: the enclaves that have rules."""
         return frozenset(
             name for subject in self.subjects for name in subject.cert_common_names or ()
         )

@@ -1,9 +1,9 @@
 """Configurations of Zenoh processes as rmw_zenoh reads them, without paths and without keys.
 
-`ZenohNetwork` has the choices for all processes of a keystore.
+`ZenohNetwork` has the settings for all processes of a keystore.
 
-A file replaces the whole default of rmw_zenoh, so it also repeats those of its values that differ
-from Zenoh's own and that ROS needs (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_*_CONFIG.json5).
+A file replaces the whole default configuration of rmw_zenoh.  So it repeats the values that ROS
+needs and that differ from Zenoh's defaults (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_*_CONFIG.json5).
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ class Mode(StrEnum):
 class ZenohRouter:
     """A router of a host or a robot: its enclave, and the enclaves whose sessions connect to it.
 
-    ``endpoints`` (``HOST:PORT``) are where these sessions and other routers connect to it, and
-    ``listen`` is where it listens; without it, at these ports of all its addresses.  ``enclaves``
-    are names, in which ``*`` stands for any characters.  ``crossing`` are the names that may pass
-    between it and other routers, if not all that may pass in the network.
+    These sessions and other routers connect to ``endpoints`` (``HOST:PORT``).  The router listens
+    at ``listen``, or at the ports of ``endpoints`` on all its addresses.  ``enclaves`` are names,
+    in which ``*`` stands for any characters.  ``crossing`` are the names that may pass between this
+    router and others; if empty, ``crossing`` of the network decides.
     """
 
     name: str
@@ -73,13 +73,15 @@ class ZenohRouter:
 class ZenohNetwork:
     """The Zenoh network of a keystore's enclaves.
 
-    ``router`` is the enclave of the router; ``endpoints`` (``HOST:PORT``) are where the sessions
-    connect to it, and ``listen`` is where it listens, if elsewhere, such as ``[::]:7447``.
-    ``mode`` is that of the sessions, client or peer.  ``domains`` are ROS domains; empty for those
-    of the keystore's governance.  ``routers`` are further routers, connected to it and to each
-    other, which have the sessions of some enclaves; the first one that names an enclave has it.
-    ``crossing`` are the names of the topics and services that may pass from one router to another,
-    with wildcards, if not all that the rights of the enclaves at both ends allow.
+    ``router`` is the enclave of the router; The sessions connect to ``endpoints`` (``HOST:PORT``);
+    the router listens there too, or at ``listen``, such as ``[::]:7447``. ``mode`` is the mode of
+    the sessions, client or peer.  ``domains`` are ROS domains; if empty, the domains of the
+    keystore's governance.
+
+    ``routers`` are further routers.  All routers connect to each other, and an enclave's sessions
+    connect to the first of ``routers`` that names it.  ``crossing`` are the topics and services,
+    perhaps with wildcards, that may pass from one router to another; if empty, the rights of the
+    enclaves alone decide.
     """
 
     router: str = "/router"
@@ -95,7 +97,7 @@ class ZenohNetwork:
         return self.listen or self.endpoints
 
     def every_router(self) -> tuple[ZenohRouter, ...]:
-        """Return all routers; the first one has the sessions of what no other one has."""
+        """Return all routers; the first router has the enclaves that no other router names."""
         return (ZenohRouter(self.router, self.endpoints, self.listening(), ("*",)), *self.routers)
 
     def router_names(self) -> tuple[str, ...]:
@@ -110,10 +112,10 @@ class ZenohNetwork:
         return self.every_router()[0]
 
     def connects(self) -> Mapping[str, tuple[str, ...]]:
-        """Map each router to where it connects to others; of two routers, one connects.
+        """Map each router to endpoints of others that it connects to; of two routers, one connects.
 
         Raises:
-            UsageError: neither of two routers can reach the other one.
+            UsageError: neither of two routers can reach the other.
         """
         found: dict[str, tuple[str, ...]] = {router.name: () for router in self.every_router()}
         for one, other in combinations(self.every_router(), 2):
@@ -134,28 +136,30 @@ _REVOKED = "last_revocation"
 _QUERY_MILLISECONDS = 600_000
 """How long rmw_zenoh waits for a reply; Zenoh's own default of 10 s would end long calls."""
 _MICROSECONDS_UNTIL_CLOSED = 60_000_000
-"""How long a session of rmw_zenoh waits for a process that takes no message before it leaves it."""
+"""How long a session of rmw_zenoh waits for a stuck receiver before it closes the connection."""
 
 
 class SettingsEdition(Enum):
-    """Which settings a file has that have nothing to do with security, and how it lists rules."""
+    """The edition of a file: its settings without effect on security, and how it lists rules."""
 
     FEW = "few"
-    """The few that the files had at first: sessions ended where rmw_zenoh waits for the router."""
+    """The few settings of the first files: a session ends instead of waiting for its router."""
     OF_RMW_ZENOH = "of rmw_zenoh"
-    """All those of rmw_zenoh (0.1.9, 0.2.10, 0.6.7, 0.10.5, which have the same) that differ from
-    Zenoh's own, and a session waits for its router."""
+    """All settings of rmw_zenoh that differ from Zenoh's defaults; a session waits for its router.
+
+    The settings are the same in rmw_zenoh 0.1.9, 0.2.10, 0.6.7 and 0.10.5.
+    """
     RULES_ONCE = "rules once"
-    """The same settings; a rule that several enclaves have is there once."""
+    """The settings of `OF_RMW_ZENOH`; a rule that several enclaves have is there once."""
 
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
     """The configuration of one Zenoh process: where it listens and connects, and what it enforces.
 
-    Endpoints have the form ``tls/HOST:PORT``.  ``revoked`` is when the last enclave was revoked, in
-    UTC, so that a file of before is known as that; "" if none was, or it does not matter.
-    ``settings`` is the edition of the file that it was read from.
+    Endpoints have the form ``tls/HOST:PORT``.  ``revoked`` is the time of the last revocation, in
+    UTC, by which older files are recognized; "" if no enclave was revoked, or if it does not
+    matter.  ``settings`` is the edition of the file from which the configuration was read.
     """
 
     mode: Mode
@@ -168,7 +172,7 @@ class Configuration:
     def render(self, settings: SettingsEdition = SettingsEdition.RULES_ONCE) -> bytes:
         """Return the file: JSON, the same for equal configurations.
 
-        TLS has no files yet: a session that is not told where its key is does not open.
+        The file does not name the files of TLS: a session needs them from elsewhere to open.
         """
         rights = [render_rights(each) for each in self.access_control.remotes]
         return render_configuration(
@@ -177,7 +181,7 @@ class Configuration:
 
 
 class RenderedRights(NamedTuple):
-    """The rules of a remote enclave as a file has them, without their ids."""
+    """The rules of a remote enclave as a file has them, without ids."""
 
     name: str
     rules: tuple[str, ...]
@@ -200,7 +204,7 @@ _CONTROL = ',\n "access_control": {\n'
 
 
 def _control(every: Sequence[RenderedRights], *, once: bool) -> str:
-    """Return the access control of a file; a rule that several enclaves have once, or for each."""
+    """Return the access control of a file, with shared rules ``once`` or once for each enclave."""
     rules: dict[str, str] = {}
     lines: dict[str, list[str]] = {"rules": [], "subjects": [], "policies": []}
     names = [each.name for each in every]
@@ -321,7 +325,7 @@ def parse_rendered(data: bytes, name: str) -> Configuration:
     """Return a configuration as `Configuration.render` writes it; ``name`` is for errors.
 
     Raises:
-        DocumentError: it is not exactly as sros writes it, so it may have another meaning.
+        DocumentError: the data is not exactly as sros writes it, so its meaning is not certain.
     """
     configuration = RenderedReader().read(data)
     if configuration is None:

@@ -1,9 +1,9 @@
-"""Deliveries between Zenoh processes: which message has to pass whom on each link.
+"""Deliveries between Zenoh processes: which messages must pass on each link.
 
-On a link two processes enforce: the one that sends a message has rules for what leaves (egress),
-the one that gets it for what arrives (ingress).  Whoever denies a message drops it without a word.
-Which messages a delivery needs, and on which links, was measured with 1.10.2 by denying one after
-the other, and is compared on random rules (``tests/integration/test_zenoh_deliveries.py``).
+On a link, both processes enforce: the sender by its egress rules, the receiver by its ingress
+rules.  A process that denies a message drops it silently.  Which messages a delivery needs, and on
+which links, was measured with 1.10.2: one message after the other was denied.  A test compares the
+result on random rules (``tests/integration/test_zenoh_deliveries.py``).
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ class Check:
     message: Message
     """The kind of message, as Zenoh's rules name it."""
     key: str
-    """Its key; `any::type/hash` stands for every type."""
+    """The key of the message; `any::type/hash` stands for every type."""
     decision: AccessDecision
 
     @property
     def allowed(self) -> bool:
-        """Whether it passes."""
+        """Whether the message passes."""
         return self.decision.allowed
 
     @property
@@ -55,7 +55,7 @@ class Check:
 
     @property
     def why(self) -> str:
-        """Why, as a clause."""
+        """The reason for the decision, as a clause."""
         return self.decision.why
 
     def __str__(self) -> str:
@@ -68,7 +68,7 @@ class Check:
 class Delivery:
     """The checks that a delivery has to pass, in the order of the messages.
 
-    ``replies`` are those of the reply to a call: the request is executed without them.
+    ``replies`` are the checks on the reply to a call: the request is executed even if they fail.
     """
 
     checks: tuple[Check, ...]
@@ -81,24 +81,24 @@ class Delivery:
 
     @property
     def answered(self) -> bool:
-        """Whether also the reply gets back."""
+        """Whether the reply arrives, too."""
         return self.arrives and all(each.allowed for each in self.replies)
 
 
 Route = tuple[ZenohProcess, ...]
-"""The processes that a message passes, with those at both ends; two to four.
+"""The two to four processes that a message passes, including the sender and the receiver.
 
-A session and the router alone are the part of a way that the rights of one enclave decide.
+A way of only a session and its router is the part that the rights of one enclave decide.
 """
 
 
 def route(
     source: ZenohProcess, target: ZenohProcess, router: ZenohProcess, to: ZenohProcess | None = None
 ) -> Route:
-    """Return the way from one process to another; ``to`` is the target's router if it has another.
+    """Return the way from ``source`` to ``target``; ``to`` is the target's router if it is another.
 
-    Peers connect to each other, and a router passes nothing on between peers; from or to a client
-    everything goes through the router, and from there through the target's.
+    Peers send to each other directly.  Messages from or to a client go through the router, and then
+    through the target's router.
     """
     if source.mode is Mode.PEER and target.mode is Mode.PEER:
         return source, target
@@ -124,9 +124,9 @@ def publication(way: Route, key: str, subscribed: str = "") -> Delivery:
 
 
 def call(way: Route, key: str, served: str = "", replied: str = "") -> Delivery:
-    """Return the delivery of a query, along ``way`` from who asks to who replies.
+    """Return the delivery of a query, along ``way`` from the asking to the replying process.
 
-    ``served`` is the key of the queryable and ``replied`` that of the reply, if they differ.
+    ``served`` is the key of the queryable, and ``replied`` the key of the reply, if they differ.
     """
     back = way[::-1]
     # Queries go to the router in any case, and to another peer only if it offers to reply.
@@ -143,10 +143,10 @@ def call(way: Route, key: str, served: str = "", replied: str = "") -> Delivery:
 def token(
     way: Route, key: str, asked: str, message: Message = Message.DECLARE_LIVELINESS_SUBSCRIBER
 ) -> Delivery:
-    """Return the delivery of a liveliness token, along ``way`` from who announces to who watches.
+    """Return the delivery of a liveliness token, along ``way`` from its owner to the watcher.
 
-    ``asked`` is the key that the watching process asks for, with ``message``.  The router answers;
-    peers tell each other all tokens unasked.
+    ``asked`` is the key that the watcher asks for, with ``message``.  The router answers; peers
+    send each other all tokens unasked.
     """
     asking = way[:-3:-1] if way[-2].mode is Mode.ROUTER else ()
     return Delivery(

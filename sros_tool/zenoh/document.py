@@ -1,10 +1,11 @@
 """Reading the configuration of a Zenoh process, whoever wrote it: JSON5, or YAML that is JSON.
 
-Zenoh chooses the language by the ending of the file's name, and reads no file of another ending.
+Zenoh chooses the language by the file name's ending, and reads no file with another ending.
 
-Only what security depends on becomes values; `ConfigurationDocument.unknown` names the rest that no
-version up to 1.10 has.  What Zenoh does not accept is an error, as a process with it does not open.
-Source: commons/zenoh-config of zenoh 1.9; compared with the wheel 1.10.2.
+Only settings that security depends on become values.  `ConfigurationDocument.unknown` names
+settings that no version up to 1.10 has.  A file that Zenoh does not accept is an error, because a
+process with it does not start. Source: commons/zenoh-config of zenoh 1.9; compared with the wheel
+1.10.2.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ _LISTEN: Mapping[Mode, tuple[str, ...]] = {
     Mode.PEER: ("tcp/[::]:0",),
     Mode.CLIENT: (),
 }
-"""Where a process listens whose configuration does not say it."""
+"""Where a process listens if its configuration does not say."""
 ENCRYPTED = frozenset({"tls", "quic"})
 """The protocols that encrypt, and authenticate by certificates."""
 _LINK_PROTOCOLS = frozenset(
@@ -65,9 +66,9 @@ _LINK_PROTOCOLS = frozenset(
 _AS_YAML = (".yaml", ".yml")
 _AS_TOML = (".toml",)
 ENDINGS = (".json5", ".json", *_AS_YAML, *_AS_TOML)
-"""The endings of the names of files that Zenoh reads (1.10.2, measured)."""
+"""Endings of the file names that Zenoh reads (1.10.2, measured)."""
 _OTHER_IN_YAML = re.compile(r"\\u|[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff]")
-"""What means another thing in YAML than in JSON, or nothing."""
+"""Characters and escapes that YAML reads differently from JSON, or refuses."""
 _MOST_MEANT = 1_000_000
 _MOST_PARTS = 10
 _ZID = re.compile(r"[1-9a-f][0-9a-f]{0,31}", re.ASCII)
@@ -81,7 +82,7 @@ class ZenohEndpoint:
 
     @property
     def protocol(self) -> str:
-        """What stands before the first slash, such as "tls"."""
+        """The text before the first slash, such as "tls"."""
         return self.text.partition("/")[0]
 
     @property
@@ -95,13 +96,13 @@ class ZenohEndpoint:
 
     @property
     def options(self) -> Mapping[str, str]:
-        """Its own options, which count in place of those of the section ``tls``."""
+        """The options of the endpoint, which override the section ``tls``."""
         stated = self.text.partition("#")[2].split(";")
         pairs = (option.partition("=") for option in stated if option)
         return {name: value for name, _, value in pairs}
 
     def option(self, name: str, otherwise: bool) -> bool:
-        """Return an option of TLS: its own one, or else that of the section."""
+        """Return an option of TLS: of the endpoint, or ``otherwise``."""
         own = self.options.get(name)
         return otherwise if own is None else own == "true"
 
@@ -110,10 +111,10 @@ class ZenohEndpoint:
 class TlsOptions:
     """The options of TLS that decide whom a process accepts, with Zenoh's defaults.
 
-    ``mutual``: who connects has to show a certificate.  ``verifies_name``: who listens has to have
-    the host of the endpoint in its certificate.  ``closes_on_expiration``: a connection ends when
-    the certificate of the other side expires.  ``named`` are the certificates and keys that it
-    names, such as "root_ca_certificate".
+    ``mutual``: a connecting process must show a certificate.  ``verifies_name``: the certificate of
+    a listening process must have the host of the endpoint.  ``closes_on_expiration``: a connection
+    ends when the certificate of the other side expires.  ``named`` are the settings for
+    certificates and keys in the file, such as "root_ca_certificate".
     """
 
     mutual: bool = False
@@ -126,10 +127,10 @@ class TlsOptions:
 class ConfigurationDocument:
     """The configuration of a Zenoh process: what security depends on, with Zenoh's defaults.
 
-    ``protocols`` are the only ones for endpoints, None for all.  ``namespace`` stands before every
-    key of the process.  ``lines`` are the lines of settings, by their paths with "/" between the
-    parts; ``unknown`` the paths of settings that no version of Zenoh up to 1.10 accepts.
-    ``settings`` are all settings that the file states, but for access control, as JSON.
+    ``protocols`` are the protocols that endpoints may have, None for all.  ``namespace`` is put
+    before every key of the process.  ``lines`` maps paths of settings, such as "transport/link", to
+    their lines; ``unknown`` are paths that no version of Zenoh up to 1.10 accepts.  ``settings``
+    are all settings of the file except access control, as JSON.
     """
 
     name: str
@@ -170,7 +171,7 @@ class ConfigurationDocument:
 
 
 class UnreadConfigurationError(DocumentError):
-    """A configuration that Zenoh may read, and sros does not: what it enforces is not known."""
+    """A configuration that Zenoh may read, but sros does not, so its rules are not known."""
 
 
 def parse_configuration(
@@ -178,9 +179,9 @@ def parse_configuration(
 ) -> ConfigurationDocument:
     """Return the configuration that a file states; ``name`` is the file's name in errors.
 
-    ``overrides`` are paths of settings and their values in JSON5, which replace those of the file,
-    as the pairs of ZENOH_CONFIG_OVERRIDE do.  Without ``lines`` the values do not know their
-    lines, and large files are read faster.
+    ``overrides`` are paths of settings and their values in JSON5, which replace settings of the
+    file, like the pairs of ZENOH_CONFIG_OVERRIDE.  Without ``lines``, every line is 1, and large
+    files are read faster.
 
     Raises:
         UnreadConfigurationError: Zenoh may read it, and sros does not: the file has more than
@@ -195,7 +196,7 @@ def parse_configuration(
 
 
 def _override(root: _Section, path: str, value: str) -> None:
-    """Replace a setting; what Zenoh does not accept is an error, as it does not start with it."""
+    """Replace a setting; a value that Zenoh does not accept is an error."""
     *parents, last = (part for part in path.split("/") if part) if path.strip("/") else [""]
     inner = root.value
     try:
@@ -252,10 +253,10 @@ def _has_ending(name: str, endings: tuple[str, ...] = (*_AS_YAML, *_AS_TOML)) ->
 
 
 def _of_yaml(text: str, name: str) -> object:
-    """Return the value of YAML that is JSON, too, where both mean the same.
+    """Return the value of YAML that is also valid JSON with the same meaning.
 
     Raises:
-        UnreadConfigurationError: it is not, or it is TOML.
+        UnreadConfigurationError: the text is not such YAML, or it is TOML.
     """
     value: object = None
     if not _has_ending(name, _AS_TOML) and not _OTHER_IN_YAML.search(text):
@@ -272,12 +273,12 @@ def _of_yaml(text: str, name: str) -> object:
 
 
 def _not_json5(name: str) -> type[DocumentError]:
-    """Return the kind of error for what is not JSON5: Zenoh chooses YAML by the file's name."""
+    """Return the error class for text that is not JSON5; Zenoh may read it as YAML by its name."""
     return UnreadConfigurationError if _has_ending(name) else DocumentError
 
 
 def _no_object(value: object) -> type[DocumentError]:
-    """Return the kind of error for what is no object: Zenoh takes a list of its values as well."""
+    """Return the error class for a value that is no object: Zenoh may read a list instead."""
     return UnreadConfigurationError if isinstance(value, list) else DocumentError
 
 
@@ -415,7 +416,7 @@ def _configuration(root: _Section, name: str) -> ConfigurationDocument:
 def _endpoints(
     section: _Section, mode: Mode, default: tuple[str, ...]
 ) -> tuple[ZenohEndpoint, ...]:
-    """Return the endpoints of a section, which may state others for each mode."""
+    """Return the endpoints of a section, which may state different endpoints for each mode."""
     if isinstance(section.value.get("endpoints"), Json5Object):
         section = section.section("endpoints")
         section.only([mode.value for mode in Mode])
@@ -504,7 +505,7 @@ def _policy(section: _Section) -> AclPolicy:
 
 
 def _check_ids(section: _Section, enforcement: Enforcement) -> None:
-    """Refuse ids that occur twice, and policies that name a rule or subject that there is not."""
+    """Refuse duplicate ids, and policies that name a missing rule or subject."""
     for member, elements in (("rules", enforcement.rules), ("subjects", enforcement.subjects)):
         ids = [element.id for element in elements]
         if twice := next(_repeated(ids), None):
@@ -517,7 +518,7 @@ def _check_ids(section: _Section, enforcement: Enforcement) -> None:
 
 
 def _check_size(section: _Section, enforcement: Enforcement) -> None:
-    """Refuse a file whose few lines mean many millions of decisions."""
+    """Refuse a small file that would need many millions of decisions."""
     values = {
         subject.id: prod(len(getattr(subject, name) or (None,)) for name in PROPERTIES)
         for subject in enforcement.subjects

@@ -1,7 +1,7 @@
 """Reading JSON5, the language of Zenoh's configurations, with the line of each member.
 
-Bounded in size and depth, and in time linear in the size: neither recursion nor backtracking.  A
-member that an object names twice is refused, as by Zenoh: readers would differ in which one counts.
+Size and depth are limited, and the time is linear in the size: no recursion, no backtracking. Like
+Zenoh, it refuses an object that names a member twice, because readers differ in which value counts.
 Source: spec.json5.org 1.0; compared with what the wheel 1.10.2 accepts.
 """
 
@@ -17,10 +17,15 @@ MOST_BYTES = 16 * 1024 * 1024
 _MOST_DEPTH = 100
 _MOST_DIGITS = 400
 _MOST_TOKENS = 2_000_000
-"""The router of a thousand enclaves has less than half of it; more would take many seconds."""
+"""Maximum number of tokens in a text; more would take many seconds.
+
+The router of a thousand enclaves has less than half of this number.
+"""
 _MOST_WITHOUT_LINES = 200_000
-"""Files of processes and of whole keystores, one after another, that are not plain JSON; the
-default configuration of Zenoh has a fiftieth of it."""
+"""Maximum number of tokens of JSON5 that is not plain JSON, if lines are not needed.
+
+The default configuration of Zenoh has a fiftieth of this number.
+"""
 
 
 class Json5Error(ValueError):
@@ -55,7 +60,7 @@ _TOKEN = re.compile(
     re.VERBOSE | re.DOTALL,
 )
 _NOT_IN_JSON5 = re.compile(r"\\u|[\u2028\u2029]")
-"""What JSON may have in a text: half a character by an escape, and ends of lines."""
+"""What JSON allows in a string, but JSON5 does not: escapes of half a character, and line ends."""
 _LINE = re.compile(r"\r\n|[\n\r\u2028\u2029]")
 _ESCAPE = re.compile(r"\\(?:u([0-9a-fA-F]{4})|x([0-9a-fA-F]{2})|(\r\n|.))", re.DOTALL)
 _ESCAPED = {"b": "\b", "f": "\f", "n": "\n", "r": "\r", "t": "\t", "v": "\v", "0": "\0"}
@@ -72,8 +77,8 @@ class _Token(NamedTuple):
 def parse_json5(text: str, *, lines: bool = True) -> Any:
     """Return the value of a JSON5 text; each object is a `Json5Object`.
 
-    Without ``lines``, which are then 1 everywhere, JSON is read some twenty times as fast, and only
-    a small text that is no JSON.
+    Without ``lines``, every line is 1.  Plain JSON is then read about twenty times as fast, and
+    other JSON5 has to be small.
 
     Raises:
         Json5Error: the text is not JSON5, is too large, has more than 100 levels, or an object that

@@ -20,14 +20,14 @@ _MANY = 65536
 _LITERAL = re.compile(r"(?<![^/])[^/*]+(?![^/])")
 """A chunk without wildcards."""
 _MOST_COMPARED = 100_000
-"""Most comparisons to leave out what is not needed: parts of a second."""
+"""Maximum number of comparisons to leave out unneeded expressions: less than a second."""
 
 
 def canonical(chunks: Iterable[str]) -> str:
     """Return the key expression of ``chunks`` in the only form that Zenoh accepts.
 
-    A chunk that is only ``$*`` becomes ``*``, and of wildcards that follow each other, each ``*``
-    stands before one ``**``.  Rules in another form keep a session from opening.
+    A chunk that is only ``$*`` becomes ``*``.  In a row of wildcards, each ``*`` is put before one
+    ``**``.  Rules in another form keep a session from opening.
     """
     chunks = tuple(chunks)
     text = "/".join(chunks)
@@ -65,7 +65,7 @@ class KeyExpressions:
 
     @cached_property
     def _by_begin(self) -> Mapping[str, Mapping[str, list[str]]]:
-        """The expressions with wildcards by what they begin with, and there by their form."""
+        """The expressions with wildcards, by the text before the wildcard, and then by `_form`."""
         found: dict[str, dict[str, list[str]]] = {}
         for each in self.all:
             if (begin := _fixed_begin(each)) != each:
@@ -88,7 +88,7 @@ class KeyExpressions:
         )
 
     def needed(self) -> list[str]:
-        """Return the expressions that no other one includes, sorted; all if they are too alike."""
+        """Return the sorted expressions that no other one includes; all if there are too many."""
         forms = {each: _form(each) for each in self.all}
         if len(set(forms.values())) == 1:
             return sorted(self.all)
@@ -127,7 +127,7 @@ def _form(expression: str) -> str:
 
 
 def _without_wildcards(expression: str) -> str:
-    """Return what every included key begins with; "/**" may stand for nothing."""
+    """Return the text with which every included key begins; "/**" may stand for nothing."""
     begin, wildcard, _ = expression.partition("*")
     return begin.rstrip("$/") if wildcard else expression
 
@@ -203,7 +203,7 @@ def _chunk_includes(wide: str, narrow: str) -> bool:
 
 
 def widest(expression: str) -> str:
-    """Return the widest expression that a wildcard makes of one: all but chunks with ``@``."""
+    """Return an expression with ``**`` in place of each chunk that does not begin with ``@``."""
     chunks = expression.split("/")
     return canonical(each if each.startswith("@") else ANY_CHUNKS for each in chunks)
 
@@ -267,11 +267,11 @@ def _sequences_intersect(
 # ── what two expressions have in common ────────────────────────────────────────────────────
 
 _MOST_COMMON = 4096
-"""Most key expressions for what two others have in common."""
+"""Maximum number of key expressions for what two key expressions have in common."""
 
 
 class TooManyExpressions(Exception):  # noqa: N818 - the caller makes an error of it
-    """What two expressions have in common takes too many others."""
+    """The common part of two expressions takes too many expressions."""
 
 
 def common(one: str, other: str) -> list[str]:
@@ -291,12 +291,12 @@ def common(one: str, other: str) -> list[str]:
 
 
 _ANY_LETTERS = "\0"
-"""In place of ``$*``, as it is no character of a key."""
+"""Stands for ``$*``; it cannot occur in a key."""
 
 
 @lru_cache(maxsize=_MANY)
 def common_chunks(one: str, other: str) -> tuple[str, ...]:
-    """Return chunks that together match what both match: of ``**``, that is the other one."""
+    """Return chunks that together match what both match; ``**`` matches all of the other chunk."""
     if one == other:
         return (one,)
     if ANY_CHUNKS in (one, other):
@@ -326,9 +326,9 @@ def _common(
     many: str,
     meet: Callable[[str, str], tuple[str, ...]],
 ) -> set[tuple[str, ...]]:
-    """Return the sequences for all that is both, where ``many`` is any number of members.
+    """Return the common part of two sequences, where ``many`` stands for any number of members.
 
-    ``meet`` returns what two members have in common; of ``many`` and another one, that it allows.
+    ``meet`` returns what two members have in common, also of ``many`` and a member.
     """
 
     @cache
@@ -366,7 +366,7 @@ _BEGINS_CHUNK = ~Letters.of("/@")
 
 @lru_cache(maxsize=_MANY)
 def _automaton(expression: str) -> Automaton | None:
-    """Return an automaton for the keys that are included; None if it is only the one key."""
+    """Return an automaton for the included keys; None if the expression is a single key."""
     if "*" not in expression:
         return None
     edges: list[tuple[int, Letters, int]] = []

@@ -1,7 +1,7 @@
-"""The releases of rmw_zenoh that supported distributions of ROS 2 have: what each one adds.
+"""The releases of rmw_zenoh in the supported distributions of ROS 2, and what they add.
 
-Files that sros writes are for all of them.
-Source: ros2/rmw_zenoh, its changelogs, rmw_publisher_data.cpp and rmw_subscription_data.cpp.
+The files that sros writes work with all of these releases. Source: ros2/rmw_zenoh, its changelogs,
+rmw_publisher_data.cpp and rmw_subscription_data.cpp.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ Version = tuple[int, int, int]
 
 
 class RmwZenohRelease(NamedTuple):
-    """The versions of rmw_zenoh_cpp of one distribution, from ``begin`` to that of the next one.
+    """The versions of rmw_zenoh_cpp in one distribution, from ``begin`` to the next distribution.
 
-    ``least`` is the first one that has `_LEAST_ZENOH` and reads ZENOH_CONFIG_OVERRIDE.
-    ``below_topics`` are the key expressions, below the key of a topic, on which its messages are
-    sent too, or instead: to the subscriptions whose graph tokens the publisher sees.
+    ``least`` is the first version that has `_LEAST_ZENOH` and reads ZENOH_CONFIG_OVERRIDE.  For
+    subscriptions whose graph tokens it sees, a publisher also sends, or only sends, on
+    ``below_topics``: key expressions below the key of the topic.
     """
 
     distribution: str
@@ -29,8 +29,10 @@ class RmwZenohRelease(NamedTuple):
 
 
 _BUFFERS = ("_buf_cpu", "_buf/*")
-"""Messages with an array of bytes (images, point clouds) between publishers and subscriptions of
-C++: one key for all subscriptions in main memory, and one for each of those on accelerators."""
+"""Keys for messages with an array of bytes (images, point clouds) between C++ nodes.
+
+All subscriptions in main memory share one key; each subscription on an accelerator has its own.
+"""
 
 RELEASES = (
     RmwZenohRelease("Humble", (0, 1, 0), (0, 1, 2)),
@@ -38,11 +40,11 @@ RELEASES = (
     RmwZenohRelease("Kilted", (0, 3, 0), (0, 6, 0)),
     RmwZenohRelease("Lyrical", (0, 7, 0), (0, 7, 0), _BUFFERS),
 )
-"""All that are supported, the earliest first; those of Rolling are counted to the next one."""
+"""All supported releases, earliest first; versions of Rolling count to the next distribution."""
 
 
 def release_of(version: Version) -> RmwZenohRelease:
-    """Return the release that a version belongs to: the latest one that had begun."""
+    """Return the release of a version: the latest release whose ``begin`` is not after it."""
     begun = (each for each in reversed(RELEASES) if each.begin <= version)
     return next(begun, RELEASES[0])
 

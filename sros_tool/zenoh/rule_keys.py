@@ -1,4 +1,4 @@
-"""The keys of rules: what is left of names without denied ones, and what two rules share."""
+"""The keys of rules: allowed names minus denied names, and the keys that two rules share."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _MANY, _FEW = 65536, 1024
 
 
 class Difference(NamedTuple):
-    """The keys of names that expressions match and denied ones do not.
+    """The keys of names that allowed expressions match and denied expressions do not.
 
-    The chunk ``begin`` stands before each name, and ``end`` behind it: "" or "/" and more.
+    A key is the chunk ``begin``, the name, and ``end``: "", or "/" and further chunks.
     """
 
     begin: str
@@ -44,11 +44,11 @@ class Difference(NamedTuple):
         return self._replace(end=f"{self.end}/{end}")
 
     def include(self, name: str) -> bool:
-        """Return whether a name without wildcards, with "/" between its chunks, is in it."""
+        """Return whether the difference has a name without wildcards, such as ``robot/chatter``."""
         return _searched(self.allowed).include(name) and not _searched(self.denied).include(name)
 
     def include_all(self, begin: str, name: Chunks, end: str) -> bool:
-        """Return whether all keys of an expression are in it; False can be wrong, True never is."""
+        """Return whether the difference has all keys of an expression; only True is certain."""
         return (
             begin == self.begin
             and _common_end(end, self.end) == end
@@ -71,7 +71,7 @@ class Difference(NamedTuple):
 
 
 def _common_end(one: str, other: str) -> str | None:
-    """Return what is behind the names of both, where one may have any keys below the other."""
+    """Return the common part of what follows the names, where "/**" in one includes the other."""
     end, longer = sorted((one, other), key=len)
     return end if longer in (end, f"{end}/{ANY_CHUNKS}") else None
 
@@ -93,19 +93,19 @@ def _common(some: frozenset[Chunks], others: frozenset[Chunks]) -> frozenset[Chu
 class RuleKeys:
     """The keys of a rule: what its expressions include.
 
-    ``plain`` are those of one name, with wildcards only for the type and its hash, and below;
-    ``tokens`` are graph tokens with wildcards; ``differences`` are all others.
+    ``plain`` are keys of one name, with wildcards only in and below the type and its hash.
+    ``tokens`` are graph tokens with wildcards; ``differences`` are all other keys.
     """
 
     def __init__(self, expressions: frozenset[str], made_of: tuple[Difference, ...]) -> None:
-        """Take the expressions, and what those with wildcards are made of, if that is known."""
+        """Take the expressions, and the differences from which they were made, if known."""
         wide = [each for each in expressions if "*" in _ENDS.sub("", each)]
         self.plain = expressions.difference(wide)
         self.tokens = KeyExpressions(each for each in wide if each.startswith("@"))
         self.differences = made_of or _differences(wide)
 
     def include(self, key: str) -> bool:
-        """Return whether all keys of an expression are keys of what the rule was made of."""
+        """Return whether the differences of the rule have all keys of an expression."""
         begin, name, end = _parted(key)
         chunks = tuple(name.split("/"))
         return any(each.include_all(begin, chunks, end) for each in self.differences)
@@ -130,7 +130,7 @@ class RuleKeys:
 
 @lru_cache(maxsize=_MANY)
 def keys_of(expressions: frozenset[str], made_of: tuple[Difference, ...] = ()) -> RuleKeys:
-    """Return the keys that expressions include: the same value for the same ones."""
+    """Return the keys that expressions include; equal arguments give the same object (a cache)."""
     return RuleKeys(expressions, made_of)
 
 
