@@ -494,7 +494,11 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
     elif answer.denied_by:
         yield _row("denied by", answer.denied_by)
     if answer.until and answer.allowed:
-        yield _row("until", f"{iso(answer.until)}, when {answer.until_file} expires")
+        from sros_tool.keystore.layout import CERTIFICATE_FILE
+
+        dropped = answer.vendor.traits.drops_expired and answer.until_file == CERTIFICATE_FILE
+        then = "; running nodes lose their peers then" if dropped else ""
+        yield _row("until", f"{iso(answer.until)}, when {answer.until_file} expires{then}")
     yield from _to_do_lines(answer)
 
 

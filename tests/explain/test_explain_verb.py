@@ -234,6 +234,19 @@ def test_all_vendors_and_where_they_differ(tmp_path: Path) -> None:
     assert alike.status == 1 and "all vendors decide alike" in alike.out
 
 
+def test_where_running_nodes_lose_their_peers_when_a_certificate_expires(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--validity", "20d", "--permissions-validity", "90d").ok()
+    sros("create_enclave", root, "/a").ok()
+    until = {
+        vendor: explain(root, "/a", "join", "--vendor", vendor).ok().out
+        for vendor in ("fastdds", "fastdds-2.6", "fastdds-3.2", "fastdds-3.6")
+    }
+    assert all("when cert.pem expires" in text for text in until.values())
+    losing = {vendor for vendor, text in until.items() if "running nodes lose their peers" in text}
+    assert losing == {"fastdds-2.6", "fastdds-3.2"}
+
+
 def test_the_vendor_of_this_machine(whole: Path) -> None:
     asked = (whole, ENCLAVE, "publish", "/chatter")
     by_rmw = answer(*asked, env={"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"})

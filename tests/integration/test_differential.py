@@ -116,6 +116,7 @@ NOT_OF_DOCUMENTS = {
     "keys",
     "reads_tokens",
     "crashes_on_empty_subject",
+    "drops_expired",
 }
 """Rules about what is around the documents: `test_signers_on_dds`, `test_subjects_on_dds`,
 `test_stranger_on_dds`, `test_drawn_trust` and `test_key_on_token` tell."""

@@ -143,6 +143,11 @@ class VendorTraits:
     """A character beyond ASCII in a certificate's subject is compared as ``\\C3\\B6``."""
     longest_subject: int | None = None
     """Number of bytes of a certificate's subject that are compared; the rest is ignored."""
+    drops_expired: bool = False
+    """Running participants lose each other when the certificate of either expires.
+
+    Since Fast DDS 2.6.12 and 3.2.5 (CVE-2025-67108); 2.14.6 and 3.6.2 keep them (all measured).
+    """
     crashes_on_empty_subject: bool = False
     """A certificate without any attribute in its subject crashes the process, and its peers'."""
     moments: Moments = Moments.STANDARD
@@ -288,6 +293,7 @@ class Vendor(StrEnum):
         replace(
             _FAST_2_14,
             title="Fast DDS 2.6",
+            drops_expired=True,
             subjects=Subjects.WHOLE_ATTRIBUTES,
             crashes_on_missing_content=False,
             largest_document=60 * 1024 - 1,
@@ -308,7 +314,9 @@ class Vendor(StrEnum):
     )
     FAST_3_2 = (
         "fastdds-3.2",
-        replace(_FAST_2_14, title="Fast DDS 3.2", crashes_on_missing_content=False),
+        replace(
+            _FAST_2_14, title="Fast DDS 3.2", drops_expired=True, crashes_on_missing_content=False
+        ),
     )
     FAST_3_6 = (
         "fastdds-3.6",
