@@ -36,6 +36,7 @@ from sros_tool.demo.scenarios.policies import DENIED_TOPIC
 from sros_tool.demo.scenarios.zenoh_forger import start_network, zenoh_variables
 from sros_tool.errors import SrosError
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
+from sros_tool.keystore.layout import ROUTER_FILE, enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.template import Template
 from sros_tool.runtime.environment import secured_environment
@@ -98,7 +99,7 @@ class KeystoreSet:
         root = self.keystores[identity.keystore]
         name = self.enclave(identity)
         if self.router:
-            router = name == self.router
+            router = (enclave_path(root, name) / ROUTER_FILE).exists()
             return zenoh_variables(root, name, domain, router=router, lawless=identity.lawless)
         return secured_environment(root, name, domain) | dict(identity.variables)
 

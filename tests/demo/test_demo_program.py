@@ -220,7 +220,7 @@ def test_the_list_of_scenarios() -> None:
         *("isolation", "services", "actions", "composition", "attacks", "governance")
     ]
     assert [line.split()[0] for line in on_zenoh.splitlines()] == [
-        *("isolation", "services", "attacks")
+        *("isolation", "services", "routers", "attacks")
     ]
     shown = json.loads(sros("demo", "--list", "--json").ok().out)["scenarios"]
     assert shown[0]["rows"] == 11

@@ -66,11 +66,14 @@ def test_every_attack_is_also_tried_without_its_defence_or_told_as_open() -> Non
                 assert any(other.removed for other in of), attack
 
 
-def test_every_row_has_one_router_that_starts_before_all_others() -> None:
+def test_every_row_has_a_router_for_each_host_and_one_starts_before_all_others() -> None:
     for row in ROWS.values():
         first = [party for party in row.parties if not party.turn]
         assert len(first) == 1, row.name
         assert first[0].role in (Role.ROUTER, Role.RELAY)
+        if "far router" in first[0].name:
+            second = [party for party in row.parties if party.turn == 1]
+            assert [party.role for party in second] == [Role.ROUTER]
 
 
 def test_an_attacker_in_another_enclave_obeys_no_rules_of_its_own() -> None:
@@ -107,7 +110,7 @@ def test_scenarios_are_chosen_by_name() -> None:
     assert choose_scenarios((), on_zenoh=True) == ZENOH_SCENARIOS
     assert choose_scenarios(("all",), on_zenoh=True) == ZENOH_SCENARIOS
     assert choose_scenarios(("attacks",), on_zenoh=True) == (ATTACKS,)
-    with pytest.raises(UsageError, match="sros has isolation, services, attacks on Zenoh"):
+    with pytest.raises(UsageError, match="sros has isolation, services, routers, attacks on Zenoh"):
         choose_scenarios(("governance",), on_zenoh=True)
     with pytest.raises(UsageError, match=r"own\.toml cannot run on Zenoh"):
         choose_scenarios(("own.toml",), on_zenoh=True)

@@ -664,6 +664,86 @@ _ROUTER_ROWS = tuple(
 )
 
 
+# ── the router of another host ─────────────────────────────────────────────────────────────
+
+
+def _far_router(keystore: KeystoreChoice) -> tuple[Party, Party]:
+    """Return both routers; the listener and the admin are at the far one, which starts first."""
+    far = Identity(keystore, zenoh_forger.FAR_ROUTER)
+    return Party("far router", Role.ROUTER, far), replace(_router(keystore), turn=1)
+
+
+def _far_pair(keystore: KeystoreChoice) -> tuple[Party, ...]:
+    """Return both routers, talker and listener."""
+    talker, listener = talker_and_listener(keystore)
+    return (*_far_router(keystore), replace(talker, turn=2), replace(listener, turn=2))
+
+
+_NEAR = replace(
+    _rightful("near talker", Role.TALKER, zenoh_forger.far_router_without_the_topic, "admin"),
+    turn=2,
+)
+_NOT_CROSSING = (*_far_pair(zenoh_forger.far_router_without_the_topic), _NEAR)
+_ROUTERS = _scenario(
+    "routers",
+    "what passes between the routers of two hosts on Zenoh",
+    _attempt(
+        "talker to listener at another router",
+        RowStatus.HEARD,
+        "both routers allow what both enclaves may, if its name may cross",
+        hears("listener", "talker"),
+        _far_pair(zenoh_forger.far_router),
+    ),
+    _attempt(
+        "talker to listener at the same router, the topic may not cross",
+        RowStatus.HEARD,
+        "what may cross concerns only other routers",
+        hears("listener", _NEAR.name),
+        _NOT_CROSSING,
+        world="not crossing",
+    ),
+    _attempt(
+        "talker to listener at another router, the topic may not cross",
+        RowStatus.NOT_HEARD,
+        "a router allows another router only names that may cross",
+        hears("listener", "talker"),
+        _NOT_CROSSING,
+        (hears("listener", _NEAR.name),),
+        world="not crossing",
+    ),
+)
+
+
+def _rogue_far_router(name: str, keystore: KeystoreChoice, removed: str = "") -> Row:
+    """Return a row in which the guest connects to the talker's router as another router."""
+    rogue = Party("attacking far router", Role.RELAY, Identity(keystore, "guest"), intruder=True)
+    wide, talker, _ = _topic_pair(keystore)
+    observer = _rightful("observer", Role.OBSERVER, keystore, "client")
+    return _attempt(
+        name,
+        RowStatus.HEARD if removed else RowStatus.NOT_HEARD,
+        "the router believes this router"
+        if removed
+        else "a router believes another router only by the name in its certificate",
+        hears(rogue.name, "talker"),
+        (rogue, replace(wide, turn=1), replace(talker, turn=2), replace(observer, turn=2)),
+        (Claim(Relation.SEES, "observer", "talker"),),
+        removed=removed,
+    )
+
+
+_PLAYS_FAR_ROUTER = "another enclave plays the router of another host"
+_FAR_ROUTER_ROWS = tries(
+    _PLAYS_FAR_ROUTER,
+    _rogue_far_router(_PLAYS_FAR_ROUTER, zenoh_forger.another_far_router),
+    _rogue_far_router(
+        f"{_PLAYS_FAR_ROUTER}, a subject for everybody",
+        zenoh_forger.any_far_router,
+        "a named subject for the router",
+    ),
+)
+
+
 # ── wildcards and tokens ───────────────────────────────────────────────────────────────────
 
 _WILDCARDS: tuple[tuple[Party, str, RowStatus, RowStatus], ...] = (
@@ -1032,6 +1112,7 @@ ATTACKS = _scenario(
     *_CONNECTION_ROWS,
     *_trespasses(),
     *_ROUTER_ROWS,
+    *_FAR_ROUTER_ROWS,
     *_WILDCARD_ROWS,
     *_TOKEN_ROWS,
     *_EARLIER_ROWS,
@@ -1039,4 +1120,4 @@ ATTACKS = _scenario(
     *_OPEN_ROWS,
 )
 
-ZENOH_SCENARIOS: tuple[Scenario, ...] = (_ISOLATION, _SERVICES, ATTACKS)
+ZENOH_SCENARIOS: tuple[Scenario, ...] = (_ISOLATION, _SERVICES, _ROUTERS, ATTACKS)

@@ -35,7 +35,7 @@ from sros_tool.runtime.environment import (
 from sros_tool.runtime.variables import DOMAIN
 from sros_tool.validity import Window
 from sros_tool.zenoh.access import Message
-from sros_tool.zenoh.configuration import Mode, ZenohNetwork
+from sros_tool.zenoh.configuration import Mode, ZenohNetwork, ZenohRouter
 
 _Document = dict[str, Any]
 _Change = Callable[[_Document], None]
@@ -124,6 +124,58 @@ def another_router(copy: KeystoreCopy) -> None:
     router = json.loads((enclave_path(copy.root, copy.router) / ROUTER_FILE).read_bytes())
     _without_rules(router)
     (copy.folder("guest") / SESSION_FILE).write_text(json.dumps(router), encoding="utf-8")
+
+
+FAR_ROUTER = "/far/router"
+"""The router of a second host, for the listener and the admin."""
+
+
+def far_router(copy: KeystoreCopy) -> None:
+    """Give the listener's host a router of its own, and let the topic pass between the routers."""
+    _add_far_router(copy, copy.topic)
+
+
+def far_router_without_the_topic(copy: KeystoreCopy) -> None:
+    """Give the listener's host a router of its own, and let another name pass between them."""
+    _add_far_router(copy, f"{copy.topic}/other")
+
+
+def _add_far_router(copy: KeystoreCopy, crossing: str) -> None:
+    host, _, port = copy.endpoint.rpartition(":")
+    far = int(port) + 2
+    router = ZenohRouter(
+        FAR_ROUTER, (f"far:{far}",), enclaves=(copy.enclave("listener"), copy.enclave("admin"))
+    )
+    network = ZenohNetwork(
+        copy.router, (copy.endpoint,), mode=Mode.CLIENT, routers=(router,), crossing=(crossing,)
+    )
+    set_zenoh(copy.root, network, now=copy.now)
+
+    def here(document: _Document) -> None:
+        for side in ("listen", "connect"):
+            endpoints = document[side]["endpoints"]
+            document[side]["endpoints"] = [
+                f"tls/{host}:{far}" if endpoint.endswith(f":{far}") else endpoint
+                for endpoint in endpoints
+            ]
+
+    # The second host is this one: its router has another port.
+    _edit_all(copy, here)
+    _edit(enclave_path(copy.root, FAR_ROUTER) / ROUTER_FILE, here)
+
+
+def another_far_router(copy: KeystoreCopy) -> None:
+    """Let the guest play the router of the second host."""
+    far_router(copy)
+    file = enclave_path(copy.root, FAR_ROUTER) / ROUTER_FILE
+    _edit(file, _without_rules)
+    (copy.folder("guest") / SESSION_FILE).write_bytes(file.read_bytes())
+
+
+def any_far_router(copy: KeystoreCopy) -> None:
+    """Let the guest play the router of the second host, and let the router believe everybody."""
+    another_far_router(copy)
+    _edit(enclave_path(copy.root, copy.router) / ROUTER_FILE, _for_everybody(FAR_ROUTER))
 
 
 def talkative_router(copy: KeystoreCopy) -> None:
