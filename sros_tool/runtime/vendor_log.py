@@ -2,7 +2,7 @@
 
 Fast DDS writes coloured text to standard output, Cyclone DDS writes to its log sink or to standard
 error.  With ROS_SECURITY_LOG_FILE, Fast DDS writes the reasons of refusals to that file instead, in
-another form.  Each text was seen in a real log of Fast DDS 2.9.1 or 2.14.5 (Permissions.cpp,
+another form.  Each text was seen in a real log of Fast DDS 2.9.1, 2.14.5 or 3.6.2 (Permissions.cpp,
 SecurityManager.cpp, PKIDH.cpp), Cyclone DDS 0.10.2 (access_control.c, authentication.c,
 q_omg_security.c), or rcl of Jazzy.
 
@@ -535,9 +535,10 @@ LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "participant", _FAST, r"Cannot create participant due to initialization error"
         r"|Problem creating RTPSParticipant|failed to create participant",
-        "the process may not join, and this log gives no reason: Fast DDS 2.9 logs nothing about "
-        "signatures, expired permissions and subjects, 2.14 logs them on standard output or in the "
-        "file of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL, unseen=_FILE, weak=2,
+        "the process may not join, and this log gives no reason: Fast DDS 2.6 and 2.9 log "
+        "nothing about signatures, expired permissions and subjects, later releases log them on "
+        "standard output or in the file of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL,
+        unseen=_FILE, weak=2,
     ),
     _text(
         "service", _ROS, r"(?:could not|failed to) create (?:service|client)"

@@ -31,6 +31,7 @@ CYCLONE_LINE = "1795242829.914522 [0]     recvUC: "
 FAST_LINE = "2026-01-01 12:00:00.000 [SECURITY Error] "
 FILE_LINE = "[1795309573.65] [EMERGENCY] 01.0f.78|0.0.1.c1 0 "
 FAST, FAST_14, CYCLONE = "fastdds_2.9.1", "fastdds_2.14.5", "cyclone_0.10.2"
+FAST_3 = "fastdds_3.6.2"
 
 CAUSES = {
     "certificate expired": ("cert.pem: it expired",),
@@ -110,6 +111,16 @@ def test_every_breakage_has_a_cause_and_its_logs() -> None:
         assert log_of(FAST, name).exists(), name
         assert log_of(FAST_14, name).exists(), name
         assert log_of(CYCLONE, name).exists() == (name not in SILENT_ON_CYCLONE), name
+
+
+@pytest.mark.parametrize("breakage", BREAKAGES)
+def test_logs_of_fast_dds_3_mean_what_those_of_2_14_mean(breakage: str) -> None:
+    of_2, of_3 = (explained(log_of(vendor, breakage).read_text()) for vendor in (FAST_14, FAST_3))
+    if breakage in ("file missing", "link to nothing"):
+        assert "does not say which" in of_2[0].cause
+        assert "/robot/keystore/enclaves/talker_listener/talker/" in of_3[0].cause
+    else:
+        assert of_2[0].cause == of_3[0].cause
 
 
 @pytest.mark.parametrize(
