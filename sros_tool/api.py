@@ -498,7 +498,7 @@ def check_requirements(
         zone=zone,
         domain=of,
         fleet=read_fleet(Path(fleet)) if fleet else None,
-        world=vendor,
+        only=(vendor,) if vendor else (),
         template=load_template(template) if template else None,
     )
     findings = requirement_findings(read, system)

@@ -5,11 +5,13 @@ Source: ``ros2.repos`` of the branches of ros2/ros2 and their release tags, Nove
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.errors import UsageError
-from sros_tool.names import DISTRIBUTIONS
+from sros_tool.names import DISTRIBUTIONS, distribution_problem
+from sros_tool.wording import enumerated
 from sros_tool.zenoh.releases import RELEASES, RmwZenohRelease
 
 ROS_DISTRO = "ROS_DISTRO"
@@ -56,9 +58,14 @@ class Distribution(NamedTuple):
     stands_for: str = ""
 
     @property
+    def named(self) -> str:
+        """The name as users write it."""
+        return self.stands_for or self.name
+
+    @property
     def title(self) -> str:
         """The name for messages, such as ``Lyrical``."""
-        return (self.stands_for or self.name).capitalize()
+        return self.named.capitalize()
 
     @property
     def shipped(self) -> tuple[Shipped, ...]:
@@ -129,7 +136,7 @@ SUPPORTED = (
 _ROLLING = "rolling"
 
 
-def distribution(name: str) -> Distribution:
+def find_distribution(name: str) -> Distribution:
     """Return a distribution by its name.
 
     One that is not supported any more is taken to be like the next supported one, and Rolling like
@@ -138,7 +145,7 @@ def distribution(name: str) -> Distribution:
     Raises:
         UsageError: there is no distribution of this name.
     """
-    if name not in DISTRIBUTIONS:
+    if distribution_problem(name):
         raise UsageError(
             f"{name!r} is not a distribution of ROS 2 that sros knows",
             f"It knows {', '.join(DISTRIBUTIONS)}.",
@@ -149,9 +156,23 @@ def distribution(name: str) -> Distribution:
     return like if like.name == name else like._replace(stands_for=name)
 
 
+def shipped_title(vendor: Vendor, distributions: Sequence[Distribution]) -> str:
+    """Return the title of a vendor, with the distributions that it decides for.
+
+    That is text such as ``Fast DDS 2.14 of Jazzy and Fast DDS 3.2 of Kilted``.
+    """
+    by_release: dict[str, list[str]] = {}
+    for distribution in distributions:
+        for shipped in distribution.shipped:
+            if shipped.vendor is vendor:
+                by_release.setdefault(shipped.release, []).append(distribution.title)
+    titles = [f"{release} of {enumerated(names)}" for release, names in by_release.items()]
+    return enumerated(titles) if titles else vendor.title
+
+
 def sourced(environment_value: str | None) -> Distribution | None:
     """Return the distribution that $ROS_DISTRO names; None if sros does not know it."""
-    return distribution(environment_value) if environment_value in DISTRIBUTIONS else None
+    return find_distribution(environment_value) if environment_value in DISTRIBUTIONS else None
 
 
 def _decided_as(product: str, version: str) -> Vendor:

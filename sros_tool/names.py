@@ -96,6 +96,13 @@ _RANGE = re.compile(r"(.)-(.)")
 _MAX_EXPRESSION = 2000  # characters; the names that an expression can match have at most 255
 
 
+def distribution_problem(name: str) -> str:
+    """Return why ``name`` is not a distribution of ROS 2, as a sentence; "" if it is one."""
+    if name in DISTRIBUTIONS:
+        return ""
+    return f"It is not a distribution of ROS 2 that sros knows: {', '.join(DISTRIBUTIONS)}."
+
+
 def has_type_descriptions(distribution: str) -> bool:
     """Return whether nodes of a ROS 2 distribution offer ``~/get_type_description``.
 

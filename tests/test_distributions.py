@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
-from sros_tool.distributions import SUPPORTED, distribution
+from sros_tool.distributions import SUPPORTED, find_distribution
 from sros_tool.errors import UsageError
 from sros_tool.names import DISTRIBUTIONS
 
 
 def test_each_release_has_its_own_rules_or_is_called_not_measured() -> None:
     for known in SUPPORTED:
-        assert distribution(known.name) is known and not known.assumption
+        assert find_distribution(known.name) is known and not known.assumption
         assert known.zenoh.distribution == known.title
         for shipped in known.shipped:
             assert shipped.vendor in MEASURED
@@ -20,28 +20,28 @@ def test_each_release_has_its_own_rules_or_is_called_not_measured() -> None:
             own = [each for each in MEASURED if shipped.vendor.title.startswith(shipped.release)]
             assert shipped.measured is bool(own)
             assert ("not measured" in known.why(shipped.vendor)) is not shipped.measured
-    assert distribution("lyrical").vendors[1] is Vendor.CYCLONE_11
-    assert distribution("jazzy").vendors == (Vendor.FAST, Vendor.CYCLONE)
+    assert find_distribution("lyrical").vendors[1] is Vendor.CYCLONE_11
+    assert find_distribution("jazzy").vendors == (Vendor.FAST, Vendor.CYCLONE)
 
 
 @pytest.mark.parametrize(
     ("name", "like"), [("foxy", "humble"), ("iron", "jazzy"), ("rolling", "lyrical")]
 )
 def test_what_is_assumed_of_others_is_said(name: str, like: str) -> None:
-    taken = distribution(name)
+    taken = find_distribution(name)
     assert (taken.name, taken.title) == (like, name.capitalize())
-    assert taken.vendors == distribution(like).vendors
+    assert taken.vendors == find_distribution(like).vendors
     assert taken.assumption.endswith(f"taken to decide as {like.capitalize()}.")
 
 
 def test_an_unknown_distribution_is_refused_with_all_that_are_known() -> None:
     with pytest.raises(UsageError) as refused:
-        distribution("Jazzy")
+        find_distribution("Jazzy")
     assert all(name in str(refused.value) for name in DISTRIBUTIONS)
 
 
 def test_a_vendor_without_a_release_means_what_the_distribution_ships() -> None:
-    lyrical = distribution("lyrical")
+    lyrical = find_distribution("lyrical")
     assert lyrical.of_vendor(Vendor.CYCLONE).vendor is Vendor.CYCLONE_11
     with pytest.raises(UsageError, match="It ships Fast DDS"):
         lyrical.of_vendor(Vendor.CONNEXT)

@@ -480,7 +480,7 @@ def _description(kind: type, name: str, declared: Any) -> str:
         if isinstance(attribute, (property, cached_property)):
             text = inspect.getdoc(attribute) or ""
         else:
-            text = _docstrings_of_fields(owner).get(name, "")
+            text = docstrings_of_fields(owner).get(name, "")
         if text:
             return _sentence(text)
     for each in getattr(declared, "__metadata__", ()):
@@ -490,17 +490,18 @@ def _description(kind: type, name: str, declared: Any) -> str:
 
 
 @cache
-def _docstrings_of_fields(kind: type) -> dict[str, str]:
-    """Return the strings after the fields of a class."""
+def docstrings_of_fields(kind: type) -> dict[str, str]:
+    """Return the strings after the fields of a class, or the members of an enumeration."""
     if kind.__module__.partition(".")[0] not in ("sros_tool", "tests"):
         return {}
     (body,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
     assert isinstance(body, ast.ClassDef)
     return {
-        field.target.id: after.value.value
+        target.id: after.value.value
         for field, after in zip(body.body, body.body[1:], strict=False)
-        if isinstance(field, ast.AnnAssign)
-        and isinstance(field.target, ast.Name)
+        if isinstance(field, ast.AnnAssign | ast.Assign)
+        for target in (field.targets if isinstance(field, ast.Assign) else [field.target])
+        if isinstance(target, ast.Name)
         and isinstance(after, ast.Expr)
         and isinstance(after.value, ast.Constant)
         and isinstance(after.value.value, str)

@@ -1,11 +1,10 @@
-"""Write docs/reference/: pages made from the program, on options, findings, texts and templates.
+"""Write docs/reference/ and docs/distributions.md: pages that are made from the program.
 
 `python -m tools.reference_pages` writes them; tests/test_pages.py compares them with the program.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 
 import click
@@ -14,12 +13,13 @@ from sros_tool.checks.registry import all_kinds
 from sros_tool.keystore.template import load_template, settings_values, template_names
 from sros_tool.policy.model import Level
 from sros_tool.runtime.vendor_log import LOG_TEXTS
+from tools.distributions_page import distributions_page
+from tools.page_parts import cell, page_text, table_text
 from tools.steps import CHECKOUT
 from tools.template_keys import ABOUT, KEYS, Key, without
 from tools.verbs import families
 
 FOLDER = CHECKOUT / "docs" / "reference"
-_MADE = "<!-- made by `python -m tools.reference_pages`; do not edit -->"
 
 
 def pages() -> Mapping[str, str]:
@@ -29,23 +29,8 @@ def pages() -> Mapping[str, str]:
         "findings.md": _findings(),
         "log_texts.md": _log_texts(),
         "template.md": _template(),
+        "../distributions.md": distributions_page(),
     }
-
-
-def _page(title: str, *parts: str) -> str:
-    return "\n\n".join([f"# {title}", _MADE, *parts]) + "\n"
-
-
-def _cell(text: str) -> str:
-    """Return a text of the program as Markdown on one line, also for a cell of a table."""
-    parts = " ".join(text.split()).replace("|", "\\|").split("`")
-    parts[::2] = [re.sub(r"[<*\[]", r"\\\g<0>", part) for part in parts[::2]]
-    return "`".join(parts)
-
-
-def _table(*heads: str, rows: Iterator[tuple[str, ...]]) -> str:
-    lines = [heads, ("---",) * len(heads), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 # ── verbs and options ──────────────────────────────────────────────────────────────────────
@@ -60,7 +45,7 @@ def _options() -> str:
         parts.append(f"## {family}")
         for name, command in verbs.items():
             parts += _verb(f"sros {name}", command)
-    return _page("Verbs and options", *parts)
+    return page_text("Verbs and options", *parts)
 
 
 def _verb(name: str, command: click.Command) -> Iterator[str]:
@@ -69,9 +54,9 @@ def _verb(name: str, command: click.Command) -> Iterator[str]:
     yield f"### {name}"
     yield f"```text\n{usage}\n```"
     help_parts = (command.help or "").replace("\b", "").split("\n\n")
-    yield "\n\n".join(map(_cell, help_parts))
+    yield "\n\n".join(map(cell, help_parts))
     if rows := [_row(each, context) for each in command.params if isinstance(each, click.Option)]:
-        yield _table("option", "meaning", rows=iter(rows))
+        yield table_text("option", "meaning", rows=iter(rows))
     if isinstance(command, click.Group):
         for part, each in command.commands.items():
             yield from _verb(f"{name} {part}", each)
@@ -79,7 +64,7 @@ def _verb(name: str, command: click.Command) -> Iterator[str]:
 
 def _row(option: click.Option, context: click.Context) -> tuple[str, str]:
     words, meaning = option.get_help_record(context) or (", ".join(option.opts), "")
-    return f"`{words.replace('|', ' or ')}`", _cell(meaning)
+    return f"`{words.replace('|', ' or ')}`", cell(meaning)
 
 
 # ── findings ───────────────────────────────────────────────────────────────────────────────
@@ -90,8 +75,8 @@ def _findings() -> str:
     for kind in all_kinds().values():
         family = kind.id.partition(".")[0]
         text = (
-            f"### {kind.id}\n\n**{kind.severity}**: {_cell(kind.title)}.\n\n{_cell(kind.why)}\n\n"
-            f"*Remedy:* {_cell(kind.remedy)}\n\n*Source:* {_cell(kind.source)}"
+            f"### {kind.id}\n\n**{kind.severity}**: {cell(kind.title)}.\n\n{cell(kind.why)}\n\n"
+            f"*Remedy:* {cell(kind.remedy)}\n\n*Source:* {cell(kind.source)}"
         )
         families.setdefault(family, []).append(text)
     parts = [
@@ -100,7 +85,7 @@ def _findings() -> str:
     ]
     for family, texts in families.items():
         parts += [f"## {family}", *texts]
-    return _page("Findings", *parts)
+    return page_text("Findings", *parts)
 
 
 # ── texts in logs ──────────────────────────────────────────────────────────────────────────
@@ -118,11 +103,11 @@ def _log_texts() -> str:
         causes = [fault.title for fault in each.faults]
         meaning = each.cause or "; or ".join(causes) or "the text alone does not show a cause"
         text = each.pattern.pattern.replace("`", "'").replace("|", "\\|")
-        row = (f"`{text}`", _cell(meaning), _cell(each.remedy or each.unseen))
+        row = (f"`{text}`", cell(meaning), cell(each.remedy or each.unseen))
         by_vendor.setdefault(vendor, []).append(row)
     for vendor, rows in by_vendor.items():
-        parts += [f"## {vendor}", _table("text", "meaning", "what to do", rows=iter(rows))]
-    return _page("Texts in logs, by vendor", *parts)
+        parts += [f"## {vendor}", table_text("text", "meaning", "what to do", rows=iter(rows))]
+    return page_text("Texts in logs, by vendor", *parts)
 
 
 # ── templates ──────────────────────────────────────────────────────────────────────────────
@@ -151,9 +136,9 @@ def _template() -> str:
             for key in KEYS
             if key.table == table
         )
-        parts.append(_table("key", "value", "without it", "meaning", rows=rows))
+        parts.append(table_text("key", "value", "without it", "meaning", rows=rows))
     parts += ["## The templates that ship with sros", _shipped_templates()]
-    return _page("Keys of keystore templates", *parts)
+    return page_text("Keys of keystore templates", *parts)
 
 
 def _values(key: Key) -> str:
@@ -171,7 +156,7 @@ def _shipped_templates() -> str:
         for path in paths
         if path not in ("name", "description")
     )
-    return _table("key", *(f"`{name}`" for name in names), rows=rows)
+    return table_text("key", *(f"`{name}`" for name in names), rows=rows)
 
 
 if __name__ == "__main__":

@@ -81,6 +81,15 @@ KEYS: tuple[Key, ...] = (
     Key("", "name", '"ours"', "text", "what `sros inspect` shows", "the file's name"),
     Key("", "description", '"our robots"', "text", "what `sros create_keystore` prints", "none"),
     Key(
+        "",
+        "distributions",
+        '["jazzy", "lyrical"]',
+        "names of distributions of ROS 2",
+        "the distributions for which the keystore has to hold: `sros check` decides as the DDS of "
+        "each",
+        "any of them",
+    ),
+    Key(
         "[authorities]",
         "layout",
         '"separate"',

@@ -26,7 +26,8 @@ from sros_tool.wording import counted
 _MODULES = (
     *("policies", "requirements", "keystores.files", "keystores.authorities"),
     *("keystores.enclaves", "keystores.vendors", "keystores.documents", "keystores.topic_names"),
-    *("keystores.issued", "keystores.zenoh_files", "zenoh", "environment", "runtime", "processes"),
+    *("keystores.issued", "keystores.zenoh_files", "zenoh", "upgrade", "environment", "runtime"),
+    "processes",
 )
 """The modules of checks, in the order in which their kinds are listed."""
 
@@ -56,10 +57,10 @@ def all_kinds() -> Mapping[str, FindingKind]:
 class FindingFilter:
     """The selection of findings to report.
 
-    With ``vendor``, findings about only other vendors, or about differences between vendors, are
-    left out.  ``include`` and ``exclude`` hold ids, ids of groups, or patterns with ``*`` and
-    ``?``; an empty ``include`` means all.  ``severity`` is the lowest severity that is shown.  A
-    prominent note is shown where warnings are.
+    With ``vendors``, findings about only other vendors are left out, and with a single one, those
+    about differences between vendors.  ``include`` and ``exclude`` hold ids, ids of groups, or
+    patterns with ``*`` and ``?``; an empty ``include`` means all.  ``severity`` is the lowest
+    severity that is shown.  A prominent note is shown where warnings are.
 
     A weakness that the keystore's template chose, such as the single CA of template sros2, is
     accepted: it counts as a note, and is summarised in one line if notes are not shown.  With
@@ -71,7 +72,7 @@ class FindingFilter:
     exclude: tuple[str, ...] = ()
     severity: Severity = WARNING
     strict: bool = False
-    vendor: str = ""
+    vendors: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for pattern in (*self.include, *self.exclude):
@@ -85,9 +86,9 @@ class FindingFilter:
     def wants(self, kind: FindingKind) -> bool:
         """Return whether the filter selects this kind, whatever its severity."""
         included = not self.include or any(_matches(kind, pattern) for pattern in self.include)
-        if self.vendor and kind.vendors and self.vendor not in kind.vendors:
+        if self.vendors and kind.vendors and not {*self.vendors} & {*kind.vendors}:
             return False
-        if self.vendor and kind.id == _DIFFERENCES:
+        if len(self.vendors) == 1 and kind.id == _DIFFERENCES:
             return False
         return included and not any(_matches(kind, pattern) for pattern in self.exclude)
 

@@ -31,7 +31,7 @@ class Circumstances:
     """The moment, time zone and other conditions of a check; see `keystore_findings`.
 
     ``distribution`` is the ROS 2 distribution of the nodes of policies; "" is the latest.
-    ``vendor`` is the DDS vendor of the nodes, or ``zenoh``; "" if they may use any.
+    ``vendors`` are the DDS vendors of the nodes, or ``zenoh``; () if they may use any.
     ``fleet`` has the robots that placeholders in policies stand for.  ``opened`` has the
     keystores that are already open, by path.
     """
@@ -41,7 +41,7 @@ class Circumstances:
     domain: int | None = None
     policies: tuple[Policy, ...] = ()
     distribution: str = ""
-    vendor: str = ""
+    vendors: tuple[str, ...] = ()
     fleet: Fleet | None = None
     opened: dict[Path, Keystore] = field(default_factory=dict, repr=False, compare=False)
 
@@ -106,6 +106,6 @@ def _keystore(root: Path, at: Circumstances, only: str | None) -> list[Finding]:
         domain=at.domain,
         policies=at.policies,
         distribution=at.distribution,
-        vendor=at.vendor,
+        vendors=at.vendors,
         only=None if only is None else (only,),
     )

@@ -21,10 +21,13 @@ from sros_tool import __version__
 from sros_tool.cli.common import (
     KEYSTORE_VARIABLE,
     PATH,
+    all_distros_option,
     check_metrics_file,
+    check_one_decider,
     check_one_format,
     check_output,
     complete_template,
+    distro_option,
     domain_of,
     dry_run_option,
     echo_findings,
@@ -56,11 +59,13 @@ if TYPE_CHECKING:
     from sros_tool.checks.registry import ChosenFindings, FindingFilter
     from sros_tool.checks.targets import Circumstances
     from sros_tool.demo.doctor import Diagnosis, SecurityProvider
+    from sros_tool.distributions import Distribution
     from sros_tool.fleet.robots import Fleet
     from sros_tool.prometheus import Metric
     from sros_tool.proof.system import System
     from sros_tool.runtime.processes import RunningProcesses
 
+_ZENOH = "zenoh"
 _FAMILIES = ("policy", "keystore", "runtime")
 _LEVELS = click.Choice(["note", "warning", "error"])
 
@@ -72,7 +77,7 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
     return [kind_id for kind_id in all_kinds() if kind_id.startswith(incomplete)]
 
 
-_VENDORS = (*(vendor.value for vendor in MEASURED), "zenoh")
+_VENDORS = (*(vendor.value for vendor in MEASURED), _ZENOH)
 
 
 @verb("check")
@@ -155,11 +160,15 @@ _VENDORS = (*(vendor.value for vendor in MEASURED), "zenoh")
 @click.option(
     "--domain", metavar="ID", help="The ROS domain that the enclaves must be able to join."
 )
-@click.option(
-    "--distro",
-    "distribution",
-    metavar="NAME",
-    help="The ROS 2 distribution of the nodes in policies. [default: $ROS_DISTRO, or the latest]",
+@distro_option(
+    "Report only findings for the nodes and the DDS of this ROS 2 distribution, such as lyrical. "
+    "[default: those of the keystore's settings; $ROS_DISTRO for the nodes in policies]"
+)
+@all_distros_option("Report the findings for all supported distributions of ROS 2.")
+@distro_option(
+    "Report only what the update to this ROS 2 distribution changes, from the one of --distro, of "
+    "the keystore's settings, or $ROS_DISTRO.",
+    "--upgrade-to",
 )
 @click.option(
     "--at",
@@ -204,7 +213,9 @@ def check(
     suggest: bool,
     vendor: str | None,
     domain: str | None,
-    distribution: str | None,
+    distro: Distribution | None,
+    all_distros: bool,
+    upgrade_to: Distribution | None,
     moment: str | None,
     form: str,
     watch: bool,
@@ -229,6 +240,8 @@ def check(
             sros renew keystore --all-expiring 30d
       $ sros check robot.xml --suggest > robot.requirements.toml
       $ sros check robot.xml --requirements robot.requirements.toml
+      $ sros check keystore --distro lyrical
+      $ sros check keystore --distro jazzy --upgrade-to lyrical
 
     Findings that the keystore's template accepts count as notes and share one line; with --strict,
     for example in CI, they count like all others. Where security is not enabled at all, `check
@@ -253,7 +266,9 @@ def check(
     lowest = Severity[severity.upper()]
     if _is_named("fail_on") and fail_on != "never":  # nothing fails that is not shown
         lowest = min(lowest, Severity[fail_on.upper()])
-    selection = FindingFilter(include, exclude, lowest, strict, vendor or "")
+    check_one_decider()
+    vendors = _vendors(vendor, distro, all_distros=all_distros)
+    selection = FindingFilter(include, exclude, lowest, strict, vendors)
     if as_list:
         if form in ("sarif", "markdown"):
             raise UsageError(f"--list has no {form} output", "", "Use --json.")
@@ -276,13 +291,31 @@ def check(
         _watch_processes(_environment(domain_of(domain)), selection, as_json=form == "json")
         return 0
     at = _circumstances(domain, moment, policies, fleet_file)
-    at = replace(at, distribution=_distribution(distribution), vendor=vendor or "")
+    at = replace(at, distribution=_nodes_of(distro, all_distros=all_distros), vendors=vendors)
+    if upgrade_to:
+        _refuse_besides_upgrade()
+        from sros_tool.distributions import ROS_DISTRO, sourced
+        from sros_tool.proof.upgrade import check_upgrade
+
+        path = _one_path(family, paths, "--upgrade-to")
+        with progress("comparing"):
+            changed = check_upgrade(
+                path,
+                upgrade_to,
+                at,
+                present=distro,
+                here=sourced(os.environ.get(ROS_DISTRO)),
+                vendor=vendor or "",
+            )
+        chosen = selection.choose(map(_shown, changed))
+        _SHOW[form](chosen, selection)
+        return _status(chosen, fail_on)
     if suggest:
         if form != "text" or requirements or earlier:
             raise UsageError("--suggest prints TOML", "", "Give it alone.")
         path = _one_path(family, paths, "--suggest")
         with progress("deciding"):
-            text = _suggested(_system(path, at, vendor, template))
+            text = _suggested(_system(path, at, template))
         echo_document(text)
         return 0
     if template and not requirements:
@@ -291,9 +324,9 @@ def check(
         raise UsageError("--requirements-before needs --requirements", "", "Name the new file.")
     decide = _requirements(family, paths, requirements, earlier)
     with progress("checking"):
-        every = _findings(family, paths, at)
+        every = [*_findings(family, paths, at), *_stated_differences(paths, at)]
         if decide:
-            every += decide(lambda path: _system(path, at, vendor, template))
+            every += decide(lambda path: _system(path, at, template))
         findings = [_shown(finding) for finding in every]
     chosen = selection.choose(findings)
     if form == "text" and at.fleet:
@@ -360,9 +393,7 @@ def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:
     raise UsageError(f"{option} takes one policy file or keystore")
 
 
-def _system(
-    path: Path, at: Circumstances, vendor: str | None, template: str | None = None
-) -> System:
+def _system(path: Path, at: Circumstances, template: str | None = None) -> System:
     from sros_tool.keystore.template import load_template
     from sros_tool.proof.system import load_system
 
@@ -373,7 +404,7 @@ def _system(
         zone=at.zone,
         domain=at.domain,
         fleet=at.fleet,
-        world=vendor or "",
+        only=at.vendors,
         template=load_template(template) if template else None,
     )
 
@@ -421,19 +452,47 @@ def _circumstances(
     return Circumstances(moment_of(moment), zone, wanted, tuple(read), fleet=fleet)
 
 
-def _distribution(named: str | None) -> str:
-    """Return the distribution that --distro or else $ROS_DISTRO names; "" stands for the latest."""
-    from sros_tool.names import DISTRIBUTIONS
+def _stated_differences(paths: Sequence[Path], at: Circumstances) -> Iterator[Finding]:
+    """Yield where keystores are decided differently on the distributions that they are for."""
+    from sros_tool.keystore.layout import is_keystore
 
-    if named is None:
-        return os.environ.get("ROS_DISTRO", "")
-    if named not in DISTRIBUTIONS:
-        raise UsageError(
-            f"{named!r} is not a distribution of ROS 2 that sros knows",
-            f"It knows {', '.join(DISTRIBUTIONS)}.",
-            "Name one of them.",
-        )
-    return named
+    for path in paths or filter(None, (Path(os.environ.get(KEYSTORE_VARIABLE, "")),)):
+        if not at.vendors and is_keystore(path):
+            from sros_tool.proof.upgrade import check_distributions
+
+            keystore = at.keystore(path)
+            yield from check_distributions(keystore, at=at.now, zone=at.zone, domain=at.domain)
+
+
+def _nodes_of(distro: Distribution | None, *, all_distros: bool) -> str:
+    """Return the distribution of the nodes in policies; "" stands for the latest."""
+    if all_distros:
+        return ""
+    return distro.named if distro else os.environ.get("ROS_DISTRO", "")
+
+
+def _vendors(
+    vendor: str | None, distro: Distribution | None, *, all_distros: bool
+) -> tuple[str, ...]:
+    """Return the DDS vendors, or ``zenoh``, that options select; () for all."""
+    from sros_tool.dds.decision.vendors import Vendor
+    from sros_tool.distributions import SUPPORTED
+
+    if vendor and (distro is None or vendor == _ZENOH):
+        return (vendor,)
+    if vendor and distro:
+        return (distro.of_vendor(Vendor(vendor)).vendor.value,)
+    chosen = SUPPORTED if all_distros else (distro,) if distro else ()
+    return tuple(dict.fromkeys(each.value for known in chosen for each in known.vendors))
+
+
+def _refuse_besides_upgrade() -> None:
+    """Raise `UsageError` for options that --upgrade-to cannot follow."""
+    given = click.get_current_context().params
+    for option in ("requirements", "suggest", "template", "all_distros", "policies"):
+        if given[option]:
+            name = "policy" if option == "policies" else option.replace("_", "-")
+            raise UsageError(f"--upgrade-to and --{name} exclude each other", "", "Choose one.")
 
 
 def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[Finding]:
@@ -465,7 +524,7 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
                 domain=at.domain,
                 policies=at.policies,
                 distribution=at.distribution,
-                vendor=at.vendor,
+                vendors=at.vendors,
             )
         ]
     if paths:

@@ -146,9 +146,9 @@ def _as_distribution(
 ) -> Distribution | None:
     if name is None:
         return None
-    from sros_tool.distributions import distribution
+    from sros_tool.distributions import find_distribution
 
-    return distribution(name)
+    return find_distribution(name)
 
 
 def distro_option(help_text: str, option: str = "--distro") -> Callable[[Decorated], Decorated]:

@@ -73,7 +73,7 @@ def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
     """Print the robots of the keystore ROOT as an inventory of Ansible.
 
     Robots are hosts and groups are groups. Variables of a host are ansible_host, ansible_user,
-    sros_robot, sros_namespace, sros_domain, sros_router and sros_crossing.
+    sros_robot, sros_namespace, sros_domain, sros_router, sros_crossing and sros_distribution.
 
     Example:
       $ sros fleet inventory keystore > hosts.json

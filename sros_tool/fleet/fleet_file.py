@@ -37,6 +37,7 @@ from sros_tool.fleet.robots import (
     router_problem,
     user_problem,
 )
+from sros_tool.names import distribution_problem
 from sros_tool.values import parse_json
 from sros_tool.xml import read_bytes
 
@@ -48,6 +49,7 @@ _VALUES: Mapping[str, Callable[[str], str]] = {
     "address": address_problem,
     "user": user_problem,
     "router": router_problem,
+    "distribution": distribution_problem,
 }
 """Text settings of a robot, with the function that returns what is wrong with a value."""
 _OF_GROUP = ("domain", *_VALUES, "crossing")
@@ -288,6 +290,7 @@ def _lines(fleet: Fleet) -> Iterator[str]:
             "user": robot.user,
             "router": robot.router,
             "crossing": list(robot.crossing),
+            "distribution": robot.distribution,
         }
         usual: dict[str, object] = {
             "groups": [],
@@ -297,6 +300,7 @@ def _lines(fleet: Fleet) -> Iterator[str]:
             "user": "",
             "router": "",
             "crossing": [],
+            "distribution": "",
         }
         shown = [
             f"{key} = {json.dumps(value)}" for key, value in values.items() if value != usual[key]
@@ -311,6 +315,7 @@ _VARIABLES = {
     "user": "ansible_user",
     "router": "sros_router",
     "crossing": "sros_crossing",
+    "distribution": "sros_distribution",
 }
 """Robot setting → the Ansible host variable that has it."""
 _ROBOT = "sros_robot"
@@ -597,6 +602,7 @@ def _variables(robot: Robot) -> dict[str, Any]:
         "user": robot.user,
         "router": robot.router,
         "crossing": list(robot.crossing),
+        "distribution": robot.distribution,
     }
     shown = {_VARIABLES[key]: value for key, value in values.items() if value not in (None, "", [])}
     return {_ROBOT: robot.name, **shown}

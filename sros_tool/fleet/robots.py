@@ -42,7 +42,8 @@ class Robot(NamedTuple):
     host name or IP address, ``user`` the account there, or "" for the default of ssh.  ``groups``
     are sorted.  ``router`` is where sessions and other routers connect to its Zenoh router, as
     ``HOST:PORT``, or "" if it has none of its own; ``crossing`` are the names that may pass between
-    that router and others, if not all.
+    that router and others, if not all.  ``distribution`` is its distribution of ROS 2, or "" for
+    those of the keystore.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Robot(NamedTuple):
     groups: tuple[str, ...] = ()
     router: str = ""
     crossing: tuple[str, ...] = ()
+    distribution: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,6 +54,21 @@ def load_fleet(keystore: Keystore) -> Fleet | None:
     return keystore.once("fleet", read)
 
 
+def stated_distributions(keystore: Keystore, enclave: str) -> tuple[str, ...]:
+    """Return the distributions of ROS 2 that an enclave is for, as far as anything says it.
+
+    That is the one of its robot in the fleet, or else those in the settings of the keystore.
+
+    Raises:
+        SrosError: the fleet or the settings cannot be read.
+    """
+    fleet = load_fleet(keystore)
+    robot = robot_of(fleet, enclave) if fleet else None
+    if robot and robot.distribution:
+        return (robot.distribution,)
+    return keystore.template.distributions
+
+
 def checked_fleet(keystore: Keystore) -> Fleet | None:
     """Return the fleet as `load_fleet`, after checking that nobody edited its file.
 

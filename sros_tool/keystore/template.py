@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import parse_toml, templates_dir, toml_error
-from sros_tool.names import check_enclave_name, expand, expression_problem
+from sros_tool.names import (
+    DISTRIBUTIONS,
+    check_enclave_name,
+    distribution_problem,
+    expand,
+    expression_problem,
+)
 from sros_tool.pki.token import refuse_pin
 from sros_tool.policy.model import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.policy.patterns import covers, matches
@@ -52,7 +58,8 @@ class Template:
     ``identity_key`` and ``permissions_key`` are the URIs of CA keys outside of the keystore.  With
     ``unique_subject``, the subject of every certificate has a unique part.  ``short_lived`` are
     enclaves whose certificates and permissions expire earlier than the others.  ``zenoh`` is the
-    network for which enclaves get Zenoh configurations, or None.
+    network for which enclaves get Zenoh configurations, or None.  ``distributions`` are the
+    distributions of ROS 2 for which the keystore has to hold; () if it does not say.
     """
 
     name: str
@@ -70,6 +77,7 @@ class Template:
     revocation_validity: timedelta = timedelta(days=3650)
     short_lived: tuple[ShortLived, ...] = ()
     zenoh: ZenohNetwork | None = None
+    distributions: tuple[str, ...] = ()
 
     def longest_validity(self, enclave: str) -> timedelta | None:
         """Return the longest validity of a short-lived enclave; None for all others."""
@@ -162,6 +170,7 @@ def _template(values: object, name: str) -> Template:
         revocation_validity=revocation.duration("validity", "10y"),
         short_lived=tuple(_short_lived(table)),
         zenoh=_zenoh(table.table("zenoh")) if table.has("zenoh") else None,
+        distributions=_distributions(table),
     )
     for part in (authorities, certificates, permissions, revocation, table):
         part.finish()
@@ -174,6 +183,11 @@ def render_template(template: Template) -> str:
     lines = [
         f"name = {_toml(template.name)}",
         f"description = {_toml(template.description)}",
+        *(
+            [f"distributions = [{', '.join(map(_toml, template.distributions))}]"]
+            if template.distributions
+            else []
+        ),
         "\n[authorities]",
         f'layout = "{"separate" if template.separate_authorities else "single"}"',
         f"name = {_toml(template.authority_name)}",
@@ -206,6 +220,15 @@ def render_template(template: Template) -> str:
     if template.zenoh:
         lines += ["\n[zenoh]", *_zenoh_lines(template.zenoh)]
     return "\n".join(lines) + "\n"
+
+
+def _distributions(table: _Table) -> tuple[str, ...]:
+    """Return the distributions that a template names, in the order of their release."""
+    named = table.texts("distributions", [])
+    for name in named:
+        if problem := distribution_problem(name):
+            raise _TemplateError(f"distributions has {name!r}: {problem}".removesuffix("."))
+    return tuple(name for name in DISTRIBUTIONS if name in named)
 
 
 def _short_lived(table: _Table) -> Iterator[ShortLived]:
@@ -378,6 +401,9 @@ def with_values(
                 "",
                 "Write them first, for example with `sros zenoh KEYSTORE --mode peer`.",
             )
+        if key == "distributions":
+            inner[last] = value.split(",") if value else []
+            continue
         if not path or not isinstance(inner, dict) or isinstance(inner.get(last), dict):
             raise UsageError(
                 f"{key!r} is not a setting of a keystore",

@@ -416,11 +416,7 @@ def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
             access_by(side, governance, name, subject, domain)
             for name in (enclave, *lenders(side, enclave))
         ]
-        return _Access(
-            {verb: NameSet.union([access.topics(verb) for access in usable]) for verb in _VERBS},
-            lambda verb, topic: any(access.decide(verb, topic).outcome.ok for access in usable),
-            any(access.join().outcome.ok for access in usable),
-        )
+        return _joined(usable)
 
     return access
 
@@ -558,20 +554,95 @@ def _each_gain(
                 continue
             for domain in world.domains:
                 before, after = (world.access(side, enclave, domain) for side in (old, new))
+                more = {verb: after.topics[verb] - before.topics[verb] for verb in _VERBS}
                 gained = False
-                for verb in _VERBS:
-                    more = after.topics[verb] - before.topics[verb]
-                    if not before.joins:
-                        more -= NameSet((ROS_DISCOVERY_TOPIC,))  # every participant has it
-                    for gain in stated.gains(enclave, verb, more, world, domain, limit):
-                        if not after.decide(verb, gain.topic) or before.decide(verb, gain.topic):
-                            raise AssertionError(f"{gain} is not what {world.title} decides")
-                        gained = True
-                        yield gain
+                for gain in _more(stated, enclave, more, (before, after), world, domain, limit):
+                    gained = True
+                    yield gain
                 if not gained and after.joins and not before.joins:
                     yield Gain(
                         (enclave,), _JOIN, None, "", "", None, None, None, (world.title,), (domain,)
                     )
+
+
+def _more(
+    stated: _Stated,
+    enclave: str,
+    topics: Mapping[AccessVerb, NameSet],
+    sides: tuple[_Access, _Access],
+    world: _World,
+    domain: int,
+    limit: SearchLimit,
+) -> Iterator[Gain]:
+    """Yield the topics that an enclave may use after a change and not before it: ``topics``."""
+    before, after = sides
+    for verb in _VERBS:
+        more = topics[verb]
+        if not before.joins:
+            more -= NameSet((ROS_DISCOVERY_TOPIC,))  # every participant has it
+        for gain in stated.gains(enclave, verb, more, world, domain, limit):
+            if not after.decide(verb, gain.topic) or before.decide(verb, gain.topic):
+                raise AssertionError(f"{gain} is not what {world.title} decides")
+            yield gain
+
+
+class AccessByVendors:
+    """The access of enclaves by their documents, compared between vendors.
+
+    Counted are names that ROS 2 can have, and those that documents name without wildcards.
+    """
+
+    def __init__(self, source: AccessSource) -> None:
+        self._stated = _Stated(source, source)
+
+    def added(
+        self,
+        enclave: str,
+        before: Sequence[Access],
+        after: Sequence[Access],
+        vendor: Vendor,
+        domain: int,
+        names: Collection[str],
+    ) -> Iterator[Gain]:
+        """Yield the topics that an enclave may use by one of ``after``, and by none of ``before``.
+
+        ``after`` is what ``vendor`` makes of the permissions that fit its certificate, ``before``
+        what another vendor makes of them; ``names`` are those that they name without wildcards.
+
+        Raises:
+            DocumentError: it cannot be decided for so many wildcards.
+        """
+        world = _World(
+            vendor.title,
+            vendor.traits.style,
+            (domain,),
+            lambda side, enclave, domain: _NO_ACCESS,
+            longest=vendor.traits.longest_topic_name,
+        )
+        sides = _joined(before), _joined(after)
+        topics = {}
+        for verb in _VERBS:
+            old, new = (
+                NameSet.union([access.ruled_topics(verb) for access in usable])
+                for usable in (before, after)
+            )
+            exact = (
+                name
+                for name in (*names, ROS_DISCOVERY_TOPIC)
+                if sides[1].decide(verb, name) and not sides[0].decide(verb, name)
+            )
+            every = NameSet() if old == new else (new - old) & ROS_TOPICS
+            topics[verb] = every | NameSet(exact)
+        yield from _more(self._stated, enclave, topics, sides, world, domain, SearchLimit())
+
+
+def _joined(usable: Sequence[Access]) -> _Access:
+    """Return what several permissions that an enclave can use give it together."""
+    return _Access(
+        {verb: NameSet.union([access.topics(verb) for access in usable]) for verb in _VERBS},
+        lambda verb, topic: any(access.decide(verb, topic).outcome.ok for access in usable),
+        any(access.join().outcome.ok for access in usable),
+    )
 
 
 def _same(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> bool:

@@ -103,14 +103,14 @@ def load_system(
     zone: tzinfo = UTC,
     domain: int | None = None,
     fleet: Fleet | None = None,
-    world: str = "",
+    only: Collection[str] = (),
     template: Template | None = None,
     opened: Keystore | None = None,
 ) -> System:
     """Return the worlds of a policy file, or of a keystore as it is signed.
 
-    ``template`` is the template of the keystore that a policy is for.  ``world`` is the only wanted
-    world of `WORLDS`; "" stands for all.  A keystore without configurations of Zenoh has no world
+    ``template`` is the template of the keystore that a policy is for.  ``only`` are the wanted
+    worlds of `WORLDS`; () stands for all.  A keystore without configurations of Zenoh has no world
     of Zenoh.  ``opened`` is the keystore at the path, if it was opened before.
 
     Raises:
@@ -125,9 +125,9 @@ def load_system(
                 "A template is for a policy that is not signed yet.",
                 "Leave --template out, or check the policy.",
             )
-        return _keystore_system(opened or Keystore(path), at, zone, domain, world)
+        return _keystore_system(opened or Keystore(path), at, zone, domain, only)
     policy = read_policy_for(path, fleet)
-    return policy_system(policy, at=at, domain=domain or 0, world=world, template=template)
+    return policy_system(policy, at=at, domain=domain or 0, only=only, template=template)
 
 
 # ── a policy ───────────────────────────────────────────────────────────────────────────────
@@ -138,7 +138,7 @@ def policy_system(
     *,
     at: datetime,
     domain: int = 0,
-    world: str = "",
+    only: Collection[str] = (),
     template: Template | None = None,
 ) -> System:
     """Return the worlds of a policy as it would be signed at ``at``.
@@ -172,7 +172,7 @@ def policy_system(
     }
     worlds = []
     for vendor in MEASURED:
-        if world in ("", vendor.value):
+        if not only or vendor.value in only:
             governed = GovernedDomain(vendor, governance, domain)
             access = {
                 name: (Access(governed, permissions, subjects[name], at=at),)
@@ -182,12 +182,12 @@ def policy_system(
             lenders = also_fitting(vendor.traits, subjects, granted)
             worlds.append(_dds_world(vendor, access, stated, demanded=demanded, lenders=lenders))
     left_out = None
-    if world in ("", _ZENOH):
+    if not only or _ZENOH in only:
         try:
             remotes = tuple(remote_rights(enclave, domain) for enclave in policy.enclaves)
             worlds.append(_planned_zenoh(policy, AccessControl(remotes), domain, stated))
         except SrosError as error:
-            if world:
+            if only:
                 raise
             left_out = error
     return System(policy.file, tuple(worlds), Places.of_policy(policy), rights, left_out)
@@ -312,7 +312,7 @@ _MOST_GOVERNANCES = 4
 
 
 def _keystore_system(
-    keystore: Keystore, at: datetime, zone: tzinfo, domain: int | None, world: str
+    keystore: Keystore, at: datetime, zone: tzinfo, domain: int | None, only: Collection[str]
 ) -> System:
     """Return the worlds of a keystore: one of each vendor for each kind of domain.
 
@@ -376,7 +376,7 @@ def _keystore_system(
     moments = {name: (at, *_later(name, grants.get(name, ()), at)) for name in names}
     worlds = []
     for vendor, number in product(MEASURED, domains):
-        if world not in ("", vendor.value):
+        if only and vendor.value not in only:
             continue
         title = vendor.title if len(domains) == 1 else f"{vendor.title} in domain {number}"
         access: dict[str, tuple[Access, ...]] = {}
@@ -399,7 +399,7 @@ def _keystore_system(
             access[name] = tuple(each for each in accesses if each is not None)
         lenders = also_fitting(vendor.traits, subjects, granting)
         worlds.append(_dds_world(vendor, access, stated, title=title, idle=idle, lenders=lenders))
-    if world == _ZENOH or (not world and has_zenoh_files(root, hidden=True)):
+    if _ZENOH in only or (not only and has_zenoh_files(root, hidden=True)):
         worlds += _zenoh_worlds(keystore, domain, stated)
     files = {name: str(enclave_path(root, name) / PERMISSIONS_FILE) for name in names}
     places = {

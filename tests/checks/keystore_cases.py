@@ -450,7 +450,7 @@ def _topic_rules_of_ros(text: str) -> str:
 
 
 def unauthenticated_on_fast_dds_2_9(bench: Bench) -> None:
-    bench.options["vendor"] = "fastdds-2.9"
+    bench.options["vendors"] = ("fastdds-2.9",)
     bench.governance(("participants>false", "participants>true"))
 
 

@@ -37,7 +37,7 @@ UNCONTROLLED = (
 
 def found_in(bench: Bench, vendor: str = "") -> list[Finding]:
     """The findings about the changed permissions, but not that sros did not sign them."""
-    found = keystore_findings(Keystore(bench.checked), now=bench.now, vendor=vendor)
+    found = keystore_findings(Keystore(bench.checked), now=bench.now, vendors=vendor and (vendor,))
     return [each for each in found if each.id != "keystore.not-in-ledger"]
 
 

@@ -24,6 +24,7 @@ from tests.checks import (
 )
 from tests.checks.bench import Bench
 from tests.cli import test_requirements
+from tests.proof import test_upgrade
 from tests.support.harness import sros
 
 pytest_plugins = ["tests.checks.sound_keystore"]
@@ -38,6 +39,7 @@ def test_every_finding_has_a_test_that_brings_it_about() -> None:
         *runtime_cases.CASES,
         *zenoh_cases.CASES,
         *test_requirements.CASES,
+        *test_upgrade.FOUND,
     }
     assert tested == set(all_kinds())
     assert len(all_kinds()) >= 50
@@ -46,7 +48,8 @@ def test_every_finding_has_a_test_that_brings_it_about() -> None:
 @pytest.mark.parametrize("kind", all_kinds().values(), ids=lambda kind: kind.id)
 def test_kinds_are_complete(kind: Any) -> None:
     assert re.fullmatch(
-        r"(policy|requirement|keystore|enclave|permissions|governance|portable|zenoh|runtime)\."
+        r"(policy|requirement|keystore|enclave|permissions|governance|portable|zenoh|runtime"
+        r"|upgrade|distribution)\."
         r"[a-z0-9]+(-[a-z0-9]+)*",
         kind.id,
     )
@@ -80,8 +83,8 @@ ONE, OTHER = all_kinds()["keystore.one-authority"], all_kinds()["portable.grant-
         (FindingFilter(include=("keystore.*",)), {ONE}),
         (FindingFilter(exclude=("keystore.one-authority",)), {OTHER}),
         (FindingFilter(include=("keystore.*",), exclude=("*.one-*",)), set()),
-        (FindingFilter(vendor="cyclonedds"), {ONE}),
-        (FindingFilter(vendor="fastdds"), {ONE, OTHER}),
+        (FindingFilter(vendors=("cyclonedds",)), {ONE}),
+        (FindingFilter(vendors=("fastdds",)), {ONE, OTHER}),
         (FindingFilter(severity=ERROR), set()),
     ],
 )

@@ -12,6 +12,7 @@ from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from shlex import quote
 
+from sros_tool.checks import upgrade
 from sros_tool.checks.keystores.authorities import ONE_AUTHORITY, check_authorities
 from sros_tool.checks.keystores.documents import (
     DIFFERS,
@@ -49,9 +50,11 @@ from sros_tool.checks.keystores.vendors import (
 )
 from sros_tool.checks.keystores.zenoh_files import check_network, check_own_zenoh
 from sros_tool.checks.kind import WARNING, Cause, Finding, some_names
-from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.dds.governance import parse_governance
+from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
+from sros_tool.keystore.fleet import stated_distributions
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     GOVERNANCE_P7S,
@@ -68,7 +71,9 @@ from sros_tool.wording import first_few
 _NAMES_SHOWN = 3
 _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
 """Ids of findings that a setting of the keystore causes in all enclaves."""
-_OF_SEVERAL_FILES = frozenset({REFUSED.id, SOME_REFUSE.id})
+_OF_SEVERAL_FILES = frozenset(
+    {REFUSED.id, SOME_REFUSE.id, *(kind.id for kind in upgrade.OF_ENCLAVES)}
+)
 """Ids of findings that have one cause if their texts are equal, such as a shared CA."""
 
 
@@ -83,7 +88,7 @@ def keystore_findings(
     only: Sequence[str] | None = None,
     on_robot: bool = False,
     distribution: str = "",
-    vendor: str = "",
+    vendors: Sequence[str] = (),
 ) -> list[Finding]:
     """Return all findings in a keystore, or in some of its enclaves.
 
@@ -96,7 +101,7 @@ def keystore_findings(
         only: the enclaves to check; None for all of them and the keystore itself.
         on_robot: whether the keystore is on a robot, where it must not have a CA key.
         distribution: the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
-        vendor: the DDS vendor of its nodes, or ``zenoh``; "" if they may use any.
+        vendors: the DDS vendors of its nodes, or ``zenoh``; () if they may use any.
 
     Raises:
         KeystoreError: the path of ``opened`` is no keystore.
@@ -113,10 +118,15 @@ def keystore_findings(
     )
     names = keystore.names if only is None else tuple(only)
     wanted = wanted_rights(keystore)
-    vendors = asked_vendors(vendor)
+    asked = asked_vendors(vendors)
+    stated = {} if vendors else _stated(keystore, names)
+    deciding = {name: _vendors_of(each) for name, each in stated.items()}
+    if stated:
+        union = {vendor for each in deciding.values() for vendor in each}
+        asked = asked if len(stated) < len(names) else asked_vendors(tuple(union))
     about_authorities = list(check_authorities(keystore))
     first, common = _governing(keystore, names)
-    about_governance = list(_governance(keystore, first, vendors))
+    about_governance = list(_governance(keystore, first, asked))
 
     def work(
         share: Sequence[str],
@@ -126,9 +136,14 @@ def keystore_findings(
         topics: dict[str, frozenset[str]] = {}
         for name in share:
             state = opened.enclave(name, now=now, domain=domain)
-            evaluation = evaluate(CheckedEnclave(keystore, name, state), vendors, domain)
+            evaluation = evaluate(
+                CheckedEnclave(keystore, name, state),
+                deciding.get(name, asked),
+                domain,
+                stated.get(name, ()),
+            )
             enclave = evaluation.enclave
-            own = list(_enclave_findings(enclave, wanted, common, vendors))
+            own = list(_enclave_findings(enclave, wanted, common, deciding.get(name, asked)))
             if not waits_for_answer(enclave.folder):
                 shared = [] if any(finding.kind is DIFFERS for finding in own) else about_governance
                 own += check_vendors(evaluation, [*about_authorities, *shared, *own])
@@ -163,6 +178,22 @@ def keystore_findings(
     located = (_at_real_file(finding, root, real_root) for finding in found)
     found = with_causes(joined([_with_names(finding, root) for finding in located]))
     return _with_cause_of_ros2(found, opened) if keystore.is_home else found
+
+
+def _stated(keystore: CheckedKeystore, names: Sequence[str]) -> dict[str, tuple[Distribution, ...]]:
+    """Map the enclaves that are for certain distributions of ROS 2 to these distributions."""
+    by_enclave = {}
+    for name in names:
+        with suppress(SrosError):  # it is a finding
+            if stated := stated_distributions(keystore.opened, name):
+                by_enclave[name] = tuple(map(find_distribution, stated))
+    return by_enclave
+
+
+def _vendors_of(distributions: Sequence[Distribution]) -> tuple[Vendor, ...]:
+    """Return the vendors that decide for some distributions, in the order of all vendors."""
+    shipped = {vendor for each in distributions for vendor in each.vendors}
+    return tuple(vendor for vendor in MEASURED if vendor in shipped)
 
 
 def _enclave_findings(

@@ -21,6 +21,7 @@ from sros_tool.dds.decision.answers import AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import MEASURED, Vendor, together
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
+from sros_tool.distributions import Distribution, shipped_title
 from sros_tool.errors import DocumentError
 from sros_tool.faults import FAULTS, Fault
 from sros_tool.keystore.layout import PERMISSIONS_FILE
@@ -124,9 +125,9 @@ _HIT_PEERS = ("start, and their peers crash", "starts, and its peers crash")
 _REFUSES = ("refuse it", "refuses it")
 
 
-def asked_vendors(vendor: str) -> tuple[Vendor, ...]:
-    """Return the measured DDS vendors that ``--vendor`` selects: all for "", none for ``zenoh``."""
-    return tuple(each for each in MEASURED if vendor in ("", each.value))
+def asked_vendors(words: Sequence[str]) -> tuple[Vendor, ...]:
+    """Return the measured DDS vendors among some words; all without any, none for ``zenoh``."""
+    return tuple(vendor for vendor in MEASURED if not words or vendor.value in words)
 
 
 class EnclaveEvaluation(NamedTuple):
@@ -134,16 +135,27 @@ class EnclaveEvaluation(NamedTuple):
 
     ``enclave`` is the loaded enclave with its faults for these vendors; ``by_domain`` maps a ROS
     domain to the participant of each vendor.  ``portable`` says that the permissions have the
-    portable form that sros writes.
+    portable form that sros writes.  ``distributions`` are those of ROS 2 that the enclave is for,
+    or () for any.
     """
 
     enclave: CheckedEnclave
     by_domain: Mapping[int, Mapping[Vendor, VendorParticipant]]
     portable: bool
+    distributions: tuple[Distribution, ...] = ()
+
+    def titles(self, vendors: Sequence[Vendor]) -> list[str]:
+        """Return the titles of vendors, with the distributions that ship them."""
+        if not self.distributions:
+            return together(vendor.title for vendor in vendors)
+        return [shipped_title(vendor, self.distributions) for vendor in vendors]
 
 
 def evaluate(
-    enclave: CheckedEnclave, vendors: Sequence[Vendor], domain: int | None
+    enclave: CheckedEnclave,
+    vendors: Sequence[Vendor],
+    domain: int | None,
+    distributions: tuple[Distribution, ...] = (),
 ) -> EnclaveEvaluation:
     """Evaluate an enclave as the vendors do.
 
@@ -151,10 +163,11 @@ def evaluate(
         enclave: the enclave.
         vendors: the vendors that its nodes may use.
         domain: the ROS domain to join; None for the domains in the enclave's documents.
+        distributions: the distributions of ROS 2 that it is for, which findings name.
     """
     keystore = enclave.keystore
     there = loaded(enclave.name, enclave.folder, enclave.state, at=keystore.now)
-    numbers = (domain,) if domain is not None else _domains(enclave.state)
+    numbers = (domain,) if domain is not None else example_domains(enclave.state)
     by_domain = {
         number: {
             vendor: VendorParticipant(
@@ -166,9 +179,8 @@ def evaluate(
     }
     participants = [participant for some in by_domain.values() for participant in some.values()]
     state = accepted_state(enclave.state, participants) if participants else enclave.state
-    return EnclaveEvaluation(
-        CheckedEnclave(keystore, enclave.name, state), by_domain, there.portable is not None
-    )
+    checked = CheckedEnclave(keystore, enclave.name, state)
+    return EnclaveEvaluation(checked, by_domain, there.portable is not None, distributions)
 
 
 def check_vendors(evaluation: EnclaveEvaluation, known: Collection[Finding]) -> Iterator[Finding]:
@@ -176,21 +188,20 @@ def check_vendors(evaluation: EnclaveEvaluation, known: Collection[Finding]) -> 
 
     ``known`` are the other findings about the enclave and its CAs.
     """
-    enclave = evaluation.enclave
     for domain, made in evaluation.by_domain.items():
-        if findings := list(_refusals(enclave, made, known)):
+        if findings := list(_refusals(evaluation, made, known)):
             yield from findings
             return
         # Vendors decide alike on a document as sros writes it, and every topic takes long.
         if evaluation.portable and all(_file(finding) != PERMISSIONS_FILE for finding in known):
             continue
         ids = {finding.id for finding in known}
-        if findings := list(_different_rights(enclave, made, domain, ids)):
+        if findings := list(_different_rights(evaluation, made, domain, ids)):
             yield from findings
             return
 
 
-def _domains(state: OpenedEnclave) -> tuple[int, ...]:
+def example_domains(state: OpenedEnclave) -> tuple[int, ...]:
     """Return example domains of an enclave: one for each group of domains with the same rules."""
     if state.governance is None:
         return (0,)
@@ -211,7 +222,7 @@ _MOST_DOMAINS = 8
 
 
 def _refusals(
-    enclave: CheckedEnclave,
+    evaluation: EnclaveEvaluation,
     made: Mapping[Vendor, VendorParticipant],
     known: Collection[Finding],
 ) -> Iterator[Finding]:
@@ -220,6 +231,7 @@ def _refusals(
     Yields nothing if errors in ``known`` name a cause for every vendor.  A refusal by only some
     vendors is left out if a finding in ``known`` names its cause.
     """
+    enclave = evaluation.enclave
     causes = {vendor: participant.causes() for vendor, participant in made.items()}
     by_cause: dict[RefusalCause, list[Vendor]] = {}
     for vendor, cause in causes.items():
@@ -241,8 +253,10 @@ def _refusals(
         }
         if not by_cause:
             return
-    clauses = [_clause(cause, vendors) for cause, vendors in by_cause.items()]
-    accepting = together(vendor.title for vendor, cause in causes.items() if not cause)
+    clauses = [
+        refusal_clause(cause, evaluation.titles(vendors)) for cause, vendors in by_cause.items()
+    ]
+    accepting = evaluation.titles([vendor for vendor, cause in causes.items() if not cause])
     if accepting:
         clauses.append(
             f"{enumerated(accepting)} {'accepts' if len(accepting) == 1 else 'accept'} it"
@@ -272,10 +286,11 @@ def _file(finding: Finding) -> str:
     return finding.file.rpartition("/")[2]
 
 
-def _clause(cause: RefusalCause, vendors: Sequence[Vendor]) -> str:
+def refusal_clause(cause: RefusalCause, titles: Sequence[str]) -> str:
+    """Return a clause on what vendors with these titles do because of a cause."""
     several, one = _HIT_PEERS if cause.hits_peers else _SAYS.get(cause.outcome, _REFUSES)
-    titles = together(vendor.title for vendor in vendors)
-    return f"{enumerated(titles)} {one if len(titles) == 1 else several} ({cause.text})"
+    says = one if len(titles) == 1 else several
+    return f"{enumerated(titles)} {says} ({cause.text})"
 
 
 # ── what they decide differently ───────────────────────────────────────────────────────────
@@ -286,7 +301,7 @@ _SHOWN = 3
 
 
 def _different_rights(
-    enclave: CheckedEnclave,
+    evaluation: EnclaveEvaluation,
     made: Mapping[Vendor, VendorParticipant],
     domain: int,
     known: Collection[str],
@@ -295,29 +310,32 @@ def _different_rights(
 
     ``known`` are the ids of the other findings about the enclave.
     """
+    enclave = evaluation.enclave
     answers = {
         vendor: participant.access
         for vendor, participant in made.items()
         if participant.access and not participant.causes()
     }
-    differing = list(_differences(answers, _topics_to_ask(enclave, known)))
+    differing = list(_differences(evaluation, answers, _topics_to_ask(enclave, known)))
     if differing:
         text = f"on domain {domain}, {first_few(differing, _SHOWN, '; ', '; and ')}"
         yield DIFFER.found(enclave.name, text, enclave.file(PERMISSIONS_FILE))
 
 
-def _differences(answers: Mapping[Vendor, Access], topics: list[str]) -> Iterator[str]:
+def _differences(
+    evaluation: EnclaveEvaluation, answers: Mapping[Vendor, Access], topics: list[str]
+) -> Iterator[str]:
     questions = [
         (verb, topic) for topic in topics for verb in (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
     ]
     for verb, topic in questions:
-        said: dict[Outcome, list[str]] = {}
+        said: dict[Outcome, list[Vendor]] = {}
         for vendor, answer in answers.items():
-            said.setdefault(answer.decide(verb, topic).outcome, []).append(vendor.title)
+            said.setdefault(answer.decide(verb, topic).outcome, []).append(vendor)
         if len({outcome.ok for outcome in said}) > 1:
             answers_text = ", ".join(
-                f"{', '.join(together(titles))}: {outcome.value}"
-                for outcome, titles in said.items()
+                f"{', '.join(evaluation.titles(vendors))}: {outcome.value}"
+                for outcome, vendors in said.items()
             )
             yield f"{verb.value} {topic} ({answers_text})"
 
@@ -433,7 +451,7 @@ def check_starting(evaluation: EnclaveEvaluation, known: Sequence[Finding]) -> l
         worst = max(filter(None, denials), key=lambda denial: len(denial.text))
         where = f"on domain {domain}, " if len(evaluation.by_domain) > 1 else ""
         if len(running) < len(made):
-            titles = together(participant.vendor.title for participant in running)
+            titles = evaluation.titles([participant.vendor for participant in running])
             where += f"on {' and '.join(titles)} "
         finding = NO_NODE.found(enclave.name, f"{where}{worst}", enclave.file(PERMISSIONS_FILE))
         return [*(each for each in known if not worst.explains(each)), finding]

@@ -253,6 +253,10 @@ class _GrantRules:
             passed = entry.criteria
         return None
 
+    def only_allows(self) -> bool:
+        """Return whether no topic is denied by a rule, or crashes the process."""
+        return all(entry.allow and entry.expression for entry in self._entries)
+
     def safe_names(self) -> NameSet:
         """Return the topics for which `crash` returns None."""
         from sros_tool.automata import NameSet
@@ -578,6 +582,13 @@ class Access:
 
         Topics are decided in the default partition, and names of any length count.
         """
+        return self.ruled_topics(verb) & _usable_topics(self._traits.topic_names)
+
+    def ruled_topics(self, verb: AccessVerb) -> NameSet:
+        """Return `topics`, also those whose names DDS does not take; all that ROS 2 has are taken.
+
+        Where documents have the same meaning for two vendors, both sets are mostly equal.
+        """
         from sros_tool.automata import NameSet
 
         if self._join.outcome in (Outcome.REFUSED, Outcome.CRASHES) or self._grant is None:
@@ -592,7 +603,7 @@ class Access:
             for kind in dict.fromkeys(kinds)
             if kind is not _Kind.NOTHING
         )
-        return NameSet.union(topics) & _usable_topics(self._traits.topic_names)
+        return NameSet.union(topics)
 
     def protection(self) -> tuple[tuple[NameSet, DomainRule, TopicRule], ...]:
         """Return the topic rules of the domain, each with the topics for which it decides."""
@@ -619,7 +630,10 @@ class Access:
         allowed = self._own[verb].names()
         if self._peers is not self._own:
             allowed &= self._peers[verb].names()
-        return allowed & self._creatable_names() if kind is _Kind.BOTH_WAYS else allowed
+        # Where nothing is denied, the rule that allows an endpoint also allows its topic.
+        if kind is not _Kind.BOTH_WAYS or self._either.only_allows():
+            return allowed
+        return allowed & self._creatable_names()
 
     def _prepare(self, grant: Grant) -> None:
         traits = self._traits

@@ -34,7 +34,7 @@ class Subjects(Enum):
     SUBSET = auto()
     """Each part of the certificate's subject, split at ``, / |``, is in the grant's (Cyclone)."""
     TRIMMED_SUBSET = auto()
-    """As SUBSET, but blanks around names and values do not count (Cyclone DDS 11)."""
+    """Each part of the certificate's subject is in the grant's, whatever the blanks (11)."""
 
 
 class Moments(Enum):
@@ -45,7 +45,7 @@ class Moments(Enum):
     LOCAL = auto()
     """A date is in the host's standard time; its offset is ignored (Fast DDS)."""
     CYCLONE = auto()
-    """As STANDARD, but an incomplete date, or a year outside of 1970 to 2262, has passed."""
+    """A date has its offset, or is in UTC; before 1970, after 2262 or incomplete, it has passed."""
 
 
 class OpenRange(Enum):
@@ -104,6 +104,7 @@ class Keys(Enum):
 
     ANY = auto()
     EC_AND_RSA = auto()
+    """EC and RSA of any size, but not Ed25519 (Fast DDS)."""
     SMALL = auto()
     """EC of 256 bits, and RSA of 2048 (Cyclone DDS)."""
 
@@ -162,6 +163,7 @@ class VendorTraits:
     """The first rule whose topic matches decides, even if its partitions then do not match."""
     deny_partitions: DenyPartitions = DenyPartitions.ANY_OR_ALL
     honours_default: bool = True
+    """Where no rule matches, the ``<default>`` of the grant decides."""
     crashes_on_missing_content: bool = False
     """An empty ``<topic_expression>``, ``<not_after>`` or document of permissions is a crash, and
     otherwise refused (Fast DDS before 3)."""

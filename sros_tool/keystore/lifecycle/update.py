@@ -340,6 +340,7 @@ def _first_step(present: PresentSettings, goal: _Goal) -> _Goal:
         protection=present.settings.protection,
         name=present.settings.name,
         description=present.settings.description,
+        distributions=present.settings.distributions,
     )
     return _Goal(settings, present.domains)
 
@@ -367,6 +368,10 @@ def _signed_payloads(before: DomainProtection, after: DomainProtection) -> list[
     return [Note("governance.signed-payload", text)]
 
 
+_ONLY_STATED = ("name", "description", "distributions")
+"""Settings that no file depends on."""
+
+
 def _pending(present: PresentSettings, goal: _Goal) -> tuple[UpdateStage, ...]:
     """Return the stages that change something, in order."""
     found = []
@@ -375,7 +380,7 @@ def _pending(present: PresentSettings, goal: _Goal) -> tuple[UpdateStage, ...]:
         found.append(UpdateStage.CREDENTIALS)
     if goal.governance() != present.governance or present.edits.governance:
         found.append(UpdateStage.GOVERNANCE)
-    named = (before.name, before.description) != (goal.settings.name, goal.settings.description)
+    named = any(getattr(before, key) != getattr(goal.settings, key) for key in _ONLY_STATED)
     if not found and (named or present.edits or present.written is None):
         found.append(UpdateStage.CREDENTIALS)
     return tuple(found)

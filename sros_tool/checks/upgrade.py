@@ -1,0 +1,117 @@
+"""Kinds of findings about the update to another distribution of ROS 2; `sros_tool.proof` decides.
+
+They also report where the distributions differ that a keystore is for.
+"""
+
+from __future__ import annotations
+
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, FindingKind
+
+_ENGINE = "sros: its decision engine, with the rules of the DDS that each distribution ships."
+_DECIDE_ALIKE = (
+    "`sros explain ROOT NAME ... --all-distros` shows the rule that decides in each. Remove "
+    "denials of what no rule allows, and sign the rights in the form that sros writes: `sros "
+    "create_permission ROOT NAME POLICY_FILE`."
+)
+
+OPENS = FindingKind(
+    "upgrade.opens",
+    ERROR,
+    "an access that is closed now and open after the update",
+    "The same signed permissions let the enclave do more with the DDS of the other distribution. "
+    "Nothing fails, so nobody notices.",
+    _ENGINE,
+    _DECIDE_ALIKE,
+)
+CLOSES = FindingKind(
+    "upgrade.closes",
+    ERROR,
+    "an access that is open now and closed after the update",
+    "The same signed permissions let the enclave do less with the DDS of the other distribution: "
+    "its nodes fail when they create the endpoint, or their messages do not arrive.",
+    _ENGINE,
+    _DECIDE_ALIKE,
+)
+REFUSED = FindingKind(
+    "upgrade.refused",
+    ERROR,
+    "an enclave that runs now and is refused after the update",
+    "The DDS of the other distribution does not accept a file of the enclave, or its peers do not "
+    "accept the enclave.",
+    _ENGINE,
+    "Replace what is refused, before the update. `sros check ROOT --distro DISTRIBUTION` names it.",
+)
+ACCEPTED = FindingKind(
+    "upgrade.accepted",
+    WARNING,
+    "an enclave that is refused now and runs after the update",
+    "The DDS of the other distribution accepts a file that is refused now, such as expired "
+    "permissions: what was shut out joins again.",
+    _ENGINE,
+    "If it must stay out, revoke it with `sros revoke ROOT NAME`. Otherwise replace what is "
+    "refused now, so that both accept it.",
+)
+NO_NODE = FindingKind(
+    "upgrade.node-cannot-start",
+    ERROR,
+    "permissions with which no ordinary node starts after the update",
+    "A node creates these endpoints when it starts, and exits if one of them is denied. Nodes of "
+    "Iron and later also offer ~/get_type_description.",
+    "ROS 2 Jazzy, rcl 9, rclcpp 28, rclpy 7 and rmw_dds_common; REP-2016.",
+    "Include common/node.xml in the profiles of its nodes (`sros check POLICY_FILE` says how), and "
+    "sign the policy with `sros generate_artifacts -k ROOT -p POLICY_FILE`.",
+)
+BUFFERS = FindingKind(
+    "upgrade.zenoh-buffers",
+    WARNING,
+    "Zenoh files without the keys on which the other release sends images",
+    "rmw_zenoh of Lyrical sends messages with arrays of bytes, such as images and point clouds, on "
+    "keys below that of the topic. Files of an earlier sros drop them without a word.",
+    "ros2/rmw_zenoh, rmw_publisher_data.cpp.",
+    "Write the files again with `sros zenoh ROOT`, and deliver them before the update.",
+)
+ZENOH = FindingKind(
+    "upgrade.zenoh-release",
+    NOTE,
+    "another release of rmw_zenoh",
+    "Files that sros writes are for all supported releases, from the version that is named.",
+    "ros2/rmw_zenoh, its changelogs.",
+    "Install at least that version on every robot.",
+)
+NOT_MEASURED = FindingKind(
+    "distribution.not-measured",
+    NOTE,
+    "a DDS that was not measured",
+    "sros decides by the rules of another release of this product, so that a difference between "
+    "the two is not seen.",
+    _ENGINE,
+    "Try the update on one robot, and look at its logs with `sros explain ROOT --log FILE`.",
+    prominent=True,
+)
+DIFFER = FindingKind(
+    "distribution.differ",
+    ERROR,
+    "an access that is open on one distribution of the keystore and closed on another",
+    "The keystore or its fleet says that it is for both. The same signed permissions give an "
+    "enclave more rights on one of them.",
+    _ENGINE,
+    _DECIDE_ALIKE,
+)
+DISTRIBUTION_REFUSES = FindingKind(
+    "distribution.refused",
+    ERROR,
+    "an enclave that runs on one distribution of the keystore and not on another",
+    "The keystore or its fleet says that it is for both.",
+    _ENGINE,
+    "Replace what is refused, or correct `distributions` in the settings of the keystore: `sros "
+    "update_keystore ROOT --set distributions=NAME,...`.",
+)
+
+OF_ENCLAVES = (OPENS, CLOSES, REFUSED, ACCEPTED, NO_NODE, DIFFER, DISTRIBUTION_REFUSES)
+"""The kinds of findings about single enclaves."""
+
+ALL = (
+    *(OPENS, CLOSES, REFUSED, ACCEPTED, NO_NODE, BUFFERS, ZENOH),
+    *(NOT_MEASURED, DIFFER, DISTRIBUTION_REFUSES),
+)
+"""All kinds of this module, those of an update first."""

@@ -1,0 +1,535 @@
+"""What changes for a keystore or policy on the day of the update to another distribution of ROS 2.
+
+The signed files stay, and another DDS reads them.  Each enclave is decided by the rules of both,
+for all names at once: whether it joins, and which topics it may use.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, tzinfo
+from pathlib import Path
+from typing import NamedTuple
+
+from sros_tool.checks.keystores.enclaves import fault_remedy
+from sros_tool.checks.keystores.keystore import joined
+from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
+from sros_tool.checks.keystores.topic_names import names_without_wildcards
+from sros_tool.checks.keystores.vendors import (
+    check_starting,
+    evaluate,
+    example_domains,
+    refusal_clause,
+)
+from sros_tool.checks.kind import Finding, FindingKind
+from sros_tool.checks.targets import Circumstances, policy_findings
+from sros_tool.checks.upgrade import (
+    ACCEPTED,
+    BUFFERS,
+    CLOSES,
+    DIFFER,
+    DISTRIBUTION_REFUSES,
+    NO_NODE,
+    NOT_MEASURED,
+    OPENS,
+    REFUSED,
+    ZENOH,
+)
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import Outcome
+from sros_tool.dds.decision.grants import also_fitting
+from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.domains import DomainSet
+from sros_tool.distributions import (
+    Distribution,
+    Shipped,
+    find_distribution,
+)
+from sros_tool.errors import UsageError
+from sros_tool.faults import FAULTS
+from sros_tool.fleet.expansion import read_policy_for
+from sros_tool.keystore.fleet import stated_distributions
+from sros_tool.keystore.layout import (
+    KEY_FILE,
+    KEY_URI_FILE,
+    PERMISSIONS_FILE,
+    enclave_names,
+    has_zenoh_files,
+    is_keystore,
+)
+from sros_tool.keystore.participant import (
+    JoinContext,
+    LoadedEnclave,
+    RefusalCause,
+    VendorParticipant,
+    load_enclave_of,
+    plan_enclave,
+)
+from sros_tool.keystore.protection import with_stated
+from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.rights import load_rights, load_zenoh_rights
+from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
+from sros_tool.names import has_type_descriptions, is_expression
+from sros_tool.policy.model import ALLOW, Policy, stated_protections
+from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.proof.growth import AccessByVendors, Gain
+from sros_tool.proof.sources import AccessSource
+from sros_tool.proof.worlds import domains_of, zenoh_message
+from sros_tool.translate import governance_for
+from sros_tool.wording import first_few
+from sros_tool.zenoh.access import Enforcement, Remote
+from sros_tool.zenoh.releases import version_text
+
+_SHOWN = 4
+_ZENOH = "zenoh"
+_KEY_FILES = (KEY_FILE, KEY_URI_FILE)
+
+
+class Stage(NamedTuple):
+    """A DDS of a distribution, by which a keystore is decided."""
+
+    distribution: Distribution
+    shipped: Shipped
+
+    @property
+    def vendor(self) -> Vendor:
+        """The vendor by whose rules it decides."""
+        return self.shipped.vendor
+
+    @property
+    def title(self) -> str:
+        """Text such as ``Kilted with Fast DDS 3.2``."""
+        return f"{self.distribution.title} with {self.shipped.release}"
+
+
+@dataclass(frozen=True, slots=True)
+class DecidedFiles:
+    """The enclaves of a keystore or policy, which two distributions decide.
+
+    ``domains`` are the ROS domains to decide for, None for examples of those in the documents of
+    each enclave.  ``keystore`` is None for a policy, whose file is ``file``.  ``chosen`` are the
+    enclaves that are decided; None for all.
+    """
+
+    file: str
+    enclaves: Mapping[str, LoadedEnclave]
+    source: AccessSource
+    at: datetime
+    zone: tzinfo = UTC
+    domain: int | None = None
+    keystore: Keystore | None = None
+    unique_subjects: bool = False
+    chosen: frozenset[str] | None = None
+
+    def domains(self, enclave: LoadedEnclave) -> tuple[int, ...]:
+        """Return the ROS domains to decide for."""
+        if self.domain is not None:
+            return (self.domain,)
+        return example_domains(enclave.state) if enclave.state else (0,)
+
+    def lenders(self, vendor: Vendor) -> Mapping[str, tuple[str, ...]]:
+        """Map enclaves to those whose permissions fit their certificate, too."""
+        if self.unique_subjects:
+            return {}
+        subjects = {name: each.subject for name, each in self.enclaves.items() if each.subject}
+        granted = {
+            name: [grant.subject for grant in permissions.grants]
+            for name, permissions in self.source.permissions.items()
+        }
+        return also_fitting(vendor.traits, subjects, granted)
+
+    def decided(self) -> Iterator[tuple[str, LoadedEnclave]]:
+        """Yield the enclaves that are decided, with their names."""
+        for name, enclave in self.enclaves.items():
+            if self.chosen is None or name in self.chosen:
+                yield name, enclave
+
+    def only(self, enclaves: Iterable[str]) -> DecidedFiles:
+        """Return the same with some of the enclaves; permissions of others still count."""
+        return replace(self, chosen=frozenset(enclaves))
+
+    def place(self, enclave: str, file: str) -> str:
+        """Return the path of a file of an enclave, or of the policy."""
+        return f"{self.keystore.folder(enclave)}/{file}" if self.keystore else self.file
+
+
+def signed_files(
+    keystore: Keystore, *, at: datetime, zone: tzinfo = UTC, domain: int | None = None
+) -> DecidedFiles:
+    """Return the enclaves of a keystore as they are signed.
+
+    Raises:
+        KeystoreError: it is no keystore.
+        DocumentError: its rights cannot be read.
+    """
+    keystore.check()
+    names = enclave_names(keystore.root, hidden=True)
+    source = load_rights(keystore, hidden=True)
+    # Without any key this is the public part of a keystore, and the keys are where it came from.
+    public = not any(
+        os.path.lexists(keystore.folder(name) / key) for name in names for key in _KEY_FILES
+    )
+    enclaves = {name: load_enclave_of(keystore, name, at=at) for name in names}
+    if public:
+        enclaves = {name: each._replace(key_elsewhere=True) for name, each in enclaves.items()}
+    side = AccessSource(str(keystore.root), "keystore", source.rights, source.documents)
+    return DecidedFiles(str(keystore.root), enclaves, side, at, zone, domain, keystore)
+
+
+def _planned_files(policy: Policy, *, at: datetime, domain: int | None = None) -> DecidedFiles:
+    """Return the enclaves of a policy as they would be signed, with the default template."""
+    template = load_template(DEFAULT_TEMPLATE)
+    domains = DomainSet.of((domain or 0, domain or 0))
+    protection = with_stated(template.protection, stated_protections(policy.enclaves))
+    governance = governance_for(protection, domains)
+    enclaves = {
+        enclave.path: plan_enclave(enclave, governance, at=at) for enclave in policy.enclaves
+    }
+    permissions = {name: each.portable for name, each in enclaves.items() if each.portable}
+    side = AccessSource(policy.file, "policy", policy_rights(policy), permissions)
+    return DecidedFiles(
+        *(policy.file, enclaves, side, at),
+        domain=domain,
+        unique_subjects=template.unique_subject,
+    )
+
+
+# ── the update ─────────────────────────────────────────────────────────────────────────────
+
+
+def check_upgrade(
+    path: Path,
+    later: Distribution,
+    at: Circumstances,
+    *,
+    present: Distribution | None = None,
+    here: Distribution | None = None,
+    vendor: str = "",
+) -> list[Finding]:
+    """Return what the update to a distribution changes for a policy file or a keystore.
+
+    Args:
+        path: the policy or keystore.
+        later: the distribution after the update.
+        at: the moment, the ROS domain, and other conditions.
+        present: the distribution before it; by default those that the keystore says.
+        here: the distribution that is sourced, where the keystore says none.
+        vendor: the only DDS vendor that is used, of any release, or ``zenoh``; "" for all.
+
+    Raises:
+        UsageError: the distribution before the update is not known, or is the same.
+        DocumentError: a file cannot be read, or there are too many wildcards to decide.
+    """
+    if is_keystore(path):
+        files = signed_files(at.keystore(path), at=at.now, zone=at.zone, domain=at.domain)
+    else:
+        files = _planned_files(read_policy_for(path, at.fleet), at=at.now, domain=at.domain)
+    findings: list[Finding] = []
+    for before, enclaves in _present(files, present, here, later).items():
+        findings += _upgrade(files.only(enclaves), before, later, vendor)
+        if not files.keystore:
+            findings += _of_nodes_in_policy(path, at, before, later)
+    return joined(list(dict.fromkeys(findings)))
+
+
+def _present(
+    files: DecidedFiles,
+    named: Distribution | None,
+    here: Distribution | None,
+    later: Distribution,
+) -> Mapping[Distribution, list[str]]:
+    """Map the distributions before the update to their enclaves."""
+    by_distribution: dict[Distribution, list[str]] = {}
+    for name in files.enclaves:
+        stated = stated_distributions(files.keystore, name) if files.keystore and not named else ()
+        for distribution in map(find_distribution, stated) if stated else (named or here,):
+            if distribution and distribution != later:
+                by_distribution.setdefault(distribution, []).append(name)
+    if files.enclaves and not by_distribution:
+        raise UsageError(
+            f"it is not known from which distribution '{files.file}' is updated to {later.title}",
+            "Neither --distro nor $ROS_DISTRO names another one, nor does the keystore.",
+            "Name the present one, for example with --distro jazzy.",
+        )
+    return by_distribution
+
+
+def _upgrade(
+    files: DecidedFiles, before: Distribution, after: Distribution, vendor: str
+) -> Iterator[Finding]:
+    product = Vendor(vendor).traits.product if vendor not in ("", _ZENOH) else ""
+    for distribution in (before, after):
+        if distribution.assumption:
+            yield NOT_MEASURED.found(f"ROS 2 {distribution.title}", distribution.assumption)
+    for old in before.shipped if vendor != _ZENOH else ():
+        new = after.of_product(old.product)
+        if new is None or product not in ("", old.product):
+            continue
+        stages = Stage(before, old), Stage(after, new)
+        yield from _not_measured(*stages)
+        for change in changes(files, *stages):
+            kind = _KINDS[change.kind]
+            yield kind.found(change.enclave, change.text, change.file, remedy=change.remedy)
+    yield from _nodes(files, before, after)
+    if vendor in ("", _ZENOH):
+        yield from _on_zenoh(files, before, after)
+
+
+def _of_nodes_in_policy(
+    path: Path, at: Circumstances, before: Distribution, after: Distribution
+) -> Iterator[Finding]:
+    """Yield what nodes of one distribution need and a policy denies, and those of another not."""
+    now, then = (
+        policy_findings(path, replace(at, distribution=distribution.named))
+        for distribution in (before, after)
+    )
+    yield from (finding for finding in then if finding not in now)
+
+
+def check_distributions(
+    keystore: Keystore, *, at: datetime, zone: tzinfo = UTC, domain: int | None = None
+) -> list[Finding]:
+    """Return where enclaves are decided differently on the distributions that they are for.
+
+    Raises:
+        DocumentError: a file cannot be read, or there are too many wildcards to decide.
+    """
+    by_distributions: dict[tuple[str, ...], list[str]] = {}
+    for name in keystore.names:
+        stated = stated_distributions(keystore, name)
+        if len(stated) > 1:
+            by_distributions.setdefault(stated, []).append(name)
+    if not by_distributions:
+        return []
+    files = signed_files(keystore, at=at, zone=zone, domain=domain)
+    findings = []
+    for names, enclaves in by_distributions.items():
+        for before, after in _pairs([find_distribution(name) for name in names]):
+            for change in changes(files.only(enclaves), before, after):
+                kind = DISTRIBUTION_REFUSES if change.kind in (_LOSES, _JOINS) else DIFFER
+                findings.append(
+                    kind.found(change.enclave, change.text, change.file, remedy=change.remedy)
+                )
+    return joined(findings)
+
+
+def _pairs(distributions: Sequence[Distribution]) -> Iterator[tuple[Stage, Stage]]:
+    """Yield the first release of each product with each other one that decides differently."""
+    by_product: dict[str, dict[Vendor, Stage]] = {}
+    for distribution in distributions:
+        for shipped in distribution.shipped:
+            stages = by_product.setdefault(shipped.product, {})
+            stages.setdefault(shipped.vendor, Stage(distribution, shipped))
+    for first, *others in (list(stages.values()) for stages in by_product.values()):
+        yield from ((first, other) for other in others)
+
+
+_MORE, _LESS, _LOSES, _JOINS = "opens", "closes", "refused", "accepted"
+_KINDS: Mapping[str, FindingKind] = {
+    _MORE: OPENS,
+    _LESS: CLOSES,
+    _LOSES: REFUSED,
+    _JOINS: ACCEPTED,
+}
+
+
+class DecisionChange(NamedTuple):
+    """A decision on an enclave in which two distributions differ."""
+
+    kind: str
+    enclave: str
+    text: str
+    file: str
+    remedy: str = ""
+
+
+def changes(files: DecidedFiles, before: Stage, after: Stage) -> Iterator[DecisionChange]:
+    """Yield the decisions in which two distributions differ; on the first domain that has some.
+
+    Raises:
+        DocumentError: it cannot be decided for so many wildcards.
+    """
+    if before.vendor is after.vendor:
+        return
+    by_vendors = AccessByVendors(files.source)
+    lenders = {stage.vendor: files.lenders(stage.vendor) for stage in (before, after)}
+    for name, enclave in files.decided():
+        numbers = files.domains(enclave)
+        for number in numbers:
+            context = JoinContext(number, files.at, files.zone)
+            where = f"on domain {number}, " if len(numbers) > 1 else ""
+            sides = [
+                _Decided(stage, files, name, context, lenders[stage.vendor].get(name, ()))
+                for stage in (before, after)
+            ]
+            if found := list(_of_enclave(files, name, sides, number, where, by_vendors)):
+                yield from found
+                break
+
+
+class _Decided:
+    """What a DDS makes of an enclave, and of permissions of others that fit its certificate."""
+
+    def __init__(
+        self,
+        stage: Stage,
+        files: DecidedFiles,
+        name: str,
+        context: JoinContext,
+        lenders: Sequence[str],
+    ) -> None:
+        own = files.enclaves[name]
+        self.stage = stage
+        participant = VendorParticipant(stage.vendor, own, context)
+        self.causes = participant.causes()
+        lent = (
+            own._replace(
+                permissions=files.enclaves[lender].permissions,
+                portable=files.enclaves[lender].portable,
+                state=None,
+            )
+            for lender in lenders
+        )
+        others = (VendorParticipant(stage.vendor, each, context).access for each in lent)
+        usable = (participant.access, *others) if participant.access else ()
+        self.access: tuple[Access, ...] = tuple(filter(None, usable))
+
+    @property
+    def crashes(self) -> bool:
+        """Whether the process, or its peers, crash."""
+        return any(cause.outcome is Outcome.CRASHES for cause in self.causes)
+
+
+def _of_enclave(
+    files: DecidedFiles,
+    name: str,
+    sides: Sequence[_Decided],
+    domain: int,
+    where: str,
+    by_vendors: AccessByVendors,
+) -> Iterator[DecisionChange]:
+    old, new = sides
+    if new.causes and (not old.causes or (new.crashes and not old.crashes)):
+        text = f"{where}{_verdict(new)}; {_verdict(old)}"
+        yield _refusal(_LOSES, files, name, new.causes[0], text)
+    elif old.causes and not new.causes:
+        text = f"{where}{_verdict(old)}; {_verdict(new)}"
+        yield DecisionChange(_JOINS, name, text, files.place(name, old.causes[0].file))
+    if old.causes or new.causes:
+        return
+    permissions = files.source.permissions.get(name)
+    names = {
+        topic
+        for grant in (permissions.grants if permissions else ())
+        for topic in names_without_wildcards(grant)
+    }
+    file = files.place(name, PERMISSIONS_FILE)
+    for kind, one, other in ((_MORE, old, new), (_LESS, new, old)):
+        gains = list(
+            by_vendors.added(name, one.access, other.access, other.stage.vendor, domain, names)
+        )
+        if gains:
+            accesses = first_few(list(dict.fromkeys(map(_words, gains))), _SHOWN, "; ", "; and ")
+            opened = f"{where}{accesses}: open on {other.stage.title}, closed on {one.stage.title}"
+            yield DecisionChange(kind, name, opened, file)
+
+
+def _words(gain: Gain) -> str:
+    """Return an access as people ask for it, such as ``publish topic /cmd_vel``."""
+    if gain.right is None:
+        return f"{gain.action} DDS topic {gain.topic}"
+    return gain.right._replace(name=gain.name).describe()
+
+
+def _verdict(side: _Decided) -> str:
+    clauses = [refusal_clause(cause, [side.stage.title]) for cause in side.causes]
+    return "; ".join(clauses) or f"{side.stage.title} accepts it"
+
+
+def _refusal(
+    kind: str, files: DecidedFiles, name: str, cause: RefusalCause, text: str
+) -> DecisionChange:
+    remedy = ""
+    state, fault = files.enclaves[name].state, FAULTS.get(cause.reason)
+    if files.keystore and state and fault:
+        view = CheckedKeystore(files.keystore, now=files.at, zone=files.zone)
+        remedy = fault_remedy(CheckedEnclave(view, name, state), fault, cause.file)
+    return DecisionChange(kind, name, text, files.place(name, cause.file), remedy)
+
+
+def _not_measured(before: Stage, after: Stage) -> Iterator[Finding]:
+    for stage in dict.fromkeys((before, after)):
+        if not stage.shipped.measured:
+            same = before.vendor is after.vendor
+            blind = ", so that no difference between both can be seen" if same else ""
+            text = f"{stage.shipped}{blind}"
+            yield NOT_MEASURED.found(f"ROS 2 {stage.distribution.title}", text)
+
+
+def _nodes(files: DecidedFiles, before: Distribution, after: Distribution) -> Iterator[Finding]:
+    """Yield enclaves in which nodes of one distribution start, and those of the other do not."""
+    if has_type_descriptions(before.name) or files.keystore is None:
+        return
+    for name, enclave in files.decided():
+        if enclave.state is None or not has_type_descriptions(after.name):
+            continue
+        starting = []
+        for distribution in (before, after):
+            view = CheckedKeystore(
+                files.keystore, now=files.at, zone=files.zone, distribution=distribution.name
+            )
+            checked = CheckedEnclave(view, name, enclave.state)
+            starting.append(check_starting(evaluate(checked, after.vendors, files.domain), ()))
+        if not starting[0]:
+            for finding in starting[1]:
+                text = f"in ROS 2 {after.title}, {finding.text}"
+                yield NO_NODE.found(name, text, finding.file)
+
+
+# ── Zenoh ──────────────────────────────────────────────────────────────────────────────────
+
+
+def _on_zenoh(files: DecidedFiles, before: Distribution, after: Distribution) -> Iterator[Finding]:
+    """Yield what another release of rmw_zenoh changes for the Zenoh files of a keystore."""
+    old, new = before.zenoh, after.zenoh
+    if old == new or not files.keystore or not has_zenoh_files(files.keystore.root, hidden=True):
+        return
+    text = (
+        f"ROS 2 {before.title} has rmw_zenoh {version_text(old.begin)} or later, {after.title} "
+        f"{version_text(new.begin)} or later, of which the files need {version_text(new.least)}"
+    )
+    yield ZENOH.found(files.file, text)
+    more = [key for key in new.below_topics if key not in (*old.below_topics, _OF_EACH)]
+    source = load_zenoh_rights(files.keystore, hidden=True)
+    domains = domains_of(source.enforcers)
+    dropped = {
+        right.name
+        for right in source.rights
+        if right.right == "publish" and right.qualifier is ALLOW and not is_expression(right.name)
+        for domain in domains
+        if any(_drops(source.enforcers, right, domain, key) for key in more)
+    }
+    if dropped:
+        yield BUFFERS.found(files.file, f"for {first_few(sorted(dropped), _SHOWN)}")
+
+
+_OF_EACH = "_buf/*"
+"""Keys of single subscriptions, which have no example without a wildcard."""
+
+
+def _drops(enforcers: Sequence[Enforcement], right: Right, domain: int, below: str) -> bool:
+    """Return whether messages of a right pass on its key, and not on a key below it."""
+    remote = Remote(right.enclave)
+    messages = [
+        message
+        for topic in right.topics.publish
+        for message in zenoh_message(topic, domain, writes=True)
+    ]
+    return bool(messages) and any(
+        enforcer.decide(remote, flow, message, key).allowed
+        and not enforcer.decide(remote, flow, message, f"{key}/{below}").allowed
+        for enforcer in enforcers
+        for flow, message, key in messages
+    )

@@ -1,0 +1,89 @@
+"""The page docs/distributions.md: which distribution ships what, and where their DDS differ."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import fields
+from enum import Enum
+
+from sros_tool.checks.upgrade import ALL
+from sros_tool.dds.decision.vendors import MEASURED, VendorTraits
+from sros_tool.distributions import SUPPORTED, Shipped
+from sros_tool.names import has_type_descriptions
+from sros_tool.zenoh.releases import version_text
+from tools.json_schemas import docstrings_of_fields
+from tools.page_parts import MADE, cell, table_text
+from tools.steps import CHECKOUT
+
+_NAMES = ("title", "product", "measured")
+"""The traits that are no rules."""
+
+_HEAD = re.compile(r".*?\n## What holds where\n", re.DOTALL)
+"""The part of the page that is written by hand."""
+
+
+def distributions_page() -> str:
+    """Return the page as Markdown, with its hand-written part as it is."""
+    written = _HEAD.match((CHECKOUT / "docs" / "distributions.md").read_text("utf-8"))
+    assert written, "docs/distributions.md has no part '## What holds where'"
+    shipped = table_text(
+        *("distribution", "supported until", "default DDS", "other DDS", "rmw_zenoh", "nodes"),
+        rows=_shipped(),
+    )
+    titles = (vendor.title.replace(" ", "\u00a0") for vendor in MEASURED)
+    parts = [
+        written[0].rstrip(),
+        MADE,
+        shipped,
+        "The versions are the latest as of November 2026; patches of a release are taken to decide "
+        "alike. *Not measured* is a release for which sros takes the rules of another one: what "
+        "differs between the two is not seen.",
+        "The rules in which two measured releases differ:",
+        table_text("rule", *titles, rows=_rules()),
+        "What an update changes is reported as:",
+        table_text("finding", "severity", "what it says", rows=_findings()),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _findings() -> Iterator[tuple[str, ...]]:
+    for kind in ALL:
+        anchor = kind.id.replace(".", "").lower()
+        yield f"[`{kind.id}`](reference/findings.md#{anchor})", str(kind.severity), cell(kind.title)
+
+
+def _shipped() -> Iterator[tuple[str, ...]]:
+    for distribution in SUPPORTED:
+        first, second = map(_release, distribution.shipped)
+        release = distribution.zenoh
+        zenoh = f"from {version_text(release.begin)}; {version_text(release.least)} is needed"
+        nodes = "~/get_type_description" if has_type_descriptions(distribution.name) else ""
+        yield distribution.title, distribution.until, first, second, zenoh, nodes or "without"
+
+
+def _release(shipped: Shipped) -> str:
+    text = f"{shipped.product} {shipped.latest}"
+    if shipped.measured:
+        return text
+    return f"{text}, *not measured*: decided as {shipped.vendor.title}"
+
+
+def _rules() -> Iterator[tuple[str, ...]]:
+    texts = docstrings_of_fields(VendorTraits)
+    for field in fields(VendorTraits):
+        values = [getattr(vendor.traits, field.name) for vendor in MEASURED]
+        if field.name in _NAMES or len(set(values)) == 1:
+            continue
+        own = next((type(value).__doc__ for value in values if isinstance(value, Enum)), "")
+        rule = (texts.get(field.name) or own or field.name).partition("\n\n")[0]
+        yield cell(rule.replace("``", "`")), *map(_value, values)
+
+
+def _value(value: object) -> str:
+    if isinstance(value, Enum):
+        text = docstrings_of_fields(type(value)).get(value.name, value.name.lower())
+        return cell(text.replace("``", "`"))
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "no limit" if value is None else str(value)
