@@ -65,7 +65,7 @@ def unguarded(governance: Governance) -> Iterator[Unguarded]:
 OF_EVERY_NODE = ("/parameter_events",)
 """Topics of every node: if they counted, every enclave would influence every other one."""
 QUESTIONS = tuple(f"*/{name}" for name in READING_SERVICES)
-"""Services whose requests change nothing: who calls them learns, and influences nobody."""
+"""Services whose requests change nothing: a caller gets information, but influences nobody."""
 
 _WRITER_RIGHTS = {
     "rt": ("topics", "publish", ""),
@@ -187,9 +187,9 @@ class Network:
     """All enclaves of a system, connected by the topics that they may write and read.
 
     ``without`` are topics (ROS names) to ignore, ``questions`` are services (names or wildcards)
-    whose requests are ignored.  All enclaves in ``everybody`` may use the
-    ``unguarded`` topics, independently of their rights.  ``links`` are those of several routers:
-    enclaves of different ones are connected only by what passes from one to the other.
+    whose requests are ignored.  All enclaves in ``everybody`` may use the ``unguarded`` topics,
+    independently of their rights.  ``links`` are the links between several Zenoh routers: enclaves
+    at different routers are connected only by what these routers pass on to each other.
     """
 
     def __init__(
@@ -292,7 +292,7 @@ class Network:
 
 
 def _ends(rights: Iterable[Right], ignored: Collection[str]) -> dict[str, list[_Access]]:
-    """Return what rights let enclaves write (publish) and read (subscribe), but for the ignored."""
+    """Return who may write (publish) and read (subscribe) which topics, without ignored topics."""
     ends: dict[str, list[_Access]] = {"publish": [], "subscribe": []}
     denied: dict[tuple[str, str], set[str]] = defaultdict(set)
     allowed: dict[tuple[str, str], set[str]] = defaultdict(set)

@@ -82,7 +82,7 @@ def read_file(
 def _read_open(path: Path, most: int) -> tuple[os.stat_result, bytes]:
     """Return the fstat(2) of a file, and its first ``most`` + 1 bytes.
 
-    Without its content if it is not a regular file, as one that has just been exchanged.
+    The content is empty if it is not a regular file, which happens if somebody just replaced it.
     """
     handle = _handle_at_once(path)
     try:
@@ -157,8 +157,8 @@ def require_child(root: etree._Element, tag: str, name: str, what: str) -> etree
     """Return the child ``tag`` of the root ``<dds>`` of a document; ``name`` names it in errors.
 
     Raises:
-        DocumentError: the root has another name, or no such child.  DDS vendors compare names as
-            they are written, so that names with a prefix, or in a namespace, are other ones.
+        DocumentError: the root has another name, or no such child.  DDS vendors compare names
+            literally, so a name with a prefix or in a namespace is a different name.
     """
     child = root.find(tag)
     if root.tag == "dds" and child is not None:

@@ -680,7 +680,7 @@ def update_keystore(
     as_json: bool,
     dry_run: bool,
 ) -> int:
-    r"""Change the settings of the keystore ROOT, and sign again what follows from them.
+    r"""Change the settings of the keystore ROOT, and sign the affected files again.
 
     KEY is a setting of sros.toml. What becomes looser and what tighter is shown, and what becomes
     looser has to be allowed. The enclaves keep their keys and their rights.

@@ -123,7 +123,7 @@ class RunPlan:
 
     @property
     def rows_at_once(self) -> int:
-        """The number of groups of rows (with common processes) to run in parallel."""
+        """The number of groups of rows to run in parallel; rows of a group share processes."""
         # Routers of one machine listen at the same port.
         return 1 if self.backend.on_zenoh and not self.own_networks else self.backend.rows_at_once
 

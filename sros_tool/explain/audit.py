@@ -145,7 +145,9 @@ def audited_enclaves(
     rights = load_rights(path, fleet)
     if fleet and rights.kind != "policy":
         raise UsageError(
-            "--fleet is for the placeholders of a policy", f"'{path}' is none.", "Leave it out."
+            "--fleet is for the placeholders of a policy",
+            f"'{path}' is no policy.",
+            "Omit --fleet.",
         )
     if rights.kind == "keystore":
         return keystore_enclaves(rights, enclave_names(path), vendor, context)

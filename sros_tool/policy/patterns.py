@@ -165,7 +165,7 @@ class _Form:
 
 
 def _meet(one: _Pieces, other: _Pieces) -> bool:
-    """Return whether pieces at equal positions share a letter; extra pieces are ignored."""
+    """Return whether the pieces at every position share a letter; extra pieces are ignored."""
     return not any(map(frozenset.isdisjoint, one, other))
 
 
@@ -357,12 +357,12 @@ class _Beginnings:
     def compatible(self, begin: str) -> list[int]:
         """Return the numbers of the texts that can begin with ``begin``."""
         first = bisect_left(self._texts, begin)
-        found = self._numbers[first : bisect_left(self._texts, begin + _LAST, lo=first)]
+        numbers = self._numbers[first : bisect_left(self._texts, begin + _LAST, lo=first)]
         for size in self._sizes:
             if size >= len(begin):
                 break
-            found += self._open.get(begin[:size], ())
-        return found
+            numbers += self._open.get(begin[:size], ())
+        return numbers
 
 
 def _letters_of(expression: str) -> str:

@@ -35,7 +35,7 @@ The folder may also be one into which Debian's packages were unpacked.
 _SYSTEM_NAMES = ("libddsc.so.0debian", "libddsc.so.0t64", "libddsc.so.0", "libddsc.so.11")
 """The shared object names of Debian 12, of Debian 13, and of an installation from source or ROS.
 
-The last is that of ROS 2 Lyrical.
+ROS 2 Lyrical has the last name.
 """
 
 INSTALL_ADVICE = (
@@ -376,9 +376,10 @@ class CycloneLog:
         os.register_at_fork(after_in_child=self._leave_parent)
 
     def _leave_parent(self) -> None:
-        """Write into a file of this process, which is a copy of the one that made the log.
+        """Write to a new file if this process was forked from the process that opened the log.
 
-        If the process before it has closed the log's file, its number may be that of another one.
+        If the parent closed the log's file, its descriptor may belong to another file, and is left
+        alone.
         """
         with suppress(OSError):
             if os.path.samestat(os.fstat(self._file), self._made):

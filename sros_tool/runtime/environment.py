@@ -413,7 +413,7 @@ def object_name(enclave: str) -> str:
     """Return a name for an enclave that no other enclave has, of at most 58 characters (RFC 1123).
 
     Names of enclaves distinguish capitals and have "_" and "/".  Where that is lost, the first 64
-    bits of the enclave's SHA-256 follow after "--", which no other name has.
+    bits of the enclave's SHA-256 follow after "--", so that the name is unique.
     """
     words = "-".join(re.findall(r"[a-z0-9]+", enclave.lower()))
     if _PLAIN.match(enclave) and len(words) <= _LONGEST_PLAIN:
@@ -443,7 +443,8 @@ def check_name(name: str, form: str) -> str:
         raise UsageError(
             f"{name!r} is not a name of an object in Kubernetes (RFC 1123)",
             "",
-            "Use at most 63 small letters, digits and '-', and begin and end with none of '-'.",
+            "Use at most 63 lower-case letters, digits and '-', "
+            "and begin and end with a letter or digit.",
         )
     return name
 

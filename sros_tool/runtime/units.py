@@ -49,7 +49,7 @@ _PLAIN_PATH = re.compile(r"(/[A-Za-z0-9_][A-Za-z0-9._+-]*)+\Z")
 _USER = re.compile(r"[A-Za-z_][A-Za-z0-9_-]{0,30}\Z")
 
 _CLOSED = """\
-# Nothing of the system can be changed, and no right be gained.
+# The process can neither change the system nor gain privileges.
 NoNewPrivileges=yes
 CapabilityBoundingSet=
 ProtectSystem=strict
@@ -248,7 +248,7 @@ def job_units(
                 "PrivateNetwork=yes",
                 "StateDirectory=sros-metrics",
                 "UMask=0022",
-                "# Robots without the present files, which the metrics tell.",
+                "# Robots without the current files, as the metrics show.",
                 "SuccessExitStatus=1",
             ],
         ),
