@@ -60,15 +60,17 @@ def same(said: str, observed: str) -> bool:
     return said == observed.removeprefix("peer ").replace("hung", "crashed")
 
 
-def engine_says(folder: Path, at: datetime) -> dict[Vendor, tuple[str, str]]:
+def engine_says(
+    folder: Path, at: datetime, vendors: Sequence[Vendor] = VENDORS
+) -> dict[Vendor, tuple[str, str]]:
     """Return what the engine says of an enclave's folder, in a word and a sentence, by vendor."""
     try:
         enclave = load_enclave("/t", folder, at=at)
         asked = question("publish", f"/{TOPIC.removeprefix('rt/')}")
         context = JoinContext(DOMAIN, at)
-        answers = {each: Evaluator(each, enclave, context).answer(asked) for each in VENDORS}
+        answers = {each: Evaluator(each, enclave, context).answer(asked) for each in vendors}
     except Exception:  # a traceback is an answer, too: a wrong one
-        return dict.fromkeys(VENDORS, ("raises", traceback.format_exc()[-500:]))
+        return dict.fromkeys(vendors, ("raises", traceback.format_exc()[-500:]))
     return {each: (WORDS[made.outcome], made.decision.text) for each, made in answers.items()}
 
 
@@ -179,7 +181,7 @@ def compare(
         set_up_token(program_folder, sorted({*keys, "p256 28"}))
     whole = folder / "whole"
     own().write(whole / "own", whole / "peer", now)
-    said = [engine_says(each / "own", now)[vendor] for each in folders]
+    said = [engine_says(each / "own", now, [vendor])[vendor] for each in folders]
     did: list[list[Reply]] = [[] for _ in cases]
     open_ones = list(range(len(cases)))
     for seconds, together in ((MATCH_SECONDS, at_once), (6.0, 3), (12.0, 2)):
