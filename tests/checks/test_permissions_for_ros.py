@@ -174,7 +174,7 @@ def test_a_denial_that_hides_several_topics_is_one_finding(bench: Bench) -> None
     bench.permissions((ALLOW, DENY_ALL.replace("rt/*", "rr/*") + ALLOW))
     (text,) = (each.text for each in found_in(bench) if each.id == "permissions.unreachable-rule")
     assert text.startswith("rule 2 allows to publish rr/base/") and text.count("rr/base/") > 1
-    assert text.endswith("after one that denies rr/*")
+    assert text.endswith("after a rule that denies rr/*")
 
 
 def test_names_that_differ_only_in_capitals(bench: Bench) -> None:
