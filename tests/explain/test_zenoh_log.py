@@ -100,7 +100,7 @@ SECRET = "0/secret/std_msgs::msg::dds_::String_/RIHS01_0"
 
 
 def dropped(*lines: str) -> list[str]:
-    return [each.cause.partition(", by")[0] for each in explained("\n".join(lines))]
+    return [each.cause.partition(": the process")[0] for each in explained("\n".join(lines))]
 
 
 def test_dropped_messages() -> None:
@@ -122,7 +122,7 @@ def test_dropped_messages() -> None:
         ("zenoh-dropped", 6, 1, "/talker"),
         ("zenoh-dropped", 7, 1, "/talker"),
     ]
-    assert found[0].cause.startswith("/talker may not publish /secret, by the rules of the process")
+    assert found[0].cause.startswith("/talker may not publish /secret: the process that logged")
     assert found[0].remedy.startswith(
         "`sros explain KEYSTORE /talker publish /secret --vendor zenoh`"
     )
