@@ -21,7 +21,7 @@ from typing import NamedTuple, TypeVar
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import Grant, parse_permissions
+from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, PolicyError, SrosError, UsageError, check_meaning
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -35,15 +35,18 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave
 from sros_tool.keystore.rights import RecordedRights, SignedRights
+from sros_tool.keystore.zenoh_permissions import (
+    grant_for_all,
+    joined_domains,
+    rights_in_domain,
+)
 from sros_tool.names import is_expression
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.pki.crl import SUPERSEDED, RevocationList, load_crl
-from sros_tool.policy.model import ALLOW, RIGHTS, Enclave, Source
-from sros_tool.policy.patterns import overlap
-from sros_tool.policy.rights import Right, Rules, nodes_from_text, parts
-from sros_tool.translate import grant_rights
+from sros_tool.policy.model import ALLOW, RIGHTS, Enclave
+from sros_tool.policy.rights import Rules, nodes_from_text
 from sros_tool.translate_zenoh.graph import (
     GRAPH,
     AnnouncedNodes,
@@ -232,11 +235,11 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
     if not is_session or state.grant is None:
         return ""
     control = configuration.access_control
-    domains = _joined_domains(state.grant, domains_of(control))
+    domains = joined_domains(state.grant, domains_of(control))
     # Only the keystore knows which nodes a policy names: here it is what the permissions CA signed.
     nodes = nodes_in_rules((rule for remote in control.remotes for rule in remote.rules), name)
     try:
-        stated = {domain: _recorded_rights(name, state.grant, domain) for domain in domains}
+        stated = {domain: rights_in_domain(name, state.grant, domain) for domain in domains}
         own = remote_of(name, stated, nodes)
     except SrosError as error:
         return f"Zenoh cannot state the permissions of the enclave: {error.what}"
@@ -737,7 +740,7 @@ class _RightsReader:
         grants |= {name: rights.grant for name, rights in issued.items()}
         joined = for_each(grants, lambda name: self._joined(grants[name]))
         stated = {
-            name: {domain: _recorded_rights(name, grants[name], domain) for domain in domains}
+            name: {domain: rights_in_domain(name, grants[name], domain) for domain in domains}
             for name, domains in joined.items()
         }
         remotes = {name: self._remote(name, rights) for name, rights in stated.items()}
@@ -788,8 +791,8 @@ class _RightsReader:
         self._recorded.policy(name, hashlib.sha256(message).hexdigest())
 
     def _grant(self, name: str, document: bytes, certificate: x509.Certificate) -> Grant:
-        permissions = parse_permissions(document, f"the permissions of {name}")
-        grant = permissions.grant_of(subject_text(certificate.subject))
+        subject = subject_text(certificate.subject)
+        grant = grant_for_all(document, f"the permissions of {name}", subject)
         if grant is None:
             raise KeystoreError("its permissions are not for its certificate")
         now = self._now
@@ -799,7 +802,7 @@ class _RightsReader:
         return grant
 
     def _joined(self, grant: Grant) -> tuple[int, ...]:
-        domains = _joined_domains(grant, self._domains)
+        domains = joined_domains(grant, self._domains)
         if not domains:
             raise KeystoreError("its permissions are for no domain of the network")
         return domains
@@ -983,64 +986,3 @@ def signed_path(path: str) -> str:
     """Return the path of the signed document next to a configuration."""
     folder, _, file = path.rpartition("/")
     return f"{folder}/{ZENOH_SIGNED[file]}"
-
-
-def _joined_domains(grant: Grant, domains: Iterable[int]) -> tuple[int, ...]:
-    """Return those of the ROS domains that signed permissions let an enclave join."""
-    allowed = grant.domains()
-    return tuple(domain for domain in domains if domain in allowed)
-
-
-def _recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRight, ...]:
-    """Return the ROS rights that signed permissions give an enclave in a ROS domain.
-
-    A topic ``*`` without a ROS name, as ros2/sros2 grants it, stands for all topics and services if
-    it may be published and subscribed.  Another topic without a ROS name is translated exactly if
-    its wildcard begins right after the prefix of ROS topics.  A topic that matches no ROS topic is
-    left out, because it is not on Zenoh.
-
-    Raises:
-        PolicyError: it is uncertain which ROS names a right or a denial is about, or the default is
-            ALLOW.
-    """
-    source = Source(f"the permissions of {enclave}", 0)
-    if grant.default_allow:
-        raise PolicyError(
-            f"{source}: <default>ALLOW</default> cannot be expressed in Zenoh",
-            "It allows what no rule names, on some vendors of DDS and not on others.",
-            "State the rights of the enclave in a policy, with `sros create_permission`.",
-        )
-    rules = tuple(rule for rule in grant.rules if domain in rule.domains.closed())
-    rights = grant_rights(enclave, grant._replace(rules=rules))
-    raw = {right for right in rights if not right.name.startswith("/")}
-    rights -= raw
-    if {right.right for right in raw if right.name == "*" and right.qualifier is ALLOW} == {
-        "publish",
-        "subscribe",
-    }:
-        rights |= {
-            Right(enclave, ALLOW, right, "/*") for right in (*RIGHTS["topics"], *RIGHTS["services"])
-        }
-        raw -= {right for right in raw if right.name == "*"}
-    for right in sorted(raw):
-        if right.name.startswith(f"{_TOPICS}*"):
-            rights |= {right._replace(name=right.name.removeprefix(_TOPICS))}
-        elif right.qualifier is not ALLOW or _meets_ros_names(right.name):
-            raise PolicyError(
-                f"{source}: {right.describe()} cannot be expressed in Zenoh",
-                "It is a DDS name, and it is uncertain which ROS names it means.",
-                "State the rights of the enclave in a policy, with `sros create_permission`.",
-            )
-    parted = (part for right in rights for part in parts(right))
-    return tuple([StatedRight(right, source) for right in sorted(set(parted))])
-
-
-_TOPICS = "rt"
-"""The prefix of ROS topics on DDS."""
-
-
-def _meets_ros_names(topic: str) -> bool:
-    """Return whether a wildcard of DDS also matches topics of ROS names."""
-    return is_expression(topic) and any(
-        overlap(topic, f"{prefix}/*") for prefix in ("rt", "rq", "rr")
-    )

@@ -15,7 +15,7 @@ from sros_tool.errors import PolicyError
 from sros_tool.files import templates_dir
 from sros_tool.keystore.lifecycle.update import set_zenoh
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.zenoh_files import _recorded_rights
+from sros_tool.keystore.zenoh_permissions import rights_in_domain
 from sros_tool.pki import smime
 from sros_tool.zenoh.configuration import ZenohNetwork
 from tests.support.harness import policy_text, publish, snapshot, sros
@@ -258,9 +258,9 @@ def test_a_wildcard_of_dds_is_said_exactly_or_refused(
     grant = Grant("/n", "CN=/n", "", "", rules)
     if names is None:
         with pytest.raises(PolicyError, match="cannot be expressed in Zenoh"):
-            _recorded_rights("/n", grant, 0)
+            rights_in_domain("/n", grant, 0)
     else:
-        stated = _recorded_rights("/n", grant, 0)
+        stated = rights_in_domain("/n", grant, 0)
         assert [(each.right.right, each.right.name) for each in stated] == [
             ("publish", name) for name in names
         ]
@@ -270,9 +270,9 @@ def test_what_permissions_allow_by_default_is_refused() -> None:
     domain = DomainSet.of((0, 0))
     rules = (Rule(allow=True, domains=domain, publish=(Criteria(("rt/a",)),)),)
     grant = Grant("/n", "CN=/n", "", "", rules)
-    assert [each.right.name for each in _recorded_rights("/n", grant, 0)] == ["/a"]
+    assert [each.right.name for each in rights_in_domain("/n", grant, 0)] == ["/a"]
     with pytest.raises(PolicyError, match="the permissions of /n: <default>ALLOW</default> cannot"):
-        _recorded_rights("/n", grant._replace(default_allow=True), 0)
+        rights_in_domain("/n", grant._replace(default_allow=True), 0)
 
 
 @pytest.mark.parametrize(

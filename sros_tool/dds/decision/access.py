@@ -1,6 +1,6 @@
 """The access control of one vendor: who may join, publish and subscribe under two documents.
 
-A decision chooses the grant of the subject (`_choose_grant`), takes its rules for the domain
+A decision chooses the grant of the subject (`choose_grant`), takes its rules for the domain
 (`_rules_for`), applies them to a topic (`_GrantRules`), and combines the result with the access
 control that the governance requires (`GovernedDomain`, `_decide_join`, `Access`).
 """
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sros_tool.automata import NameSet
 
 
-def _choose_grant(
+def choose_grant(
     traits: VendorTraits, permissions: Permissions, subject: str, *, at: datetime, zone: tzinfo
 ) -> int | Refusal:
     """Return the index of the grant that decides, or a refusal if there is none."""
@@ -520,6 +520,53 @@ def _usable_topics(rule: TopicNames) -> NameSet:
 _ENDPOINTS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 
 
+class GrantedAccess:
+    """What the rules of a grant alone decide in a domain: without governance, validity and joining.
+
+    The participant itself and its peers each apply them; both have to allow it.
+    """
+
+    def __init__(self, traits: VendorTraits, grant: Grant, domain: int) -> None:
+        """Take the rules of ``grant`` that the vendor applies in ``domain``."""
+        self._traits = traits
+        self._domain = domain
+        self.rules, self.otherwise = _rules_for(traits, grant, domain)
+        """The rules for the domain, and the verdict if none of them matches."""
+        self._own_rules = self.rules if traits.filters_own_domain else list(enumerate(grant.rules))
+
+    def topics(self, verb: AccessVerb) -> NameSet:
+        """Return the topics that the rules allow for ``verb`` in the default partition."""
+        allowed = self.own[verb].names()
+        return allowed if self.peers is self.own else allowed & self.peers[verb].names()
+
+    def reason(self, verb: AccessVerb, topic: str) -> str:
+        """Return which rule allows or denies ``verb`` on a topic in the default partition."""
+        verdict, by_peers = self.own[verb].ask(topic, ()), False
+        if verdict.allowed and self.peers is not self.own:
+            verdict, by_peers = self.peers[verb].ask(topic, ()), True
+        return _verdict_text(verdict, f"{verb} {topic}", self._domain, by_peers=by_peers)
+
+    @cached_property
+    def own(self) -> dict[AccessVerb, _GrantRules]:
+        """The rules as the participant itself applies them."""
+        return {verb: self.deciding(self._own_rules, verb) for verb in _ENDPOINTS}
+
+    @cached_property
+    def peers(self) -> dict[AccessVerb, _GrantRules]:
+        """The rules as peers apply them; the same object as `own` if they are equal."""
+        relays = ("relay",) if self._traits.relays_count_for_readers else ()
+        if self._own_rules is self.rules and not relays:
+            return self.own
+        return {
+            AccessVerb.PUBLISH: self.deciding(self.rules, AccessVerb.PUBLISH),
+            AccessVerb.SUBSCRIBE: self.deciding(self.rules, AccessVerb.SUBSCRIBE, *relays),
+        }
+
+    def deciding(self, rules: Sequence[NumberedRule], *verbs: str) -> _GrantRules:
+        """Return rules in order, for one verb or several at once."""
+        return _GrantRules(self._traits, rules, self.otherwise, *verbs)
+
+
 class Access:
     """The access control of one vendor for one subject; prepared once, queried often.
 
@@ -542,7 +589,7 @@ class Access:
         self._traits = governed.vendor.traits
         self._governed = governed
         self._grant: int | None = None
-        chosen = _choose_grant(self._traits, permissions, subject, at=at, zone=zone)
+        chosen = choose_grant(self._traits, permissions, subject, at=at, zone=zone)
         if isinstance(chosen, Refusal):
             self._join = chosen.decision()
             return
@@ -627,9 +674,7 @@ class Access:
     def _allowed_in(self, verb: AccessVerb, kind: _Kind) -> NameSet:
         if kind is _Kind.EVERYTHING:
             return _every_topic()
-        allowed = self._own[verb].names()
-        if self._peers is not self._own:
-            allowed &= self._peers[verb].names()
+        allowed = self._granted.topics(verb)
         # Where nothing is denied, the rule that allows an endpoint also allows its topic.
         if kind is not _Kind.BOTH_WAYS or self._either.only_allows():
             return allowed
@@ -637,34 +682,27 @@ class Access:
 
     def _prepare(self, grant: Grant) -> None:
         traits = self._traits
-        rules, otherwise = _rules_for(traits, grant, self._governed.domain)
+        self._granted = GrantedAccess(traits, grant, self._governed.domain)
+        rules, otherwise = self._granted.rules, self._granted.otherwise
         joining = _decide_join(traits, self._governed, grant, rules, otherwise)
         self._join = self._answer(joining.outcome, joining.reason, joining.text)._replace(
             hits_peers=joining.hits_peers,
         )
-        self._rules, self._otherwise = rules, otherwise
-        self._own_rules = rules if traits.filters_own_domain else list(enumerate(grant.rules))
 
     @cached_property
     def _own(self) -> dict[AccessVerb, _GrantRules]:
         """The grant's rules as the participant itself applies them."""
-        return {verb: self._deciding(self._own_rules, verb) for verb in _ENDPOINTS}
+        return self._granted.own
 
     @cached_property
     def _peers(self) -> dict[AccessVerb, _GrantRules]:
         """The grant's rules as peers apply them; the same object as `_own` if they are equal."""
-        relays = ("relay",) if self._traits.relays_count_for_readers else ()
-        if self._own_rules is self._rules and not relays:
-            return self._own
-        return {
-            AccessVerb.PUBLISH: self._deciding(self._rules, AccessVerb.PUBLISH),
-            AccessVerb.SUBSCRIBE: self._deciding(self._rules, AccessVerb.SUBSCRIBE, *relays),
-        }
+        return self._granted.peers
 
     @cached_property
     def _either(self) -> _GrantRules:
         """The grant's rules for creating a topic if one list of both directions decides."""
-        return self._deciding(self._rules, *_ENDPOINTS)
+        return self._granted.deciding(self._granted.rules, *_ENDPOINTS)
 
     def _creation(self, verb: AccessVerb, topic: str) -> RuleVerdict:
         """Return the verdict on creating a topic, which opening it for ``verb`` needs first."""
@@ -683,9 +721,6 @@ class Access:
         publish, subscribe = (self._own[direction] for direction in _ENDPOINTS)
         either = publish.topic_names() | subscribe.topic_names()
         return either & publish.safe_names() & subscribe.safe_names()
-
-    def _deciding(self, rules: Sequence[NumberedRule], *verbs: str) -> _GrantRules:
-        return _GrantRules(self._traits, rules, self._otherwise, *verbs)
 
     # ── deciding ───────────────────────────────────────────────────────────────────────────
 

@@ -1,0 +1,306 @@
+"""The ROS rights in signed permissions, whoever wrote them: as all vendors of DDS decide, or none.
+
+Zenoh has no partitions, and its rules have no order.  A node of ROS opens its topics in the default
+partition.  What an earlier rule decides is taken out of the later ones, and the result is compared
+with the decisions of each vendor: where two of them differ, or where the order cannot be said in
+another way, the permissions are refused.
+
+One difference between vendors is left out: on Cyclone DDS 0.10, a denial of one direction also
+keeps an enclave from the other direction of the topic (``portable.deny-blocks-topic``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from functools import cache
+from string import ascii_letters, digits
+from typing import NamedTuple
+
+from sros_tool.automata import Automaton, Letters, NameSet
+from sros_tool.dds.decision.access import GrantedAccess, choose_grant
+from sros_tool.dds.decision.answers import AccessVerb, Refusal
+from sros_tool.dds.decision.documents import canonical_permissions, read_permissions_as
+from sros_tool.dds.decision.expressions import names_of
+from sros_tool.dds.decision.vendors import MEASURED, DocumentReader, Style, Vendor, together
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, parse_permissions
+from sros_tool.errors import DocumentError, PolicyError
+from sros_tool.names import expression_problem, is_expression
+from sros_tool.policy.model import ALLOW, RIGHTS, Source
+from sros_tool.policy.patterns import covers, matches, overlap
+from sros_tool.policy.rights import Right, parts
+from sros_tool.translate import grant_rights
+from sros_tool.translate_zenoh.rights import StatedRight
+
+_VENDORS = (*MEASURED, Vendor.CONNEXT)
+"""The vendors of ROS 2, whose decisions have to be the same; Connext stands for the standard."""
+_VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
+_REMEDY = "State the rights of the enclave in a policy, with `sros create_permission`."
+_TOPICS = "rt"
+"""The prefix of ROS topics on DDS."""
+_PREFIXES = (_TOPICS, "rq", "rr")
+
+
+def grant_for_all(document: bytes, name: str, subject: str) -> Grant | None:
+    """Return the grant that every vendor takes from signed permissions; None if it is not there.
+
+    ``name`` is that of the document in errors, ``subject`` the subject of the certificate.
+
+    Raises:
+        DocumentError: a vendor refuses the document, or takes other rules from it.
+    """
+    permissions = parse_permissions(document, name)
+    grant = permissions.grant_of(subject)
+    single = len(permissions.grants) == 1
+    if grant is None or (single and canonical_permissions(permissions, document)):
+        return grant
+    validity = grant.validity
+    at = (validity.not_before + (validity.not_after - validity.not_before) / 2).astimezone(UTC)
+    read: dict[DocumentReader, Permissions | Refusal] = {}
+    for vendor in _VENDORS:
+        reader = vendor.traits.reader
+        if reader not in read:
+            read[reader] = read_permissions_as(vendor, document)
+        chosen = _grant_for(vendor, read[reader], subject, at)
+        if isinstance(chosen, Refusal):
+            raise DocumentError(f"{name} give no rights with every vendor of DDS: {chosen.text}")
+        if (chosen.rules, chosen.default_allow) != (grant.rules, grant.default_allow):
+            raise DocumentError(
+                f"{name} are not the same for every vendor of DDS: {vendor.title} takes other rules"
+            )
+    return grant
+
+
+def _grant_for(
+    vendor: Vendor, permissions: Permissions | Refusal, subject: str, at: datetime
+) -> Grant | Refusal:
+    """Return the grant that a vendor takes at a moment, or why it takes none."""
+    if isinstance(permissions, Refusal):
+        return permissions
+    index = choose_grant(vendor.traits, permissions, subject, at=at, zone=UTC)
+    return index if isinstance(index, Refusal) else permissions.grants[index]
+
+
+def joined_domains(grant: Grant, domains: Iterable[int]) -> tuple[int, ...]:
+    """Return those of the ROS domains that signed permissions let an enclave join."""
+    allowed = grant.domains()
+    return tuple(domain for domain in domains if domain in allowed)
+
+
+def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRight, ...]:
+    """Return the ROS rights that signed permissions give an enclave in a ROS domain.
+
+    A topic ``*`` without a ROS name, as ros2/sros2 grants it, stands for all topics and services if
+    it may be published and subscribed.  Another topic without a ROS name is translated exactly if
+    its wildcard begins right after the prefix of ROS topics.  A topic that matches no ROS topic is
+    left out, because it is not on Zenoh.
+
+    Raises:
+        PolicyError: it is uncertain which ROS names a right or a denial is about, what no rule
+            names is allowed, vendors of DDS do not decide alike, or the order of the rules counts
+            in a way that Zenoh does not have.
+    """
+    source = Source(f"the permissions of {enclave}", 0)
+    if grant.default_allow:
+        raise PolicyError(
+            f"{source}: <default>ALLOW</default> cannot be expressed in Zenoh",
+            "It allows what no rule names, on some vendors of DDS and not on others.",
+            _REMEDY,
+        )
+    rules = [rule for rule in grant.rules if domain in rule.domains.closed()]
+    if not _is_plain(grant):
+        rules = _without_order(rules)
+        _check_vendors(source, grant, domain, rules)
+    rights = set(grant_rights(enclave, grant._replace(rules=_joined(rules))))
+    raw = {right for right in rights if not right.name.startswith("/")}
+    rights -= raw
+    everything = {right for right in raw if right.name == "*" and right.qualifier is ALLOW}
+    if {right.right for right in everything} == {"publish", "subscribe"}:
+        rights |= {
+            Right(enclave, ALLOW, right, "/*") for right in (*RIGHTS["topics"], *RIGHTS["services"])
+        }
+        raw -= everything
+    for right in sorted(raw):
+        if right.name.startswith(f"{_TOPICS}*"):
+            rights |= {right._replace(name=right.name.removeprefix(_TOPICS))}
+        elif right.qualifier is not ALLOW or _meets_ros_names(right.name):
+            raise PolicyError(
+                f"{source}: {right.describe()} cannot be expressed in Zenoh",
+                "It is a DDS name, and it is uncertain which ROS names it means.",
+                _REMEDY,
+            )
+    parted = (part for right in rights for part in parts(right))
+    return tuple([StatedRight(right, source) for right in sorted(set(parted))])
+
+
+def _meets_ros_names(topic: str) -> bool:
+    """Return whether a wildcard of DDS also matches topics of ROS names."""
+    return is_expression(topic) and any(overlap(topic, f"{prefix}/*") for prefix in _PREFIXES)
+
+
+# ── rules without an order ─────────────────────────────────────────────────────────────────
+
+
+def _is_plain(grant: Grant) -> bool:
+    """Return whether all vendors decide alike, and denials come first: as sros writes it."""
+    kinds = [rule.allow for rule in grant.rules]
+    return (
+        not (grant.default_first or grant.default_empty)
+        and len({rule.domains for rule in grant.rules}) == 1
+        and _are_plain_domains(grant.rules[0].domains)
+        and kinds == sorted(kinds)
+        and not any(rule.relay for rule in grant.rules)
+        and all(
+            not criteria.partitions and all(map(_is_plain_topic, criteria.topics))
+            for rule in grant.rules
+            for criteria in (*rule.publish, *rule.subscribe)
+        )
+    )
+
+
+def _are_plain_domains(domains: DomainSet) -> bool:
+    ends = ((part.first, part.last) for part in domains.ranges)
+    return all(first is not None and last is not None and first <= last for first, last in ends)
+
+
+def _is_plain_topic(topic: str) -> bool:
+    if not topic or topic != topic.strip():
+        return False
+    return "[" not in topic or not expression_problem(f"/{topic}")
+
+
+class _Ordered(NamedTuple):
+    """Topics that rules allow and deny, with the position of each in the rules."""
+
+    allowed: list[tuple[int, str]]
+    denied: list[tuple[int, str]]
+
+
+def _without_order(rules: Sequence[Rule]) -> list[Rule]:
+    """Return rules of the default partition whose denials come first and mean the same, if any do.
+
+    A right that an earlier rule denies as a whole is left out, and so is a denial behind all rights
+    that it is about.
+    """
+    allowed: dict[AccessVerb, tuple[str, ...]] = {}
+    denied: dict[AccessVerb, tuple[str, ...]] = {}
+    for verb in _VERBS:
+        ordered = _Ordered([], [])
+        for position, rule in enumerate(rules):
+            topics = [(position, topic) for topic in _in_default_partition(getattr(rule, verb))]
+            (ordered.allowed if rule.allow else ordered.denied).extend(topics)
+        kept = [
+            (position, topic)
+            for position, topic in ordered.allowed
+            if not any(at < position and covers(wide, topic) for at, wide in ordered.denied)
+        ]
+        allowed[verb] = tuple(topic for _, topic in kept)
+        denied[verb] = tuple(
+            topic
+            for position, topic in ordered.denied
+            if any(at > position and overlap(topic, of) for at, of in kept)
+        )
+    return [
+        Rule(
+            allow,
+            DomainSet(()),
+            _criteria(topics[AccessVerb.PUBLISH]),
+            _criteria(topics[AccessVerb.SUBSCRIBE]),
+        )
+        for allow, topics in ((False, denied), (True, allowed))
+    ]
+
+
+def _in_default_partition(all_criteria: Iterable[Criteria]) -> Iterator[str]:
+    for criteria in all_criteria:
+        if not criteria.partitions or any(matches(text, "") for text in criteria.partitions):
+            yield from criteria.topics
+
+
+def _criteria(topics: tuple[str, ...]) -> tuple[Criteria, ...]:
+    return (Criteria(topics),) if topics else ()
+
+
+def _joined(rules: Iterable[Rule]) -> tuple[Rule, ...]:
+    """Return one rule with all denials and one with all rights, of rules that have no order."""
+    joined = []
+    for allow in (False, True):
+        of = [rule for rule in rules if rule.allow is allow]
+        publish, subscribe = (
+            _criteria(tuple(topic for rule in of for topic in _topics(getattr(rule, verb))))
+            for verb in _VERBS
+        )
+        if publish or subscribe:
+            joined.append(Rule(allow, of[0].domains, publish, subscribe))
+    return tuple(joined)
+
+
+def _topics(all_criteria: Iterable[Criteria]) -> Iterator[str]:
+    for criteria in all_criteria:
+        yield from criteria.topics
+
+
+def _check_vendors(source: Source, grant: Grant, domain: int, rules: Sequence[Rule]) -> None:
+    """Raise `PolicyError` unless every vendor decides as ``rules``, of which denials win."""
+    decisions = {vendor: GrantedAccess(vendor.traits, grant, domain) for vendor in _VENDORS}
+    for verb in _VERBS:
+        denied, allowed = (
+            names_of(Style.FNMATCH, _topics(getattr(rule, verb)))
+            for rule in sorted(rules, key=lambda rule: rule.allow)
+        )
+        meant = allowed - denied
+        for decision in decisions.values():
+            granted = decision.topics(verb)
+            more, less = granted - meant, meant - granted
+            topic = ((more | less) & _ros_topics()).example()
+            if topic is not None:
+                raise _refused(source, grant, verb, topic, decisions)
+
+
+def _refused(
+    source: Source,
+    grant: Grant,
+    verb: AccessVerb,
+    topic: str,
+    decisions: Mapping[Vendor, GrantedAccess],
+) -> PolicyError:
+    """Return the error about a topic on which vendors, or vendors and Zenoh, decide differently."""
+    what = f"{source}: {verb} {topic} cannot be expressed in Zenoh"
+    reasons: dict[str, list[str]] = {}
+    for vendor, decision in decisions.items():
+        reasons.setdefault(decision.reason(verb, topic), []).append(vendor.title)
+    if len({topic in decision.topics(verb) for decision in decisions.values()}) > 1:
+        differing = "; ".join(
+            f"{reason} ({', '.join(together(of))})" for reason, of in reasons.items()
+        )
+        return PolicyError(
+            f"{what}, because vendors of DDS do not decide alike",
+            f"{differing[:1].upper()}{differing[1:]}.",
+            _REMEDY,
+        )
+    denying = next(
+        number
+        for number, rule in enumerate(grant.rules, 1)
+        if not rule.allow and any(matches(each, topic) for each in _topics(getattr(rule, verb)))
+    )
+    return PolicyError(
+        f"{what}, because the order of its rules counts",
+        f"On DDS {next(iter(reasons))}, and rule {denying} comes too late to deny it. On Zenoh, as "
+        "in a policy, a denial wins wherever it stands.",
+        f"List the names to {verb} in a policy, without that denial, and sign it with `sros "
+        "create_permission`.",
+    )
+
+
+@cache
+def _ros_topics() -> NameSet:
+    """Return the DDS topics that ROS names can have."""
+    letters = [Letters.of("r"), Letters.of("tqr"), Letters.of("/"), Letters.of(_ROS_LETTERS)]
+    edges = [(at, letter, at + 1) for at, letter in enumerate(letters)]
+    end = len(letters)
+    edges.append((end, letters[-1] | Letters.of("/"), end))
+    return NameSet((), [Automaton(tuple(edges), frozenset((end,)))])
+
+
+_ROS_LETTERS = f"{ascii_letters}{digits}_"
