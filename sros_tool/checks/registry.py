@@ -27,7 +27,7 @@ _MODULES = (
     *("policies", "requirements", "keystores.files", "keystores.authorities"),
     *("keystores.enclaves", "keystores.vendors", "keystores.documents", "keystores.topic_names"),
     *("keystores.issued", "keystores.zenoh_files", "zenoh", "upgrade", "environment", "runtime"),
-    "processes",
+    *("processes", "vulnerabilities"),
 )
 """The modules of checks, in the order in which their kinds are listed."""
 

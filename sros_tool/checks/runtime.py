@@ -12,7 +12,9 @@ from sros_tool.checks.environment import variable_findings, zenoh_environment_fi
 from sros_tool.checks.keystores.keystore import joined
 from sros_tool.checks.kind import ERROR, Finding, FindingKind
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
-from sros_tool.runtime.processes import RunningProcesses
+from sros_tool.checks.vulnerabilities import vulnerability_findings
+from sros_tool.dds.advisories import Advisory
+from sros_tool.runtime.processes import MappedLibrary, RunningProcesses
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
 from sros_tool.runtime.variables import ENABLE, KEYSTORE
 from sros_tool.validity import iso
@@ -24,7 +26,9 @@ class RuntimeState:
 
     ``now`` is the moment to check for; ``clock`` is the host's clock, or None if it is ``now``.
     ``rmws`` are the installed RMWs; ``insecure_rmws`` maps an RMW that was tested and does not
-    enforce security to the result of the test.  ``zone`` is the host's time zone.
+    enforce security to the result of the test.  ``zone`` is the host's time zone.  ``libraries``
+    are installed libraries of DDS, in addition to those of the processes, and ``advisories`` the
+    known vulnerabilities; None for those that ship with sros.
     """
 
     environment: Mapping[str, str]
@@ -34,6 +38,8 @@ class RuntimeState:
     rmws: tuple[str, ...] = ()
     insecure_rmws: Mapping[str, str] = field(default_factory=dict)
     clock: datetime | None = None
+    libraries: tuple[MappedLibrary, ...] = ()
+    advisories: tuple[Advisory, ...] | None = None
 
 
 RMW_NOT_INSTALLED = FindingKind(
@@ -75,6 +81,7 @@ def runtime_findings(state: RuntimeState) -> list[Finding]:
             *zenoh_environment_findings(environment),
             *_clock(state),
             *process_findings(environment, state.running, now=state.now, zone=state.zone),
+            *vulnerability_findings(state.running, state.libraries, state.advisories),
         ]
     )
 

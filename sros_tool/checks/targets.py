@@ -8,6 +8,7 @@ from pathlib import Path
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
+from sros_tool.dds.advisories import Advisory
 from sros_tool.errors import DocumentError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import (
@@ -33,7 +34,8 @@ class Circumstances:
     ``distribution`` is the ROS 2 distribution of the nodes of policies; "" is the latest.
     ``vendors`` are the DDS vendors of the nodes, or ``zenoh``; () if they may use any.
     ``fleet`` has the robots that placeholders in policies stand for.  ``opened`` has the
-    keystores that are already open, by path.
+    keystores that are already open, by path.  ``advisories`` are known vulnerabilities of DDS; None
+    for those that ship with sros.
     """
 
     now: datetime
@@ -43,6 +45,7 @@ class Circumstances:
     distribution: str = ""
     vendors: tuple[str, ...] = ()
     fleet: Fleet | None = None
+    advisories: tuple[Advisory, ...] | None = None
     opened: dict[Path, Keystore] = field(default_factory=dict, repr=False, compare=False)
 
     def keystore(self, root: Path) -> Keystore:

@@ -58,12 +58,13 @@ if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.checks.registry import ChosenFindings, FindingFilter
     from sros_tool.checks.targets import Circumstances
+    from sros_tool.dds.advisories import Advisory
     from sros_tool.demo.doctor import Diagnosis, SecurityProvider
     from sros_tool.distributions import Distribution
     from sros_tool.fleet.robots import Fleet
     from sros_tool.prometheus import Metric
     from sros_tool.proof.system import System
-    from sros_tool.runtime.processes import RunningProcesses
+    from sros_tool.runtime.processes import MappedLibrary, RunningProcesses
 
 _ZENOH = "zenoh"
 _FAMILIES = ("policy", "keystore", "runtime")
@@ -78,6 +79,13 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
 
 
 _VENDORS = (*(vendor.value for vendor in MEASURED), _ZENOH)
+
+_advisories_option = click.option(
+    "--advisories",
+    metavar="FILE",
+    type=PATH,
+    help="Also take known vulnerabilities of DDS from FILE, in the OSV format (JSON).",
+)
 
 
 @verb("check")
@@ -197,6 +205,7 @@ _VENDORS = (*(vendor.value for vendor in MEASURED), _ZENOH)
     help="List only the enclaves that expire within DURATION (30d), or have used PERCENT of their "
     "validity (66%).",
 )
+@_advisories_option
 def check(
     targets: tuple[Path, ...],
     as_list: bool,
@@ -222,6 +231,7 @@ def check(
     as_json: bool,
     as_sarif: bool,
     needs_renewal: str | None,
+    advisories: Path | None,
 ) -> int:
     r"""Find errors and weaknesses in policies, keystores and the runtime.
 
@@ -280,6 +290,9 @@ def check(
             "",
             f"`sros audit {policies[0]}` reports what a policy would deny to the running robot.",
         )
+    if advisories and (family not in ("", "runtime") or paths or needs_renewal is not None):
+        raise UsageError("--advisories is for `sros check runtime`", "", "Leave it out.")
+    known = _advisories(advisories)
     if watch:
         if family != "runtime" or form not in ("text", "json") or moment:
             raise UsageError(
@@ -288,10 +301,11 @@ def check(
                 "Write `sros check runtime --watch`.",
             )
 
-        _watch_processes(_environment(domain_of(domain)), selection, as_json=form == "json")
+        _watch_processes(_environment(domain_of(domain)), selection, known, as_json=form == "json")
         return 0
     at = _circumstances(domain, moment, policies, fleet_file)
-    at = replace(at, distribution=_nodes_of(distro, all_distros=all_distros), vendors=vendors)
+    nodes_of = _nodes_of(distro, all_distros=all_distros)
+    at = replace(at, distribution=nodes_of, vendors=vendors, advisories=known)
     if upgrade_to:
         _refuse_besides_upgrade()
         from sros_tool.distributions import ROS_DISTRO, sourced
@@ -541,7 +555,14 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
 
 
 def _runtime(at: Circumstances) -> list[Finding]:
-    return _findings_here(_environment(at.domain), at.now, {})
+    return _findings_here(_environment(at.domain), at.now, {}, advisories=at.advisories)
+
+
+def _advisories(file: Path | None) -> tuple[Advisory, ...] | None:
+    """Return the advisories of sros with those of --advisories; None without the option."""
+    from sros_tool.dds.advisories import read_advisories
+
+    return read_advisories(file) if file else None
 
 
 def _environment(domain: int | None) -> dict[str, str]:
@@ -550,11 +571,17 @@ def _environment(domain: int | None) -> dict[str, str]:
 
 
 def _findings_here(
-    environment: Mapping[str, str], moment: datetime, insecure_rmws: Mapping[str, str]
+    environment: Mapping[str, str],
+    moment: datetime,
+    insecure_rmws: Mapping[str, str],
+    libraries: tuple[MappedLibrary, ...] = (),
+    advisories: tuple[Advisory, ...] | None = None,
 ) -> list[Finding]:
     """Return the runtime findings on this machine, for the environment variables given.
 
     ``insecure_rmws`` maps RMWs that were found not to enforce security to the evidence.
+    ``libraries`` are installed libraries of DDS, and ``advisories`` are the
+    known vulnerabilities; None for those that ship with sros.
     """
     from sros_tool.checks.runtime import RuntimeState, runtime_findings
     from sros_tool.cli.common import local_zone
@@ -564,7 +591,9 @@ def _findings_here(
     zone = local_zone(environment)
     clock = now()
     rmws, running = rmw_implementations(environment), ProcessTable().look(clock)
-    state = RuntimeState(environment, moment, zone, running, rmws, insecure_rmws, clock)
+    state = RuntimeState(
+        environment, moment, zone, running, rmws, insecure_rmws, clock, libraries, advisories
+    )
     return runtime_findings(state)
 
 
@@ -747,13 +776,15 @@ _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
     "findings, without secrets and without names of hosts, users and paths.",
 )
 @force_option
+@_advisories_option
 @json_option
-def doctor(report: Path | None, force: bool, as_json: bool) -> None:
+def doctor(report: Path | None, force: bool, advisories: Path | None, as_json: bool) -> None:
     """Find out which DDS stacks and RMWs of this machine enforce security.
 
     Each one is tried in a separate process, in a temporary enclave: its name and version do not
-    show whether it was built with security. Also reports the findings of `sros check runtime`,
-    such as misspelt ROS_SECURITY_* values, missing files or a wrong clock.
+    show whether it was built with security. Also names their known vulnerabilities, and reports
+    the findings of `sros check runtime`, such as misspelt ROS_SECURITY_* values, missing files or a
+    wrong clock.
 
     Example:
       $ sros doctor
@@ -777,6 +808,7 @@ def doctor(report: Path | None, force: bool, as_json: bool) -> None:
         raise UsageError("--force is for --report", "", "Name a file, or leave --force out.")
     if report:
         check_output(report, force=force)
+    known = _advisories(advisories)
     moment = now()
     diagnosis = examine(moment)
     insecure = {
@@ -784,7 +816,7 @@ def doctor(report: Path | None, force: bool, as_json: bool) -> None:
         for stack in diagnosis.stacks
         if stack.rmw and stack.enforces is False
     }
-    findings = _findings_here(os.environ, moment, insecure)
+    findings = _findings_here(os.environ, moment, insecure, diagnosis.libraries, known)
     provider = security_provider(os.environ)
     if as_json:
         print_json(MachineReport(diagnosis, provider, findings))
@@ -839,11 +871,16 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def _watch_processes(
-    environment: Mapping[str, str], selection: FindingFilter, *, as_json: bool
+    environment: Mapping[str, str],
+    selection: FindingFilter,
+    advisories: tuple[Advisory, ...] | None,
+    *,
+    as_json: bool,
 ) -> None:
     """Report what changes among the findings about processes, until SIGINT or SIGTERM."""
     from sros_tool.checks.processes import process_findings
     from sros_tool.checks.runtime import FindingNews
+    from sros_tool.checks.vulnerabilities import vulnerability_findings
     from sros_tool.runtime.processes import ProcessTable
 
     table, news, zone = ProcessTable(), FindingNews(), local_zone(environment)
@@ -857,9 +894,10 @@ def _watch_processes(
             running = table.look(moment)
             if judged is None or judged[0] != running or moment - judged[1] >= _AGAIN:
                 judged = running, moment
-                findings = process_findings(
-                    environment, running, now=moment, zone=zone, one_by_one=True
-                )
+                findings = [
+                    *process_findings(environment, running, now=moment, zone=zone, one_by_one=True),
+                    *vulnerability_findings(running, (), advisories),
+                ]
                 for change in news.changes(selection.choose(findings).shown, moment):
                     if as_json:
                         line = json.dumps(versioned(change), ensure_ascii=False)

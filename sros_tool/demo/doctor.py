@@ -35,6 +35,7 @@ from sros_tool.demo.scenarios.communication import ISOLATION
 from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
+from sros_tool.runtime.processes import MappedLibrary
 from sros_tool.runtime.rmw import RMW
 from sros_tool.runtime.stacks import ROS_ADVICE, Stack, survey
 from sros_tool.values import shows
@@ -69,6 +70,15 @@ class Diagnosis(NamedTuple):
     def sound(self) -> bool:
         """Whether ROS nodes are secured by their RMW; without an RMW, whether any DDS is."""
         return self.enforces if self.ros is None else self.ros.enforces is True
+
+    @property
+    def libraries(self) -> tuple[MappedLibrary, ...]:
+        """The libraries of the DDS stacks that were tried, with their versions ("": unknown)."""
+        return tuple(
+            MappedLibrary(stack.dds, ".".join(stack.version.split(".")[:3]), stack.where)
+            for stack in self.stacks
+            if stack.present and stack.where.startswith("/") and "lib" in stack.where
+        )
 
     @property
     def conclusion(self) -> str:

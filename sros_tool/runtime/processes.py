@@ -45,6 +45,13 @@ _LIBRARIES = re.compile(
     rb"/(lib(?:rcl|rmw_[a-z_]+?|ddsc|dds_security_auth|fastrtps|fastdds|nddsc|nddscore|zenohc"
     rb"|zenohpico)|zenoh)(?:-[0-9a-f]{6,40})?(?:\.abi3|\.cpython-[\w-]+)?\.so"
 )
+_DDS_LIBRARIES = re.compile(
+    rb"(/[^\n]*/lib(fastrtps|fastdds|ddsc)(?:-[0-9a-f]{6,40})?\.so([.\d]*))( \(deleted\))?$",
+    re.MULTILINE,
+)
+_PRODUCTS = {b"fastrtps": "Fast DDS", b"fastdds": "Fast DDS", b"ddsc": "Cyclone DDS"}
+_THREE_NUMBERS = re.compile(r"\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
+_MOST_ENTRIES = 10_000
 _DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
 _ROUTERS = ("rmw_zenohd", "zenohd")
 _BRIDGES = ("zenoh-bridge-ros2dds", "zenoh-bridge-dds")
@@ -60,15 +67,28 @@ _KERNEL_THREAD = 0x00200000
 _LONGEST = 40
 
 
+class MappedLibrary(NamedTuple):
+    """A library of DDS that a process has mapped.
+
+    ``version`` has three numbers, or is "" if the name of the file does not show it.  ``path`` is
+    what the process sees; ``replaced`` says that another file is there now, or none.
+    """
+
+    product: str
+    version: str
+    path: str
+    replaced: bool = False
+
+
 @dataclass(frozen=True, slots=True)
 class Process:
     """A running process that uses ROS 2, DDS or Zenoh.
 
     ``started`` is the earliest moment at which it can have loaded its files.  ``libraries`` are the
-    names of the libraries of ROS 2, DDS and Zenoh that it has mapped, such as "libddsc".
-    ``network`` names its network namespace; "" is the namespace of this process.  ``enclave`` is
-    the enclave that it names, if it asks for security, and ``configuration`` the file that it names
-    for Zenoh.
+    names of the libraries of ROS 2, DDS and Zenoh that it has mapped, such as "libddsc", and
+    ``dds`` the libraries of DDS with their versions.  ``network`` names its network
+    namespace; "" is the namespace of this process.  ``enclave`` is the enclave that it names, if it
+    asks for security, and ``configuration`` the file that it names for Zenoh.
     """
 
     pid: int
@@ -80,6 +100,7 @@ class Process:
     network: str = ""
     enclave: ProcessEnclave | None = None
     configuration: LoadedFile | None = None
+    dds: tuple[MappedLibrary, ...] = ()
 
     @property
     def label(self) -> str:
@@ -325,7 +346,16 @@ def with_files(process: Process, root: ProcessRoot, folder: str) -> Process:
     enclave = _loaded_enclave(
         process.environment, process.command, root, user=process.user, folder=folder
     )
-    return replace(process, enclave=enclave, configuration=zenoh)
+    dds = tuple(_with_version(library, root) for library in process.dds)
+    return replace(process, enclave=enclave, configuration=zenoh, dds=dds)
+
+
+def _with_version(library: MappedLibrary, root: ProcessRoot) -> MappedLibrary:
+    """Return a library with the version in the name of its only copy: wheels have no links."""
+    if library.version or library.replaced:
+        return library
+    versions = {_version(name) for name in root.copies(library.path)} - {""}
+    return library._replace(version=versions.pop()) if len(versions) == 1 else library
 
 
 class _TooLongError(OSError):
@@ -356,7 +386,27 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
         libraries,
         _user(folder),
         "" if network == _namespace(Path("/proc/thread-self/ns/net")) else network,
+        dds=_mapped_dds(maps),
     )
+
+
+def _mapped_dds(maps: bytes) -> tuple[MappedLibrary, ...]:
+    """Return the libraries of DDS in /proc/PID/maps, with the versions in their names."""
+    return tuple(
+        MappedLibrary(_PRODUCTS[name], _version(os.fsdecode(numbers)), os.fsdecode(path), replaced)
+        for path, name, numbers, replaced in sorted(
+            {
+                (path, name, numbers, bool(mark))
+                for path, name, numbers, mark in _DDS_LIBRARIES.findall(maps)
+            }
+        )
+    )
+
+
+def _version(name: str) -> str:
+    """Return the three numbers at the end of a library's name, or ""."""
+    numbers = _THREE_NUMBERS.search(name)
+    return numbers[1] if numbers else ""
 
 
 _FIRST_PID_NAMESPACE = "pid:[4026531836]"
@@ -561,6 +611,35 @@ class ProcessRoot:
             return LoadedFile(name, problem=_reason(error))
         return LoadedFile(name, _moment(changed), data)
 
+    def copies(self, path: str) -> list[str]:
+        """Return names in the folder of a file that continue its name, of files of its size.
+
+        An empty list if the folder cannot be examined, or has too many entries.
+        """
+        above, _, name = path.rpartition("/")
+        try:
+            with self._opened(above) as (folder, _way):
+                handle = os.open(f"/proc/self/fd/{folder}", os.O_RDONLY | os.O_DIRECTORY)
+                try:
+                    size = os.stat(name, dir_fd=handle, follow_symlinks=False).st_size
+                    with os.scandir(handle) as entries:
+                        names = [
+                            entry.name
+                            for entry, _ in zip(entries, range(_MOST_ENTRIES + 1), strict=False)
+                        ]
+                    if len(names) > _MOST_ENTRIES:
+                        return []
+                    return [
+                        copy
+                        for copy in names
+                        if copy.startswith(f"{name}.")
+                        and _is_of_size(os.stat(copy, dir_fd=handle, follow_symlinks=False), size)
+                    ]
+                finally:
+                    os.close(handle)
+        except OSError:
+            return []
+
     def folders(self, path: str) -> dict[str, os.stat_result]:
         """Map the folders on the way to a folder, and the folder itself, to their states.
 
@@ -617,6 +696,10 @@ class ProcessRoot:
         finally:
             for _, handle in folders:
                 os.close(handle)
+
+
+def _is_of_size(state: os.stat_result, size: int) -> bool:
+    return stat.S_ISREG(state.st_mode) and state.st_size == size
 
 
 def _open_part(name: str, folder: int) -> int:

@@ -17,6 +17,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import pem
 from sros_tool.runtime.processes import (
     FileReader,
+    MappedLibrary,
     Process,
     ProcessRoot,
     RunningProcesses,
@@ -118,6 +119,12 @@ def changed(index: int, **fields: Any) -> Change:
         return with_processes(state, *processes)
 
     return change
+
+
+def on_fast_dds(folder: str, version: str) -> Change:
+    """A process that has mapped a release of Fast DDS; "" is one whose name does not show it."""
+    path = f"{folder}/libfastrtps.so.{version}".rstrip(".")
+    return changed(0, dds=(MappedLibrary("Fast DDS", version, path),))
 
 
 def _written_in_the_future(state: RuntimeState, bench: Bench) -> RuntimeState:
@@ -251,5 +258,8 @@ CASES: dict[str, Change] = {
     "runtime.zenoh-no-certificate": on_zenoh(**{OVERRIDE: None}),
     "runtime.zenoh-process-open": on_zenoh(**{OVERRIDE: "/access_control/enabled=false"}),
     "runtime.mixed-vendors": running(0, **{RMW: "rmw_cyclonedds_cpp"}),
+    "runtime.known-vulnerabilities": on_fast_dds("/opt/ros/jazzy/lib", "2.14.5"),
+    "runtime.package-vulnerabilities": on_fast_dds("/usr/lib/x86_64-linux-gnu", "2.14.5"),
+    "runtime.dds-version-unknown": on_fast_dds("/opt/ros/jazzy/lib", ""),
 }
 SOUND: Change = _without_ca_keys

@@ -1,0 +1,147 @@
+"""Checks for known vulnerabilities of the DDS libraries that processes have mapped."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, some_names
+from sros_tool.dds.advisories import (
+    Advisory,
+    known_vulnerabilities,
+    shipped_advisories,
+    version_numbers,
+)
+from sros_tool.prometheus import Metric, Sample
+from sros_tool.runtime.processes import MappedLibrary, RunningProcesses, plain
+from sros_tool.wording import counted
+
+KNOWN_VULNERABILITIES = FindingKind(
+    "runtime.known-vulnerabilities",
+    WARNING,
+    "a DDS with known vulnerabilities",
+    "Some end a process by one packet of anybody on the network, also of a secured robot; the "
+    "version that counts is that of the library which a process has loaded.",
+    "Advisories in the OSV format: those of sros, and of --advisories FILE.",
+    "Upgrade the package of the library to a release with the mends, and restart the processes. "
+    "Vulnerabilities that no release mends stay: keep others out of the network.",
+)
+PACKAGE_VULNERABILITIES = FindingKind(
+    "runtime.package-vulnerabilities",
+    NOTE,
+    "a DDS with known vulnerabilities, unless its package mends them",
+    "Packages of Debian and Ubuntu carry mends of later releases under the version of an earlier "
+    "one, so the version of the library does not tell.",
+    "Advisories in the OSV format; Debian's changelog of fastdds 2.9.1+ds-1+deb12u2, which names "
+    "eight numbers of 2023.",
+    "Compare the numbers with the changelog of the package (`apt changelog`) or the security "
+    "tracker of the distribution.",
+    prominent=True,
+)
+VERSION_UNKNOWN = FindingKind(
+    "runtime.dds-version-unknown",
+    NOTE,
+    "a DDS of unknown version",
+    "Which known vulnerabilities it has cannot be told.",
+    "The name of the library that a process has mapped.",
+    "Look for the version in the package that the library belongs to; if the library was replaced, "
+    "restart the processes.",
+    prominent=True,
+)
+_LINUX_PACKAGES = ("/usr/lib/", "/lib/")
+_ROS_PACKAGES = "/opt/ros/"
+_FASTRTPS = ("foxy", "galactic", "humble", "iron", "jazzy")
+"""Distributions whose package of Fast DDS is named fastrtps; later ones have fastdds."""
+
+
+def vulnerability_findings(
+    running: RunningProcesses,
+    libraries: Iterable[MappedLibrary] = (),
+    advisories: Sequence[Advisory] | None = None,
+) -> Iterator[Finding]:
+    """Yield one finding for each DDS library of the processes, and of ``libraries``."""
+    used = shipped_advisories() if advisories is None else advisories
+    for library, users in _users(running, libraries).items():
+        if not any(advisory.product == library.product for advisory in used):
+            continue
+        place = f"'{plain(library.path, _LONGEST_PATH)}'"
+        by = f", loaded by {some_names(users)}" if users else ""
+        known = known_vulnerabilities(library.product, library.version, used)
+        if known is None:
+            text = f"the name of {place} does not show its version{by}"
+            yield VERSION_UNKNOWN.found(library.product, text)
+        elif known.known:
+            kind = KNOWN_VULNERABILITIES
+            if library.path.startswith(_LINUX_PACKAGES):
+                kind = PACKAGE_VULNERABILITIES
+            text = f"{place}{by}, {_described(known.known, library.version)}"
+            if known.unclear:
+                numbers = ", ".join(advisory.id for advisory in known.unclear)
+                text += f". Not known for this release: {numbers}"
+            name = f"{library.product} {library.version}"
+            yield kind.found(name, text, remedy=_remedy(kind, library))
+
+
+_LONGEST_PATH = 200
+
+
+def vulnerability_metric(running: RunningProcesses) -> Metric:
+    """Return the number of known vulnerabilities by DDS library; none for unknown versions."""
+    numbers = {
+        (library.product, library.version): len(known.known)
+        for library in _users(running)
+        if (known := known_vulnerabilities(library.product, library.version))
+    }
+    return Metric(
+        "sros_dds_known_vulnerabilities",
+        "Number of known vulnerabilities of each DDS release that processes have loaded, without "
+        "regard to mends of a package. A release whose version is unknown has none.",
+        tuple(
+            Sample(number, {"product": product, "version": version})
+            for (product, version), number in sorted(numbers.items())
+        ),
+    )
+
+
+def _users(
+    running: RunningProcesses, libraries: Iterable[MappedLibrary] = ()
+) -> Mapping[MappedLibrary, list[str]]:
+    """Map libraries to the labels of the processes that have mapped them."""
+    users: dict[MappedLibrary, list[str]] = {library: [] for library in libraries}
+    for process in running.processes:
+        for library in process.dds:
+            users.setdefault(library._replace(replaced=False), []).append(process.label)
+    return users
+
+
+def _described(known: Sequence[Advisory], version: str) -> str:
+    """Return a clause with the number of vulnerabilities, what they need, and their ids."""
+    secured = sum("security" in advisory.needs for advisory in known)
+    needs = (
+        [f"{len(known) - secured} need only access to the network"] if secured < len(known) else []
+    )
+    needs += [f"{secured} concern only processes with DDS Security"] if secured else []
+    numbers = version_numbers(version)
+    major = numbers[0] if numbers else ""
+    releases = Counter(advisory.mended_in(numbers) if numbers else "" for advisory in known)
+    mends = [
+        f"{number} in {release}" if release else f"{number} in no known release {major}.x"
+        for release, number in sorted(releases.items(), reverse=True)
+    ]
+    ids = ", ".join(advisory.id for advisory in known)
+    count = counted(len(known), "known vulnerability", "known vulnerabilities")
+    return f"{count} ({'; '.join(needs)}), mended: {', '.join(mends)}: {ids}"
+
+
+def _remedy(kind: FindingKind, library: MappedLibrary) -> str:
+    """Return what to upgrade, with the package's name where the path shows it; "": as the kind."""
+    if kind is PACKAGE_VULNERABILITIES or not library.path.startswith(_ROS_PACKAGES):
+        return ""
+    distribution = plain(library.path.removeprefix(_ROS_PACKAGES).partition("/")[0])
+    package = "cyclonedds"
+    if library.product == "Fast DDS":
+        package = "fastrtps" if distribution in _FASTRTPS else "fastdds"
+    return (
+        f"Upgrade the package ros-{distribution}-{package}, and restart the processes. "
+        "Vulnerabilities that no release mends stay: keep others out of the network."
+    )

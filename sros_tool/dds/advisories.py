@@ -1,0 +1,266 @@
+"""Known vulnerabilities of DDS products by release, as advisories in the OSV format.
+
+The advisories that ship with sros are ``advisories.json`` next to this module: for Fast DDS, what
+the history of eProsima/Fast-DDS says of each release line (as of 2026-08-20).  An event ``fixed``
+names the first release with the mend; a line whose mend is in no release has none, so that its
+later releases count as affected until newer advisories say otherwise.  ``database_specific`` has
+what an attack needs (``security``: DDS Security is on, ``identity``: a certificate of the
+keystore's CA, ``document``: a document that the permissions CA signed; none: only the network),
+what it gives (``denial``, ``memory``, ``access``, or ``unclear``), and ``unclear_lines``: release
+lines of which the history says nothing, which is not the same as not affected.
+
+Source: https://ossf.github.io/osv-schema.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sros_tool.errors import DocumentError
+from sros_tool.values import parse_json
+from sros_tool.xml import read_bytes
+
+_SHIPPED = Path(__file__).with_name("advisories.json")
+_REPOSITORIES = {
+    "github.com/eprosima/fast-dds": "Fast DDS",
+    "github.com/eclipse-cyclonedds/cyclonedds": "Cyclone DDS",
+    "github.com/eclipse-zenoh/zenoh": "Zenoh",
+}
+_MOST_BYTES = 4 * 1024 * 1024
+_MOST_ADVISORIES = 10_000
+_ID = re.compile(r"[A-Za-z][A-Za-z0-9]*(?:-[A-Za-z0-9]+){1,6}", re.ASCII)
+_VERSION = re.compile(r"v?(\d{1,6})(?:\.(\d{1,6}))?(?:\.(\d{1,6}))?(?:\.0)?", re.ASCII)
+_LONGEST_ID, _LONGEST_SUMMARY = 60, 200
+
+Version = tuple[int, int, int]
+
+
+class _Range(NamedTuple):
+    """Releases from ``introduced`` up to ``end``: None is without end."""
+
+    introduced: Version
+    end: Version | None
+    inclusive: bool
+
+    def has(self, version: Version) -> bool:
+        """Return whether a release is within."""
+        if version < self.introduced:
+            return False
+        return self.end is None or version < self.end or (self.inclusive and version == self.end)
+
+
+class Advisory(NamedTuple):
+    """A known vulnerability of one product.
+
+    ``needs`` and ``gives`` are words of ``database_specific``.  ``unclear_lines`` are release lines
+    such as 2.14 of which it is not known whether they are affected.
+    """
+
+    id: str
+    product: str
+    summary: str
+    needs: tuple[str, ...]
+    gives: str
+    ranges: tuple[_Range, ...]
+    versions: frozenset[Version]
+    unclear_lines: tuple[str, ...]
+
+    def affects(self, version: Version) -> bool:
+        """Return whether a release has the vulnerability."""
+        return version in self.versions or any(part.has(version) for part in self.ranges)
+
+    def mended_in(self, version: Version) -> str:
+        """Return the first release of the same major version with the mend; "" if none has it."""
+        for part in self.ranges:
+            if part.has(version) and part.end and part.end[0] == version[0] and not part.inclusive:
+                return ".".join(map(str, part.end))
+        return ""
+
+
+class KnownVulnerabilities(NamedTuple):
+    """The advisories for one release of a product.
+
+    ``known`` affect it; of ``unclear`` it is not known whether they do.
+    """
+
+    known: tuple[Advisory, ...]
+    unclear: tuple[Advisory, ...]
+
+
+def known_vulnerabilities(
+    product: str, version: str, advisories: Iterable[Advisory] | None = None
+) -> KnownVulnerabilities | None:
+    """Return what is known of a release, such as "Fast DDS" and "2.14.5".
+
+    Without ``advisories``, those that ship with sros count.  None if the version cannot be read,
+    or if no advisory is about the product: then nothing can be said.
+    """
+    numbers = version_numbers(version)
+    own = [
+        advisory
+        for advisory in (shipped_advisories() if advisories is None else advisories)
+        if advisory.product == product
+    ]
+    if numbers is None or not own:
+        return None
+    known = tuple(advisory for advisory in own if advisory.affects(numbers))
+    unclear = tuple(
+        advisory
+        for advisory in own
+        if advisory not in known and _line(numbers) in advisory.unclear_lines
+    )
+    return KnownVulnerabilities(known, unclear)
+
+
+def version_numbers(version: str) -> Version | None:
+    """Return the three numbers of a release such as "2.14.5"; None if they are not all there."""
+    numbers = _VERSION.fullmatch(version)
+    if not numbers or numbers[3] is None:
+        return None
+    return int(numbers[1]), int(numbers[2]), int(numbers[3])
+
+
+@cache
+def shipped_advisories() -> tuple[Advisory, ...]:
+    """Return the advisories that ship with sros."""
+    return parse_advisories(_SHIPPED.read_bytes(), "the advisories of sros")
+
+
+def read_advisories(path: Path) -> tuple[Advisory, ...]:
+    """Return the advisories of sros with those of a file, which replace those with their ids.
+
+    Raises:
+        DocumentError: The file cannot be read, or is not of the OSV format.
+    """
+    newer = parse_advisories(read_bytes(path, "advisories", most=_MOST_BYTES), f"'{path}'")
+    replaced = {advisory.id for advisory in newer}
+    return (*(old for old in shipped_advisories() if old.id not in replaced), *newer)
+
+
+def parse_advisories(data: bytes, what: str) -> tuple[Advisory, ...]:
+    """Return the advisories of an OSV record or a list of them; ``what`` names it in errors.
+
+    Records that were withdrawn, and products that sros does not know, are left out.
+
+    Raises:
+        DocumentError: It is not of the OSV format, or states no releases of a known product.
+    """
+    try:
+        value = parse_json(data)
+        records = value if isinstance(value, list) else [value]
+        if len(records) > _MOST_ADVISORIES:
+            raise ValueError(f"it has more than {_MOST_ADVISORIES} advisories")
+        return tuple(advisory for record in records for advisory in _advisories_of(_object(record)))
+    except ValueError as error:
+        raise DocumentError(
+            f"{what} has no advisories in the OSV format",
+            str(error).partition("\n")[0][:_LONGEST_SUMMARY],
+            "Give a JSON file with an OSV record, or with a list of them.",
+        ) from error
+
+
+def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
+    identity = record.get("id")
+    if not isinstance(identity, str) or len(identity) > _LONGEST_ID or not _ID.fullmatch(identity):
+        raise ValueError("an advisory has no id such as CVE-2025-62599")
+    if "withdrawn" in record:
+        return
+    aliases = _list(record.get("aliases", []), "aliases")
+    cve = (name for name in aliases if isinstance(name, str) and re.fullmatch(_CVE, name))
+    own = _object(record.get("database_specific", {}))
+    by_product: dict[str, list[Mapping[str, Any]]] = {}
+    for part in map(_object, _list(record.get("affected", []), "affected")):
+        if product := _product(part):
+            by_product.setdefault(product, []).append(part)
+    name = identity if identity.startswith("CVE-") else next(cve, identity)
+    for product, parts in by_product.items():
+        ranges = tuple(each for part in parts for each in _ranges(part, identity))
+        versions = frozenset(version for part in parts for version in _versions(part))
+        if not ranges and not versions:
+            raise ValueError(f"{identity} does not say which releases of {product} it affects")
+        yield Advisory(
+            name,
+            product,
+            _text(record.get("summary", "")),
+            tuple(map(_text, _list(own.get("needs", []), "needs"))),
+            _text(own.get("gives", "unclear")),
+            ranges,
+            versions,
+            tuple(map(_text, _list(own.get("unclear_lines", []), "unclear_lines"))),
+        )
+
+
+_CVE = re.compile(r"CVE-\d{4}-\d{4,9}", re.ASCII)
+
+
+def _product(affected: Mapping[str, Any]) -> str:
+    """Return the product by the package's name or the repository of a range; "" if unknown."""
+    names = [_object(affected.get("package", {})).get("name", "")]
+    names += [_object(part).get("repo", "") for part in _list(affected.get("ranges", []), "ranges")]
+    for name in names:
+        plain = re.sub(r"^https?://|(?:\.git)?/?$", "", str(name)).lower()
+        if plain in _REPOSITORIES:
+            return _REPOSITORIES[plain]
+    return ""
+
+
+def _ranges(affected: Mapping[str, Any], identity: str) -> Iterator[_Range]:
+    for part in map(_object, _list(affected.get("ranges", []), "ranges")):
+        if part.get("type") not in ("SEMVER", "ECOSYSTEM"):
+            continue  # commits of git: the releases are in `versions`
+        introduced: Version | None = None
+        for event in map(_object, _list(part.get("events", []), "events")):
+            for kind, version in event.items():
+                if kind == "introduced":
+                    introduced = introduced or _numbers(version, identity)
+                elif kind in ("fixed", "last_affected"):
+                    end = _numbers(version, identity)
+                    if introduced is None or end < introduced:
+                        raise ValueError(f"the events of {identity} are not in order")
+                    yield _Range(introduced, end, kind == "last_affected")
+                    introduced = None
+        if introduced is not None:
+            yield _Range(introduced, None, inclusive=False)
+
+
+def _versions(affected: Mapping[str, Any]) -> Iterator[Version]:
+    for version in _list(affected.get("versions", []), "versions"):
+        if isinstance(version, str) and (numbers := version_numbers(version)):
+            yield numbers
+
+
+def _numbers(version: object, identity: str) -> Version:
+    numbers = _VERSION.fullmatch(version) if isinstance(version, str) else None
+    if not numbers:
+        raise ValueError(f"{identity} names a release that is not three numbers")
+    return int(numbers[1]), int(numbers[2] or 0), int(numbers[3] or 0)
+
+
+def _object(value: object) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError("a part is not an object")
+    return value
+
+
+def _list(value: object, name: str) -> list[Any]:
+    if not isinstance(value, list):
+        raise ValueError(f"{name} is not a list")
+    return value
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise ValueError("a text is not a string")
+    return value[:_LONGEST_SUMMARY]
+
+
+def _line(version: Version) -> str:
+    """Return the line of the advisories that a release of Fast DDS belongs to."""
+    for first, line in ((3, 3), "3.6"), ((3, 0), "3.2"), ((2, 7), "2.14"):
+        if version >= (*first, 0):
+            return line
+    return "2.6"
