@@ -39,7 +39,7 @@ REFUSED = FindingKind(
     "The DDS of the other distribution does not accept a file of the enclave, or its peers do not "
     "accept the enclave.",
     _ENGINE,
-    "Replace what is refused, before the update. `sros check ROOT --distro DISTRIBUTION` names it.",
+    "Replace what is refused, before the update. `sros check ROOT --all-distros` names it.",
 )
 ACCEPTED = FindingKind(
     "upgrade.accepted",
@@ -78,6 +78,17 @@ ZENOH = FindingKind(
     "ros2/rmw_zenoh, its changelogs.",
     "Install at least that version on every robot.",
 )
+VULNERABILITIES = FindingKind(
+    "upgrade.vulnerabilities",
+    NOTE,
+    "known vulnerabilities that the update mends or brings",
+    "The latest releases that both distributions ship are compared; `sros check runtime` looks at "
+    "the libraries that processes have loaded.",
+    "Advisories in the OSV format: those of sros, and of --advisories FILE.",
+    "Take new ones into account before the update. Those that no release mends stay: keep others "
+    "out of the network.",
+    prominent=True,
+)
 NOT_MEASURED = FindingKind(
     "distribution.not-measured",
     NOTE,
@@ -111,7 +122,7 @@ OF_ENCLAVES = (OPENS, CLOSES, REFUSED, ACCEPTED, NO_NODE, DIFFER, DISTRIBUTION_R
 """The kinds of findings about single enclaves."""
 
 ALL = (
-    *(OPENS, CLOSES, REFUSED, ACCEPTED, NO_NODE, BUFFERS, ZENOH),
+    *(OPENS, CLOSES, REFUSED, ACCEPTED, NO_NODE, BUFFERS, ZENOH, VULNERABILITIES),
     *(NOT_MEASURED, DIFFER, DISTRIBUTION_REFUSES),
 )
 """All kinds of this module, those of an update first."""

@@ -290,8 +290,10 @@ def check(
             "",
             f"`sros audit {policies[0]}` reports what a policy would deny to the running robot.",
         )
-    if advisories and (family not in ("", "runtime") or paths or needs_renewal is not None):
-        raise UsageError("--advisories is for `sros check runtime`", "", "Leave it out.")
+    if advisories and not upgrade_to and (family not in ("", "runtime") or paths):
+        raise UsageError(
+            "--advisories is for `sros check runtime` and --upgrade-to", "", "Leave it out."
+        )
     known = _advisories(advisories)
     if watch:
         if family != "runtime" or form not in ("text", "json") or moment:

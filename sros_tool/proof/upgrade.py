@@ -35,8 +35,10 @@ from sros_tool.checks.upgrade import (
     NOT_MEASURED,
     OPENS,
     REFUSED,
+    VULNERABILITIES,
     ZENOH,
 )
+from sros_tool.dds.advisories import Advisory, known_vulnerabilities
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import Outcome
 from sros_tool.dds.decision.grants import also_fitting
@@ -229,6 +231,7 @@ def check_upgrade(
     findings: list[Finding] = []
     for before, enclaves in _present(files, present, here, later).items():
         findings += _upgrade(files.only(enclaves), before, later, vendor)
+        findings += _vulnerabilities(before, later, vendor, at.advisories)
         if not files.keystore:
             findings += _of_nodes_in_policy(path, at, before, later)
     return joined(list(dict.fromkeys(findings)))
@@ -259,14 +262,10 @@ def _present(
 def _upgrade(
     files: DecidedFiles, before: Distribution, after: Distribution, vendor: str
 ) -> Iterator[Finding]:
-    product = Vendor(vendor).traits.product if vendor not in ("", _ZENOH) else ""
     for distribution in (before, after):
         if distribution.assumption:
             yield NOT_MEASURED.found(f"ROS 2 {distribution.title}", distribution.assumption)
-    for old in before.shipped if vendor != _ZENOH else ():
-        new = after.of_product(old.product)
-        if new is None or product not in ("", old.product):
-            continue
+    for old, new in _products(before, after, vendor):
         stages = Stage(before, old), Stage(after, new)
         yield from _not_measured(*stages)
         for change in changes(files, *stages):
@@ -275,6 +274,33 @@ def _upgrade(
     yield from _nodes(files, before, after)
     if vendor in ("", _ZENOH):
         yield from _on_zenoh(files, before, after)
+
+
+def _products(
+    before: Distribution, after: Distribution, vendor: str
+) -> Iterator[tuple[Shipped, Shipped]]:
+    """Yield what both distributions ship of each DDS product, or of that of ``vendor``."""
+    product = Vendor(vendor).traits.product if vendor not in ("", _ZENOH) else ""
+    for old in before.shipped if vendor != _ZENOH else ():
+        if (new := after.of_product(old.product)) and product in ("", old.product):
+            yield old, new
+
+
+def _vulnerabilities(
+    before: Distribution, after: Distribution, vendor: str, advisories: Sequence[Advisory] | None
+) -> Iterator[Finding]:
+    """Yield the known vulnerabilities in which the latest releases of two distributions differ."""
+    for releases in _products(before, after, vendor):
+        known = [known_vulnerabilities(each.product, each.latest, advisories) for each in releases]
+        if None in known or releases[0].latest == releases[1].latest:
+            continue
+        old, new = ({advisory.id for advisory in each.known} for each in known if each)
+        parts = [f"{len(old & new)} stay"] if old & new else []
+        for ids, what in ((old - new, "mended"), (new - old, "new")):
+            parts += [f"{what}: {', '.join(sorted(ids))}"] if ids else []
+        if old != new:
+            title = f"{releases[0].product} {releases[0].latest} to {releases[1].latest}"
+            yield VULNERABILITIES.found(title, "; ".join(parts))
 
 
 def _of_nodes_in_policy(

@@ -32,6 +32,7 @@ from tests.checks.test_vendor_refusals import (
     without_constraints,
 )
 from tests.support.harness import policy_text, sros
+from tests.support.long_form import some
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
@@ -190,10 +191,12 @@ PLANTED: dict[str, tuple[Callable[[Bench], object], set[tuple[str, str, str]]]] 
 }
 
 
+VULNERABLE = "upgrade.vulnerabilities"
 FOUND = {
     *(f"upgrade.{kind}" for _, wanted in PLANTED.values() for kind, *_ in wanted),
     *("upgrade.closes", "upgrade.zenoh-release", "upgrade.node-cannot-start"),
     *("distribution.not-measured", "distribution.differ", "distribution.refused"),
+    VULNERABLE,
 }
 """The ids of findings that the tests of this file bring about."""
 
@@ -205,7 +208,7 @@ def changed(
     changes = set()
     for finding in check_upgrade(bench.root, after, Circumstances(bench.now), present=before):  # type: ignore[arg-type]
         kind = finding.id.removeprefix("upgrade.")
-        if kind == "zenoh-release":
+        if kind in ("zenoh-release", "vulnerabilities"):
             continue
         product = next((name for name in (FAST, CYCLONE) if name in finding.text), "")
         text = f"{finding.subject}: {finding.text}".partition(": open on")[0]
@@ -247,9 +250,27 @@ def test_an_update_changes_nothing_of_shipped_policies(tmp_path: Path) -> None:
         alike = other.vendor.traits.style is first.vendor.traits.style
         assert list(changes(files if alike else few, first, other)) == []
     at = Circumstances(now())
-    for before, after in permutations(SUPPORTED, 2):
+    for before, after in some(list(permutations(SUPPORTED, 2)), 2):
         found = check_upgrade(root, after, at, present=before)
-        assert {each.id for each in found} <= {"distribution.not-measured"}
+        assert {each.id for each in found} <= {"distribution.not-measured", VULNERABLE}
+
+
+def test_an_update_mends_and_brings_known_vulnerabilities(bench: Bench) -> None:
+    jazzy, lyrical = find_distribution("jazzy"), find_distribution("lyrical")
+    at = Circumstances(bench.now)
+    texts = [
+        {
+            finding.subject: finding.text
+            for finding in check_upgrade(bench.root, after, at, present=before)
+            if finding.id == VULNERABLE
+        }
+        for before, after in ((jazzy, lyrical), (lyrical, jazzy), (jazzy, jazzy._replace(until="")))
+    ]
+    there, back = "Fast DDS 2.14.6 to 3.6.2", "Fast DDS 3.6.2 to 2.14.6"
+    assert texts[0][there].startswith("9 stay; mended: CVE-")
+    assert texts[1][back] == texts[0][there].replace("mended", "new")
+    assert texts[0]["Cyclone DDS 0.10.5 to 11.0.1"] == "mended: CVE-2023-24011"
+    assert texts[2] == {}
 
 
 def test_what_an_update_cannot_show_is_said(bench: Bench) -> None:
@@ -257,7 +278,8 @@ def test_what_an_update_cannot_show_is_said(bench: Bench) -> None:
     with_zenoh(bench)
     unknown = AFTER._replace(fast="99.1.0")
     found = check_upgrade(bench.root, unknown, Circumstances(bench.now), present=BEFORE)
-    assert [each.id for each in found] == ["distribution.not-measured", "upgrade.zenoh-release"]
+    ids = [each.id for each in found if each.id != VULNERABLE]
+    assert ids == ["distribution.not-measured", "upgrade.zenoh-release"]
     assert "Fast DDS 99.1, taken to decide as Fast DDS" in found[0].text
 
 
