@@ -12,6 +12,7 @@ from sros_tool.dds.advisories import (
     shipped_advisories,
     version_numbers,
 )
+from sros_tool.names import DISTRIBUTIONS
 from sros_tool.prometheus import Metric, Sample
 from sros_tool.runtime.processes import MappedLibrary, RunningProcesses, plain
 from sros_tool.wording import counted
@@ -38,6 +39,15 @@ PACKAGE_VULNERABILITIES = FindingKind(
     "tracker of the distribution.",
     prominent=True,
 )
+UNCLEAR_VULNERABILITIES = FindingKind(
+    "runtime.vulnerabilities-unclear",
+    NOTE,
+    "a DDS without known vulnerabilities, of which some advisories say nothing",
+    "The history of a release line that does not name a vulnerability does not show whether the "
+    "line is not affected or not mended.",
+    "Advisories in the OSV format: those of sros, and of --advisories FILE.",
+    "Look the numbers up in the advisories of the product.",
+)
 VERSION_UNKNOWN = FindingKind(
     "runtime.dds-version-unknown",
     NOTE,
@@ -48,6 +58,8 @@ VERSION_UNKNOWN = FindingKind(
     "restart the processes.",
     prominent=True,
 )
+NOTES_ON_LIBRARIES = (PACKAGE_VULNERABILITIES, VERSION_UNKNOWN)
+"""Notes that `doctor` shows among its warnings: they say that a library may be vulnerable."""
 _LINUX_PACKAGES = ("/usr/lib/", "/lib/")
 _ROS_PACKAGES = "/opt/ros/"
 _FASTRTPS = ("foxy", "galactic", "humble", "iron", "jazzy")
@@ -64,6 +76,7 @@ def vulnerability_findings(
     for library, users in _users(running, libraries).items():
         if not any(advisory.product == library.product for advisory in used):
             continue
+        name = f"{library.product} {library.version}"
         place = f"'{plain(library.path, _LONGEST_PATH)}'"
         by = f", loaded by {some_names(users)}" if users else ""
         known = known_vulnerabilities(library.product, library.version, used)
@@ -76,10 +89,11 @@ def vulnerability_findings(
                 kind = PACKAGE_VULNERABILITIES
             text = f"{place}{by}, {_described(known.known, library.version)}"
             if known.unclear:
-                numbers = ", ".join(advisory.id for advisory in known.unclear)
-                text += f". Not known for this release: {numbers}"
-            name = f"{library.product} {library.version}"
+                text += f". {_unclear(known.unclear)}"
             yield kind.found(name, text, remedy=_remedy(kind, library))
+        elif known.unclear:
+            text = f"{place}{by}. {_unclear(known.unclear)}"
+            yield UNCLEAR_VULNERABILITIES.found(name, text)
 
 
 _LONGEST_PATH = 200
@@ -133,11 +147,17 @@ def _described(known: Sequence[Advisory], version: str) -> str:
     return f"{count} ({'; '.join(needs)}), mended: {', '.join(mends)}: {ids}"
 
 
+def _unclear(advisories: Sequence[Advisory]) -> str:
+    return f"Not known for this release: {', '.join(advisory.id for advisory in advisories)}"
+
+
 def _remedy(kind: FindingKind, library: MappedLibrary) -> str:
     """Return what to upgrade, with the package's name where the path shows it; "": as the kind."""
     if kind is PACKAGE_VULNERABILITIES or not library.path.startswith(_ROS_PACKAGES):
         return ""
-    distribution = plain(library.path.removeprefix(_ROS_PACKAGES).partition("/")[0])
+    distribution = library.path.removeprefix(_ROS_PACKAGES).partition("/")[0]
+    if distribution not in DISTRIBUTIONS:  # the process chose the path
+        return ""
     package = "cyclonedds"
     if library.product == "Fast DDS":
         package = "fastrtps" if distribution in _FASTRTPS else "fastdds"

@@ -804,6 +804,7 @@ def doctor(report: Path | None, force: bool, advisories: Path | None, as_json: b
     any RMW: if nothing here does), or if a finding is an error; else 0.
     """
     from sros_tool.checks.kind import ERROR, WARNING
+    from sros_tool.checks.vulnerabilities import NOTES_ON_LIBRARIES
     from sros_tool.demo.doctor import diagnosis_text, examine, security_provider, support_report
 
     if force and not report:
@@ -827,7 +828,7 @@ def doctor(report: Path | None, force: bool, advisories: Path | None, as_json: b
         if provider:
             echo(str(provider))
         for finding in findings:
-            if finding.severity >= WARNING:
+            if finding.severity >= WARNING or finding.kind in NOTES_ON_LIBRARIES:
                 echo("")
                 echo_findings([finding])
     if report:

@@ -46,12 +46,16 @@ _LIBRARIES = re.compile(
     rb"|zenohpico)|zenoh)(?:-[0-9a-f]{6,40})?(?:\.abi3|\.cpython-[\w-]+)?\.so"
 )
 _DDS_LIBRARIES = re.compile(
-    rb"(/[^\n]*/lib(fastrtps|fastdds|ddsc)(?:-[0-9a-f]{6,40})?\.so([.\d]*))( \(deleted\))?$",
+    rb"^[^/\n]*(/(?:[^\n]*/)?lib(fastrtps|fastdds|ddsc)(?:-[0-9a-f]{6,40})?"
+    rb"(?:\.abi3|\.cpython-[\w-]+)?\.so[^/\n]*?)( \(deleted\))?$",
     re.MULTILINE,
 )
+"""Tried once for each line: a process may map thousands of files with long paths."""
 _PRODUCTS = {b"fastrtps": "Fast DDS", b"fastdds": "Fast DDS", b"ddsc": "Cyclone DDS"}
-_THREE_NUMBERS = re.compile(r"\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
+_THREE_NUMBERS = re.compile(r"\.so\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
 _MOST_ENTRIES = 10_000
+_MOST_COPIES_SOUGHT = 20
+"""Libraries of one process whose copies are looked for; further ones are of unknown version."""
 _DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
 _ROUTERS = ("rmw_zenohd", "zenohd")
 _BRIDGES = ("zenoh-bridge-ros2dds", "zenoh-bridge-dds")
@@ -346,14 +350,14 @@ def with_files(process: Process, root: ProcessRoot, folder: str) -> Process:
     enclave = _loaded_enclave(
         process.environment, process.command, root, user=process.user, folder=folder
     )
-    dds = tuple(_with_version(library, root) for library in process.dds)
+    unknown = [library for library in process.dds if not library.version and not library.replaced]
+    named = {library: _with_version(library, root) for library in unknown[:_MOST_COPIES_SOUGHT]}
+    dds = tuple(named.get(library, library) for library in process.dds)
     return replace(process, enclave=enclave, configuration=zenoh, dds=dds)
 
 
 def _with_version(library: MappedLibrary, root: ProcessRoot) -> MappedLibrary:
     """Return a library with the version in the name of its only copy: wheels have no links."""
-    if library.version or library.replaced:
-        return library
     versions = {_version(name) for name in root.copies(library.path)} - {""}
     return library._replace(version=versions.pop()) if len(versions) == 1 else library
 
@@ -393,11 +397,11 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
 def _mapped_dds(maps: bytes) -> tuple[MappedLibrary, ...]:
     """Return the libraries of DDS in /proc/PID/maps, with the versions in their names."""
     return tuple(
-        MappedLibrary(_PRODUCTS[name], _version(os.fsdecode(numbers)), os.fsdecode(path), replaced)
-        for path, name, numbers, replaced in sorted(
+        MappedLibrary(_PRODUCTS[name], _version(path), path, replaced)
+        for path, name, replaced in sorted(
             {
-                (path, name, numbers, bool(mark))
-                for path, name, numbers, mark in _DDS_LIBRARIES.findall(maps)
+                (os.fsdecode(path), name, bool(mark))
+                for path, name, mark in _DDS_LIBRARIES.findall(maps)
             }
         )
     )

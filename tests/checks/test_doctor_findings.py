@@ -79,3 +79,16 @@ def test_the_status_is_about_the_nodes_of_ros(
     assert ended.status == status
     assert said in ended.out.rpartition("\n\n")[2]
     assert json.loads(sros("doctor", "--json", env={}).out)["ros_enforces"] is ros
+
+
+def test_a_dds_of_which_little_is_known_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ProcessTable, "look", lambda *_: RunningProcesses())
+    for version, said in (
+        ("0.10.2", "[runtime.package-vulnerabilities]"),
+        ("of unknown version", "[runtime.dds-version-unknown]"),
+        ("11.0.1", ""),
+    ):
+        stack = CYCLONE._replace(version=version, where="/usr/lib/libddsc.so")
+        monkeypatch.setattr(doctor, "examine", lambda *_, found=stack: Diagnosis((found,)))
+        out = sros("doctor", env={}).out
+        assert said in out and ("/usr/lib/libddsc.so'" in out) is bool(said)

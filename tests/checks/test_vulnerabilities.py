@@ -50,10 +50,24 @@ def test_one_finding_for_each_library(path: str, version: str, identity: str) ->
     assert "ros-jazzy-fastrtps" in finding.remedy or "/opt" not in path
 
 
-def test_a_mended_release_has_no_finding() -> None:
+def test_a_mended_release_has_no_known_vulnerability() -> None:
     library = MappedLibrary("Fast DDS", "3.2.5", "/opt/ros/kilted/lib/libfastdds.so.3.2.5")
-    assert not list(vulnerability_findings(running(library)))
-    assert list(vulnerability_findings(running(library._replace(version="3.2.4"))))
+    (finding,) = vulnerability_findings(running(library))
+    assert finding.id == "runtime.vulnerabilities-unclear"
+    assert finding.text.endswith("Not known for this release: CVE-2024-30258, CVE-2024-30259")
+    (finding,) = vulnerability_findings(running(library._replace(version="3.2.4")))
+    assert finding.id == "runtime.known-vulnerabilities"
+    mended = MappedLibrary("Cyclone DDS", "11.0.1", "/opt/ros/lyrical/lib/libddsc.so.11.0.1")
+    assert not list(vulnerability_findings(running(mended)))
+    assert list(vulnerability_findings(running(mended._replace(version="0.10.5"))))
+
+
+def test_a_path_names_no_package_that_is_none() -> None:
+    path = "/opt/ros/{}/lib/libfastrtps.so.2.14.5"
+    for distribution, named in (("jazzy", True), ("jazzy-desktop from elsewhere", False)):
+        library = MappedLibrary("Fast DDS", "2.14.5", path.format(distribution))
+        (finding,) = vulnerability_findings(running(library))
+        assert ("package ros-" in finding.remedy) is named
 
 
 def test_installed_and_loaded_library_have_one_finding() -> None:
@@ -75,13 +89,24 @@ def test_versions_are_read_from_the_mapped_files() -> None:
         b"7f1 r--p 0 08:01 12  /x y/libfastrtps.so.2.14.5\n"
         b"7f2 r-xp 0 08:01 13  /a/libfastdds.so.3.6.2.0\n"
         b"7f3 r-xp 0 08:01 14  /a/libddsc.so.0.10.2 (deleted)\n"
-        b"7f4 r-xp 0 08:01 15  /a/libfastrtps.so.2.14.5.txt\n"
+        b"7f4 r-xp 0 08:01 15  /libfastrtps.so.2.6.9\n"
+        b"7f5 r-xp 0 08:01 16  /a/libfastrtps.so.2.14.5-patched\n"
+        b"7f6 r-xp 0 08:01 17  /a/libddsc.so.0.10.5\\012x (deleted)\n"
+        b"7f7 r-xp 0 08:01 18  /a/libddsc.so.0.10.5/data\n"
     )
     assert set(_mapped_dds(maps)) == {
         MappedLibrary("Fast DDS", "2.14.5", "/x y/libfastrtps.so.2.14.5"),
         MappedLibrary("Fast DDS", "3.6.2", "/a/libfastdds.so.3.6.2.0"),
         MappedLibrary("Cyclone DDS", "0.10.2", "/a/libddsc.so.0.10.2", replaced=True),
+        MappedLibrary("Fast DDS", "2.6.9", "/libfastrtps.so.2.6.9"),
+        MappedLibrary("Fast DDS", "", "/a/libfastrtps.so.2.14.5-patched"),
+        MappedLibrary("Cyclone DDS", "", "/a/libddsc.so.0.10.5\\012x", replaced=True),
     }
+
+
+def test_each_line_of_the_maps_is_tried_once() -> None:
+    lines = b"7f0 r-xp 0 08:01 12  " + b"/a" * 50_000 + b"\n7f1 r-xp 0 08:01 12  /libddsc.so.0.10.2"
+    assert [library.version for library in _mapped_dds(lines)] == ["0.10.2"]
 
 
 def test_a_copy_next_to_a_library_shows_its_version(tmp_path: Path) -> None:
