@@ -75,10 +75,19 @@ class Advisory(NamedTuple):
 
     def mended_in(self, version: Version) -> str:
         """Return the first release of the same major version with the mend; "" if none has it."""
-        for part in self.ranges:
-            if part.has(version) and part.end and part.end[0] == version[0] and not part.inclusive:
-                return ".".join(map(str, part.end))
-        return ""
+        ends = {None if part.inclusive else part.end for part in self.ranges if part.has(version)}
+        last = max((end for end in ends if end), default=None)
+        if last is None or None in ends or last[0] != version[0] or self.affects(last):
+            return ""
+        return ".".join(map(str, last))
+
+    def with_releases_of(self, other: Advisory) -> Advisory:
+        """Return the advisory with what another one of the same number adds."""
+        return self._replace(
+            ranges=self.ranges + other.ranges,
+            versions=self.versions | other.versions,
+            unclear_lines=self.unclear_lines + other.unclear_lines,
+        )
 
 
 class KnownVulnerabilities(NamedTuple):
@@ -111,7 +120,7 @@ def known_vulnerabilities(
     unclear = tuple(
         advisory
         for advisory in own
-        if advisory not in known and _line(numbers) in advisory.unclear_lines
+        if not advisory.affects(numbers) and _line(product, numbers) in advisory.unclear_lines
     )
     return KnownVulnerabilities(known, unclear)
 
@@ -131,20 +140,32 @@ def shipped_advisories() -> tuple[Advisory, ...]:
 
 
 def read_advisories(path: Path) -> tuple[Advisory, ...]:
-    """Return the advisories of sros with those of a file, which replace those with their ids.
+    """Return the advisories of sros with those of a file.
+
+    An advisory replaces the one of sros with the same id, for the products that it names.
 
     Raises:
-        DocumentError: The file cannot be read, or is not of the OSV format.
+        DocumentError: The file cannot be read, is not of the OSV format, or is about no product
+            that sros knows.
     """
     newer = parse_advisories(read_bytes(path, "advisories", most=_MOST_BYTES), f"'{path}'")
-    replaced = {advisory.id for advisory in newer}
-    return (*(old for old in shipped_advisories() if old.id not in replaced), *newer)
+    if not newer:
+        *products, last = _REPOSITORIES.values()
+        raise DocumentError(
+            f"'{path}' has no advisory about {', '.join(products)} or {last}",
+            "sros knows them by their repositories.",
+            f"Name the package as in {next(iter(_REPOSITORIES))}, or the repository of a range.",
+        )
+    replaced = {(advisory.id, advisory.product) for advisory in newer}
+    kept = (old for old in shipped_advisories() if (old.id, old.product) not in replaced)
+    return (*kept, *newer)
 
 
 def parse_advisories(data: bytes, what: str) -> tuple[Advisory, ...]:
     """Return the advisories of an OSV record or a list of them; ``what`` names it in errors.
 
-    Records that were withdrawn, and products that sros does not know, are left out.
+    Records of one number become one advisory, which has the releases of all of them.  A record that
+    was withdrawn affects no release.  Products that sros does not know are left out.
 
     Raises:
         DocumentError: It is not of the OSV format, or states no releases of a known product.
@@ -154,7 +175,13 @@ def parse_advisories(data: bytes, what: str) -> tuple[Advisory, ...]:
         records = value if isinstance(value, list) else [value]
         if len(records) > _MOST_ADVISORIES:
             raise ValueError(f"it has more than {_MOST_ADVISORIES} advisories")
-        return tuple(advisory for record in records for advisory in _advisories_of(_object(record)))
+        merged: dict[tuple[str, str], Advisory] = {}
+        for record in records:
+            for advisory in _advisories_of(_object(record)):
+                key = advisory.id, advisory.product
+                same = merged.get(key)
+                merged[key] = same.with_releases_of(advisory) if same else advisory
+        return tuple(merged.values())
     except ValueError as error:
         raise DocumentError(
             f"{what} has no advisories in the OSV format",
@@ -167,8 +194,7 @@ def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
     identity = record.get("id")
     if not isinstance(identity, str) or len(identity) > _LONGEST_ID or not _ID.fullmatch(identity):
         raise ValueError("an advisory has no id such as CVE-2025-62599")
-    if "withdrawn" in record:
-        return
+    is_withdrawn = bool(_text(record.get("withdrawn") or ""))
     aliases = _list(record.get("aliases", []), "aliases")
     cve = (name for name in aliases if isinstance(name, str) and re.fullmatch(_CVE, name))
     own = _object(record.get("database_specific", {}))
@@ -178,18 +204,22 @@ def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
             by_product.setdefault(product, []).append(part)
     name = identity if identity.startswith("CVE-") else next(cve, identity)
     for product, parts in by_product.items():
-        ranges = tuple(each for part in parts for each in _ranges(part, identity))
-        versions = frozenset(version for part in parts for version in _versions(part))
-        if not ranges and not versions:
-            raise ValueError(f"{identity} does not say which releases of {product} it affects")
+        ranges: list[_Range] = []
+        versions: set[Version] = set()
+        for part in () if is_withdrawn else parts:
+            new_ranges, new_versions = list(_ranges(part, identity)), set(_versions(part))
+            if not new_ranges and not new_versions:
+                raise ValueError(f"{identity} does not say which releases of {product} it affects")
+            ranges += new_ranges
+            versions |= new_versions
         yield Advisory(
             name,
             product,
             _text(record.get("summary", "")),
             tuple(map(_text, _list(own.get("needs", []), "needs"))),
             _text(own.get("gives", "unclear")),
-            ranges,
-            versions,
+            tuple(ranges),
+            frozenset(versions),
             tuple(map(_text, _list(own.get("unclear_lines", []), "unclear_lines"))),
         )
 
@@ -210,18 +240,21 @@ def _product(affected: Mapping[str, Any]) -> str:
 
 def _ranges(affected: Mapping[str, Any], identity: str) -> Iterator[_Range]:
     for part in map(_object, _list(affected.get("ranges", []), "ranges")):
-        if part.get("type") not in ("SEMVER", "ECOSYSTEM"):
-            continue  # commits of git: the releases are in `versions`
+        kind = part.get("type")
+        if kind == "GIT":
+            continue  # commits: the releases are in `versions`
+        if kind not in ("SEMVER", "ECOSYSTEM") or not part.get("events"):
+            raise ValueError(f"a range of {identity} has another type, or no events")
         introduced: Version | None = None
         for event in map(_object, _list(part.get("events", []), "events")):
-            for kind, version in event.items():
-                if kind == "introduced":
+            for name, version in event.items():
+                if name == "introduced":
                     introduced = introduced or _numbers(version, identity)
-                elif kind in ("fixed", "last_affected"):
+                elif name in ("fixed", "last_affected"):
                     end = _numbers(version, identity)
                     if introduced is None or end < introduced:
                         raise ValueError(f"the events of {identity} are not in order")
-                    yield _Range(introduced, end, kind == "last_affected")
+                    yield _Range(introduced, end, name == "last_affected")
                     introduced = None
         if introduced is not None:
             yield _Range(introduced, None, inclusive=False)
@@ -258,8 +291,10 @@ def _text(value: object) -> str:
     return value[:_LONGEST_SUMMARY]
 
 
-def _line(version: Version) -> str:
-    """Return the line of the advisories that a release of Fast DDS belongs to."""
+def _line(product: str, version: Version) -> str:
+    """Return the line of the advisories that a release belongs to."""
+    if product != "Fast DDS":
+        return f"{version[0]}.{version[1]}"
     for first, line in ((3, 3), "3.6"), ((3, 0), "3.2"), ((2, 7), "2.14"):
         if version >= (*first, 0):
             return line

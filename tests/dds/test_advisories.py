@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,13 +32,16 @@ NUMBERS = {
 }
 
 
-def affected_by(*events: dict[str, str]) -> list[object]:
+def affected_by(*events: dict[str, str]) -> list[Any]:
     """Return the releases of Fast DDS between events as ``affected``."""
     package = {"ecosystem": "GIT", "name": "https://github.com/eProsima/Fast-DDS"}
     return [{"package": package, "ranges": [{"type": "SEMVER", "events": events}]}]
 
 
-RECORD = {"id": "CVE-2030-12345", "affected": affected_by({"introduced": "0"}, {"fixed": "3.6.3"})}
+RECORD: dict[str, Any] = {
+    "id": "CVE-2030-12345",
+    "affected": affected_by({"introduced": "0"}, {"fixed": "3.6.3"}),
+}
 
 
 def document(**changes: object) -> bytes:
@@ -87,6 +91,47 @@ def test_a_file_adds_advisories(tmp_path: Path) -> None:
     assert "CVE-2025-67108" not in {advisory.id for advisory in known.known}
 
 
+def test_a_withdrawn_advisory_affects_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "newer.json"
+    everything = affected_by({"introduced": "0"})
+    for withdrawn, number in ((None, 1), ("2030-01-01T00:00:00Z", 0)):
+        path.write_bytes(document(id="CVE-2025-62599", affected=everything, withdrawn=withdrawn))
+        known = known_vulnerabilities("Fast DDS", "2.14.5", read_advisories(path))
+        assert known is not None
+        assert len([each for each in known.known if each.id == "CVE-2025-62599"]) == number
+
+
+def test_records_of_one_number_are_one_advisory() -> None:
+    other = {
+        **RECORD,
+        "id": "GHSA-aaaa-bbbb-cccc",
+        "aliases": [RECORD["id"]],
+        "affected": affected_by({"introduced": "3.0.0"}, {"fixed": "3.6.5"}),
+    }
+    (advisory,) = parse_advisories(json.dumps([RECORD, other]).encode(), "it")
+    assert advisory.affects((3, 6, 4))
+    assert advisory.mended_in((3, 6, 2)) == "3.6.5"
+    assert advisory.mended_in((2, 14, 5)) == ""
+
+
+def test_an_advisory_replaces_only_what_it_names(tmp_path: Path) -> None:
+    path = tmp_path / "newer.json"
+    path.write_bytes(document(id="CVE-2023-24011"))  # shipped for Cyclone DDS
+    known = known_vulnerabilities("Cyclone DDS", "0.10.5", read_advisories(path))
+    assert known is not None
+    assert "CVE-2023-24011" in {advisory.id for advisory in known.known}
+
+
+@pytest.mark.parametrize(
+    "affected", [[], [{"package": {"ecosystem": "Debian", "name": "fastdds"}}]]
+)
+def test_advisories_about_nothing_known_are_refused(affected: object, tmp_path: Path) -> None:
+    path = tmp_path / "newer.json"
+    path.write_bytes(document(affected=affected))
+    with pytest.raises(DocumentError, match="no advisory about Fast DDS, Cyclone DDS or Zenoh"):
+        read_advisories(path)
+
+
 def test_releases_can_be_listed_beside_ranges_of_git() -> None:
     repository = {"type": "GIT", "repo": "https://github.com/eProsima/Fast-DDS", "events": []}
     data = document(affected=[{"ranges": [repository], "versions": ["v2.14.5", "v3.0.0-rc1"]}])
@@ -111,6 +156,10 @@ def test_releases_can_be_listed_beside_ranges_of_git() -> None:
         document(database_specific=[]),
         document(affected=affected_by({"fixed": "3.6.3"})),
         document(affected=affected_by({"introduced": "3.6.3"}, {"fixed": "3.6.0"})),
+        document(affected=RECORD["affected"] + affected_by()),
+        document(affected=[{**RECORD["affected"][0], "ranges": [{"type": "semver"}]}]),
+        document(affected=[*RECORD["affected"], {**RECORD["affected"][0], "ranges": []}]),
+        document(withdrawn=True),
     ],
 )
 def test_what_is_no_advisory_is_refused(data: bytes) -> None:
