@@ -245,14 +245,18 @@ def _present(
 ) -> Mapping[Distribution, list[str]]:
     """Map the distributions before the update to their enclaves."""
     by_distribution: dict[Distribution, list[str]] = {}
+    unknown: list[str] = []
     for name in files.enclaves:
         stated = stated_distributions(files.keystore, name) if files.keystore and not named else ()
+        if not (stated or named or here):
+            unknown.append(name)
         for distribution in map(find_distribution, stated) if stated else (named or here,):
             if distribution and distribution != later:
                 by_distribution.setdefault(distribution, []).append(name)
-    if files.enclaves and not by_distribution:
+    if unknown or (files.enclaves and not by_distribution):
+        what = first_few(unknown, _SHOWN) if by_distribution else f"'{files.file}'"
         raise UsageError(
-            f"it is not known from which distribution '{files.file}' is updated to {later.title}",
+            f"it is not known from which distribution {what} is updated to {later.title}",
             "Neither --distro nor $ROS_DISTRO names another one, nor does the keystore.",
             "Name the present one, for example with --distro jazzy.",
         )

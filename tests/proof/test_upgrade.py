@@ -337,6 +337,9 @@ def test_a_robot_of_a_fleet_has_a_distribution_of_its_own(tmp_path: Path) -> Non
     root = tmp_path / "ks"
     sros("create_keystore", root).ok()
     sros("generate_artifacts", "-k", root, "-p", policy, "--fleet", fleet).ok()
+    refused = sros("check", root, "--upgrade-to", "jazzy", env={"ROS_DISTRO": None})
+    assert "from which distribution /r2/base is updated to Jazzy" in refused.err
+    assert refused.status == 2
     sros("update_keystore", root, "--set", "distributions=jazzy").ok()
     keystore = Keystore(root)
     assert stated_distributions(keystore, "/r1/base") == ("humble",)
