@@ -292,13 +292,18 @@ def refuse_stale_domains(
 
 
 def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
-    """Yield a note for each robot that loses enclaves which the keystore still has.
+    """Yield notes for robots that lose enclaves, or their Zenoh router, which the keystore has.
 
     No two robots of ``after`` have an enclave in common, as `write_fleet` makes sure.
     """
     for robot in before.robots.values():
         same = after.robots.get(robot.name)
-        kept = frozenset(enclaves_of(after, same) if same else ())
+        kept = set(enclaves_of(after, same) if same else ())
+        if same and robot.router and not same.router:
+            router = router_of(before, robot)
+            kept.add(router)
+            if has_enclave(root, router):
+                yield _lost_router(root, robot.name, router)
         names = (name for name in enclaves_of(before, robot) if name not in kept)
         left = [name for name in names if has_enclave(root, name)]
         if left:
@@ -310,6 +315,14 @@ def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
                 f"the robot {robot.name} {why}: {shown} stay valid. To take "
                 f"them back, run `sros revoke {quote(str(root))} {words_for(root, left)}`.",
             )
+
+
+def _lost_router(root: Path, robot: str, router: str) -> Note:
+    text = (
+        f"the robot {robot} has no Zenoh router any more: its enclave {router} stays valid. Stop "
+        f"the router, and take its enclave back: `sros revoke {quote(str(root))} {router}`."
+    )
+    return Note("fleet.left-router", text)
 
 
 def words_for(root: Path, names: Sequence[str]) -> str:

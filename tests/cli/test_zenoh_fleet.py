@@ -113,6 +113,20 @@ def test_the_network_follows_the_fleet_file(keystore: Path) -> None:
     assert [router.name for router in network(keystore).routers] == ["/extra/router", "/r2/router"]
 
 
+def test_a_robot_that_loses_its_router_alone_is_named(keystore: Path) -> None:
+    one = FLEET.replace('r1 = { groups = ["carriers"] }', "r1 = {}")
+    noted = generate(keystore, one)
+    assert "note [fleet.left-router]: the robot r1 has no Zenoh router any more" in noted
+    assert f"`sros revoke {keystore} /r1/router`" in noted
+    assert "fleet.left-enclaves" not in noted and "robot r2 has no" not in noted
+    assert network(keystore).routers == (R2,)
+    # So is the last router of a fleet.
+    noted = generate(keystore, "robots = { r1 = {}, r2 = {}, r3 = {} }")
+    assert "the robot r2 has no Zenoh router any more: its enclave /r2/router stays" in noted
+    assert "fleet.left-enclaves" not in noted
+    sros("revoke", keystore, "/r1/router", "/r2/router").ok()
+
+
 def test_a_revoked_robot_has_no_router(keystore: Path) -> None:
     revoked = sros("revoke", keystore, "--robot", "r1").ok()
     assert "/r1/router: no router any more" in revoked.err
