@@ -14,6 +14,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance
 from sros_tool.dds.permissions import Permissions
 from sros_tool.fleet.enclaves import robot_of
+from sros_tool.proof.crossing import limits_crossing, states_routers
 from sros_tool.proof.protection import strict_protection
 from sros_tool.proof.sources import ALL_DOMAINS, AccessSource
 from sros_tool.translate import governance_for
@@ -189,6 +190,8 @@ def _left_out(base: AccessSource, head: AccessSource) -> Iterator[str]:
             yield f"the CAs and revocation lists of {name}"
         if side.later is not None and other.later is None:
             yield f"what {name} gives to enclaves that are created later"
+        if limits_crossing(side) and not states_routers(other):
+            yield f"what {name} lets cross between routers of Zenoh"
         if side.zenoh_files and not other.zenoh_files:
             yield f"where the Zenoh processes of {name} listen and connect"
         if side.scope is not None and other.scope is None:

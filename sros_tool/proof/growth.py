@@ -37,6 +37,7 @@ from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.model import ALLOW, Source
 from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.assumptions import assumptions, completed, domains_of_robots, left_out
+from sros_tool.proof.crossing import more_crossing, more_passed_on
 from sros_tool.proof.protection import contradiction, less_protection
 from sros_tool.proof.sources import AT, AccessSource
 from sros_tool.proof.worlds import ROS_TOPICS, domains_of, enforced_access, is_enforced
@@ -237,7 +238,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     before, after = completed(base, head), completed(head, base)
     worlds = _worlds(before, after)
     added = tuple(_gains(before, after, worlds, scope, limit))
-    lost = tuple(dict.fromkeys(less_protection(base, head, limit)))
+    lost = tuple(dict.fromkeys(_less(base, head, limit, rules=not added)))
     unclear = tuple(_not_compared(base, head))
     if unclear and not added and not lost:
         raise DocumentError(
@@ -250,7 +251,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     unknown = "only some enclaves are compared" if scope is not None else ""
     if None in sides:
         unknown = f"there are more than {_MOST_HOPS:,} hops between enclaves"
-    more = dict.fromkeys(less_protection(head, base, limit))
+    more = dict.fromkeys(_less(head, base, limit, rules=False))
     return Growth(
         added,
         tuple(_gains(after, before, worlds, scope, limit)),
@@ -264,6 +265,19 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         left_out(base, head),
         unclear,
     )
+
+
+def _less(
+    old: AccessSource, new: AccessSource, limit: SearchLimit, *, rules: bool
+) -> Iterator[SettingChange]:
+    """Yield weaker protection in ``new``, and what more crosses between routers there.
+
+    With ``rules``, the rules between routers are compared, too, unless settings state the cause:
+    rights that are new would change these rules.
+    """
+    yield from less_protection(old, new, limit)
+    crossing = tuple(more_crossing(old, new, limit))
+    yield from crossing or (more_passed_on(old, new, limit) if rules else ())
 
 
 def _not_compared(base: AccessSource, head: AccessSource) -> Iterator[str]:

@@ -104,7 +104,8 @@ class AccessSource:
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh"; ``shown`` is its name.
     ``permissions`` are what DDS loads for each enclave, or would load after signing.  ``rights``
     are the rights in ROS terms.  ``zenoh`` are the rights that rules of Zenoh give, None without
-    rules; ``enforcers`` are these rules, ``routers`` the rules of routers.  ``scope`` are the
+    rules; ``enforcers`` are these rules, ``routers`` the enclaves of routers.  ``passing`` maps
+    each of several routers to the rights that it gives to the others.  ``scope`` are the
     enclaves that the source is for; None for all.  ``governance`` is None if the source has none.
     ``authorities`` are the CAs that its enclaves trust, as pairs of role and fingerprint.
     ``trusts`` maps enclaves and `KEYSTORE_ITSELF` to their trust; None if it is not known.
@@ -120,6 +121,7 @@ class AccessSource:
     zenoh: frozenset[Right] | None = None
     enforcers: tuple[Enforcement, ...] = ()
     routers: tuple[str, ...] = ()
+    passing: Mapping[str, frozenset[Right]] = field(default_factory=dict)
     governance: Governance | None = None
     authorities: frozenset[tuple[str, str]] | None = None
     trusts: Mapping[str, Trust] | None = None
@@ -246,11 +248,13 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         f"{names[file.parent]} {file.name}": _zenoh_file(file, document)
         for file, document in rights_source.configurations.items()
     }
+    passing = rights_source.links.passing if rights_source.links else {}
     return replace(
         side,
         zenoh=rights_source.rights,
         enforcers=rights_source.enforcers,
         routers=rights_source.routers,
+        passing={router: frozenset(rights) for router, rights in passing.items()},
         zenoh_files=configurations,
     )
 

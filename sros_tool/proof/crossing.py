@@ -1,0 +1,172 @@
+"""Find names that pass between Zenoh routers on one side of a comparison, and not on the other.
+
+Two enclaves at one router exchange all that their rights allow.  At two routers they exchange only
+names that may cross at both.  So a wider ``crossing`` lets more pass, and so does a router that is
+gone, or an enclave that moves to the router of another one.
+
+This module reads no files.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from functools import lru_cache
+
+from sros_tool.automata import NameSet, SearchLimit
+from sros_tool.keystore.comparison import Effect, SettingChange
+from sros_tool.keystore.fleet import with_routers_of_robots
+from sros_tool.proof.sources import AccessSource
+from sros_tool.proof.worlds import named, valid_topics
+from sros_tool.zenoh.configuration import ZenohNetwork
+
+_ALL = named("*")
+_ABSOLUTE = valid_topics("", "")
+
+
+def limits_crossing(side: AccessSource) -> bool:
+    """Return whether the settings or the fleet of a side limit what crosses between routers."""
+    network = _network(side, side)
+    return network is not None and _limited(network)
+
+
+def states_routers(side: AccessSource) -> bool:
+    """Return whether settings or a fleet say which routers there are, and what crosses there."""
+    return _network(side, side) is not None
+
+
+def more_crossing(
+    old: AccessSource, new: AccessSource, limit: SearchLimit
+) -> Iterator[SettingChange]:
+    """Yield what the settings or the fleet of ``new`` let cross, and those of ``old`` do not."""
+    before, after = _network(old, new), _network(new, old)
+    if before is None or not _limited(before):
+        return
+    if after is None:
+        if new.later is not None and new.zenoh_files:
+            meaning = "what passes between routers is not known"
+            yield SettingChange(
+                Effect.LOOSER, "settings of Zenoh", "limit crossing", "missing", meaning
+            )
+        return
+    kept = {*before.router_names()} & {*after.router_names()}
+    for router in sorted(kept):
+        one, other = _expressions(before, router), _expressions(after, router)
+        if one != other and (name := _more(one, other, limit)):
+            meaning = f"{name} may pass between this router and others"
+            yield SettingChange(
+                Effect.LOOSER, f"crossing of router {router}", _text(one), _text(other), meaning
+            )
+    yield from _moved(before, after, {*new.permissions, *new.certified, *kept}, limit)
+
+
+def _moved(
+    before: ZenohNetwork, after: ZenohNetwork, enclaves: set[str], limit: SearchLimit
+) -> Iterator[SettingChange]:
+    """Yield the routers whose enclaves are at another router, where more of their names pass."""
+    places: dict[tuple[str, str], str] = {}
+    for enclave in sorted(enclaves):
+        places.setdefault((_router(before, enclave), _router(after, enclave)), enclave)
+    for (one, other), enclave in places.items():
+        if one == other:
+            continue
+        for there, later in places:
+            if there == one:
+                continue
+            has = () if later == other else _both(after, other, later)
+            if name := _more(_both(before, one, there), has, limit):
+                crossing = _text(_both(before, one, there))
+                yield SettingChange(
+                    Effect.LOOSER,
+                    f"router of {enclave}",
+                    f"{one}, where {crossing} crosses",
+                    other,
+                    f"{name} may pass between it and enclaves that were at {there}",
+                )
+                break
+
+
+def more_passed_on(
+    old: AccessSource, new: AccessSource, limit: SearchLimit
+) -> Iterator[SettingChange]:
+    """Yield what the rules of routers in ``new`` let other routers do, and those of ``old`` do not.
+
+    A router that is gone counts only if settings do not say to which router its enclaves go.
+    """
+    if new.routers and not (states_routers(old) and states_routers(new)):
+        for router in sorted({*old.passing} - {*new.routers}):
+            meaning = "its enclaves and others may be at one router"
+            yield SettingChange(
+                Effect.LOOSER, f"router {router} of Zenoh", "present", "missing", meaning
+            )
+    routers: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for router in sorted(old.passing.keys() & new.passing.keys()):
+        had = old.passing[router]
+        for right in sorted(new.passing[router] - had):
+            if right.enclave not in old.passing:
+                continue
+            known = [r.name for r in had if r[:-1] == right[:-1]]
+            if name := _more(((right.name,), tuple(known)), ((right.name,),), limit):
+                routers[router, right.enclave].append(name)
+    for (router, other), names in routers.items():
+        yield SettingChange(
+            Effect.LOOSER,
+            f"rules of router {router} for router {other}",
+            "without",
+            f"with {names[0]}",
+            "it may pass between them",
+        )
+
+
+_Crossing = tuple[tuple[str, ...], ...]
+"""Lists of expressions; a name crosses if each list has one that matches it."""
+
+
+def _more(before: _Crossing, after: _Crossing, limit: SearchLimit) -> str:
+    """Return a name that crosses by ``after`` and not by ``before``, or ""."""
+    names = _names(after) - _names(before)
+    return (names & _ABSOLUTE).example(limit) or names.example(limit) or ""
+
+
+@lru_cache(maxsize=1024)
+def _names(crossing: _Crossing) -> NameSet:
+    names = _ALL
+    for expressions in crossing:
+        names &= NameSet.union(map(named, expressions))
+    return names
+
+
+def _expressions(network: ZenohNetwork, router: str) -> _Crossing:
+    own = next((each.crossing for each in network.routers if each.name == router), ())
+    return tuple(dict.fromkeys(filter(None, (network.crossing, own))))
+
+
+def _both(network: ZenohNetwork, one: str, other: str) -> _Crossing:
+    return tuple(dict.fromkeys((*_expressions(network, one), *_expressions(network, other))))
+
+
+def _router(network: ZenohNetwork, enclave: str) -> str:
+    return enclave if enclave in network.router_names() else network.router_of(enclave).name
+
+
+def _text(crossing: _Crossing) -> str:
+    return " within ".join(",".join(expressions) for expressions in crossing) or "everything"
+
+
+def _limited(network: ZenohNetwork) -> bool:
+    return bool(network.routers) and any(
+        (network.crossing, *(router.crossing for router in network.routers))
+    )
+
+
+def _network(side: AccessSource, other: AccessSource) -> ZenohNetwork | None:
+    """Return the network of a side: of its settings, or of its fleet and else the other's settings.
+
+    None if neither says anything about routers.
+    """
+    if side.later is not None:
+        return side.later.zenoh
+    if side.kind != "policy" or side.fleet is None:
+        return None
+    settings = other.later.zenoh if other.later else ZenohNetwork()
+    return with_routers_of_robots(settings, other.fleet, side.fleet) if settings else None
