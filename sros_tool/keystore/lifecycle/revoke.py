@@ -27,7 +27,7 @@ from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.selection import no_such_enclave
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import issued_by
-from sros_tool.pki.crl import REASONS
+from sros_tool.pki.crl import REASONS, SUPERSEDED
 
 _FILES = (
     *REQUIRED_FILES,
@@ -97,6 +97,8 @@ def revoke(
         change.remarks += lists.remarks
         _drop_routers(change, gone)
         change.keep_zenoh({}, gone=gone)
+        if reason == SUPERSEDED and change.template.zenoh:
+            change.notes.append(_keeps_earlier_files())
         change.record()
         change.finish(aim="revoke")
     return change.result(
@@ -157,6 +159,16 @@ def _drop_routers(change: KeystoreChange, gone: Collection[str]) -> None:
             "connect to another router by their new files."
         )
         change.notes.append(Note("zenoh.router-revoked", text))
+
+
+def _keeps_earlier_files() -> Note:
+    text = (
+        "the reason superseded is that of renewed certificates, whose enclaves keep their rights: "
+        "earlier Zenoh files, which give the revoked enclaves rights, are refused by no machine "
+        "that has only an export. Whoever could bring one back there is stopped by another "
+        "reason, such as --reason cessation_of_operation."
+    )
+    return Note("zenoh.superseded", text)
 
 
 def _is_router(change: KeystoreChange, router: str) -> KeystoreError:
