@@ -299,8 +299,13 @@ def _vulnerabilities(
         if None in known or releases[0].latest == releases[1].latest:
             continue
         old, new = ({advisory.id for advisory in each.known} for each in known if each)
+        unclear = {advisory.id for advisory in known[1].unclear} if known[1] else set()
         parts = [f"{len(old & new)} stay"] if old & new else []
-        for ids, what in ((old - new, "mended"), (new - old, "new")):
+        for ids, what in (
+            (old - new - unclear, "mended"),
+            (old & unclear, f"not known for {releases[1].latest}"),
+            (new - old, "new"),
+        ):
             parts += [f"{what}: {', '.join(sorted(ids))}"] if ids else []
         if old != new:
             title = f"{releases[0].product} {releases[0].latest} to {releases[1].latest}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import permutations
 from pathlib import Path
@@ -15,6 +16,7 @@ from cryptography.hazmat.primitives import hashes
 
 from sros_tool.checks.targets import Circumstances
 from sros_tool.cli.common import now
+from sros_tool.dds.advisories import parse_advisories
 from sros_tool.dds.decision.vendors import MEASURED
 from sros_tool.distributions import SUPPORTED, Shipped, find_distribution
 from sros_tool.errors import DocumentError
@@ -271,6 +273,26 @@ def test_an_update_mends_and_brings_known_vulnerabilities(bench: Bench) -> None:
     assert texts[1][back] == texts[0][there].replace("mended", "new")
     assert texts[0]["Cyclone DDS 0.10.5 to 11.0.1"] == "mended: CVE-2023-24011"
     assert texts[2] == {}
+    releases = {"introduced": "2.14.0"}, {"fixed": "3.0.0"}
+    record = {
+        "id": "CVE-2030-12345",
+        "affected": [
+            {
+                "package": {"name": "github.com/eProsima/Fast-DDS"},
+                "ranges": [{"type": "SEMVER", "events": releases}],
+            }
+        ],
+    }
+    for lines, said in (([], "mended: "), (["3.6"], "not known for 3.6.2: ")):
+        record["database_specific"] = {"unclear_lines": lines}
+        advisories = parse_advisories(json.dumps(record).encode(), "it")
+        asked = replace(at, advisories=advisories)
+        (finding,) = (
+            finding
+            for finding in check_upgrade(bench.root, lyrical, asked, present=jazzy)
+            if finding.id == VULNERABLE
+        )
+        assert finding.text == f"{said}CVE-2030-12345"
 
 
 def test_what_an_update_cannot_show_is_said(bench: Bench) -> None:
