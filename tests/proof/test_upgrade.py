@@ -274,7 +274,7 @@ def test_an_update_mends_and_brings_known_vulnerabilities(bench: Bench) -> None:
     assert texts[0]["Cyclone DDS 0.10.5 to 11.0.1"] == "mended: CVE-2023-24011"
     assert texts[2] == {}
     releases = {"introduced": "2.14.0"}, {"fixed": "3.0.0"}
-    record = {
+    record: dict[str, object] = {
         "id": "CVE-2030-12345",
         "affected": [
             {
