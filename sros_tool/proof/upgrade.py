@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -49,7 +50,7 @@ from sros_tool.distributions import (
     Shipped,
     find_distribution,
 )
-from sros_tool.errors import UsageError
+from sros_tool.errors import SrosError, UsageError
 from sros_tool.faults import FAULTS
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.keystore.fleet import stated_distributions
@@ -333,9 +334,10 @@ def check_distributions(
     """
     by_distributions: dict[tuple[str, ...], list[str]] = {}
     for name in keystore.names:
-        stated = stated_distributions(keystore, name)
-        if len(stated) > 1:
-            by_distributions.setdefault(stated, []).append(name)
+        with suppress(SrosError):  # it is a finding of the keystore
+            stated = stated_distributions(keystore, name)
+            if len(stated) > 1:
+                by_distributions.setdefault(stated, []).append(name)
     if not by_distributions:
         return []
     files = signed_files(keystore, at=at, zone=zone, domain=domain)

@@ -309,6 +309,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("/a publish /x --policy denied.xml --all-vendors", 1),
         Case("broken /b publish /x --all-vendors", 1),
         Case("ks /a publish /x --all-distros"),
+        Case("closed /a publish /x --all-distros"),
         Case("broken /b publish /x --all-distros", 1),
         Case("ks --who publish /x"),
         Case("closed /a publish /x"),

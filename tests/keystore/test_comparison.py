@@ -161,6 +161,7 @@ def test_every_field_of_the_settings_is_compared() -> None:
     seen = {
         "name",
         "description",
+        "distributions",  # says for what the keystore is, and changes no file
         "identity_key",  # a place, which an update does not change
         "permissions_key",
         "protection",  # compared as governance

@@ -410,7 +410,7 @@ OPEN_SETTINGS = [
     (
         "downsampling",
         [],
-        "the setting downsampling of /router router.json5, of which sros does not",
+        "the setting downsampling of /router router.json5, whose effect sros does not",
     ),
     ("scouting/gossip/target/peer", ["peer"], "the setting scouting/gossip/target/peer of"),
     ("queries_default_timeout", 1, ""),
@@ -432,7 +432,7 @@ def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, s
     ended = sros(*words, cwd=sound)
     assert said in ended.out + ended.err
     assert "hush" not in ended.out + ended.err
-    refused = "of which sros does not" in ended.err or "cannot be compared" in ended.err
+    refused = "whose effect sros does not know" in ended.err or "cannot be compared" in ended.err
     assert ended.status == (2 if refused else int(bool(said))), ended
 
 
