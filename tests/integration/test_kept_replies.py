@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
@@ -122,3 +123,15 @@ def test_only_what_is_new_or_drawn_or_not_believed_is_asked(
         assert 0 < len(again) < 4 * AGAIN * 400
         answered("stack", forms, ask, believe=lambda place, _: place != 7)
         assert 7 in asked[2]
+
+
+def test_kept_replies_name_no_folder_of_a_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    error = "Subject name: CN=/t ({}/src/cpp/security/Permissions.cpp:743); rt/x"
+    for file in replies.HERE.glob("*.txt"):
+        assert not re.search(r"\(/[^()]*\.cpp:", file.read_text(encoding="utf-8")), file.name
+    monkeypatch.setattr(replies, "HERE", tmp_path)
+    monkeypatch.setattr(replies, "KEEP", True)
+    answered("stack", ["form"], lambda places: [("refused", error.format("/build/fast"))])
+    assert replies.kept_replies("stack", ["form"]) == [("refused", error.format("."))]

@@ -29,6 +29,8 @@ AGAIN = 1 / 20
 Reply = tuple[str, ...]
 
 _TEMPORARY = re.compile(r"/[^\s:'\",]*/pytest-of-[^\s:'\",]*/")
+_BUILT_IN = re.compile(r"\(/[^()]*/src/")
+"""The folder in which a library was built, before the path of a source file in its errors."""
 
 
 def answered(
@@ -103,4 +105,4 @@ def _keep(file: Path, found: dict[str, Reply]) -> None:
 
 
 def _without_folders(text: str) -> str:
-    return _TEMPORARY.sub("", text)
+    return _BUILT_IN.sub("(./src/", _TEMPORARY.sub("", text))
