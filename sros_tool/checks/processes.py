@@ -27,7 +27,7 @@ from sros_tool.checks.environment import (
     value_text,
 )
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
-from sros_tool.checks.vulnerabilities import vulnerability_metric
+from sros_tool.checks.vulnerabilities import vulnerability_metrics
 from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import Moments, Vendor
 from sros_tool.dds.permissions import Grant, parse_permissions
@@ -846,7 +846,7 @@ def runtime_metrics(
                 for (severity, identity), number in sorted(kinds.items())
             ),
         ),
-        vulnerability_metric(running),
+        *vulnerability_metrics(running),
         Metric(
             "sros_processes_examined_timestamp_seconds",
             "When the processes were examined, in seconds since 1970.",

@@ -99,20 +99,31 @@ def vulnerability_findings(
 _LONGEST_PATH = 200
 
 
-def vulnerability_metric(running: RunningProcesses) -> Metric:
-    """Return the number of known vulnerabilities by DDS library; none for unknown versions."""
-    numbers = {
-        (library.product, library.version): len(known.known)
-        for library in _users(running)
-        if (known := known_vulnerabilities(library.product, library.version))
-    }
-    return Metric(
-        "sros_dds_known_vulnerabilities",
-        "Number of known vulnerabilities of each DDS release that processes have loaded, without "
-        "regard to mends of a package. A release whose version is unknown has none.",
-        tuple(
-            Sample(number, {"product": product, "version": version})
-            for (product, version), number in sorted(numbers.items())
+def vulnerability_metrics(running: RunningProcesses) -> tuple[Metric, Metric]:
+    """Return the number of known vulnerabilities by DDS release, and of libraries that hide it."""
+    numbers: dict[tuple[str, str], int] = {}
+    unknown: Counter[str] = Counter()
+    for library in _users(running):
+        known = known_vulnerabilities(library.product, library.version)
+        if known is None:
+            unknown[library.product] += 1
+        else:
+            numbers[library.product, library.version] = len(known.known)
+    return (
+        Metric(
+            "sros_dds_known_vulnerabilities",
+            "Number of known vulnerabilities of each DDS release that processes have loaded, "
+            "without regard to mends of a package.",
+            tuple(
+                Sample(number, {"product": product, "version": version})
+                for (product, version), number in sorted(numbers.items())
+            ),
+        ),
+        Metric(
+            "sros_dds_unknown_versions",
+            "Number of DDS libraries that processes have loaded and whose known vulnerabilities "
+            "cannot be told: their version is unknown, or no advisory is about the product.",
+            tuple(Sample(number, {"product": name}) for name, number in sorted(unknown.items())),
         ),
     )
 
@@ -131,10 +142,8 @@ def _users(
 def _described(known: Sequence[Advisory], version: str) -> str:
     """Return a clause with the number of vulnerabilities, what they need, and their ids."""
     secured = sum("security" in advisory.needs for advisory in known)
-    needs = (
-        [f"{len(known) - secured} need only access to the network"] if secured < len(known) else []
-    )
-    needs += [f"{secured} concern only processes with DDS Security"] if secured else []
+    needs = [f"{len(known) - secured} concern all processes"] if secured < len(known) else []
+    needs += [f"{secured} only those with DDS Security"] if secured else []
     numbers = version_numbers(version)
     major = numbers[0] if numbers else ""
     releases = Counter(advisory.mended_in(numbers) if numbers else "" for advisory in known)

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.checks.vulnerabilities import vulnerability_findings, vulnerability_metric
+from sros_tool.checks.vulnerabilities import vulnerability_findings, vulnerability_metrics
+from sros_tool.prometheus import Sample
 from sros_tool.runtime.processes import (
     FileReader,
     MappedLibrary,
@@ -79,8 +80,11 @@ def test_installed_and_loaded_library_have_one_finding() -> None:
 def test_the_metric_counts_by_release() -> None:
     library = MappedLibrary("Fast DDS", "2.14.5", "/a/libfastrtps.so.2.14.5")
     unknown = MappedLibrary("Fast DDS", "", "/b/libfastrtps.so")
-    (sample,) = vulnerability_metric(running(library, unknown)).samples
+    known, hidden = vulnerability_metrics(running(library, unknown))
+    (sample,) = known.samples
     assert (sample.value, sample.labels) == (27, {"product": "Fast DDS", "version": "2.14.5"})
+    assert hidden.samples == (Sample(1, {"product": "Fast DDS"}),)
+    assert vulnerability_metrics(running(library))[1].samples == ()
 
 
 def test_versions_are_read_from_the_mapped_files() -> None:
