@@ -470,13 +470,16 @@ def _circumstances(
 
 def _stated_differences(paths: Sequence[Path], at: Circumstances) -> Iterator[Finding]:
     """Yield where keystores are decided differently on the distributions that they are for."""
+    from sros_tool.keystore.fleet import of_several_distributions
     from sros_tool.keystore.layout import is_keystore
 
     for path in paths or filter(None, (Path(os.environ.get(KEYSTORE_VARIABLE, "")),)):
-        if not at.vendors and is_keystore(path):
+        if at.vendors or not is_keystore(path):
+            continue
+        keystore = at.keystore(path)
+        if of_several_distributions(keystore):
             from sros_tool.proof.upgrade import check_distributions
 
-            keystore = at.keystore(path)
             yield from check_distributions(keystore, at=at.now, zone=at.zone, domain=at.domain)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -15,7 +16,7 @@ from shlex import quote
 from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.errors import KeystoreError, Note
+from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.fleet.enclaves import enclaves_of, robot_of, router_of, size_problem
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.layout import FLEET, enclave_names, has_enclave
@@ -67,6 +68,19 @@ def stated_distributions(keystore: Keystore, enclave: str) -> tuple[str, ...]:
     if robot and robot.distribution:
         return (robot.distribution,)
     return keystore.template.distributions
+
+
+def of_several_distributions(keystore: Keystore) -> dict[tuple[str, ...], list[str]]:
+    """Map the distributions of ROS 2, where there are several, to the enclaves that are for them.
+
+    Enclaves whose settings or fleet cannot be read are left out: that is a finding of the keystore.
+    """
+    enclaves: dict[tuple[str, ...], list[str]] = {}
+    for name in keystore.names:
+        with suppress(SrosError):
+            if len(stated := stated_distributions(keystore, name)) > 1:
+                enclaves.setdefault(stated, []).append(name)
+    return enclaves
 
 
 def checked_fleet(keystore: Keystore) -> Fleet | None:

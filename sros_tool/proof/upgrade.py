@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -50,10 +49,10 @@ from sros_tool.distributions import (
     Shipped,
     find_distribution,
 )
-from sros_tool.errors import SrosError, UsageError
+from sros_tool.errors import UsageError
 from sros_tool.faults import FAULTS
 from sros_tool.fleet.expansion import read_policy_for
-from sros_tool.keystore.fleet import stated_distributions
+from sros_tool.keystore.fleet import of_several_distributions, stated_distributions
 from sros_tool.keystore.layout import (
     KEY_FILE,
     KEY_URI_FILE,
@@ -332,17 +331,11 @@ def check_distributions(
     Raises:
         DocumentError: a file cannot be read, or there are too many wildcards to decide.
     """
-    by_distributions: dict[tuple[str, ...], list[str]] = {}
-    for name in keystore.names:
-        with suppress(SrosError):  # it is a finding of the keystore
-            stated = stated_distributions(keystore, name)
-            if len(stated) > 1:
-                by_distributions.setdefault(stated, []).append(name)
-    if not by_distributions:
+    if not (of_several := of_several_distributions(keystore)):
         return []
     files = signed_files(keystore, at=at, zone=zone, domain=domain)
     findings = []
-    for names, enclaves in by_distributions.items():
+    for names, enclaves in of_several.items():
         for before, after in _pairs([find_distribution(name) for name in names]):
             for change in changes(files.only(enclaves), before, after):
                 kind = DISTRIBUTION_REFUSES if change.kind in (_LOSES, _JOINS) else DIFFER

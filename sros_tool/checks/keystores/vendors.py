@@ -192,8 +192,8 @@ def check_vendors(evaluation: EnclaveEvaluation, known: Collection[Finding]) -> 
         if findings := list(_refusals(evaluation, made, known)):
             yield from findings
             return
-        # Vendors decide alike on a document as sros writes it, and every topic takes long.
-        if evaluation.portable and all(_file(finding) != PERMISSIONS_FILE for finding in known):
+        # Vendors decide alike on usual names in a document as sros writes it, and each topic costs.
+        if evaluation.portable and not any(_is_about_rules(finding) for finding in known):
             continue
         ids = {finding.id for finding in known}
         if findings := list(_different_rights(evaluation, made, domain, ids)):
@@ -279,6 +279,12 @@ def _is_named(cause: RefusalCause, known: Iterable[Finding]) -> bool:
         finding.id in wanted or (finding.id == own and _file(finding) == cause.file)
         for finding in known
     )
+
+
+def _is_about_rules(finding: Finding) -> bool:
+    """Return whether a finding is about the rules of the permissions or the names in them."""
+    family, _, _ = finding.id.partition(".")
+    return family in {"permissions", "portable"} and _file(finding) == PERMISSIONS_FILE
 
 
 def _file(finding: Finding) -> str:
