@@ -28,6 +28,7 @@ from sros_tool.checks.environment import (
 )
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.vulnerabilities import vulnerability_metrics
+from sros_tool.dds.advisories import Advisory
 from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import Moments, Vendor
 from sros_tool.dds.permissions import Grant, parse_permissions
@@ -821,9 +822,17 @@ def _not_seen(running: RunningProcesses) -> Iterator[Finding]:
 
 
 def runtime_metrics(
-    environment: Mapping[str, str], running: RunningProcesses, *, now: datetime, zone: tzinfo
+    environment: Mapping[str, str],
+    running: RunningProcesses,
+    *,
+    now: datetime,
+    zone: tzinfo,
+    advisories: Sequence[Advisory] | None = None,
 ) -> tuple[Metric, ...]:
-    """Return the metrics of the running processes, compared with the environment of this shell."""
+    """Return the metrics of the running processes, compared with the environment of this shell.
+
+    ``advisories`` are the known vulnerabilities; None for those that ship with sros.
+    """
     security = Counter(_security_of(process) for process in running.processes)
     findings = process_findings(environment, running, now=now, zone=zone)
     kinds = Counter((finding.severity, finding.id) for finding in findings)
@@ -846,7 +855,7 @@ def runtime_metrics(
                 for (severity, identity), number in sorted(kinds.items())
             ),
         ),
-        *vulnerability_metrics(running),
+        *vulnerability_metrics(running, advisories),
         Metric(
             "sros_processes_examined_timestamp_seconds",
             "When the processes were examined, in seconds since 1970.",

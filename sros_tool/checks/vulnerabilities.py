@@ -1,4 +1,4 @@
-"""Checks for known vulnerabilities of the DDS libraries that processes have mapped."""
+"""Checks for known vulnerabilities of the DDS of this machine's processes, and of robots."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from sros_tool.dds.advisories import (
     shipped_advisories,
     version_numbers,
 )
+from sros_tool.keystore.confirmation import RobotDds, RobotLibrary, Seen
 from sros_tool.names import DISTRIBUTIONS
 from sros_tool.prometheus import Metric, Sample
 from sros_tool.runtime.processes import MappedLibrary, RunningProcesses, plain
@@ -58,8 +59,18 @@ VERSION_UNKNOWN = FindingKind(
     "restart the processes.",
     prominent=True,
 )
-NOTES_ON_LIBRARIES = (PACKAGE_VULNERABILITIES, VERSION_UNKNOWN)
-"""Notes that `doctor` shows among its warnings: they say that a library may be vulnerable."""
+ROBOTS_UNKNOWN = FindingKind(
+    "runtime.robots-dds-unknown",
+    NOTE,
+    "robots whose DDS is not known, or not all of it",
+    "Which known vulnerabilities they have cannot be told.",
+    "The last confirmations of the robots.",
+    "Confirm again with this version of sros (`sros fleet report` on the robot), as a user who may "
+    "look at all processes, and while the nodes run.",
+    prominent=True,
+)
+NOTES_ON_LIBRARIES = (PACKAGE_VULNERABILITIES, VERSION_UNKNOWN, ROBOTS_UNKNOWN)
+"""Notes that are shown among warnings: they say that a library may be vulnerable."""
 _LINUX_PACKAGES = ("/usr/lib/", "/lib/")
 _ROS_PACKAGES = "/opt/ros/"
 _FASTRTPS = ("foxy", "galactic", "humble", "iron", "jazzy")
@@ -72,13 +83,71 @@ def vulnerability_findings(
     advisories: Sequence[Advisory] | None = None,
 ) -> Iterator[Finding]:
     """Yield one finding for each DDS library of the processes, and of ``libraries``."""
+    users = _users(running, libraries)
+    by = {library: [f"loaded by {some_names(of)}"] if of else [] for library, of in users.items()}
+    yield from _library_findings(by, advisories)
+
+
+def robot_findings(
+    robots: Mapping[str, RobotDds | None], advisories: Sequence[Advisory] | None = None
+) -> Iterator[Finding]:
+    """Yield a finding for each DDS library of robots, and one on robots whose DDS is not known.
+
+    ``robots`` maps the names of robots to their DDS, None where they did not report it.
+    """
+    seen: dict[MappedLibrary, dict[Seen, list[str]]] = {}
+    lacking: dict[str, list[str]] = {}
+    for robot, dds in robots.items():
+        if dds is None:
+            lacking.setdefault("not reported by", []).append(robot)
+            continue
+        for library in dds.libraries:
+            where = seen.setdefault(_as_mapped(library), {})
+            where.setdefault(library.seen, []).append(robot)
+        if not dds.libraries:
+            lacking.setdefault("none seen on", []).append(robot)
+        if dds.unseen:
+            lacking.setdefault("processes that could not be looked at on", []).append(robot)
+    by = {
+        library: [f"{_SEEN[how]} {some_names(where[how])}" for how in Seen if how in where]
+        for library, where in seen.items()
+    }
+    yield from _library_findings(by, advisories)
+    if lacking:
+        parts = (f"{what} {some_names(names)}" for what, names in lacking.items())
+        yield ROBOTS_UNKNOWN.found("DDS of robots", "; ".join(parts))
+
+
+_SEEN = {Seen.PROCESS: "loaded by processes of", Seen.INSTALLED: "installed, but not loaded, on"}
+
+
+def is_mended_later(library: RobotLibrary, advisories: Sequence[Advisory] | None = None) -> bool:
+    """Return whether a later release of the same major version mends a known vulnerability.
+
+    False for packages of Debian and Ubuntu, whose version does not tell.
+    """
+    known = known_vulnerabilities(library.product, library.version, advisories)
+    numbers = version_numbers(library.version)
+    if known is None or numbers is None or library.path.startswith(_LINUX_PACKAGES):
+        return False
+    return any(advisory.mended_in(numbers) for advisory in known.known)
+
+
+def _as_mapped(library: RobotLibrary) -> MappedLibrary:
+    return MappedLibrary(library.product, library.version, library.path)
+
+
+def _library_findings(
+    users: Mapping[MappedLibrary, Sequence[str]], advisories: Sequence[Advisory] | None
+) -> Iterator[Finding]:
+    """Yield one finding for each library; ``users`` maps it to clauses on where it is used."""
     used = shipped_advisories() if advisories is None else advisories
-    for library, users in _users(running, libraries).items():
+    for library, clauses in users.items():
         if not any(advisory.product == library.product for advisory in used):
             continue
         name = f"{library.product} {library.version}"
         place = f"'{plain(library.path, _LONGEST_PATH)}'"
-        by = f", loaded by {some_names(users)}" if users else ""
+        by = "".join(f", {clause}" for clause in clauses)
         known = known_vulnerabilities(library.product, library.version, used)
         if known is None:
             text = f"the name of {place} does not show its version{by}"
@@ -99,12 +168,14 @@ def vulnerability_findings(
 _LONGEST_PATH = 200
 
 
-def vulnerability_metrics(running: RunningProcesses) -> tuple[Metric, Metric]:
+def vulnerability_metrics(
+    running: RunningProcesses, advisories: Sequence[Advisory] | None = None
+) -> tuple[Metric, Metric]:
     """Return the number of known vulnerabilities by DDS release, and of libraries that hide it."""
     numbers: dict[tuple[str, str], int] = {}
     unknown: Counter[str] = Counter()
     for library in _users(running):
-        known = known_vulnerabilities(library.product, library.version)
+        known = known_vulnerabilities(library.product, library.version, advisories)
         if known is None:
             unknown[library.product] += 1
         else:

@@ -21,6 +21,8 @@ from sros_tool import __version__
 from sros_tool.cli.common import (
     KEYSTORE_VARIABLE,
     PATH,
+    advisories_of,
+    advisories_option,
     all_distros_option,
     check_metrics_file,
     check_one_decider,
@@ -79,13 +81,6 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
 
 
 _VENDORS = (*(vendor.value for vendor in MEASURED), _ZENOH)
-
-_advisories_option = click.option(
-    "--advisories",
-    metavar="FILE",
-    type=PATH,
-    help="Also take known vulnerabilities of DDS from FILE, in the OSV format (JSON).",
-)
 
 
 @verb("check")
@@ -205,7 +200,7 @@ _advisories_option = click.option(
     help="List only the enclaves that expire within DURATION (30d), or have used PERCENT of their "
     "validity (66%).",
 )
-@_advisories_option
+@advisories_option
 def check(
     targets: tuple[Path, ...],
     as_list: bool,
@@ -294,7 +289,7 @@ def check(
         raise UsageError(
             "--advisories is for `sros check runtime` and --upgrade-to", "", "Leave it out."
         )
-    known = _advisories(advisories)
+    known = advisories_of(advisories)
     if watch:
         if family != "runtime" or form not in ("text", "json") or moment:
             raise UsageError(
@@ -563,13 +558,6 @@ def _runtime(at: Circumstances) -> list[Finding]:
     return _findings_here(_environment(at.domain), at.now, {}, advisories=at.advisories)
 
 
-def _advisories(file: Path | None) -> tuple[Advisory, ...] | None:
-    """Return the advisories of sros with those of --advisories; None without the option."""
-    from sros_tool.dds.advisories import read_advisories
-
-    return read_advisories(file) if file else None
-
-
 def _environment(domain: int | None) -> dict[str, str]:
     """Return the variables of this process, with the domain of --domain."""
     return {**os.environ, **({} if domain is None else {"ROS_DOMAIN_ID": str(domain)})}
@@ -781,7 +769,7 @@ _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
     "findings, without secrets and without names of hosts, users and paths.",
 )
 @force_option
-@_advisories_option
+@advisories_option
 @json_option
 def doctor(report: Path | None, force: bool, advisories: Path | None, as_json: bool) -> None:
     """Find out which DDS stacks and RMWs of this machine enforce security.
@@ -814,7 +802,7 @@ def doctor(report: Path | None, force: bool, advisories: Path | None, as_json: b
         raise UsageError("--force is for --report", "", "Name a file, or leave --force out.")
     if report:
         check_output(report, force=force)
-    known = _advisories(advisories)
+    known = advisories_of(advisories)
     moment = now()
     diagnosis = examine(moment)
     insecure = {
@@ -939,6 +927,7 @@ def _watch_processes(
     is_flag=True,
     help="Also print the number of running ROS processes, by the state of their security.",
 )
+@advisories_option
 @dry_run_option
 @json_option
 def metrics(
@@ -948,6 +937,7 @@ def metrics(
     policies: tuple[Path, ...],
     fleet_file: Path | None,
     runtime: bool,
+    advisories: Path | None,
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -975,6 +965,9 @@ def metrics(
         check_output(output, force=True)
     if fleet_file and not policies:
         raise UsageError("--fleet is for the placeholders of a policy: add --policy FILE")
+    if advisories and not runtime:
+        raise UsageError("--advisories is for the DDS of processes: add --runtime")
+    known = advisories_of(advisories)
     wanted = tuple(policy_for(policy, fleet_file) for policy in policies)
     with progress("examining"):
         keystore = Keystore(root)
@@ -982,7 +975,7 @@ def metrics(
             keystore, now=moment, zone=local_zone(os.environ), policies=wanted
         )
         gauges = keystore_metrics(keystore, findings, now=moment, each_enclave=not earliest)
-        gauges += _of_processes(moment) if runtime else ()
+        gauges += _of_processes(moment, known) if runtime else ()
     text = render_metrics(gauges)
     changes = file_change(output, existed=output.exists()) if output else ()
     saved = save(output, text.encode()) if output and not dry_run else ""
@@ -996,9 +989,10 @@ def metrics(
         echo_document(text)
 
 
-def _of_processes(moment: datetime) -> tuple[Metric, ...]:
+def _of_processes(moment: datetime, advisories: tuple[Advisory, ...] | None) -> tuple[Metric, ...]:
     from sros_tool.checks.processes import runtime_metrics
     from sros_tool.runtime.processes import ProcessTable
 
     running = ProcessTable().look(moment)
-    return runtime_metrics(os.environ, running, now=moment, zone=local_zone(os.environ))
+    zone = local_zone(os.environ)
+    return runtime_metrics(os.environ, running, now=moment, zone=zone, advisories=advisories)

@@ -33,7 +33,7 @@ from sros_tool.terminal import (
     visible_json,
     visible_line,
 )
-from sros_tool.wording import counted
+from sros_tool.wording import counted, first_few
 
 if TYPE_CHECKING:
     from datetime import datetime, tzinfo
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
     from sros_tool.checks.kind import Finding
+    from sros_tool.dds.advisories import Advisory
     from sros_tool.distributions import Distribution
     from sros_tool.enclave_environment import EnclaveEnvironment
     from sros_tool.errors import Note
@@ -165,6 +166,33 @@ def distro_option(help_text: str, option: str = "--distro") -> Callable[[Decorat
 def all_distros_option(help_text: str) -> Callable[[Decorated], Decorated]:
     """Add ``--all-distros`` to a verb that decides as a DDS vendor does."""
     return click.option("--all-distros", is_flag=True, help=help_text)
+
+
+advisories_option = click.option(
+    "--advisories",
+    metavar="FILE",
+    type=PATH,
+    help="Also take known vulnerabilities of DDS from FILE, in the OSV format (JSON).",
+)
+
+
+def advisories_of(file: Path | None) -> tuple[Advisory, ...] | None:
+    """Return the advisories of sros with those of --advisories; None without the option.
+
+    Prints a note on versions in the file that cannot be read.
+    """
+    if file is None:
+        return None
+    from sros_tool.dds.advisories import read_advisories
+    from sros_tool.errors import Note
+
+    advisories = read_advisories(file)
+    unread = list(dict.fromkeys(text for advisory in advisories for text in advisory.unread))
+    if unread:
+        are, names = counted(len(unread), "version"), first_few(unread, 3)
+        text = f"{are} in '{file}' left out, as they are not three numbers: {names}"
+        print_notes([Note("check.advisory-versions", text)])
+    return advisories
 
 
 def check_one_decider() -> None:
@@ -897,7 +925,7 @@ def echo_findings(findings: Sequence[Finding], *, err: bool = False) -> None:
         for text in (f"[{ids}]", first.cause.text, first.cause.remedy):
             lines += _wrapped(text, "    ")
     else:
-        lines = _finding_lines(first)
+        lines = finding_lines(first)
     word = first.severity.word
     place, _, title = lines[0].partition(f": {word}: ")
     echo(f"{place}: ", Coloured(word), f": {title}", err=err)
@@ -905,7 +933,7 @@ def echo_findings(findings: Sequence[Finding], *, err: bool = False) -> None:
         echo(line, err=err)
 
 
-def _finding_lines(finding: Finding) -> list[str]:
+def finding_lines(finding: Finding) -> list[str]:
     """Return a finding as lines: place and title, reason, remedy, and related places."""
     head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
     subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
 from sros_tool.cli.common import (
     Verb,
+    advisories_of,
+    advisories_option,
     check_metrics_file,
     check_output,
     complete_file,
     complete_robot,
     dry_run_option,
+    finding_lines,
     json_option,
     json_text,
     keystore_argument,
@@ -32,12 +35,14 @@ from sros_tool.cli.common import (
 )
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo, echo_document, visible_line
-from sros_tool.values import file_change
+from sros_tool.values import file_change, shows
 from sros_tool.wording import counted, first_few
 
 if TYPE_CHECKING:
     from datetime import datetime
 
+    from sros_tool.checks.kind import Finding
+    from sros_tool.keystore.confirmation import RobotDds
     from sros_tool.keystore.fleet_status import FleetStatus, RobotStatus
 
 
@@ -98,10 +103,11 @@ def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
 @keystore_argument("folder", "[DIR]")
 @click.option("--robot", metavar="NAME", required=True, help="The name of this robot.")
 def _report(folder: Path, robot: str) -> None:
-    """On a robot: print which files of its enclaves it has, for `sros fleet confirm`.
+    """On a robot: print which files of its enclaves and which DDS it has, for `fleet confirm`.
 
-    The report is JSON: the time, and the SHA-256 of each file of the enclaves in DIR except their
-    keys. docs/json.md describes it under confirmation.
+    The report is JSON: the time, the SHA-256 of each file of the enclaves in DIR except their keys,
+    and the DDS libraries that processes have loaded or that are installed. docs/json.md describes
+    it under confirmation.
 
     Example:
       $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
@@ -110,8 +116,28 @@ def _report(folder: Path, robot: str) -> None:
     from sros_tool.keystore.confirmation import make_confirmation, render_confirmation
 
     with progress("reading"):
-        confirmation = make_confirmation(folder, robot, now=now())
+        moment = now()
+        confirmation = make_confirmation(folder, robot, now=moment, dds=_dds_here(moment))
     echo_document(render_confirmation(confirmation))
+
+
+def _dds_here(moment: datetime) -> RobotDds:
+    """Return the DDS libraries that processes of this machine have loaded, or that it has."""
+    from sros_tool.keystore.confirmation import RobotDds, RobotLibrary, Seen
+    from sros_tool.runtime.processes import ProcessTable, installed_dds, plain
+
+    running = ProcessTable().look(moment)
+    loaded = [library for process in running.processes for library in process.dds]
+    seen = dict.fromkeys(installed_dds(), Seen.INSTALLED)
+    seen |= dict.fromkeys((library._replace(replaced=False) for library in loaded), Seen.PROCESS)
+    libraries = dict.fromkeys(
+        RobotLibrary(library.product, library.version, plain(library.path, _LONGEST_PATH), how)
+        for library, how in sorted(seen.items(), key=lambda pair: (pair[1] != "process", pair[0]))
+    )
+    return RobotDds(tuple(libraries), len(running.unseen) + bool(running.hidden))
+
+
+_LONGEST_PATH = 200
 
 
 # ── at home ────────────────────────────────────────────────────────────────────────────────
@@ -180,6 +206,20 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     print_notes(notes)
 
 
+@shows(spread=("status",))
+class ComparedFleet(NamedTuple):
+    """The deployment status of a fleet at a moment, and what is known of its DDS."""
+
+    at: datetime
+    """When the robots were compared with the keystore, in UTC."""
+    status: FleetStatus
+    outdated_dds: Sequence[str]
+    """Robots with a DDS that has known vulnerabilities which a later release of the same major
+    version mends, sorted by name; if there are any, the exit status is 1."""
+    findings: Sequence[Finding]
+    """Findings on known vulnerabilities of the robots' DDS, as those of ``sros check runtime``."""
+
+
 @fleet.command("status")
 @keystore_argument()
 @robot_option("Show only this robot of the fleet, with each of its files.")
@@ -190,6 +230,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
 )
 @click.option("--prometheus", is_flag=True, help="Print metrics for node_exporter's textfile.")
 @click.option("--html", is_flag=True, help="Print the status as an HTML page.")
+@advisories_option
 @output_option("Replace FILE at once instead of printing.")
 @dry_run_option
 @json_option
@@ -199,6 +240,7 @@ def _status(
     max_age: str | None,
     prometheus: bool,
     html: bool,
+    advisories: Path | None,
     output: Path | None,
     dry_run: bool,
     as_json: bool,
@@ -208,7 +250,8 @@ def _status(
     A robot should have what an export from the keystore ROOT would give it now. A file is current;
     earlier (issued for this enclave before); another's (issued for another enclave); revoked;
     missing; or unknown (never issued by this keystore). Processes use new files only after a
-    restart, which a confirmation does not show.
+    restart, which a confirmation does not show. Then the known vulnerabilities of the DDS that the
+    robots reported are named, by the advisories of sros and of --advisories.
 
     Example:
       $ sros fleet status keystore
@@ -221,9 +264,11 @@ def _status(
       $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
 
     The exit status is 0 if every robot confirmed that it has what an export would
-    give it now, and 1 if not.
+    give it now, and 1 if not, or if a robot has a DDS with known vulnerabilities that
+    a later release of the same major version mends.
     """
-    from sros_tool.keystore.fleet_status import ComparedFleet, fleet_status
+    from sros_tool.checks.vulnerabilities import is_mended_later, robot_findings
+    from sros_tool.keystore.fleet_status import fleet_status
     from sros_tool.keystore.reader import Keystore
     from sros_tool.validity import parse_duration
 
@@ -237,32 +282,41 @@ def _status(
         if prometheus:
             check_metrics_file(output)
         check_output(output, force=True)
+    known = advisories_of(advisories)
     with progress("comparing"):
         status = fleet_status(Keystore(root), robots)
     if oldest:
         status = status.with_overdue(oldest, moment)
+    reported = {robot.robot: robot.dds for robot in status.robots if robot.received}
+    outdated = [
+        robot
+        for robot, dds in reported.items()
+        if dds and any(is_mended_later(library, known) for library in dds.libraries)
+    ]
+    compared = ComparedFleet(moment, status, outdated, list(robot_findings(reported, known)))
+    exit_status = 0 if status.complete and not outdated else 1
     if as_json:
-        print_json(ComparedFleet(moment, status))
-        return 0 if status.complete else 1
+        print_json(compared)
+        return exit_status
     if prometheus:
         from sros_tool.keystore.fleet_status import fleet_metrics
         from sros_tool.prometheus import render_metrics
 
-        text = render_metrics(fleet_metrics(status, now=moment))
+        text = render_metrics(fleet_metrics(status, now=moment, advisories=known))
     elif html:
         from sros_tool.report.pages import render_fleet_page
         from sros_tool.values import as_plain
 
-        text = render_fleet_page(as_plain(ComparedFleet(moment, status)))
+        text = render_fleet_page(as_plain(compared))
     else:
-        text = "".join(f"{visible_line(line)}\n" for line in _lines(status, moment, robots))
+        text = "".join(f"{visible_line(line)}\n" for line in _lines(compared, robots))
     if output and not dry_run:
         echo(save(output, text.encode()), err=True)
     elif output:
         echo(f"would {'replace' if output.exists() else 'create'} {output}")
     else:
         echo_document(text)
-    return 0 if status.complete else 1
+    return exit_status
 
 
 _WORDS = {
@@ -279,8 +333,12 @@ _MOST_LINES, _MOST_GROUPS = 50, 3
 """Maximum number of listed files of a robot, and of listed groups or unrecorded enclaves."""
 
 
-def _lines(status: FleetStatus, moment: datetime, robots: Sequence[str]) -> Iterator[str]:
-    """Yield the counts, then a line for every robot that is not current, or that was named."""
+def _lines(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[str]:
+    """Yield the counts, a line for every robot that is not current or was named, and findings."""
+    from sros_tool.checks.kind import WARNING
+    from sros_tool.checks.vulnerabilities import NOTES_ON_LIBRARIES
+
+    status, moment = compared.status, compared.at
     counts = ", ".join(f"{number} {_word(state)}" for state, number in status.counts.items())
     yield f"{counted(len(status.robots), 'robot')}: {counts}"
     if status.stage != "complete":
@@ -311,6 +369,9 @@ def _lines(status: FleetStatus, moment: datetime, robots: Sequence[str]) -> Iter
         yield "  ".join((*cells, row[3])).rstrip()
     for robot in status.robots if robots else ():
         yield from _details(robot)
+    for finding in compared.findings:
+        if finding.severity >= WARNING or finding.kind in NOTES_ON_LIBRARIES:
+            yield from finding_lines(finding)
 
 
 def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
@@ -359,6 +420,12 @@ def _details(robot: RobotStatus) -> Iterator[str]:
             )
     for kind, states in robot.files.items():
         yield f"  {kind:14} {', '.join(f'{number} {state}' for state, number in states.items())}"
+    for library in robot.dds.libraries if robot.dds else ():
+        version = library.version or "of unknown version"
+        how = "loaded" if library.seen == "process" else "installed, not loaded"
+        yield f"  {library.product} {version}, {how}: {library.path}"
+    if robot.dds and robot.dds.unseen:
+        yield f"  {counted(robot.dds.unseen, 'process', 'processes')} could not be looked at"
     for file in robot.pending[:_MOST_LINES]:
         issued = f" of {file.since}" if file.since else ""
         whose = f" of {file.robot or file.enclave}" if file.enclave else ""

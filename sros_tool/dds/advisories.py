@@ -30,6 +30,8 @@ _REPOSITORIES = {
     "github.com/eclipse-cyclonedds/cyclonedds": "Cyclone DDS",
     "github.com/eclipse-zenoh/zenoh": "Zenoh",
 }
+PRODUCTS = tuple(_REPOSITORIES.values())
+"""The products that advisories can be about."""
 _MOST_BYTES = 4 * 1024 * 1024
 _MOST_ADVISORIES = 10_000
 _ID = re.compile(r"[A-Za-z][A-Za-z0-9]*(?:-[A-Za-z0-9]+){1,6}", re.ASCII)
@@ -57,7 +59,8 @@ class Advisory(NamedTuple):
     """A known vulnerability of one product.
 
     ``needs`` and ``gives`` are words of ``database_specific``.  ``unclear_lines`` are release lines
-    such as 2.14 of which it is not known whether they are affected.
+    such as 2.14 of which it is not known whether they are affected.  ``unread`` are listed versions
+    that are not three numbers, such as those of release candidates; they count for nothing.
     """
 
     id: str
@@ -68,6 +71,7 @@ class Advisory(NamedTuple):
     ranges: tuple[_Range, ...]
     versions: frozenset[Version]
     unclear_lines: tuple[str, ...]
+    unread: tuple[str, ...] = ()
 
     def affects(self, version: Version) -> bool:
         """Return whether a release has the vulnerability."""
@@ -87,6 +91,7 @@ class Advisory(NamedTuple):
             ranges=self.ranges + other.ranges,
             versions=self.versions | other.versions,
             unclear_lines=self.unclear_lines + other.unclear_lines,
+            unread=self.unread + other.unread,
         )
 
 
@@ -206,12 +211,17 @@ def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
     for product, parts in by_product.items():
         ranges: list[_Range] = []
         versions: set[Version] = set()
+        unread: list[str] = []
         for part in () if is_withdrawn else parts:
-            new_ranges, new_versions = list(_ranges(part, identity)), set(_versions(part))
+            new_ranges = list(_ranges(part, identity))
+            listed = list(map(_text, _list(part.get("versions", []), "versions")))
+            numbers = {text: version_numbers(text) for text in listed}
+            new_versions = set(filter(None, numbers.values()))
             if not new_ranges and not new_versions:
                 raise ValueError(f"{identity} does not say which releases of {product} it affects")
             ranges += new_ranges
             versions |= new_versions
+            unread += (text for text, version in numbers.items() if version is None)
         yield Advisory(
             name,
             product,
@@ -221,6 +231,7 @@ def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
             tuple(ranges),
             frozenset(versions),
             tuple(map(_text, _list(own.get("unclear_lines", []), "unclear_lines"))),
+            tuple(unread),
         )
 
 
@@ -258,12 +269,6 @@ def _ranges(affected: Mapping[str, Any], identity: str) -> Iterator[_Range]:
                     introduced = None
         if introduced is not None:
             yield _Range(introduced, None, inclusive=False)
-
-
-def _versions(affected: Mapping[str, Any]) -> Iterator[Version]:
-    for version in _list(affected.get("versions", []), "versions"):
-        if isinstance(version, str) and (numbers := version_numbers(version)):
-            yield numbers
 
 
 def _numbers(version: object, identity: str) -> Version:

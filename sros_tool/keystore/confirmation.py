@@ -1,4 +1,4 @@
-"""Confirmations of robots: the digests of the enclave files that a robot says it has.
+"""Confirmations of robots: the digests of the enclave files that a robot says it has, and its DDS.
 
 A confirmation proves nothing: whoever controls the robot can write anything into it.  So it is read
 as hostile input, and only compared with what the keystore knows; no path in it is ever opened.
@@ -15,9 +15,11 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sros_tool.dds.advisories import PRODUCTS
 from sros_tool.errors import DocumentError, InvalidNameError
 from sros_tool.files import staged_file
 from sros_tool.fleet.robots import name_problem
@@ -38,7 +40,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.names import check_enclave_name
 from sros_tool.validity import elapsed, iso, parse_iso
-from sros_tool.values import DryRun, FileChange, NamedKeystore, Notes, parse_json
+from sros_tool.values import DryRun, FileChange, NamedKeystore, Notes, as_plain, parse_json
 from sros_tool.xml import read_bytes
 
 _FORMAT = 1
@@ -53,26 +55,64 @@ CONFIRMED_FILES = (
 _CERTIFICATE_FILES = (CERTIFICATE_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
 _KEYS = {"format", "robot", "time", "files"}
+_OPTIONAL_KEYS = {"certificates", "dds"}
 _CLOCK_TOLERANCE = timedelta(minutes=1)
 _MOST_CERTIFICATES = 32  # in a file
+_MOST_LIBRARIES, _MOST_UNSEEN = 100, 1_000_000
+_LIBRARY_VERSION = re.compile(r"\d{1,6}\.\d{1,6}\.\d{1,6}\Z", re.ASCII)
+_LIBRARY_PATH = re.compile(r"/[\w.+/ ?-]{1,199}\Z")
+"""Paths as a robot makes them plain; they are shown, and never opened."""
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 _MOMENT = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z\Z")
 _PEM = re.compile(rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERTIFICATE-----")
 
 
+class Seen(StrEnum):
+    """Where a robot saw a library of DDS."""
+
+    PROCESS = "process"
+    """At least one running process has loaded it."""
+    INSTALLED = "installed"
+    """It is installed, and no process that could be looked at has loaded it."""
+
+
+class RobotLibrary(NamedTuple):
+    """A library of DDS on a robot."""
+
+    product: str
+    """Name of the DDS, such as ``Fast DDS``."""
+    version: str
+    """Version of the DDS in three numbers; empty if the name of the file does not show it."""
+    path: str
+    """Path of the library on the robot."""
+    seen: Seen
+    """Whether a running process has loaded the library, or it is only installed."""
+
+
+class RobotDds(NamedTuple):
+    """The DDS of a robot, as the robot saw it."""
+
+    libraries: tuple[RobotLibrary, ...]
+    """The libraries of DDS; an empty list if the robot saw none."""
+    unseen: int
+    """Number of processes that could not be looked at, so that other libraries may be in use."""
+
+
 @dataclass(frozen=True, slots=True)
 class Confirmation:
-    """The enclave files that a robot says it has, and the time of the robot's clock.
+    """The enclave files that a robot says it has, its DDS, and the time of the robot's clock.
 
     ``files`` maps paths to the SHA-256 of the files.  ``certificates`` maps the paths of
     certificate and CA files to the SHA-256 of each certificate (DER) in the file, in order; without
-    an entry, an earlier certificate in that file cannot be recognised.
+    an entry, an earlier certificate in that file cannot be recognised.  ``dds`` is None if the
+    confirmation does not say it.
     """
 
     robot: str
     time: datetime
     files: Mapping[str, str]
     certificates: Mapping[str, tuple[str, ...]]
+    dds: RobotDds | None = None
 
     def enclaves(self) -> tuple[str, ...]:
         """Return the names of the enclaves in the confirmation, sorted."""
@@ -87,10 +127,13 @@ def enclave_of(path: str) -> str:
 # ── on the robot ───────────────────────────────────────────────────────────────────────────
 
 
-def make_confirmation(root: Path, robot: str, *, now: datetime) -> Confirmation:
+def make_confirmation(
+    root: Path, robot: str, *, now: datetime, dds: RobotDds | None = None
+) -> Confirmation:
     """Return a confirmation of all enclaves in ``root``, a keystore or a robot's installed folder.
 
     Folders that are not named like an enclave are left out: no process can run in them.
+    Libraries in ``dds`` beyond the first 100 are counted as unseen processes.
 
     Raises:
         DocumentError: ``robot`` is not a robot's name.
@@ -112,7 +155,9 @@ def make_confirmation(root: Path, robot: str, *, now: datetime) -> Confirmation:
                 files[path] = hashlib.sha256(data).hexdigest()
                 if file in _CERTIFICATE_FILES:
                     certificates[path] = certificate_digests(data)
-    return Confirmation(robot, now, files, certificates)
+    if dds and (more := len(dds.libraries) - _MOST_LIBRARIES) > 0:
+        dds = RobotDds(dds.libraries[:_MOST_LIBRARIES], min(dds.unseen + more, _MOST_UNSEEN))
+    return Confirmation(robot, now, files, certificates, dds)
 
 
 def certificate_digests(data: bytes) -> tuple[str, ...]:
@@ -135,6 +180,7 @@ def render_confirmation(confirmation: Confirmation) -> bytes:
 
 
 def _value_of(confirmation: Confirmation) -> dict[str, Any]:
+    dds = confirmation.dds
     return {
         "format": _FORMAT,
         "robot": confirmation.robot,
@@ -143,6 +189,7 @@ def _value_of(confirmation: Confirmation) -> dict[str, Any]:
         "certificates": {
             path: list(digests) for path, digests in sorted(confirmation.certificates.items())
         },
+        **({"dds": as_plain(dds)} if dds else {}),
     }
 
 
@@ -277,7 +324,7 @@ def _confirmation_from(value: Any, what: str) -> Confirmation:
         raise _refused(what, "it is not a JSON object")
     if value.get("format") != _FORMAT or type(value["format"]) is not int:
         raise _refused(what, f"its format is not {_FORMAT}", "Use an sros of the same version.")
-    if unknown := sorted(value.keys() - {*_KEYS, "certificates"}):
+    if unknown := sorted(value.keys() - _KEYS - _OPTIONAL_KEYS):
         raise _refused(what, f"it has the unknown key {_short(unknown[0])}")
     if missing := sorted(_KEYS - value.keys()):
         raise _refused(what, f"it lacks {', '.join(missing)}")
@@ -296,7 +343,38 @@ def _confirmation_from(value: Any, what: str) -> Confirmation:
         if not listed or not all(_is_digest(digest) for digest in digests):
             raise _refused(what, f"the certificates of {path} are not a list of SHA-256 digests")
         certificates[path] = tuple(digests)
-    return Confirmation(robot, _moment(value["time"], what), files, certificates)
+    dds = _dds_from(value["dds"], what) if "dds" in value else None
+    return Confirmation(robot, _moment(value["time"], what), files, certificates, dds)
+
+
+def _dds_from(value: Any, what: str) -> RobotDds:
+    """Return the DDS of a robot in a JSON value.
+
+    Raises:
+        DocumentError: it is not of that form.
+    """
+    if not isinstance(value, dict) or value.keys() != set(RobotDds._fields):
+        raise _refused(what, "its dds has not the keys libraries and unseen")
+    listed, unseen = value["libraries"], value["unseen"]
+    if type(unseen) is not int or not 0 <= unseen <= _MOST_UNSEEN:
+        raise _refused(what, "its number of unseen processes is no number")
+    if not isinstance(listed, list) or len(listed) > _MOST_LIBRARIES:
+        raise _refused(what, f"its libraries of DDS are no list of at most {_MOST_LIBRARIES}")
+    libraries = []
+    for library in listed:
+        if not isinstance(library, dict) or library.keys() != set(RobotLibrary._fields):
+            raise _refused(what, "a library of its DDS has not the keys product, version, ...")
+        product, version, path, seen = (library[key] for key in RobotLibrary._fields)
+        if product not in PRODUCTS:
+            raise _refused(what, f"{_short(product)} is no DDS that confirmations name")
+        if not isinstance(version, str) or (version and not _LIBRARY_VERSION.match(version)):
+            raise _refused(what, f"{_short(version)} is not the version of a DDS")
+        if not isinstance(path, str) or not _LIBRARY_PATH.match(path):
+            raise _refused(what, f"{_short(path)} is not the path of a library")
+        if seen not in tuple(Seen):
+            raise _refused(what, f"{_short(seen)} does not say where a library was seen")
+        libraries.append(RobotLibrary(product, version, path, Seen(seen)))
+    return RobotDds(tuple(libraries), unseen)
 
 
 def _entries(value: Mapping[str, Any], key: str, what: str) -> Iterator[tuple[str, Any]]:

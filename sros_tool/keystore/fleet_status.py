@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
@@ -17,12 +17,14 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+from sros_tool.dds.advisories import Advisory, known_vulnerabilities
 from sros_tool.errors import SrosError
 from sros_tool.fleet.enclaves import Unrecorded, enclaves_of, robot_of, unrecorded_enclaves
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     CONFIRMED_FILES,
+    RobotDds,
     certificate_digests,
     enclave_of,
     last_confirmation,
@@ -132,7 +134,7 @@ class ConfirmedFile:
 
 @shows(
     *("robot", "state", "enclaves", "revoked", "unrecorded", "sharing_name", "received", "clock"),
-    *("stage", "files", "pending", "notes"),
+    *("stage", "files", "pending", "dds", "notes"),
     null_if_empty=("stage",),
 )
 @dataclass(frozen=True, slots=True)
@@ -164,6 +166,8 @@ class RobotStatus:
     """Number of the robot's files, by kind and state."""
     pending: tuple[ConfirmedFile, ...]
     """Files that differ from the keystore; empty if the robot sent no confirmation."""
+    dds: RobotDds | None
+    """The DDS of the robot by its last confirmation; null if it does not say it."""
     notes: tuple[str, ...]
     """Remarks, as clauses, such as on the robot's clock."""
 
@@ -206,8 +210,8 @@ class FleetStatus:
 
     @property
     def complete(self) -> bool:
-        """Whether every robot that has enclaves confirmed the present files in time: the exit
-        status is 0.
+        """Whether every robot that has enclaves confirmed the present files in time; if not, the
+        exit status is 1.
         """
         return not self.overdue and all(
             robot.state in (State.CURRENT, State.NONE) for robot in self.robots
@@ -221,15 +225,6 @@ class FleetStatus:
             if robot.enclaves and robot.received and now - robot.received > max_age
         )
         return replace(self, overdue=frozenset(late))
-
-
-@shows(spread=("status",))
-class ComparedFleet(NamedTuple):
-    """The deployment status of a fleet at a moment."""
-
-    at: datetime
-    """When the robots were compared with the keystore, in UTC."""
-    status: FleetStatus
 
 
 def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
@@ -286,6 +281,7 @@ class _ComparedRobot(NamedTuple):
     current: Mapping[str, int]
     different: tuple[_Difference, ...]
     authorities: Mapping[str, frozenset[tuple[str, ...]]]
+    dds: RobotDds | None
     notes: tuple[str, ...]
 
 
@@ -309,7 +305,7 @@ def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _Compare
     except SrosError as error:
         notes.append(f"its last confirmation cannot be used: {error}")
     if received is None:
-        return _ComparedRobot(robot, enclaves, None, None, {}, (), {}, tuple(notes))
+        return _ComparedRobot(robot, enclaves, None, None, {}, (), {}, None, tuple(notes))
     if note := received.clock_note():
         notes.append(note)
     confirmed = received.confirmation
@@ -343,6 +339,7 @@ def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _Compare
         current,
         tuple(different),
         {kind: frozenset(certificates) for kind, certificates in authorities.items()},
+        confirmed.dds,
         tuple(notes),
     )
 
@@ -519,6 +516,7 @@ def _status(
         stages.of(compared),
         {kind: counts[kind] for kind in (*_KINDS.values(), _ZENOH) if kind in counts},
         different,
+        compared.dds,
         compared.notes,
     )
 
@@ -570,8 +568,13 @@ class _Stages:
 # ── metrics ───────────────────────────────────────────────────────────────────────────────
 
 
-def fleet_metrics(status: FleetStatus, *, now: datetime) -> tuple[Metric, ...]:
-    """Return the Prometheus metrics of a fleet; ``now`` is the time of the comparison."""
+def fleet_metrics(
+    status: FleetStatus, *, now: datetime, advisories: Sequence[Advisory] | None = None
+) -> tuple[Metric, ...]:
+    """Return the Prometheus metrics of a fleet; ``now`` is the time of the comparison.
+
+    ``advisories`` are the known vulnerabilities; None for those that ship with sros.
+    """
     place = {"keystore": str(status.keystore.absolute())}
     robots = [({**place, "robot": robot.robot}, robot) for robot in status.robots]
     return (
@@ -623,4 +626,45 @@ def fleet_metrics(status: FleetStatus, *, now: datetime) -> tuple[Metric, ...]:
                 for kind, states in robot.files.items()
             ),
         ),
+        *_dds_metrics(robots, advisories),
+    )
+
+
+def _dds_metrics(
+    robots: Sequence[tuple[Mapping[str, str], RobotStatus]], advisories: Sequence[Advisory] | None
+) -> Iterator[Metric]:
+    """Yield the known vulnerabilities of robots, and how much of their DDS is not known."""
+    numbers: list[Sample] = []
+    unknown: list[Sample] = []
+    for labels, robot in robots:
+        hidden = 0 if robot.dds and robot.dds.libraries else 1
+        releases: dict[tuple[str, str, str], int] = {}
+        for library in robot.dds.libraries if robot.dds else ():
+            known = known_vulnerabilities(library.product, library.version, advisories)
+            if known is None:
+                hidden += 1
+            else:
+                release = library.product, library.version, library.seen.value
+                releases[release] = len(known.known)
+        numbers += (
+            Sample(number, {**labels, "product": product, "version": version, "seen": seen})
+            for (product, version, seen), number in sorted(releases.items())
+        )
+        unknown.append(Sample(hidden, labels))
+    yield Metric(
+        "sros_fleet_dds_known_vulnerabilities",
+        "Number of known vulnerabilities of each DDS release of a robot, in a process or only "
+        "installed, without regard to mends of a package.",
+        tuple(numbers),
+    )
+    yield Metric(
+        "sros_fleet_dds_unknown",
+        "Number of DDS libraries of a robot whose known vulnerabilities cannot be told; 1 if it "
+        "reported no library.",
+        tuple(unknown),
+    )
+    yield Metric(
+        "sros_fleet_processes_not_seen",
+        "Number of processes that a robot could not look at, which may use other libraries.",
+        tuple(Sample(robot.dds.unseen, labels) for labels, robot in robots if robot.dds),
     )

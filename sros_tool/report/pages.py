@@ -350,7 +350,12 @@ _OUT_OF_DATE = ("earlier", "different", "missing", "never")
 
 def render_fleet_page(status: Json) -> str:
     """Return the HTML page of a fleet's status."""
-    body = f"{_fleet_head(status)}<section>{_fleet_table(status)}</section>"
+    findings = "".join(
+        f"<li>{escape(finding['subject'])}: {escape(finding['text'])}</li>"
+        for finding in status["findings"]
+    )
+    listed = f"<h2>Vulnerabilities of the DDS</h2><ul>{findings}</ul>" if findings else ""
+    body = f"{_fleet_head(status)}<section>{_fleet_table(status)}{listed}</section>"
     return _document(f"Fleet of {status['keystore']}", f"<main>{body}</main>", _asset("demo.css"))
 
 

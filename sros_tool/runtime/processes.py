@@ -407,6 +407,29 @@ def _mapped_dds(maps: bytes) -> tuple[MappedLibrary, ...]:
     )
 
 
+def installed_dds(top: Path = Path("/")) -> tuple[MappedLibrary, ...]:
+    """Return the libraries of DDS in the folders of ROS and of packages below ``top``.
+
+    No environment is asked for: that of a login by ssh does not name the folder of ROS.
+    """
+    files = {
+        (file.resolve(), product)
+        for folder in _LIBRARY_FOLDERS
+        for name, product in _PRODUCTS.items()
+        for file in top.glob(f"{folder}/lib{name.decode()}.so*")
+        if file.is_file()
+    }
+    return tuple(
+        MappedLibrary(product, _version(str(file)), str(file)) for file, product in sorted(files)
+    )
+
+
+_LIBRARY_FOLDERS = (
+    *("opt/ros/*/lib", "opt/ros/*/lib/*-linux-gnu*"),
+    *("usr/lib", "usr/lib/*-linux-gnu*", "usr/local/lib"),
+)
+
+
 def _version(name: str) -> str:
     """Return the three numbers at the end of a library's name, or ""."""
     numbers = _THREE_NUMBERS.search(name)

@@ -24,6 +24,7 @@ from tests.checks import (
 )
 from tests.checks.bench import Bench
 from tests.cli import test_requirements
+from tests.fleet import test_status
 from tests.proof import test_upgrade
 from tests.support.harness import sros
 
@@ -40,6 +41,7 @@ def test_every_finding_has_a_test_that_brings_it_about() -> None:
         *zenoh_cases.CASES,
         *test_requirements.CASES,
         *test_upgrade.FOUND,
+        *test_status.FOUND,
     }
     assert tested == set(all_kinds())
     assert len(all_kinds()) >= 50

@@ -90,7 +90,7 @@ def test_the_router_belongs_to_the_robot(keystore: Path, tmp_path: Path) -> None
     report = sros("fleet", "report", tmp_path / "r1", "--robot", "r1").ok().out
     (tmp_path / "r1.json").write_text(report)
     sros("fleet", "confirm", keystore, "--robot", "r1", tmp_path / "r1.json").ok()
-    assert sros("fleet", "status", keystore, "--robot", "r1").ok().out.startswith("1 robot: 1 curr")
+    assert sros("fleet", "status", keystore, "--robot", "r1").out.startswith("1 robot: 1 current")
     sros("env", tmp_path / "r1", "/r1/router", "--rmw", "rmw_zenoh_cpp").ok()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import shutil
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -13,10 +14,11 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from sros_tool.keystore.confirmation import parse_confirmation
 from sros_tool.keystore.layout import ENCLAVES
 from sros_tool.keystore.reader import Keystore
 from sros_tool.validity import iso, parse_iso
-from tests.keystore.test_confirmation import hostile
+from tests.keystore.test_confirmation import DDS, LIBRARY, hostile
 from tests.support.harness import Ended, policy_text, publish, sros
 
 ROBOTS = ("r1", "r2", "r3")
@@ -48,9 +50,9 @@ class Field:
             self.confirm(robot)
 
     def confirm(self, robot: str, **changed: object) -> Ended:
-        """Confirm what a robot has, with ``changed`` values."""
-        said = self.run("fleet", "report", robot, "--robot", robot).out
-        (self.folder / "said.json").write_text(json.dumps(json.loads(said) | changed))
+        """Confirm what a robot has, with a sound DDS and with ``changed`` values."""
+        said = json.loads(self.run("fleet", "report", robot, "--robot", robot).out)
+        (self.folder / "said.json").write_text(json.dumps(said | {"dds": DDS} | changed))
         return self.run("fleet", "confirm", "ks", "said.json", "--robot", robot)
 
     def status(self) -> dict[str, Any]:
@@ -59,7 +61,7 @@ class Field:
         found: dict[str, Any] = json.loads(ended.out)
         states = {each["state"] for each in found["robots"]}
         assert found["complete"] == (states <= {"current", "none"})
-        assert ended.status == (0 if found["complete"] else 1)
+        assert ended.status == (0 if found["complete"] and not found["outdated_dds"] else 1)
         found["robots"] = {each["robot"]: each for each in found["robots"]}
         return found
 
@@ -329,7 +331,73 @@ def test_the_module_on_the_robot_confirms_the_same(field: Field) -> None:
         if path.is_file()
     }
     said = json.loads(field.run("fleet", "report", "r1", "--robot", "r1").out)
-    assert module.confirmation("r1", files, parse_iso(said["time"]).timestamp()) == said
+    made = module.confirmation("r1", files, parse_iso(said["time"]).timestamp())
+    assert parse_confirmation(json.dumps(made).encode(), "it").dds
+    assert {**made, "dds": 0} == {**said, "dds": 0}
+    found = [
+        {(each["product"], each["version"]) for each in dds["libraries"] if "/usr/" in each["path"]}
+        for dds in (made["dds"], said["dds"])
+    ]
+    assert found[0] == found[1]
+
+
+OLD = {**LIBRARY, "product": "Fast DDS", "version": "2.14.5", "path": "/a/libfastrtps.so.2.14.5"}
+MENDED = {**OLD, "version": "2.14.6"}
+NOT_SEEN = "runtime.robots-dds-unknown"
+FOUND = frozenset({NOT_SEEN})
+
+
+@pytest.mark.parametrize(
+    ("library", "unseen", "outdated", "text"),
+    [
+        (OLD, 0, ["r1"], "loaded by processes of r1, 27 known vulnerabilities"),
+        ({**OLD, "seen": "installed"}, 0, ["r1"], "installed, but not loaded, on r1, 27 known"),
+        (MENDED, 0, [], "17 known vulnerabilities"),
+        ({**OLD, "path": "/usr/lib/libfastrtps.so.2.14.5"}, 0, [], "27 known vulnerabilities"),
+        ({**OLD, "version": ""}, 0, [], "does not show its version, loaded by processes of r1"),
+        (None, 0, [], "none seen on r1"),
+        (LIBRARY, 7, [], "processes that could not be looked at on r1"),
+    ],
+)
+def test_the_dds_of_a_robot(
+    field: Field, library: dict[str, str] | None, unseen: int, outdated: list[str], text: str
+) -> None:
+    assert "DDS" not in field.run("fleet", "status", "ks").out
+    libraries = [library] if library else []
+    field.confirm("r1", dds={"libraries": libraries, "unseen": unseen})
+    ended = field.run("fleet", "status", "ks", status=1 if outdated else 0)
+    assert "3 robots: 3 current" in ended.out and text in ended.out
+    found = json.loads(field.run("fleet", "status", "ks", "--json", status=ended.status).out)
+    assert (found["complete"], found["outdated_dds"]) == (True, outdated)
+    assert text in " ".join(finding["text"] for finding in found["findings"])
+    assert found["robots"][0]["dds"] == {"libraries": libraries, "unseen": unseen}
+    numbers = field.run("fleet", "status", "ks", "--prometheus", status=ended.status).out
+    known = re.findall(r'vulnerabilities\{.*robot="r1".*seen="(\w+)"\} (\d+)', numbers)
+    unknown = re.findall(r'dds_unknown\{.*robot="r1"\} (\d+)', numbers)
+    is_known = bool(library and library["version"])
+    assert (bool(known), unknown) == (is_known, ["0" if is_known else "1"])
+
+
+def test_an_earlier_confirmation_does_not_name_the_dds(field: Field) -> None:
+    kept = field.root / "confirmed/r1.json"
+    value = json.loads(kept.read_text())
+    del value["confirmation"]["dds"]
+    kept.write_text(json.dumps(value))
+    ended = field.run("fleet", "status", "ks")
+    assert f"[{NOT_SEEN}]" in ended.out and "not reported by r1" in ended.out
+
+
+def test_newer_advisories_judge_what_robots_reported(field: Field, tmp_path: Path) -> None:
+    package = {"name": "github.com/eclipse-cyclonedds/cyclonedds"}
+    events = [{"introduced": "0"}, {"fixed": "11.0.2"}]
+    affected = {"package": package, "ranges": [{"type": "SEMVER", "events": events}]}
+    listed = {"package": package, "versions": ["11.0.1", "11.0", "v12.0.0-rc1"]}
+    path = tmp_path / "newer.json"
+    path.write_text(json.dumps({"id": "CVE-2030-12345", "affected": [affected, listed]}))
+    field.run("fleet", "status", "ks")
+    ended = field.run("fleet", "status", "ks", "--advisories", path, status=1)
+    assert "r1, r2, r3, 1 known vulnerability" in ended.out and "CVE-2030-12345" in ended.out
+    assert "2 versions in" in ended.err and "11.0, v12.0.0-rc1" in ended.err
 
 
 def test_metrics_and_the_page(field: Field) -> None:
@@ -350,5 +418,9 @@ def test_metrics_and_the_page(field: Field) -> None:
     assert "sros_fleet_robots" in (field.folder / "x.prom").read_text()
     page = field.run("fleet", "status", renamed, "--html", status=1).out
     assert "1 certificate earlier" in page and "&lt;b&gt;ks" in page and "<b>ks" not in page
+    renamed = renamed.rename(field.root)
+    field.confirm("r1", dds={"libraries": [OLD], "unseen": 0})
+    page = field.run("fleet", "status", renamed, "--html", status=1).out
+    assert "<li>Fast DDS 2.14.5: &#x27;/a/libfastrtps.so.2.14.5&#x27;, loaded by" in page
     for words in ("--json --html", "--json -o x.json", "--prometheus -o x.txt"):
         field.run("fleet", "status", renamed, *words.split(), status=2)

@@ -16,6 +16,9 @@ from sros_tool.errors import DocumentError, KeystoreError
 from sros_tool.keystore.confirmation import (
     CONFIRMED_FILES,
     MAX_BYTES,
+    RobotDds,
+    RobotLibrary,
+    Seen,
     make_confirmation,
     parse_confirmation,
     render_confirmation,
@@ -42,7 +45,9 @@ def test_a_confirmation_names_all_files_but_keys(export: Path) -> None:
     (export / "enclaves/r7/base/notes.txt").write_text("mine")
     (export / "enclaves/my-backup").mkdir(exist_ok=True)
     (export / "enclaves/my-backup/key.pem").write_text("not an enclave")
-    made = make_confirmation(export, "r7", now=NOW)
+    dds = RobotDds((RobotLibrary("Fast DDS", "", "/libfastdds.so", Seen.INSTALLED),) * 102, 3)
+    made = make_confirmation(export, "r7", now=NOW, dds=dds)
+    assert made.dds == RobotDds(dds.libraries[:100], 5), "what it does not name counts as unseen"
     wanted = {
         f"{folder}/{file}": hashlib.sha256((export / folder / file).read_bytes()).hexdigest()
         for folder in ("enclaves", "enclaves/r7/base")
@@ -77,14 +82,32 @@ def test_a_file_that_cannot_be_confirmed_is_an_error(export: Path, tmp_path: Pat
 
 
 PATH = "enclaves/r7/cert.pem"
+LIBRARY = {
+    "product": "Cyclone DDS",
+    "version": "11.0.1",
+    "path": "/opt/ros/lyrical/lib/libddsc.so.11.0.1",
+    "seen": "process",
+}
+"""A library without known vulnerabilities."""
+DDS: dict[str, Any] = {"libraries": [LIBRARY], "unseen": 0}
 VALID: dict[str, Any] = {
     "format": 1,
     "robot": "r7",
     "time": "2027-05-21T12:50:48Z",
     "files": {PATH: DIGEST},
     "certificates": {PATH: [DIGEST]},
+    "dds": DDS,
 }
+OPTIONAL = ("certificates", "dds")
 CONTROLS = "\x1b[2J\x9b\u202e\udc9b\x00\n"
+NO_LIBRARIES: Any = {
+    "product": ("DDS", "", None, [], CONTROLS),
+    "version": ("2.14", "v2.14.5", "1" * 5000, CONTROLS, None, []),
+    "path": ("", "lib", "/" * 201, f"/{CONTROLS}", "/a\n", None, []),
+    "seen": ("", "both", None, [], {}),
+    CONTROLS: (1,),
+}
+"""Values of a library that nobody may take for one."""
 
 
 def hostile() -> list[tuple[str, bytes]]:
@@ -99,7 +122,7 @@ def hostile() -> list[tuple[str, bytes]]:
         ("empty", b""),
         ("list", b"[]"),
     ]
-    for key, values in {
+    faults: dict[str, tuple[object, ...]] = {
         "format": (True, "1", 2, 1.0, None, [1]),
         "robot": (7, "", "a" * 65, "r7/..", "r7\n", "r__7", CONTROLS, None, {}),
         "time": (
@@ -119,10 +142,21 @@ def hostile() -> list[tuple[str, bytes]]:
             [], None, {PATH: DIGEST}, {PATH: [1]}, {PATH: [DIGEST] * 33}, {PATH: [CONTROLS]},
             {"enclaves/r7/permissions.p7s": [DIGEST]}, {"enclaves/r8/cert.pem": [DIGEST]},
         ),
+        "dds": (
+            [], None, {}, {"libraries": []}, {**DDS, "more": 1}, {**DDS, "libraries": {}},
+            *({**DDS, "unseen": wrong} for wrong in (-1, True, 1.0, "1", 10**9, None)),
+            {**DDS, "libraries": [LIBRARY] * 101}, {**DDS, "libraries": [[]]},
+            *(
+                {**DDS, "libraries": [{**LIBRARY, part: wrong}]}
+                for part, wrongs in NO_LIBRARIES.items()
+                for wrong in wrongs
+            ),
+        ),
         CONTROLS: (1,),
-    }.items():  # fmt: skip
+    }  # fmt: skip
+    for key, values in faults.items():
         found += [(f"{key} {each!r}"[:60], _json({**VALID, key: each})) for each in values]
-        if key in VALID and key != "certificates":
+        if key in VALID and key not in OPTIONAL:
             found.append((f"no {key}", _json({k: v for k, v in VALID.items() if k != key})))
     return found
 
@@ -133,8 +167,10 @@ def _json(value: object) -> bytes:
 
 def test_a_hostile_confirmation_is_refused_in_one_paragraph() -> None:
     assert parse_confirmation(_json(VALID), "it").certificates == {PATH: (DIGEST,)}
-    without = {key: VALID[key] for key in VALID if key != "certificates"}
-    assert parse_confirmation(_json(without), "it").certificates == {}
+    without = parse_confirmation(
+        _json({key: VALID[key] for key in VALID if key not in OPTIONAL}), "it"
+    )
+    assert (without.certificates, without.dds) == ({}, None), "as earlier versions write it"
     for name, data in hostile():
         with pytest.raises(DocumentError) as caught:
             parse_confirmation(data, "it")

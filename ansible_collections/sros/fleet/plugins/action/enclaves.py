@@ -44,6 +44,10 @@ class ActionModule(RobotAction):
             time=name,
             files=map_of(name),
             certificates=map_of(list_of(name)),
+            dds=record(
+                libraries=list_of(record(product=name, version=name, path=name, seen=name)),
+                unseen=number,
+            ),
         ),
         "clock_difference": number,
         "diff": DIFFERENCES,

@@ -8,8 +8,10 @@ from __future__ import annotations
 import base64
 import binascii
 import datetime
+import glob
 import hashlib
 import io
+import os
 import re
 import tarfile
 import zlib
@@ -182,7 +184,7 @@ def certificate_digests(content: bytes) -> list[str]:
 
 
 def confirmation(robot: str, files: Files, now: float) -> dict:
-    """Return what a robot confirms that it has (sros_tool/schemas/confirmation.json).
+    """Return what a robot confirms that it has (sros_tool/schemas/confirmation.json), with its DDS.
 
     Args:
         robot: the name of the robot.
@@ -205,4 +207,61 @@ def confirmation(robot: str, files: Files, now: float) -> dict:
             for path, each in confirmed.items()
             if path.rpartition("/")[2] in (CERTIFICATE_FILE, *AUTHORITY_FILES)
         },
+        "dds": _dds_here(),
+    }
+
+
+_MAPPED = re.compile(
+    rb"^[^/\n]*(/(?:[^\n]*/)?lib(?:fastrtps|fastdds|ddsc)(?:-[0-9a-f]{6,40})?"
+    rb"(?:\.abi3|\.cpython-[\w-]+)?\.so[^/\n]*?)(?: \(deleted\))?$",
+    re.MULTILINE,
+)
+_FOLDERS = (
+    *("/opt/ros/*/lib", "/opt/ros/*/lib/*-linux-gnu*"),
+    *("/usr/lib", "/usr/lib/*-linux-gnu*", "/usr/local/lib"),
+)
+_VERSION = re.compile(r"\.so\.([0-9]{1,6}\.[0-9]{1,6}\.[0-9]{1,6})(?:\.[0-9]+)?\Z")
+_MOST_MAPS = 32 * 1024 * 1024
+_MOST_LIBRARIES, _LONGEST_PATH = 100, 200
+
+
+def _dds_here() -> dict:
+    """Return the libraries of DDS that processes have loaded, or that are installed.
+
+    A wheel's library, whose name does not show its version, is of unknown version.
+    """
+    loaded: set[str] = set()
+    unseen = 0 if os.path.exists("/proc/1") else 1  # /proc hides those of other users
+    for pid in filter(str.isdigit, os.listdir("/proc")):
+        try:
+            with open(f"/proc/{pid}/maps", "rb") as file:
+                maps = file.read(_MOST_MAPS)
+                unseen += bool(file.read(1))
+            loaded.update(map(os.fsdecode, _MAPPED.findall(maps)))
+        except (FileNotFoundError, ProcessLookupError):
+            continue  # it has ended
+        except OSError:
+            unseen += 1
+    installed = {
+        os.path.realpath(path)
+        for folder in _FOLDERS
+        for name in ("fastrtps", "fastdds", "ddsc")
+        for path in glob.glob(f"{folder}/lib{name}.so*")
+    }
+    seen = [(path, "process") for path in sorted(loaded)]
+    seen += [(path, "installed") for path in sorted(installed - loaded)]
+    more = max(len(seen) - _MOST_LIBRARIES, 0)
+    return {
+        "libraries": [_library(path, how) for path, how in seen[:_MOST_LIBRARIES]],
+        "unseen": unseen + more,
+    }
+
+
+def _library(path: str, seen: str) -> dict:
+    version = _VERSION.search(path)
+    return {
+        "product": "Cyclone DDS" if "/libddsc" in path else "Fast DDS",
+        "version": version.group(1) if version else "",
+        "path": re.sub(r"[^\w.+/ -]", "?", path[:_LONGEST_PATH]),
+        "seen": seen,
     }

@@ -119,7 +119,7 @@ verification:
   type: dict
   returned: unless something would change in check mode
 confirmation:
-  description: What the robot has, as SHA-256, for C(sros fleet confirm).
+  description: What the robot has, as SHA-256, and its DDS, for C(sros fleet confirm).
   type: dict
   returned: always
 remarks:
