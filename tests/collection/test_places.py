@@ -1,15 +1,16 @@
-"""The folder of a robot's enclaves: replaced whole or not at all, and hostile until then."""
+"""The folder of a robot's enclaves: changed wholly or not at all, and hostile until then."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import stat
+import subprocess
 from pathlib import Path
+from subprocess import PIPE
 
 import pytest
 
-from ansible_collections.sros.fleet.plugins.module_utils import places
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
 from ansible_collections.sros.fleet.plugins.module_utils.places import Place
 
@@ -36,12 +37,7 @@ def beside(place: Place) -> set[str]:
     return set(os.listdir(Path(place.path).parent)) - {"keystore", ".keystore.sros-lock"}
 
 
-@pytest.mark.parametrize("exchange", [True, False])
-def test_a_folder_is_replaced_whole(
-    exchange: bool, place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if not exchange:
-        monkeypatch.setattr(places, "_exchange", lambda *_: False)
+def test_the_files_of_a_folder_are_replaced(place: Place) -> None:
     assert place.read() == OLD
     assert place.is_closed()
     key = Path(place.path, "enclaves/a/key.pem")
@@ -54,51 +50,92 @@ def test_a_folder_is_replaced_whole(
     assert not beside(place)
 
 
+def test_what_somebody_else_put_there_gives_way(place: Place) -> None:
+    """Where a file or folder belongs, something else can have appeared since it was read."""
+    top = Path(place.path, "enclaves")
+    (top / "a/cert.pem").unlink()
+    (top / "a/cert.pem").mkdir()
+    (top / "a/key.pem").unlink()
+    (top / "a/key.pem").symlink_to("/etc/hostname")
+    (top / "b").symlink_to("/etc")
+    install(place, {**NEW, "enclaves/a/key.pem": b"new key"})
+    assert place.read() == {**NEW, "enclaves/a/key.pem": b"new key"}
+    assert place.is_closed()
+    assert not beside(place)
+
+
 class Killed(BaseException):
     pass
 
 
-@pytest.mark.parametrize("exchange", [True, False])
-def test_killed_at_any_rename_it_is_old_or_new(
-    exchange: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_killed_at_any_step_it_becomes_old_or_new(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And whoever comes next finds it whole, with nothing next to it."""
-    real_exchange, rename, remove = places._exchange, os.rename, shutil.rmtree
+    rename, remove = os.rename, shutil.rmtree
     seen = set()
-    for number in range(8):
+    for number in range(12):
         place = Place(str(tmp_path / str(number) / "keystore"))
-        install(place, OLD)
+        install(place, {**OLD, "enclaves/left/cert.pem": b"left"})
         left = number
 
-        def step() -> bool:
+        def step() -> None:
             nonlocal left
             if left == 0:
                 raise Killed
             left -= 1
-            return True
 
-        def exchanged(one: str, other: str) -> bool:
-            if not exchange:
-                return False
+        def renamed(old: str, new: str, **folders: int | None) -> None:
             step()
-            return real_exchange(one, other)
+            rename(old, new, **folders)
+
+        def removed(path: str) -> None:
+            step()
+            remove(path)
 
         with monkeypatch.context() as patch:
-            patch.setattr(places, "_exchange", exchanged)
-            patch.setattr(os, "rename", lambda *names: rename(*names) if step() else None)
-            patch.setattr(shutil, "rmtree", lambda path: remove(path) if step() else None)
+            patch.setattr(os, "rename", renamed)
+            patch.setattr(shutil, "rmtree", removed)
             try:
                 with place.locked():
                     place.prepare(NEW)
                     place.replace()
             except Killed:
                 seen.add("killed")
+            else:
+                seen.add("ended")
+            decided = place.is_pending()
         with place.locked():
-            found = place.read()
-        assert found in (OLD, NEW), number
+            present = place.read()
         assert not beside(place)
-        seen.add("new" if found == NEW else "old")
-    assert seen == {"killed", "old", "new"}
+        assert not place.is_pending()
+        seen.add("new" if present == NEW else "old")
+        assert present == NEW or (set(present) == {*OLD, "enclaves/left/cert.pem"} and not decided)
+    assert seen == {"killed", "ended", "old", "new"}
+
+
+@pytest.mark.skipif(not shutil.which("unshare"), reason="unshare is needed")
+def test_a_process_that_sees_one_enclave_goes_on_to_see_only_that(place: Place) -> None:
+    """A unit of systemd mounts the folder of its enclave over an empty one, as here."""
+    before = {**OLD, "enclaves/b/cert.pem": b"other"}
+    install(place, before)
+    top = place.path + "/enclaves"
+    view = (
+        f"mkdir -p {top}.view && mount --bind {top}/a {top}.view && mount -t tmpfs none {top} &&"
+        f" mkdir {top}/a && mount --bind {top}.view {top}/a && echo ready && read line &&"
+        f" cd / && ls {top} && cat {top}/a/*"
+    )
+    user = [] if os.getuid() == 0 else ["--map-root-user"]
+    command = ["unshare", *user, "--mount", "sh", "-c", view]
+    with subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True) as unit:
+        assert unit.stdin
+        assert unit.stdout
+        if unit.stdout.readline() != "ready\n":
+            pytest.skip("mount namespaces are not allowed here")
+        Path(place.path, "enclaves.view").rmdir()
+        install(place, {**before, "enclaves/b/cert.pem": b"new", "enclaves/c/cert.pem": b"c"})
+        seen, _ = unit.communicate("\n")
+    assert seen == "a\noldkey"
 
 
 def test_restarts_that_are_due_are_remembered(place: Place) -> None:
@@ -107,6 +144,9 @@ def test_restarts_that_are_due_are_remembered(place: Place) -> None:
     assert Place(place.path).due() == ["/a", "/b"]
     place.set_due([])
     assert place.due() == []
+    place.set_delivered(["/a"])
+    assert (place.due(), place.delivered()) == ([], ["/a"])
+    place.set_delivered([])
     assert not beside(place)
     for bad in (b"", b"{", b"[1]", b'["a"]', b'["/a/../b"]', b"[" * 100_000):
         Path(place.path).with_name(".keystore.sros-restart").write_bytes(bad)
@@ -226,3 +266,24 @@ def test_the_owner_gets_the_files(tmp_path: Path) -> None:
     assert not Place(place.path).is_closed()
     with pytest.raises(RefusedError, match="no user"):
         Place(place.path, "no such user")
+
+
+def test_processes_of_a_folder_that_was_lost_have_to_be_restarted(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They still have the files of before.  Twin: an enclave that is new has no processes."""
+    module = pytest.importorskip("ansible_collections.sros.fleet.plugins.modules.enclaves")
+    verified = {"by": "openssl", "ok": True, "problems": [], "remarks": []}
+    monkeypatch.setattr(module, "verify", lambda *_: verified)
+    asked = {"robot": "r1", "verifier": ["sros"], "replace_authorities": False}
+
+    def deliver(files: dict[str, bytes]) -> list[str]:
+        due: list[str] = module._install(place, place.read(), files, asked, 0.0)["restart"]
+        place.set_due([])
+        return due
+
+    assert deliver(OLD) == []
+    assert deliver(NEW) == ["/a"]
+    shutil.rmtree(place.path)
+    changed = {**NEW, "enclaves/b/c/cert.pem": b"changed", "enclaves/d/cert.pem": b"new"}
+    assert deliver(changed) == ["/a", "/b/c"]

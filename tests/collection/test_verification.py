@@ -5,12 +5,17 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
-from ansible_collections.sros.fleet.plugins.module_utils.verification import clock_remark, verify
+from ansible_collections.sros.fleet.plugins.module_utils.verification import (
+    check_lists,
+    clock_remark,
+    verify,
+)
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
@@ -40,8 +45,13 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         export(name, "/a", "/b", keystore=name, at=moment)
     create_enclaves(folder / "ks", ["/c"], now=now)
     export("c", "/c")
+    shutil.copytree(folder / "ks", folder / "restored", symlinks=True)
     revoke(folder / "ks", ["/c"], now=now)
     export("revoked", "/a", "/b")
+    create_enclaves(folder / "restored", ["/d"], now=now)
+    for which, name in (("restored", "/d"), ("restored twice", "/b")):
+        revoke(folder / "restored", [name], now=now)
+        export(which, "/a", keystore="restored")
     for each in ("distribute", "reissue", "retire"):
         rotate_ca(folder / "ks", now=now)
         export(each, "/a", "/b")
@@ -140,6 +150,53 @@ def test_who_verifies(exports: dict[str, Path], monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv("PATH", "/nonexistent")
     with pytest.raises(RefusedError, match="neither sros nor openssl"):
         verify(folder, ["/a"], NONE)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def test_no_older_list_takes_the_place_of_a_newer_one(
+    exports: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A home that was restored from a backup would let revoked enclaves be trusted again."""
+    files = {what: files_of(folder) for what, folder in exports.items()}
+    stages = ["ks", "revoked", "distribute", "reissue", "retire"]
+    for before, after in [*pairwise(stages), ("revoked", "revoked")]:
+        assert check_lists(files[before], files[after], str(tmp_path)) == [], (before, after)
+    for before, after, number in (
+        ("revoked", "ks", "none"),
+        ("reissue", "distribute", "the number"),
+        ("revoked", "restored", "the number 1"),  # another list of the same number
+        ("restored twice", "restored", "the number 1"),
+    ):
+        with pytest.raises(RefusedError, match=f"older than .* the keystore has {number}"):
+            check_lists(files[before], files[after], str(tmp_path))
+    (remark,) = check_lists(files["revoked"], files["restored twice"], str(tmp_path))
+    assert remark.startswith("The present revocation list has 1 serial numbers")
+    monkeypatch.setenv("PATH", "/nonexistent")
+    with pytest.raises(RefusedError, match="lacks openssl"):
+        check_lists(files["revoked"], files["ks"], str(tmp_path))
+
+
+def test_a_list_that_the_robot_made_itself_holds_up_nothing(
+    exports: dict[str, Path], tmp_path: Path
+) -> None:
+    """Twin: the same list, signed by the CA that the new files trust."""
+    forger, now = tmp_path / "forger", datetime.now(UTC)
+    create_keystore(forger, template=load_template("production"), now=now)
+    create_enclaves(forger, ["/a", "/b"], now=now)
+    revoke(forger, ["/b"], now=now)
+    distribute(forger, ["/a"], tmp_path / "forged", now=now)
+    forged = files_of(tmp_path / "forged")
+    before, after = files_of(exports["revoked"]), files_of(exports["ks"])
+    path = "enclaves/a/crl.pem"
+    for content in (forged[path], b"", b"-----BEGIN X509 CRL-----\n" * 100_000, b"\xff\0"):
+        mine = {key: value for key, value in before.items() if not key.startswith("enclaves/b/")}
+        assert check_lists({**mine, path: content}, after, str(tmp_path)) == []
+        with pytest.raises(RefusedError, match="older"):
+            check_lists({**mine, path: content + before[path]}, after, str(tmp_path))
 
 
 def test_clocks() -> None:

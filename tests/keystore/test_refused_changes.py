@@ -7,6 +7,7 @@ in `tests.integration`.
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -295,6 +296,20 @@ def test_a_revoked_enclave_that_is_put_back_keeps_nobody_from_signing_a_list(
     ended = sros("crl", root, "--refresh").ok()
     assert "note [keystore.revoked-put-back]: the folder of /a is in the keystore" in ended.err
     assert (enclave_path(root, "/b") / "crl.pem").read_bytes() == (root / CRL).read_bytes()
+
+
+def test_a_list_that_comes_back_from_a_robot_is_signed_again(sound: Path, tmp_path: Path) -> None:
+    """A keystore from a backup knows of a revocation only by the list that a robot still has."""
+    root, backup = tmp_path / "ks", tmp_path / "backup"
+    shutil.copytree(sound, backup, symlinks=True)
+    shutil.copytree(sound, root, symlinks=True)
+    sros("revoke", root, "/a").ok()
+    shutil.copy(root / "enclaves/b/crl.pem", backup / CRL)
+    ended = sros("crl", backup, "--refresh").ok()
+    assert "note [keystore.revoked-put-back]: the folder of /a is in the keystore" in ended.err
+    sros("revoke", backup, "/a").ok()
+    (revoked,) = json.loads(sros("crl", backup, "--json").ok().out)["revoked"]
+    assert revoked["enclave"] == "/a"
 
 
 def test_a_dry_run_says_what_it_did_not_keep(

@@ -112,8 +112,8 @@ def refuse_stopping(
 ) -> tuple[Note, ...]:
     """Refuse a transaction after which vendors refuse enclaves that they accept today.
 
-    A new enclave is refused if no vendor would accept it.  Enclaves whose certificates the ledger
-    has as revoked are meant to be refused: somebody put their files back.
+    A new enclave is refused if no vendor would accept it.  Enclaves whose certificates were revoked
+    before are meant to be refused: somebody put their files back.
 
     Args:
         transaction: the transaction, with all its files staged.
@@ -395,9 +395,14 @@ class _FilesOfChange:
 
     @cached_property
     def _revoked_serials(self) -> frozenset[int]:
-        """The serial numbers that the ledger had as revoked before the transaction."""
+        """The serial numbers that ledger or revocation list had before the transaction.
+
+        Only the list has them where it comes from a robot, and the keystore from a backup.
+        """
         entries = self._keystore.ledger_with("what", "revocation").entries
-        return frozenset(int(entry.serial, 16) for entry in entries if entry.what == "revocation")
+        of_ledger = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
+        has_list = self._keystore.has(CRL)
+        return _listed(self._keystore.read(CRL, "revocation list") if has_list else b"") | of_ledger
 
     def was_revoked(self, name: str) -> bool:
         """Return whether the enclave's certificate, before and after, was revoked before."""

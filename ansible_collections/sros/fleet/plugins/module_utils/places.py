@@ -1,10 +1,8 @@
-"""The folder of a robot's enclaves: read as hostile input, replaced whole or not at all."""
+"""The folder of a robot's enclaves: read as hostile input, changed wholly or not at all."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import errno
 import fcntl
 import json
 import os
@@ -29,7 +27,6 @@ _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _OF_OTHERS = stat.S_IWGRP | stat.S_IWOTH
-_EXCHANGE = 2
 _MOST_LINKS = 40
 _LONGEST_WAIT = 60.0
 
@@ -41,9 +38,17 @@ class Place:
     else made is on the way, and none can appear.  The folder itself may belong to another user,
     ``owner``, and so its content is not trusted.
 
-    Next to the folder ``keystore``, ``.keystore.sros-new`` and ``.keystore.sros-old`` exist only
-    during a change, and ``.keystore.sros-restart`` lists the enclaves whose processes still have
-    files of before.
+    Units and containers mount the folders of enclaves, so a folder stays the same folder while its
+    files are exchanged.  Next to ``keystore`` exist, only during a change:
+
+    - ``.keystore.sros-new``: files that are prepared and verified; then it becomes
+    - ``.keystore.sros-remove``: the change is decided.  What the new files lack is removed.
+    - ``.keystore.sros-apply``: each new file takes its place.
+    - ``.keystore.sros-old``: folders that are removed.
+
+    Whoever comes after a process that was killed ends a change that was decided, and drops another.
+    ``.keystore.sros-restart`` lists the enclaves whose processes still have files of before, and
+    ``.keystore.sros-delivered`` those that were installed last.
     """
 
     def __init__(self, path: str, owner: str | None = None) -> None:
@@ -96,8 +101,8 @@ class Place:
                     path = name if below == "." else f"{below}/{name}"
                     if not self._belongs(path, name, is_folder, handle):
                         raise RefusedError(
-                            f"'{self.path}/{path}' is not a file of an enclave. The folder is"
-                            " replaced as a whole, so only enclaves may be in it: move the file"
+                            f"'{self.path}/{path}' is not a file of an enclave. All that is in"
+                            " this folder is replaced, so only enclaves may be in it: move the file"
                             " away, or choose another folder."
                         )
                     if is_folder:
@@ -173,13 +178,16 @@ class Place:
             ) from error
 
     def _recover(self) -> None:
-        """Undo a change that was interrupted before the new folder was in its place."""
+        """End a change that was decided, and drop one that was not."""
         old = self._beside("old")
-        if not os.path.lexists(self.path) and os.path.isdir(old):
-            os.rename(old, self.path)
-        for each in (self.stage, old):
-            if os.path.lexists(each):
-                shutil.rmtree(each)
+        if not (self.is_pending() or os.path.lexists(self.path)) and os.path.isdir(old):
+            os.rename(old, self.path)  # of a version that exchanged the whole folder
+        self.discard()
+        self._end()
+
+    def is_pending(self) -> bool:
+        """Return whether a process was killed in a change that was decided."""
+        return any(os.path.lexists(self._beside(each)) for each in ("remove", "apply"))
 
     def prepare(self, files: Files) -> None:
         """Write all files into `stage`, which only this user can open."""
@@ -200,31 +208,107 @@ class Place:
             shutil.rmtree(self.stage)
 
     def replace(self) -> None:
-        """Put the prepared folder in place of the present one; the present one is removed."""
+        """Put the prepared files in place, and remove all others."""
         if self._owner:
             for _, _, files, handle in os.fwalk(self.stage, topdown=False):
                 for name in files:
                     os.chown(name, *self._owner, dir_fd=handle, follow_symlinks=False)
                 os.fchown(handle, *self._owner)
         os.sync()
-        old = self._beside("old")
-        if not os.path.lexists(self.path):
-            os.rename(self.stage, self.path)
-        elif _exchange(self.stage, self.path):
-            os.rename(self.stage, old)
-        else:
-            os.rename(self.path, old)
-            os.rename(self.stage, self.path)
+        os.rename(self.stage, self._beside("remove"))
         _flush(self._parent)
+        self._end()
+
+    def _end(self) -> None:
+        """Go on with a change that was decided, from the step that it reached."""
+        remove, apply, old = (self._beside(each) for each in ("remove", "apply", "old"))
+        if os.path.lexists(remove):
+            with _opened(self._parent) as parent:
+                if os.path.lexists(self.path) and not self._is_kept(self._name, parent):
+                    self._put_away(self._name, parent)
+            if not os.path.lexists(self.path):
+                os.rename(remove, self.path)
+            else:
+                with _opened(remove) as new, _opened(self.path) as present:
+                    self._remove_others(new, present)
+                os.rename(remove, apply)
+            _flush(self._parent)
+        if os.path.lexists(apply):
+            if not os.path.lexists(self.path):
+                os.rename(apply, self.path)
+            else:
+                with _opened(apply) as new, _opened(self.path) as present:
+                    self._move_in(new, present)
+                shutil.rmtree(apply)
         if os.path.lexists(old):
             shutil.rmtree(old)
+        _flush(self._parent)
 
-    # ── restarts that are due ──────────────────────────────────────────────────────────────
+    def _remove_others(self, new: int, present: int) -> None:
+        """Remove what the open folder ``present`` has and ``new`` lacks."""
+        wanted = set(os.listdir(new))
+        for name in os.listdir(present):
+            is_folder = name in wanted and _is_folder(name, new)
+            fits = self._is_kept if is_folder else _is_no_folder
+            if name not in wanted or not fits(name, present):
+                self._put_away(name, present)
+            elif is_folder:
+                with _opened(name, new) as below_new, _opened(name, present) as below:
+                    self._remove_others(below_new, below)
+        os.fsync(present)
+
+    def _move_in(self, new: int, present: int) -> None:
+        """Move the files of the open folder ``new`` to those of the same name in ``present``."""
+        os.fchmod(present, 0o700)
+        for name in os.listdir(new):
+            if _is_folder(name, new) and name in os.listdir(present):
+                with _opened(name, new) as below_new, _opened(name, present) as below:
+                    self._move_in(below_new, below)
+            elif _is_folder(name, new) or not _are_same(name, new, present):
+                os.rename(name, name, src_dir_fd=new, dst_dir_fd=present)
+        os.fsync(present)
+
+    def _is_kept(self, name: str, where: int) -> bool:
+        """Return whether something is a folder of the owner of the enclaves."""
+        wanted = self._owner[0] if self._owner else os.geteuid()
+        state = os.stat(name, dir_fd=where, follow_symlinks=False)
+        return stat.S_ISDIR(state.st_mode) and state.st_uid == wanted
+
+    def _put_away(self, name: str, where: int) -> None:
+        """Move something out of an open folder, to where it is removed."""
+        old = self._beside("old")
+        os.makedirs(old, 0o700, exist_ok=True)
+        os.rename(name, os.path.join(old, str(len(os.listdir(old)))), src_dir_fd=where)
+
+    # ── what is remembered ─────────────────────────────────────────────────────────────────
 
     def due(self) -> list[str]:
-        """Return the enclaves whose processes have to be restarted since earlier changes."""
+        """Return the enclaves whose processes have to be restarted since earlier changes.
+
+        Raises:
+            RefusedError: the record cannot be read.
+        """
+        return self._names("restart")
+
+    def set_due(self, names: list[str]) -> None:
+        """Record the enclaves whose processes have to be restarted; flushed to the disk."""
+        self._set_names("restart", names)
+
+    def delivered(self) -> list[str]:
+        """Return the enclaves that were installed last, also if somebody removed them since.
+
+        Raises:
+            RefusedError: the record cannot be read.
+        """
+        return self._names("delivered")
+
+    def set_delivered(self, names: list[str]) -> None:
+        """Record the enclaves that are installed; flushed to the disk."""
+        self._set_names("delivered", names)
+
+    def _names(self, record: str) -> list[str]:
         try:
-            handle = os.open(self._beside("restart"), _FILE)
+            handle = os.open(self._beside(record), _FILE)
             with os.fdopen(handle, "rb") as file:
                 names = json.loads(file.read(MOST_OF_FILE).decode())
             return sorted({check_enclave(each) for each in names})
@@ -232,13 +316,13 @@ class Place:
             return []
         except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise RefusedError(
-                f"'{self._beside('restart')}' cannot be read: {error}. Restart all processes with"
+                f"'{self._beside(record)}' cannot be read: {error}. Restart all processes with"
                 " enclaves, then remove it."
             ) from error
 
-    def set_due(self, names: list[str]) -> None:
-        """Record the enclaves whose processes have to be restarted; flushed to the disk."""
-        path, spare = self._beside("restart"), self._beside("restart-new")
+    def _set_names(self, record: str, names: list[str]) -> None:
+        path = self._beside(record)
+        spare = path + "-new"
         if not names:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(path)
@@ -351,24 +435,38 @@ def _may_be_linked(file: os.stat_result, folder: os.stat_result) -> bool:
     return not same and not file.st_mode & stat.S_IROTH
 
 
-def _exchange(one: str, other: str) -> bool:
-    """Atomically exchange two names (renameat2(2)); return False if that is not supported."""
+@contextlib.contextmanager
+def _opened(folder: str, where: int | None = None) -> Iterator[int]:
+    """Open a folder, itself or below the open folder ``where``, and never through a link."""
+    handle = os.open(folder, _FOLDER, dir_fd=where)
     try:
-        rename = ctypes.CDLL(None, use_errno=True).renameat2
-    except AttributeError:
-        return False
-    here = -100  # AT_FDCWD
-    if rename(here, os.fsencode(one), here, os.fsencode(other), _EXCHANGE) == 0:
-        return True
-    number = ctypes.get_errno()
-    if number in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
-        return False
-    raise OSError(number, os.strerror(number), one, None, other)
+        yield handle
+    finally:
+        os.close(handle)
+
+
+def _is_folder(name: str, where: int) -> bool:
+    return stat.S_ISDIR(os.stat(name, dir_fd=where, follow_symlinks=False).st_mode)
+
+
+def _is_no_folder(name: str, where: int) -> bool:
+    return not _is_folder(name, where)
+
+
+def _are_same(name: str, one: int, other: int) -> bool:
+    """Return whether two open folders have the same file: content, owner and mode."""
+    contents = []
+    for folder in (one, other):
+        try:
+            with os.fdopen(os.open(name, _FILE, dir_fd=folder), "rb") as file:
+                state = os.fstat(file.fileno())
+                attributes = state.st_mode, state.st_uid, state.st_gid, state.st_nlink
+                contents.append((attributes, file.read(MOST_OF_FILE)))
+        except OSError:
+            return False
+    return contents[0] == contents[1]
 
 
 def _flush(folder: str) -> None:
-    handle = os.open(folder, _FOLDER)
-    try:
+    with _opened(folder) as handle:
         os.fsync(handle)
-    finally:
-        os.close(handle)

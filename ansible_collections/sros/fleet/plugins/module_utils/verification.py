@@ -1,4 +1,7 @@
-"""Whether enclaves on a robot can be used: asked of `sros verify`, or else of OpenSSL."""
+"""Whether enclaves on a robot can be used: asked of `sros verify`, or else of OpenSSL.
+
+And whether their revocation lists are older than those that the robot has: asked of OpenSSL.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import re
 import shutil
 import subprocess
 import time
+from typing import NamedTuple
 
 from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     AUTHORITY_FILES,
@@ -16,7 +20,9 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import (
     KEY_FILE,
     KEY_URI_FILE,
     SIGNED_FILES,
+    Files,
     RefusedError,
+    enclaves_in,
     folder_of,
 )
 
@@ -27,6 +33,13 @@ _DATES = re.compile(r"<not_(before|after)>\s*([0-9T:+Z-]{10,40})\s*</not_")
 _SUBJECT = re.compile(r"<subject_name>([^<]{1,2000})</subject_name>")
 _REASON = re.compile(r"(?:depth lookup|Verify error): ?(.+)")
 _MOST_SHOWN = 1000
+_CERTIFICATE, _LIST = (
+    re.compile(rb"-----BEGIN %b-----[A-Za-z0-9+/=\s]+-----END %b-----\n?" % (each, each))
+    for each in (b"CERTIFICATE", b"X509 CRL")
+)
+_MOST_LISTS = 8
+_NUMBER = re.compile(r"X509v3 CRL Number: (?:critical)?\s+(\w+)")
+_SERIAL = re.compile(r"^ {4}Serial Number: (\w+)", re.MULTILINE)
 
 
 def verify(folder: str, enclaves: list[str], program: list[str]) -> dict:
@@ -57,6 +70,90 @@ def verify(folder: str, enclaves: list[str], program: list[str]) -> dict:
         found = _by_openssl(openssl, os.path.join(folder, folder_of(name)), name)
         problems += [f"{name}: {each}" for each in found]
     return {"by": "openssl", "ok": not problems, "problems": problems, "remarks": []}
+
+
+def check_lists(before: Files, after: Files, spare: str) -> list[str]:
+    """Return remarks on certificates that new revocation lists lack and the present ones have.
+
+    The owner of the enclaves can write whatever into the present files.  So only a list counts that
+    is signed by a CA that the new files trust.
+
+    Args:
+        before: the files that the robot has.
+        after: the files that are to be installed.
+        spare: a folder of this user alone, for files of OpenSSL.
+
+    Raises:
+        RefusedError: a new list is older, or missing; revoked enclaves would be trusted again.
+    """
+    asked: dict[tuple, _List | None] = {}
+
+    def newest(files: Files, name: str) -> _List | None:
+        """Return the newest list of an enclave that a CA signed which the new files trust."""
+        path, trust = (f"{folder_of(name)}/{file}" for file in ("crl.pem", AUTHORITY_FILES[0]))
+        known = []
+        for block in _LIST.findall(files.get(path, b""))[:_MOST_LISTS]:
+            for authority in _CERTIFICATE.findall(after.get(trust, b""))[:_MOST_LISTS]:
+                if (block, authority) not in asked:
+                    asked[block, authority] = _read_list(block, authority, spare)
+                known.append(asked[block, authority])
+        return max(filter(None, known), default=None)
+
+    remarks = {}
+    for name in sorted(set(enclaves_in(before)) & set(enclaves_in(after))):
+        present = newest(before, name)
+        new = newest(after, name) if present else None
+        if not present or new == present:
+            continue
+        if not new or new.number <= present.number:
+            number = f"the number {new.number}" if new else "none"
+            raise RefusedError(
+                f"The revocation list for {name} is older than the one of this robot, which has the"
+                f" number {present.number}; the keystore has {number}. Revoked enclaves would be"
+                " trusted again. The keystore at home may come from a backup: copy crl.pem of"
+                f" {name} on this robot to public/identity_ca.crl.pem there, run `sros revoke` for"
+                " each enclave that `sros crl` then shows, and deliver again. If the older list is"
+                " right, set allow_older_lists (sros_allow_older_lists)."
+            )
+        lost = present.serials - new.serials
+        if lost and present.authority == new.authority:
+            remarks[present] = (
+                f"The present revocation list has {len(lost)} serial numbers that the new one"
+                f" lacks, such as {min(lost)}. This is right if these certificates have expired,"
+                " but not if the keystore comes from a backup."
+            )
+    return list(remarks.values())
+
+
+class _List(NamedTuple):
+    """A revocation list and its CA, both in PEM, and its number and the serial numbers on it."""
+
+    number: int
+    text: bytes
+    authority: bytes
+    serials: frozenset
+
+
+def _read_list(block: bytes, authority: bytes, spare: str) -> _List | None:
+    """Return a revocation list (PEM) if a CA (PEM) signed it, else None."""
+    openssl = shutil.which("openssl")
+    if not openssl:
+        raise RefusedError(
+            "Revocation lists cannot be compared: this robot lacks openssl. Install the package"
+            " openssl on it."
+        )
+    at = {each: os.path.join(spare, each) for each in ("list.pem", "ca.pem")}
+    for path, content in zip(at.values(), (block, authority)):
+        with open(path, "wb") as file:
+            file.write(content)
+    command = [openssl, "crl", "-in", at["list.pem"], "-noout"]
+    done = _run([*command, "-CAfile", at["ca.pem"], "-no-CApath"])
+    if done.returncode or b"verify OK" not in done.stderr:
+        return None
+    text = _run([*command, "-text"]).stdout.decode(errors="replace")
+    number = _NUMBER.search(text)
+    serials = frozenset(_SERIAL.findall(text))
+    return _List(int(number.group(1), 0) if number else 0, block, authority, serials)
 
 
 def _by_sros(folder: str, enclaves: list[str], program: list[str]) -> dict:

@@ -11,9 +11,13 @@ short_description: Install the enclaves of a robot from a keystore of sros
 description:
   - At home, exports the enclaves of the robot with C(sros distribute_key), and installs them on
     the robot, all of them or, if anything fails, none.
-  - The new files are verified next to the present ones, and then take their place in one step.
-    Enclaves that the keystore does not have any more are removed. An enclave that waits for the
+  - The new files are verified next to the present ones, and only then take their place; who is
+    interrupted in between ends it at the next run. Folders stay the same folders, so that units and
+    containers that mounted them still have them.
+  - Enclaves that the keystore does not have any more are removed. An enclave that waits for the
     answer to its signing request stays.
+  - A revocation list that is older than the one on the robot is refused, since it would let revoked
+    enclaves be trusted again.
   - A key that was made on the robot stays where it is; the other files have to fit it.
   - Returns what the robot then has, without secrets, so that C(sros fleet confirm) can record it.
   - The robot needs Python 3.8 and OpenSSL (the program C(openssl)), not sros. Where it has sros,
@@ -53,6 +57,10 @@ options:
   replace_authorities:
     description:
       - Also install enclaves of another keystore, which share no CA with the present ones.
+    type: bool
+    default: false
+  allow_older_lists:
+    description: Install also revocation lists that are older than those on the robot.
     type: bool
     default: false
   verifier:
@@ -135,8 +143,10 @@ clock_difference:
 
 import base64
 import binascii
+import contextlib
 import hashlib
 import re
+import tempfile
 import time
 
 from ansible.module_utils.basic import AnsibleModule
@@ -158,6 +168,7 @@ from ansible_collections.sros.fleet.plugins.module_utils.exports import (
 )
 from ansible_collections.sros.fleet.plugins.module_utils.places import Place
 from ansible_collections.sros.fleet.plugins.module_utils.verification import (
+    check_lists,
     clock_remark,
     verify,
 )
@@ -171,6 +182,7 @@ _ARGUMENTS = {
     "dest": {"type": "path", "default": "/etc/sros/keystore"},
     "owner": {"type": "str"},
     "replace_authorities": {"type": "bool", "default": False},
+    "allow_older_lists": {"type": "bool", "default": False},
     "verifier": {"type": "list", "elements": "str", "default": ["sros"]},
     "longest_clock_difference": {"type": "int", "default": 300},
     "archive": {"type": "str", "no_log": True},
@@ -190,7 +202,8 @@ def main() -> None:
     except (RefusedError, OSError) as error:
         module.fail_json(msg="{}{}".format(error, " " + remark if remark else ""))
     said = result.get("verification", {}).get("remarks", [])
-    module.exit_json(remarks=[*([remark] if remark else []), *said], **result)
+    remarks = [*([remark] if remark else []), *result.pop("about_lists", []), *said]
+    module.exit_json(remarks=remarks, **result)
 
 
 def _run(module: AnsibleModule, now: float) -> dict:
@@ -205,19 +218,23 @@ def _run(module: AnsibleModule, now: float) -> dict:
     except binascii.Error as error:
         raise RefusedError("The export was damaged on its way.") from error
     difference = {"clock_difference": int(now - asked["home_time"])} if asked["home_time"] else {}
-    if module.check_mode:
+    with contextlib.nullcontext() if module.check_mode else place.locked():
         before = place.read()
-        return {
-            **_install(place, before, _after(before, sent), asked, now, check=True),
-            **difference,
-        }
-    with place.locked():
-        before = place.read()
-        return {**_install(place, before, _after(before, sent), asked, now), **difference}
+        after = _after(before, sent)
+        remarks = []
+        if not asked["allow_older_lists"]:
+            # The folder of this user alone.
+            with tempfile.TemporaryDirectory(dir=module.tmpdir) as spare:
+                remarks = check_lists(before, after, spare)
+        result = _install(place, before, after, asked, now, check=module.check_mode)
+    return {**result, **difference, "about_lists": remarks}
 
 
 def _look(place: Place, asked: dict, now: float) -> dict:
     """Return what is there, verified."""
+    if place.is_pending():
+        with place.locked():  # ends a change that was interrupted
+            pass
     present = place.read()
     names = [
         each for each in enclaves_in(present) if folder_of(each) + "/" + CERTIFICATE_FILE in present
@@ -281,8 +298,9 @@ def _install(
         "routers": _routers(after),
         "diff": _difference(before, after),
     }
-    # In an enclave that had no certificate no process can have run.
-    ran = {enclave_of(each) for each in before if each.endswith("/" + CERTIFICATE_FILE)}
+    # In an enclave that never had a certificate no process can run.
+    has_certificate = {enclave_of(each) for each in before if each.endswith("/" + CERTIFICATE_FILE)}
+    ran = has_certificate.union(place.delivered())
     due = sorted({*place.due(), *(ran & set(changed))} & set(enclaves_in(after)))
     if check and not present:
         return {**result, "restart": due, "confirmation": confirmation(asked["robot"], before, now)}
@@ -296,6 +314,7 @@ def _install(
                 # Recorded first: who is killed in between restarts once too often, not never.
                 place.set_due(due)
                 place.replace()
+                place.set_delivered(names)
         finally:
             place.discard()
     if not found["ok"]:
