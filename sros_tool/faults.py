@@ -354,6 +354,14 @@ class Fault(Enum):
         "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp); measured.",
         "Issue a certificate with the common name of the enclave.",
     )
+    CERTIFICATE_LASTS = (
+        "certificate-lasts",
+        "a certificate that expires more than 292 years from now",
+        "Fast DDS 2.6 and 3.2 set a timer for its expiry, whose nanoseconds overflow: the node is "
+        "refused as if it had expired, or crashes.",
+        "Fast DDS 2.6.12 and 3.2.5 (PKIDH.cpp, arm_identity_expiry); measured.",
+        "Issue a certificate for a shorter time: `sros renew {root} {enclave}`.",
+    )
     CA_CHAIN = (
         "ca-chain",
         "a CA certificate that a vendor refuses",
@@ -437,6 +445,7 @@ VENDOR_FAULTS = (
     Fault.CERTIFICATE_FILE,
     Fault.CA_CRASH,
     Fault.CERTIFICATE_CRASH,
+    Fault.CERTIFICATE_LASTS,
     Fault.CA_CHAIN,
     Fault.SIGNATURE_HASH,
     Fault.KEY_ALGORITHM,

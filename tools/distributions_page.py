@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from enum import Enum
 
 from sros_tool.checks.upgrade import ALL
-from sros_tool.dds.decision.vendors import MEASURED, VendorTraits
+from sros_tool.dds.decision.vendors import MEASURED, VendorTraits, together
 from sros_tool.distributions import SUPPORTED, Shipped
 from sros_tool.names import has_type_descriptions
 from sros_tool.zenoh.releases import version_text
@@ -18,6 +18,9 @@ from tools.steps import CHECKOUT
 
 _NAMES = ("title", "product", "measured")
 """The traits that are no rules."""
+
+_RELEASES = re.compile(r" \((?:Fast DDS|Cyclone|\d)[^)]*\)(?=\.$)")
+"""The releases at the end of a sentence, which the page names for themselves."""
 
 _HEAD = re.compile(r".*?\n## What holds where\n", re.DOTALL)
 """The part of the page that is written by hand."""
@@ -31,7 +34,6 @@ def distributions_page() -> str:
         *("distribution", "supported until", "default DDS", "other DDS", "rmw_zenoh", "nodes"),
         rows=_shipped(),
     )
-    titles = (vendor.title.replace(" ", "\u00a0") for vendor in MEASURED)
     parts = [
         written[0].rstrip(),
         MADE,
@@ -40,7 +42,7 @@ def distributions_page() -> str:
         "alike. *Not measured* is a release for which sros takes the rules of another one: what "
         "differs between the two is not seen.",
         "The rules in which two measured releases differ:",
-        table_text("rule", *titles, rows=_rules()),
+        table_text("rule", "where it holds", rows=_rules()),
         "What an update changes is reported as:",
         table_text("finding", "severity", "what it says", rows=_findings()),
     ]
@@ -77,13 +79,24 @@ def _rules() -> Iterator[tuple[str, ...]]:
             continue
         own = next((type(value).__doc__ for value in values if isinstance(value, Enum)), "")
         rule = (texts.get(field.name) or own or field.name).partition("\n\n")[0]
-        yield cell(rule.replace("``", "`")), *map(_value, values)
+        yield _plain(rule), "<br>".join(_where(values))
 
 
-def _value(value: object) -> str:
-    if isinstance(value, Enum):
-        text = docstrings_of_fields(type(value)).get(value.name, value.name.lower())
-        return cell(text.replace("``", "`"))
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return "no limit" if value is None else str(value)
+def _where(values: Sequence[object]) -> Iterator[str]:
+    """Yield the releases that have each of a trait's values, in words."""
+    for value in dict.fromkeys(values):
+        titles = [
+            vendor.title for vendor, own in zip(MEASURED, values, strict=True) if own == value
+        ]
+        releases = ", ".join(together(titles))
+        if value is True:
+            yield releases
+        elif isinstance(value, Enum):
+            text = docstrings_of_fields(type(value)).get(value.name, value.name.lower())
+            yield f"{releases}: {_plain(text)}"
+        elif value is not False:
+            yield f"{releases}: {'no limit' if value is None else value}"
+
+
+def _plain(text: str) -> str:
+    return cell(_RELEASES.sub("", text).replace("``", "`"))

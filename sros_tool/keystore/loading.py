@@ -7,7 +7,7 @@ the faults that all vendors refuse; they are not checked here again.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from datetime import datetime
+from datetime import datetime, timedelta
 from functools import lru_cache
 from itertools import dropwhile
 from typing import NamedTuple
@@ -425,11 +425,16 @@ def _identity_faults(
     if traits.crashes_on_empty_subject and not certificate.subject.rdns:
         text = "its subject is empty, which crashes the process"
         yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_CRASH)
+    remaining = certificate.not_valid_after_utc - at
+    if traits.expiry_overflows and remaining // _LONGEST_TIMER % 2:
+        text = "it expires more than 292 years from now, which counts as expired, or crashes"
+        yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_LASTS)
     if fault := chain_fault(certificate, trusted, at=at, checks=_checks(traits)):
         yield Problem(CERTIFICATE_FILE, fault, Fault.CERTIFICATE_ISSUER)
 
 
 _ALONE = " for RSA-PSS alone"
+_LONGEST_TIMER = timedelta(microseconds=2**63 / 1000)  # of 64 bits of nanoseconds
 
 
 def _list_faults(

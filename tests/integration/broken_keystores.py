@@ -4,7 +4,7 @@ The enclave /base publishes /chatter and is broken, /arm hears it and is sound. 
 ``fast`` tell what becomes of /base: refused (it does not start), denied (it cannot publish),
 unmatched (it starts, and nobody hears it), matched, crashed; ``..._says`` is a part of what the
 vendor logs.  Runs of Cyclone DDS 0.10.2 and 11.0.1, and Fast DDS 2.9.1; ``later`` is what Fast DDS
-2.6.12, 2.14 and 3 do, where that differs.
+2.6.12, 2.14 and 3 do, where that differs, and ``with_timer`` what 2.6.12 and 3.2.5 alone do.
 """
 
 from __future__ import annotations
@@ -49,9 +49,10 @@ class Breakage:
     fast_says: str = ""
     cyclone_says: str | tuple[str, ...] = ""  # a tuple: one of them
     race: str = ""
-    """What Fast DDS does at other times."""
+    """What a Fast DDS that does not match does at other times."""
     zone: str = "UTC"
     later: str = ""
+    with_timer: str = ""
     shared: bool = False
     """Whether the other enclave has its part of what is broken; else it is that of a sound one."""
 
@@ -59,6 +60,8 @@ class Breakage:
         """Return what a release of Fast DDS does, and a part of what it logs."""
         if vendor is Vendor.FAST_2_9:
             return self.fast, self.fast_says
+        if self.with_timer and vendor.traits.drops_expired:
+            return self.with_timer, ""
         as_before = vendor is Vendor.FAST_2_6 and self.name in AS_BEFORE_ON_FAST_2_6
         return self.fast if as_before else (self.later or self.fast), ""
 
@@ -420,6 +423,10 @@ MORE = (
     Breakage(
         "RSA-PSS key for an RSA certificate", pss_key_alone, REFUSED, REFUSED,
         "enclave.key-mismatch", "Error verifying private key", "private key has not supported type",
+    ),
+    Breakage(
+        "a certificate for 300 years", lambda b: b.issue(after=b.now + 300 * 365 * DAY),
+        MATCHED, MATCHED, "portable.refused", race=CRASHED, with_timer=REFUSED,
     ),
     Breakage("leaf signed with SHA-384", sha384, REFUSED, MATCHED, "portable.signature-hash"),
     Breakage(

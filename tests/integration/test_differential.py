@@ -117,9 +117,10 @@ NOT_OF_DOCUMENTS = {
     "reads_tokens",
     "crashes_on_empty_subject",
     "drops_expired",
+    "expiry_overflows",
 }
 """Rules about what is around the documents: `test_signers_on_dds`, `test_subjects_on_dds`,
-`test_stranger_on_dds`, `test_drawn_trust` and `test_key_on_token` tell."""
+`test_stranger_on_dds`, `test_broken_keystores`, `test_drawn_trust` and `test_key_on_token` tell."""
 
 
 @pytest.mark.parametrize("vendor", ASK)

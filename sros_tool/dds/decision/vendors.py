@@ -149,6 +149,11 @@ class VendorTraits:
 
     Since Fast DDS 2.6.12 and 3.2.5 (CVE-2025-67108); 2.14.6 and 3.6.2 keep them (all measured).
     """
+    expiry_overflows: bool = False
+    """A certificate that expires more than 292 years from now counts as expired.
+
+    Its nanoseconds overflow 64 bits, so it is accepted again from 584 years on, and so forth.
+    """
     crashes_on_empty_subject: bool = False
     """A certificate without any attribute in its subject crashes the process, and its peers'."""
     moments: Moments = Moments.STANDARD
@@ -296,6 +301,7 @@ class Vendor(StrEnum):
             _FAST_2_14,
             title="Fast DDS 2.6",
             drops_expired=True,
+            expiry_overflows=True,
             subjects=Subjects.WHOLE_ATTRIBUTES,
             crashes_on_missing_content=False,
             largest_document=60 * 1024 - 1,
@@ -317,7 +323,11 @@ class Vendor(StrEnum):
     FAST_3_2 = (
         "fastdds-3.2",
         replace(
-            _FAST_2_14, title="Fast DDS 3.2", drops_expired=True, crashes_on_missing_content=False
+            _FAST_2_14,
+            title="Fast DDS 3.2",
+            drops_expired=True,
+            expiry_overflows=True,
+            crashes_on_missing_content=False,
         ),
     )
     FAST_3_6 = (

@@ -265,6 +265,7 @@ def openssl_text(of: Name, flags: int = RFC2253) -> str:
     at = ctypes.cast(ctypes.create_string_buffer(data, len(data)), ctypes.c_void_p)
     read = library.d2i_X509_NAME(None, ctypes.byref(at), len(data))
     if not read:
+        library.ERR_clear_error()  # a process that is forked would take it for an error of its own
         return ""
     text = ctypes.create_string_buffer(5000)
     if flags:
