@@ -41,6 +41,16 @@ ASSUMED = FindingKind(
     "keystore.",
     prominent=True,
 )
+NOT_CROSSING = FindingKind(
+    "requirement.not-crossing",
+    NOTE,
+    "a demanded right whose data does not pass between routers of Zenoh",
+    "The enclave has the right, and so has an enclave at another router, but the routers do not "
+    "pass the name on to each other.",
+    "The requirements file, and the router.json5 of both routers.",
+    "Add the name to `crossing` in the settings, or ignore this if it is for one robot alone.",
+    prominent=True,
+)
 NOT_ON_ZENOH = FindingKind(
     "requirement.not-on-zenoh",
     NOTE,

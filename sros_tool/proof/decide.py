@@ -14,6 +14,7 @@ from collections.abc import Callable, Collection, Container, Iterable, Iterator,
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import lru_cache
+from itertools import product
 
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.names import (
@@ -87,7 +88,8 @@ class Verdict:
     ``witness`` is None if the requirement holds.  ``empty`` are names and enclaves in the
     requirement that do not occur in the world, so that it cannot fail for them.  ``always`` says
     why it cannot fail whatever rights the enclaves get, or is "".  ``assumed`` is a name whose
-    protection is not stated but assumed, or "".
+    protection is not stated but assumed, or "".  ``kept`` is a use that the requirement demands and
+    that other enclaves do not get, because it does not pass between routers of Zenoh; or None.
     """
 
     requirement: Requirement
@@ -95,6 +97,15 @@ class Verdict:
     empty: tuple[str, ...] = ()
     always: str = ""
     assumed: str = ""
+    kept: KeptUse | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class KeptUse:
+    """A use of an enclave with which ``others``, at other routers of Zenoh, have nothing to do."""
+
+    use: Use
+    others: tuple[str, ...]
 
 
 class Worlds:
@@ -158,7 +169,10 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
     empty = tuple(_empty(requirement, world, limit))
     always = "" if witness or empty else _always(requirement, world)
     assumed = "" if witness else _assumed(requirement, world, limit)
-    return Verdict(requirement, witness, empty, always, assumed)
+    kept = None
+    if isinstance(requirement, Must) and not witness and world.crossing:
+        kept = _kept_from_others(requirement, world, limit)
+    return Verdict(requirement, witness, empty, always, assumed, kept)
 
 
 def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
@@ -287,6 +301,26 @@ def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | 
     for writes, topic in world.needed:
         if topic not in _own(world, enclave, writes):
             return Witness((Use(enclave, "", topic, topic, writes),))
+    return None
+
+
+def _kept_from_others(requirement: Must, world: World, limit: SearchLimit) -> KeptUse | None:
+    """Return a demanded use that enclaves at other routers have the right for, and do not get."""
+    enclave = requirement.enclave
+    for right, names in requirement.rights:
+        for part, name in product(_parts_of(right), names):
+            topics, own = part.topics(name), _own(world, enclave, part.writes)
+            others: dict[str, str] = {}
+            for met in world.side(not part.writes).meeting(topics, limit):
+                ends = (enclave, met.enclave) if part.writes else (met.enclave, enclave)
+                crossing = world.between(*ends)
+                if crossing is None:
+                    continue
+                if topic := world.example((own & met.names) - crossing, topics, limit):
+                    others[met.enclave] = topic
+            if others:
+                topic = next(iter(others.values()))
+                return KeptUse(_use(enclave, right, part, topics, topic), tuple(others))
     return None
 
 
@@ -619,7 +653,7 @@ def _shortest_chain(
     # A target can be a source, too, and must be reached from another one: so two are kept.
     most = 2 if any(start in targets for start in starts) else 1
     origins: dict[str, set[str]] = {start: {start} for start in starts}
-    used: dict[str, set[str]] = {}
+    used: dict[tuple[str, str], set[str]] = {}
     queue: deque[tuple[str, str, _Chain]] = deque((start, start, ()) for start in starts)
     flow = _Flow(world, limit)
     while queue:
@@ -629,8 +663,10 @@ def _shortest_chain(
             there = origins.get(enclave, ())
             return enclave not in without and origin not in there and len(there) < most
 
-        def is_unused(topic: str, origin: str = origin) -> bool:
-            by = used.setdefault(topic, set())
+        def is_unused(
+            topic: str, origin: str = origin, router: str = world.router_of(here)
+        ) -> bool:
+            by = used.setdefault((topic, router), set())
             fresh = origin not in by and len(by) < most
             by.add(origin)
             return fresh
@@ -680,7 +716,10 @@ class _Flow:
         for topic in sorted(around.exact if around else (), key=_plain_first):
             if topic in written and is_unused(topic):
                 for reader in self._world.readers_of(topic):
-                    if reader != enclave and is_new(reader):
+                    if reader == enclave or not is_new(reader):
+                        continue
+                    crossing = self._world.between(enclave, reader)
+                    if crossing is None or topic in crossing:
                         yield topic, reader
         if around is not None and not around.automata:
             return

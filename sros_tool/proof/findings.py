@@ -10,7 +10,7 @@ from itertools import islice
 
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
-from sros_tool.checks.requirements import ASSUMED, NOT_ON_ZENOH, VACUOUS, VIOLATED
+from sros_tool.checks.requirements import ASSUMED, NOT_CROSSING, NOT_ON_ZENOH, VACUOUS, VIOLATED
 from sros_tool.dds.decision.vendors import together
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import (
@@ -22,7 +22,7 @@ from sros_tool.names import (
 )
 from sros_tool.policy.model import OTHER_SIDE, RIGHTS, Level, Source
 from sros_tool.policy.rights import KIND_OF, Right
-from sros_tool.proof.decide import Use, Verdict, Witness, Worlds, influencers
+from sros_tool.proof.decide import KeptUse, Use, Verdict, Witness, Worlds, influencers
 from sros_tool.proof.requirements import (
     Apart,
     AtMost,
@@ -105,12 +105,14 @@ class Decided:
     """All decisions: broken requirements, and why (parts of) requirements cannot fail.
 
     ``assumed`` are requirements that hold only with the protection of the default template, which
-    is assumed, each with a name whose protection the policy does not state.
+    is assumed, each with a name whose protection the policy does not state.  ``kept`` are those
+    that hold, with a use that does not pass between routers of Zenoh.
     """
 
     violations: tuple[Violation, ...]
     vacuous: tuple[tuple[Requirement, tuple[str, ...]], ...]
     assumed: tuple[tuple[Requirement, str], ...] = ()
+    kept: tuple[tuple[Requirement, KeptUse], ...] = ()
 
 
 _MOST_STEPS = 8_000_000
@@ -123,7 +125,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
     """
-    violations, vacuous, assumed = [], [], []
+    violations, vacuous, assumed, kept = [], [], [], []
     limit = SearchLimit(_MOST_STEPS)
     worlds = Worlds(system.worlds)
     for requirement in requirements:
@@ -146,7 +148,8 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             names := [verdict.assumed for _, verdict in verdicts if verdict.assumed]
         ):
             assumed.append((requirement, names[0]))
-    return Decided(tuple(violations), tuple(vacuous), tuple(assumed))
+        kept += [(requirement, verdict.kept) for _, verdict in verdicts if verdict.kept][:1]
+    return Decided(tuple(violations), tuple(vacuous), tuple(assumed), tuple(kept))
 
 
 def _step(use: Use, world: World, system: System) -> Step:
@@ -185,6 +188,7 @@ def decided_findings(decided: Decided, system: System) -> list[Finding]:
     findings = [_violated(violation) for violation in decided.violations]
     findings += [_vacuous(requirement, why) for requirement, why in decided.vacuous]
     findings += [_assumed(*each) for each in decided.assumed]
+    findings += [_not_crossing(*each) for each in decided.kept]
     if system.left_out:
         error = system.left_out
         text = f"{error.what}: {error.why}" if error.why else error.what
@@ -291,6 +295,13 @@ def _assumed(requirement: Requirement, name: str) -> Finding:
     own = requirement.source
     text = f"{demand(requirement)}: {assumption_text(name)}"
     return ASSUMED.found(own.file, text, own.file, own.line)
+
+
+def _not_crossing(requirement: Requirement, kept: KeptUse) -> Finding:
+    own, use, others = requirement.source, kept.use, _listed(kept.others)
+    ends = f"from {use.enclave} to {others}" if use.writes else f"from {others} to {use.enclave}"
+    text = f"{use.name} does not pass {ends}, at other routers: {demand(requirement)}"
+    return NOT_CROSSING.found(own.file, text, own.file, own.line)
 
 
 def assumption_text(name: str) -> str:

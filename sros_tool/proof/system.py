@@ -28,6 +28,7 @@ from sros_tool.keystore.layout import (
     KEY_FILE,
     KEY_URI_FILE,
     PERMISSIONS_FILE,
+    ROUTER_FILE,
     enclave_names,
     enclave_path,
     has_zenoh_files,
@@ -55,6 +56,7 @@ from sros_tool.proof.decide import Use
 from sros_tool.proof.sources import UNCERTAIN
 from sros_tool.proof.worlds import (
     LONGEST,
+    Crossing,
     TopicAccess,
     World,
     dds_access,
@@ -458,9 +460,15 @@ def _zenoh_worlds(
             )
     enforcers = source.enforcers
     domains = (domain,) if domain is not None else domains_of(enforcers) or (0,)
+    rules = {
+        name: source.configurations[enclave_path(root, name) / ROUTER_FILE].access
+        for name in (source.routers if source.links else ())
+    }
     for each in domains:
         title = "Zenoh" if len(domains) == 1 else f"Zenoh in domain {each}"
-        yield _enforced(title, enforcers, {*stated}.difference(source.routers), each, stated)
+        crossing = Crossing(source.links.router_of, rules, each) if source.links else None
+        enclaves = {*stated}.difference(source.routers)
+        yield _enforced(title, enforcers, enclaves, each, stated, crossing)
 
 
 def _enforced(
@@ -469,6 +477,7 @@ def _enforced(
     enclaves: Iterable[str],
     domain: int,
     stated: Mapping[str, TopicAccess],
+    crossing: Crossing | None,
 ) -> World:
     """Return the world of a domain on Zenoh, of enclaves and of all other names in the rules."""
     names = {*enclaves, *(name for enforcer in enforcers for name in enforcer.names())}
@@ -482,6 +491,7 @@ def _enforced(
         {name: enforced_access(enforcers, name, domain) for name in names},
         confirm=confirm,
         stated={name: stated.get(name, nothing) for name in names},
+        crossing=crossing,
     )
 
 

@@ -226,6 +226,33 @@ def _starting(ordered: list[str], begin: str) -> range:
     return range(bisect_left(ordered, begin), bisect_left(ordered, begin + _LAST))
 
 
+class Crossing:
+    """What several routers of Zenoh pass on to each other, by the rules of the receiving router.
+
+    ``router_of`` maps enclaves to the routers that they connect to, and each router to itself;
+    ``rules`` maps routers to their access control.
+    """
+
+    def __init__(
+        self, router_of: Mapping[str, str], rules: Mapping[str, Enforcement], domain: int
+    ) -> None:
+        self.router_of = router_of
+        self._rules = rules
+        self._domain = domain
+        self._passing: dict[tuple[str, str], NameSet] = {}
+
+    def between(self, writer: str, reader: str) -> NameSet | None:
+        """Return the topics that get from a writer to a reader; None for all, at one router."""
+        sending, receiving = self.router_of.get(writer), self.router_of.get(reader)
+        if sending is None or receiving is None or sending == receiving:
+            return None
+        if (sending, receiving) not in self._passing:
+            rules = (self._rules[receiving],)
+            passing = enforced_access(rules, sending, self._domain).writes
+            self._passing[sending, receiving] = passing
+        return self._passing[sending, receiving]
+
+
 Confirm = Callable[[str, bool, str], bool]
 """Whether an enclave may write (or else read) a topic, as the engine of the world decides."""
 
@@ -249,6 +276,7 @@ class World:
         idle: Collection[str] = (),
         lenders: Mapping[str, Sequence[str]] = MappingProxyType({}),
         longest: int = LONGEST,
+        crossing: Crossing | None = None,
     ) -> None:
         """Create a world from the access of each enclave by its own permissions.
 
@@ -261,7 +289,8 @@ class World:
         every node has to write (True) and read (False).  ``idle`` are enclaves in which no process
         starts with their files as they are: they may do what their rights give, but are able to do
         nothing.  ``lenders`` maps an enclave to others whose permissions it can use as well.  These
-        count for what it may do, but not for what it must be able to do.
+        count for what it may do, but not for what it must be able to do.  ``crossing`` is what
+        passes between several routers of Zenoh; None if all enclaves reach each other.
         """
         self.title = title
         self.confirm_own = confirm
@@ -273,6 +302,7 @@ class World:
         self._access = {name: self._with_lent(name, access) for name in access}
         self.needed = tuple(needed)
         self.idle = frozenset(idle)
+        self.crossing = crossing
         self._weak = weak
         self.demanded = demanded
         self._readers_of: dict[str, list[str]] = {}
@@ -307,6 +337,7 @@ class World:
             and (self._weak, self.demanded) == (other._weak, other.demanded)
             and self.own == other.own
             and self.lenders == other.lenders
+            and self.crossing is other.crossing is None
         )
 
     @cached_property
@@ -368,13 +399,23 @@ class World:
             self._readers_of[topic] = self._readers.users_of(topic)
         return self._readers_of[topic]
 
+    def between(self, writer: str, reader: str) -> NameSet | None:
+        """Return the topics that get from one enclave to another one; None for all."""
+        return self.crossing.between(writer, reader) if self.crossing else None
+
+    def router_of(self, enclave: str) -> str:
+        """Return the router that an enclave connects to, if there are several, or ""."""
+        return self.crossing.router_of.get(enclave, "") if self.crossing else ""
+
     def shared(self, writer: str, reader: str, written: NameSet, limit: SearchLimit) -> str | None:
-        """Return a topic in ``written`` that the reader may read, or None.
+        """Return a topic in ``written`` that the reader may read, and gets, or None.
 
         ``written`` depends on the writer alone.
         """
         if (writer, reader) not in self._shared:
             both = written & self._readers.of[reader]
+            crossing = self.between(writer, reader)
+            both = both if crossing is None else both & crossing
             valid = (both & names for names in _VALID)
             example = next(
                 filter(None, (name_set.example(limit, longest=self.longest) for name_set in valid)),

@@ -74,12 +74,16 @@ _COMMANDS = ("send_goal", "cancel_goal")
 _NAMED = 3  # enclaves that a sentence names; of more it says the number
 
 
-def focused(picture: Picture, sources: Sequence[PictureSource], words: Sequence[str]) -> Picture:
+def focused(
+    picture: Picture, sources: Sequence[PictureSource], words: Sequence[str], routers: int = 0
+) -> Picture:
     """Return the part of a picture connected to the names or enclaves in ``words``.
 
     Args:
         picture: a picture of ``sources``, one or two.
         words: absolute ROS names, perhaps with wildcards; DDS topics; paths of enclaves.
+        routers: number of Zenoh routers.  If there are several, the answers say that they do not
+            consider what passes between routers.
 
     Raises:
         UsageError: nothing in the sources has such a name.
@@ -87,6 +91,9 @@ def focused(picture: Picture, sources: Sequence[PictureSource], words: Sequence[
     system = _System(picture, sources)
     wanted = dict.fromkeys(meant for word in words for meant in system.meant(word))
     focuses = tuple(system.focus(kind, name) for kind, name in wanted)
+    if routers > 1:
+        left_out = f"; what passes between the {routers} routers of Zenoh is not considered"
+        focuses = tuple(replace(each, sentence=f"{each.sentence}{left_out}") for each in focuses)
     picture = system.with_shortest_paths(replace(picture, focus=focuses))
     flow = FocusFlow.of(picture)
     edges = tuple(edge for edge in picture.edges if flow.has(edge))

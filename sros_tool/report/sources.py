@@ -27,7 +27,7 @@ from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
 from sros_tool.keystore.fleet import load_fleet
-from sros_tool.keystore.layout import PUBLIC, is_keystore
+from sros_tool.keystore.layout import PUBLIC, ROUTER_FILE, is_keystore
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.reader import (
@@ -138,11 +138,19 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
         read.append(union([read_source(path, now=drawing.now) for path in drawing.observed]))
     picture = _compared(read, context, use=bool(drawing.observed))
     if drawing.focus:
-        picture = focused(picture, read, drawing.focus)
+        routers = max(_routers(source.keystore) for source in read)
+        picture = focused(picture, read, drawing.focus, routers)
     if drawing.requirements:
         picture = _with_requirements(picture, drawing.requirements, drawing, read[0].keystore)
     folding = Folding.of(picture, robots)
     return replace(picture, equal=folding.equal, different=folding.different), folding
+
+
+def _routers(keystore: Keystore | None) -> int:
+    """Return the number of Zenoh routers whose files a keystore has."""
+    if keystore is None:
+        return 0
+    return sum((keystore.folder(name) / ROUTER_FILE).exists() for name in keystore.names)
 
 
 def _compared(read: Sequence[PictureSource], context: Context, *, use: bool) -> Picture:

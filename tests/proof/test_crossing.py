@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.proof.test_review import Change
 from tests.support.harness import policy_text, publish, sros
 
 OFFICE = publish("/fleet/state", "/r1/scan").replace("publish", "subscribe")
@@ -102,6 +103,52 @@ def test_a_router_that_is_gone_lets_all_pass_only_where_that_was_limited(
     assert no_new_access(routed, "wide", "narrow")[0] == 0
     status, said = no_new_access(routed, "narrow", "wide")
     assert (status, "/fleet/* -> everything" in said) == (1, True)
+
+
+REQUIRED = """[[apart]]
+from = ["/r1/base"]
+to = ["/office"]
+[[must]]
+enclave = "/r1/base"
+publish = ["/r1/scan"]
+"""
+
+
+def test_requirements_and_pictures_know_of_routers(routed: Path, tmp_path: Path) -> None:
+    """On DDS, and with all names crossing, the one influences the other; with none, it does not."""
+    (tmp_path / "robot.toml").write_text(REQUIRED)
+    shutil.copytree(routed / "narrow", tmp_path / "none", symlinks=True)
+    sros("zenoh", "none", "--cross", "/nothing", cwd=tmp_path).ok()
+    scan, state = (f"/r1/base -publish {name}-> /office" for name in ("/r1/scan", "/fleet/state"))
+    kept = "/r1/scan does not pass from /r1/base to /office, at other routers"
+    for keystore, said, not_said in (
+        (routed / "wide", (scan,), (kept,)),
+        (routed / "narrow", (state, kept), (scan,)),
+        (tmp_path / "none", (kept,), (scan, state)),
+    ):
+        words = ("check", str(keystore), "--requirements", "robot.toml", "--vendor", "zenoh")
+        out = sros(*words, cwd=tmp_path).out
+        assert all(text in out for text in said), out
+        assert not any(text in out for text in not_said), out
+    drawn = sros("view", str(routed / "wide"), "--focus", "/r1/scan", "-o", tmp_path / "wide.svg")
+    assert "what passes between the 2 routers of Zenoh is not considered" in drawn.err
+
+
+def test_a_review_compares_what_crosses(routed: Path, tmp_path: Path) -> None:
+    reviewed = tmp_path / "repository/ks"
+    reviewed.parent.mkdir()
+    change = Change(reviewed.parent)
+    said = f"crossing of router {NAME}"
+    for number, keystore in enumerate(("narrow", "narrow", "wide")):
+        shutil.rmtree(reviewed, ignore_errors=True)
+        shutil.copytree(routed / keystore, reviewed, symlinks=True)
+        for key in [*reviewed.glob("**/key.pem"), *reviewed.glob("**/*.key.pem")]:
+            key.unlink()
+        change.commit({"README": str(number)})
+        if number:
+            summary = tmp_path / f"{number}.md"
+            assert change.review("--keystore", "ks", "--summary", str(summary)).status == 1
+            assert (said in summary.read_text()) is (keystore == "wide")
 
 
 def test_a_policy_says_nothing_of_crossing_and_that_is_said(routed: Path) -> None:
