@@ -71,7 +71,6 @@ ROBOTS_UNKNOWN = FindingKind(
 )
 NOTES_ON_LIBRARIES = (PACKAGE_VULNERABILITIES, VERSION_UNKNOWN, ROBOTS_UNKNOWN)
 """Notes that are shown among warnings: they say that a library may be vulnerable."""
-_LINUX_PACKAGES = ("/usr/lib/", "/lib/")
 _ROS_PACKAGES = "/opt/ros/"
 _FASTRTPS = ("foxy", "galactic", "humble", "iron", "jazzy")
 """Distributions whose package of Fast DDS is named fastrtps; later ones have fastdds."""
@@ -128,7 +127,7 @@ def is_mended_later(library: RobotLibrary, advisories: Sequence[Advisory] | None
     """
     known = known_vulnerabilities(library.product, library.version, advisories)
     numbers = version_numbers(library.version)
-    if known is None or numbers is None or library.path.startswith(_LINUX_PACKAGES):
+    if known is None or numbers is None or _as_mapped(library).packaged:
         return False
     return any(advisory.mended_in(numbers) for advisory in known.known)
 
@@ -154,7 +153,7 @@ def _library_findings(
             yield VERSION_UNKNOWN.found(library.product, text)
         elif known.known:
             kind = KNOWN_VULNERABILITIES
-            if library.path.startswith(_LINUX_PACKAGES):
+            if library.packaged:
                 kind = PACKAGE_VULNERABILITIES
             text = f"{place}{by}, {_described(known.known, library.version)}"
             if known.unclear:

@@ -14,6 +14,8 @@ from click.core import ParameterSource
 
 from sros_tool.cli.common import (
     PATH,
+    advisories_of,
+    advisories_option,
     check_output,
     complete_template,
     force_option,
@@ -117,6 +119,7 @@ def _complete_scenario(
     metavar="FILE.html",
     help="Write all results as one HTML page.",
 )
+@advisories_option
 @force_option
 @json_option
 @click.pass_context
@@ -136,6 +139,7 @@ def demo(
     keep: Path | None,
     summary: Path | None,
     report: Path | None,
+    advisories: Path | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -198,6 +202,7 @@ def demo(
         domain=domain,
         network=network,
         keep=keep,
+        advisories=advisories_of(advisories),
     )
     for path in (summary, report):
         if path is not None:  # fail before the demo runs, not after it

@@ -18,6 +18,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
 
+from sros_tool.dds.advisories import Advisory
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.demo.backend import (
     AUTO,
@@ -30,7 +31,13 @@ from sros_tool.demo.backend import (
 )
 from sros_tool.demo.casting import CastMember, UserKeystore, open_user_keystore
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
-from sros_tool.demo.result import DemoResult, KeystoreSummary, RowResult, ScenarioResult
+from sros_tool.demo.result import (
+    DemoResult,
+    KeystoreSummary,
+    RowResult,
+    ScenarioResult,
+    used_libraries,
+)
 from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios.communication import ISOLATION
 from sros_tool.demo.scenarios.model import Row, Scenario, joined
@@ -63,7 +70,8 @@ class DemoOptions:
     ``keystore`` is a keystore of the user, a copy of which is attacked.  The default ``template``
     is the template of that keystore, or production; the default ``topic`` is one that the cast may
     use.  ``only`` selects the rows whose names contain one of its words.  ``accept_open`` names the
-    rows of attacks that may succeed because of the user's keystore.
+    rows of attacks that may succeed because of the user's keystore.  ``advisories`` are the known
+    vulnerabilities of DDS; None for those that ship with sros.
     """
 
     template: Template | None = None
@@ -77,6 +85,7 @@ class DemoOptions:
     only: tuple[str, ...] = ()
     accept_open: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
+    advisories: tuple[Advisory, ...] | None = None
 
 
 def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoResult:
@@ -165,6 +174,9 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             network_reason=isolation.reason,
             scenarios=tuple(results),
             left_out=left_out,
+            libraries=used_libraries(
+                (row for scenario in results for row in scenario.rows), options.advisories
+            ),
         )
         if options.keep is not None:
             text = json.dumps(versioned(result), indent=2) + "\n"

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Annotated, NamedTuple
 
+from sros_tool.dds.advisories import Advisory, known_vulnerabilities
 from sros_tool.demo.backend import CYCLONE, RCLPY, ZENOH
 from sros_tool.demo.casting import CastMember
 from sros_tool.demo.scenarios.model import (
@@ -29,6 +30,7 @@ from sros_tool.demo.scenarios.model import (
 from sros_tool.demo.wire import Injection, WireCount
 from sros_tool.errors import NOT_DONE
 from sros_tool.runtime.events import Event, EventKind, ProcessStage, signal_name
+from sros_tool.runtime.processes import MappedLibrary
 from sros_tool.runtime.vendor_log import (
     endpoint_refusal,
     missing_security,
@@ -37,6 +39,7 @@ from sros_tool.runtime.vendor_log import (
 )
 from sros_tool.validity import iso
 from sros_tool.values import Words, shows
+from sros_tool.wording import counted, first_few
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,8 @@ class RowRecord:
     ready in time.  ``injected`` counts the packets that were sent again or changed; ``skipped`` is
     why the row was not run, or "".  ``expiry`` is when the certificate of a short-lived talker
     expires (CLOCK_MONOTONIC, s); ``memory`` counts the segments of shared memory with the text of
-    each party.  Without ``applies``, the keystore has nobody for a part of the row.
+    each party.  Without ``applies``, the keystore has nobody for a part of the row.  ``libraries``
+    are those of DDS that the parties had mapped at the end of the observation.
     """
 
     row: Row
@@ -77,6 +81,7 @@ class RowRecord:
     memory: Mapping[str, int] = field(default_factory=dict)
     skipped: str = ""
     applies: bool = True
+    libraries: frozenset[MappedLibrary] = frozenset()
 
     @property
     def seconds(self) -> float:
@@ -121,6 +126,7 @@ class RowResult:
     """Whether the keystore has an enclave for each part; if not, the row was skipped."""
     scenario: str = ""
     """Name of the scenario."""
+    libraries: frozenset[MappedLibrary] = frozenset()
 
     @property
     def defence_removed(self) -> str:
@@ -187,6 +193,7 @@ def judge_row(record: RowRecord) -> RowResult:
         accepted=row.accepted,
         unaccepted=row.unaccepted,
         applies=record.applies,
+        libraries=record.libraries,
     )
 
 
@@ -562,8 +569,8 @@ class ScenarioResult:
 
 
 @shows(
-    *("backend", "dds", "why", "template", "topic", "own_network", "network_reason"),
-    *("as_expected", "left_out", "scenarios", "rows"),
+    *("backend", "dds", "libraries", "vulnerabilities", "why", "template", "topic"),
+    *("own_network", "network_reason", "as_expected", "left_out", "scenarios", "rows"),
 )
 @dataclass(frozen=True)
 class DemoResult:
@@ -587,6 +594,20 @@ class DemoResult:
     """Results of the scenarios."""
     left_out: int = 0
     """Number of rows that `--only` left out."""
+    libraries: tuple[UsedLibrary, ...] = ()
+    """Libraries of DDS that the processes had loaded, with their known vulnerabilities; an empty
+    list if none was seen."""
+
+    @property
+    def vulnerabilities(self) -> str:
+        """The known vulnerabilities with which the demo ran, in sentences."""
+        return self.known_vulnerabilities(_ALL_IDS)
+
+    def known_vulnerabilities(self, most: int) -> str:
+        """Return the known vulnerabilities with which the demo ran, at most ``most`` by name."""
+        if not self.libraries:
+            return f"{self.dds} may have vulnerabilities: {_UNKNOWN}."
+        return " ".join(library.sentence(most) for library in self.libraries)
 
     @property
     def rows(self) -> tuple[RowResult, ...]:
@@ -604,6 +625,56 @@ class DemoResult:
         if any(scenario.wrong for scenario in self.scenarios):
             return 1
         return 0 if self.as_expected else NOT_DONE
+
+
+_MOST_IDS, _ALL_IDS = 3, 10_000
+_UNKNOWN = "its version is not known, or no advisory is about it"
+
+
+class UsedLibrary(NamedTuple):
+    """A library of DDS that processes of the demo had loaded, and its known vulnerabilities."""
+
+    product: str
+    """Name of the DDS."""
+    version: str
+    """Version of the DDS in three numbers; empty if the name of the library does not show it."""
+    packaged: bool
+    """Whether a package of Debian or Ubuntu has the library, which can carry mends of later
+    releases."""
+    vulnerabilities: Sequence[str] | None
+    """Ids of the known vulnerabilities of this version; null if they are not known."""
+    unclear: Sequence[str]
+    """Ids of vulnerabilities of which it is not known whether this version has them."""
+
+    def sentence(self, most: int) -> str:
+        """Return what is known of the library, with at most ``most`` ids."""
+        version = self.version or "of unknown version"
+        name = f"{self.product} {version}, which the processes loaded,"
+        if self.vulnerabilities is None:
+            return f"{name} may have vulnerabilities: {_UNKNOWN}."
+        unclear = f"; of {len(self.unclear)} more it is not known" if self.unclear else ""
+        if not self.vulnerabilities:
+            return f"{name} has no known vulnerability{unclear}."
+        number = counted(len(self.vulnerabilities), "known vulnerability", "known vulnerabilities")
+        ids = first_few(self.vulnerabilities, most)
+        unless = ", unless its package mends them" if self.packaged else ""
+        return f"{name} has {number}{unless}: {ids}{unclear}."
+
+
+def used_libraries(
+    rows: Iterable[RowResult], advisories: Sequence[Advisory] | None = None
+) -> tuple[UsedLibrary, ...]:
+    """Return the libraries of DDS that processes of the rows had loaded, sorted.
+
+    ``advisories`` are the known vulnerabilities; None for those that ship with sros.
+    """
+    used = set()
+    for library in {library for row in rows for library in row.libraries}:
+        known = known_vulnerabilities(library.product, library.version, advisories)
+        ids = tuple(advisory.id for advisory in known.known) if known else None
+        unclear = tuple(advisory.id for advisory in known.unclear) if known else ()
+        used.add(UsedLibrary(library.product, library.version, library.packaged, ids, unclear))
+    return tuple(sorted(used))
 
 
 class ListedScenario(NamedTuple):
@@ -641,6 +712,7 @@ def demo_table(result: DemoResult) -> str:
     lines = [
         f"{result.dds}, topic {result.topic}, in {network}",
         f"backend {result.backend}: {result.why}",
+        result.known_vulnerabilities(_MOST_IDS),
     ]
     for scenario in result.scenarios:
         lines.append("")
@@ -752,6 +824,8 @@ def summary_page(result: DemoResult, now: datetime) -> str:
         "",
         f"Run {iso(now)} with `sros demo` on {result.dds}; expected statuses are those of"
         f" the keystore template `{result.template}`: **{_verdict(result, wrong)}**",
+        "",
+        result.vulnerabilities,
         "",
     ]
     for scenario in result.scenarios:

@@ -54,6 +54,7 @@ from sros_tool.demo.wire import (
 )
 from sros_tool.runtime.events import Event, EventKind, EventReader
 from sros_tool.runtime.netns import ENDING_SIGNALS, Progress, RowNetwork, end_with_starter
+from sros_tool.runtime.processes import MappedLibrary, dds_of
 from sros_tool.runtime.vendor_log import plain_text
 
 _LOG = logging.getLogger(__name__)
@@ -228,6 +229,9 @@ class _Runner:
                             started = self._start(index, row, party, folder, patience)
                             processes[party.name] = started
             window = await self._watch(row, processes, expiry)
+            libraries = frozenset[MappedLibrary]().union(
+                *(process.dds() for process in processes.values())
+            )
             if _in_memory(row):
                 texts = {name: process.text for name, process in processes.items()}
                 segments = frozenset().union(
@@ -253,7 +257,9 @@ class _Runner:
                     tap.close()
                 network.close()
         records = {name: process.record() for name, process in processes.items()}
-        return RowRecord(row, domain, records, window, wire, injected, expiry, memory)
+        return RowRecord(
+            row, domain, records, window, wire, injected, expiry, memory, libraries=libraries
+        )
 
     def _elapsed(self) -> float:
         """Return the seconds since the plan was made."""
@@ -589,6 +595,10 @@ class _PartyProcess:
     def segments(self) -> frozenset[Path]:
         """Return the segments of shared memory that the process maps."""
         return mapped_segments(self._process.pid)
+
+    def dds(self) -> tuple[MappedLibrary, ...]:
+        """Return the libraries of DDS that the process has mapped; empty if it has ended."""
+        return dds_of(self._process.pid)
 
     def ask_to_end(self) -> None:
         """Send SIGTERM; an end after that does not count as `ended`."""

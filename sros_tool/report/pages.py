@@ -248,6 +248,7 @@ def _demo_head(result: Json) -> str:
         if number != "0"
     )
     why = f'<p class="soft">{escape(result["why"])}</p>' if result.get("why") else ""
+    why += f"<p>{escape(result['vulnerabilities'])}</p>"
     return (
         f"<header><h1>Attempts and their results</h1><p>{', '.join(facts)}.</p>{why}"
         f'<ul class="tiles">{shown}</ul></header>'

@@ -83,6 +83,11 @@ class MappedLibrary(NamedTuple):
     path: str
     replaced: bool = False
 
+    @property
+    def packaged(self) -> bool:
+        """Whether a package of Debian or Ubuntu has it, which can carry mends of later releases."""
+        return self.path.startswith(("/usr/lib/", "/lib/"))
+
 
 @dataclass(frozen=True, slots=True)
 class Process:
@@ -350,10 +355,34 @@ def with_files(process: Process, root: ProcessRoot, folder: str) -> Process:
     enclave = _loaded_enclave(
         process.environment, process.command, root, user=process.user, folder=folder
     )
-    unknown = [library for library in process.dds if not library.version and not library.replaced]
-    named = {library: _with_version(library, root) for library in unknown[:_MOST_COPIES_SOUGHT]}
-    dds = tuple(named.get(library, library) for library in process.dds)
+    dds = _with_versions(process.dds, root)
     return replace(process, enclave=enclave, configuration=zenoh, dds=dds)
+
+
+def dds_of(pid: int) -> tuple[MappedLibrary, ...]:
+    """Return the libraries of DDS that a process has mapped; empty if that cannot be seen."""
+    try:
+        folder = os.open(f"/proc/{pid}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            libraries = _mapped_dds(_read(folder, "maps", _MOST_MAPS))
+            root = os.open("root", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
+        finally:
+            os.close(folder)
+    except OSError:
+        return ()
+    try:
+        return _with_versions(libraries, ProcessRoot(root, FileReader()))
+    finally:
+        os.close(root)
+
+
+def _with_versions(
+    libraries: tuple[MappedLibrary, ...], root: ProcessRoot
+) -> tuple[MappedLibrary, ...]:
+    """Return the libraries with versions that copies next to them show."""
+    unknown = [library for library in libraries if not library.version and not library.replaced]
+    named = {library: _with_version(library, root) for library in unknown[:_MOST_COPIES_SOUGHT]}
+    return tuple(named.get(library, library) for library in libraries)
 
 
 def _with_version(library: MappedLibrary, root: ProcessRoot) -> MappedLibrary:

@@ -21,7 +21,7 @@ from sros_tool.demo import doctor
 from sros_tool.demo import program as demo
 from sros_tool.demo.casting import CastMember
 from sros_tool.demo.doctor import Diagnosis, SecurityProvider
-from sros_tool.demo.result import KeystoreSummary
+from sros_tool.demo.result import KeystoreSummary, used_libraries
 from sros_tool.runtime.processes import Process, ProcessTable, RunningProcesses
 from tests.checks.test_doctor_findings import CYCLONE, RMW
 from tests.cli.json_cases import (
@@ -34,7 +34,7 @@ from tests.cli.json_cases import (
     make_folder,
 )
 from tests.cli.test_audit import FINE, LOUD, POLICY, SHORT
-from tests.demo.test_demo_result import CLOSED, OPEN, TWIN, result
+from tests.demo.test_demo_result import CLOSED, OLD, OPEN, TWIN, result
 from tests.graph.fake_graph import Beside, graph
 from tests.support.harness import Ended, snapshot, sros
 from tests.support.long_form import drawn
@@ -299,7 +299,8 @@ def test_what_demo_prints(
     keystore = KeystoreSummary(3, not_tried=("/b with a governance of its own",))
     scenario = replace(shown.scenarios[0], cast=cast, attacked=keystore)
     unproved = replace(shown, scenarios=(scenario,))
-    opened = result(replace(OPEN, unaccepted=True))
+    run = replace(OPEN, unaccepted=True, libraries=frozenset({OLD}))
+    opened = replace(result(run), libraries=used_libraries([run]))
     for each, status in ((shown, 0), (opened, 1), (unproved, 2)):
         monkeypatch.setattr(demo, "run_demo", lambda *_, found=each: found)
         ended = sros("demo", "--json", cwd=tmp_path)

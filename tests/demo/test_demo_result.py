@@ -8,9 +8,17 @@ from datetime import UTC, datetime
 
 import pytest
 
-from sros_tool.demo.result import DemoResult, RowResult, ScenarioResult, demo_table, summary_page
+from sros_tool.demo.result import (
+    DemoResult,
+    RowResult,
+    ScenarioResult,
+    demo_table,
+    summary_page,
+    used_libraries,
+)
 from sros_tool.demo.scenarios.model import RowStatus
 from sros_tool.report.pages import render_demo_page
+from sros_tool.runtime.processes import MappedLibrary
 from sros_tool.values import as_plain
 
 NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
@@ -62,6 +70,36 @@ def test_json_says_what_the_module_describes() -> None:
     assert (closed["scenario"], closed["attack"]) == ("attacks", "forged")
     assert (twin["defence_removed"], closed["defence_removed"]) == ("the signature", "")
     assert (open_["open_because"], open_["remedy"]) == ("nothing revokes it", "renew")
+
+
+OLD = MappedLibrary("Fast DDS", "2.14.5", "/opt/ros/jazzy/lib/libfastrtps.so.2.14.5")
+
+
+@pytest.mark.parametrize(
+    ("library", "text"),
+    [
+        (
+            OLD,
+            "27 known vulnerabilities: CVE-2025-62599, CVE-2025-62600, CVE-2025-62601 and 24",
+        ),
+        (OLD._replace(path="/usr/lib/x.so"), "vulnerabilities, unless its package mends them: CVE"),
+        (OLD._replace(version="3.2.5"), "has no known vulnerability; of 2 more it is not known."),
+        (OLD._replace(version=""), "of unknown version, which the processes loaded, may have"),
+        (None, "Cyclone DDS 0.10.2 may have vulnerabilities: its version is not known"),
+    ],
+)
+def test_the_known_holes_with_which_it_ran_are_named(
+    library: MappedLibrary | None, text: str
+) -> None:
+    row = replace(CLOSED, libraries=frozenset({library} if library else ()))
+    shown = replace(result(row), libraries=used_libraries([row, CLOSED]))
+    assert text in demo_table(shown)
+    listed = as_plain(shown)
+    assert len(listed["libraries"]) == bool(library)
+    for name in listed["libraries"][0]["vulnerabilities"] or () if library else ():
+        assert name in listed["vulnerabilities"]
+    assert listed["vulnerabilities"] in summary_page(shown, NOW)
+    assert listed["vulnerabilities"] in render_demo_page(listed)
 
 
 def test_a_known_open_door_is_named_and_no_failure() -> None:

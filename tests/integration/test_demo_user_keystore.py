@@ -258,3 +258,6 @@ def test_a_scenario_of_a_user(tmp_path: Path) -> None:
     assert [row["observed"] for row in shown["rows"]] == ["not heard", "refused", "refused"]
     assert [row["as_expected"] for row in shown["rows"]] == [True, True, False]
     assert ended.status == 1
+    loaded = {f"{library['product']} {library['version']}" for library in shown["libraries"]}
+    assert shown["dds"] in loaded, "what the processes had mapped"
+    assert shown["vulnerabilities"].count("which the processes loaded") == len(loaded)

@@ -44,6 +44,7 @@ def result(*rows: dict[str, Any]) -> dict[str, Any]:
     return {
         "backend": "cyclone",
         "dds": "Cyclone DDS 0.10.2",
+        "vulnerabilities": HOSTILE[0],
         "why": "",
         "template": "production",
         "topic": "/chatter",
