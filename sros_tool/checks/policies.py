@@ -38,7 +38,7 @@ from sros_tool.dds.permissions import (
 from sros_tool.errors import DocumentError, Note, PolicyError, SrosError
 from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
-from sros_tool.fleet.robots import Fleet
+from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.keystore.protection import contradictions
 from sros_tool.names import (
@@ -847,6 +847,15 @@ REDUNDANT_INCLUDE = FindingKind(
     "XInclude 1.0.",
     "Remove the include.",
 )
+SHARED_NAMESPACE = FindingKind(
+    "policy.shared-namespace",
+    WARNING,
+    "robots whose namespaces are the same, or lie in one another",
+    "Names of one robot are also names of the other: both publish and subscribe them, and what is "
+    "allowed with a wildcard in the outer namespace is allowed in the inner one.",
+    "rcl (names are the namespace and the rest); sros (placeholder {namespace}).",
+    "Give each robot a namespace of its own in the fleet file, or a ROS domain of its own.",
+)
 
 _CHECKS = (
     _check_rules,
@@ -886,6 +895,39 @@ def policy_file_findings(
         return
     yield from findings_in(policy, distribution)
     yield from _includes(path)
+    if fleet and (shared := [*_shared_namespaces(fleet)]):
+        yield SHARED_NAMESPACE.found(str(path), first_few(shared, 3, "; "), str(path))
+
+
+def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
+    """Yield a clause for each namespace that several robots on one ROS domain have, or are in."""
+    robots = {
+        namespace: [fleet.robots[name] for name in names]
+        for namespace, names in fleet.by_namespace.items()
+    }
+    for namespace, inside in robots.items():
+        if met := _on_one_domain(inside):
+            yield f"{met[0].name} and {met[1].name} have the namespace {namespace}"
+        above = namespace
+        while above := above.rpartition("/")[0]:  # a robot in / is meant to be above the others
+            if met := _on_one_domain(inside, robots.get(above, [])):
+                outer, inner = (robot.name for robot in met)
+                yield f"the namespace of {inner}, {namespace}, is in {above}, that of {outer}"
+
+
+def _on_one_domain(
+    robots: Sequence[Robot], others: Sequence[Robot] | None = None
+) -> tuple[Robot, Robot] | None:
+    """Return one of ``others``, or of ``robots``, and one of ``robots`` that can share a domain."""
+    seen = {robot.domain: robot for robot in others or ()}
+    for robot in robots:
+        same = (seen.get(robot.domain), seen.get(None))
+        for other in seen.values() if robot.domain is None else same:
+            if other:
+                return other, robot
+        if others is None:
+            seen[robot.domain] = robot
+    return None
 
 
 def _unreadable(path: Path, error: SrosError) -> Iterator[Finding]:

@@ -9,6 +9,7 @@ import pytest
 from sros_tool.checks.kind import WARNING, Finding
 from sros_tool.checks.policies import policy_file_findings
 from sros_tool.files import policies_dir
+from sros_tool.fleet.robots import Fleet, Robot
 from tests.checks.policy_cases import (
     BASICS,
     CASES,
@@ -30,6 +31,7 @@ FOUND_OTHERWISE = {
     "policy.redundant-include",
     "portable.enclave-names",
     "policy.root-enclave",
+    "policy.shared-namespace",
 }
 """These are about more than the content of one profile; they have tests of their own here."""
 HEAD = 3
@@ -243,3 +245,26 @@ WIDE_ON_PURPOSE = {
 def test_nothing_in_the_policies_of_sros(path: Path) -> None:
     found = {each.id for each in policy_file_findings(path) if each.severity >= WARNING}
     assert found == WIDE_ON_PURPOSE.get(path.stem, set())
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        (("/hall", None), "the namespace of a, /hall/r1, is in /hall, that of b"),
+        (("/hall/r1", None), "a and b have the namespace /hall/r1"),
+        (("/hall/r1/arm", None), "the namespace of b, /hall/r1/arm, is in /hall/r1, that of a"),
+        (("/hall/r1/arm", 7), "the namespace of b, /hall/r1/arm, is in /hall/r1, that of a"),
+        (("/hall/r1/arm", 8), ""),
+        (("/hall/r10", 7), ""),
+        (("/", 7), ""),
+    ],
+)
+def test_robots_that_share_a_namespace(
+    settings: tuple[str, int | None], text: str, tmp_path: Path
+) -> None:
+    fleet = Fleet.of([Robot("a", "/hall/r1", 7), Robot("b", *settings)])
+    file = tmp_path / "policy.xml"
+    file.write_text(policy(enclave(topics("publish", "/x/a"))))
+    found = [each.text for each in policy_file_findings(file, fleet=fleet)]
+    shared = [each for each in found if "namespace" in each]
+    assert shared == ([text] if text else [])
