@@ -33,6 +33,7 @@ from sros_tool.cli.common import (
     save,
     words_argument,
 )
+from sros_tool.cli.program import VerbGroup
 from sros_tool.errors import Note, UsageError
 from sros_tool.terminal import echo, echo_document, visible_line
 from sros_tool.values import file_change, shows
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.fleet_status import FleetStatus, RobotStatus
 
 
-class _Fleet(Verb, click.Group):
+class _Fleet(Verb, VerbGroup):
     """A click group whose subcommands are verbs."""
 
     command_class = Verb

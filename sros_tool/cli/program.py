@@ -134,7 +134,21 @@ _VERBOSE = click.Option(
 )
 
 
-class _Program(click.Group):
+class VerbGroup(click.Group):
+    """A group that, without arguments, prints its help on standard error and ends with status 2.
+
+    So does click from release 8.2 on; earlier releases end with 0.
+    """
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments; without any, print the help and exit."""
+        if not args and not ctx.resilient_parsing:
+            echo(ctx.get_help(), err=True)
+            ctx.exit(NOT_DONE)
+        return super().parse_args(ctx, args)
+
+
+class _Program(VerbGroup):
     """A command group that imports verbs when used, and accepts "-" for "_" in their names."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -209,7 +223,6 @@ asked or done."""
     cls=_Program,
     epilog=_EPILOG,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 80},
-    no_args_is_help=True,
 )
 @click.version_option(__version__, "--version", "-V", message="sros %(version)s")
 def program() -> None:
@@ -264,9 +277,6 @@ def report_error(error: BaseException, arguments: Sequence[str], name: str = "sr
     if isinstance(error, (KeyboardInterrupt, click.Abort)):
         echo("sros: interrupted", err=True)
         return 130
-    if isinstance(error, click.exceptions.NoArgsIsHelpError):
-        error.show()
-        return NOT_DONE
     if isinstance(error, click.UsageError):
         where = error.ctx.command_path if error.ctx else _named_command(arguments, name)
         return _print_error(f"{where}: {error.format_message()} See `{where} --help`.")

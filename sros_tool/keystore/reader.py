@@ -70,9 +70,11 @@ from sros_tool.pki.chains import chain_fault
 from sros_tool.pki.crl import (
     CRL_MARK,
     RevocationList,
+    last_update,
     lists_as_revoked,
     load_crl,
     may_sign_lists,
+    next_update,
     read_list,
     refusal_of,
     signed_by,
@@ -1000,13 +1002,12 @@ class _EnclaveFiles:
         if refusal := refusal_of(crl):
             text = f"{refusal}, so DDS refuses every participant"
             self._add(CRL_FILE, text, Fault.CRL_PARTIAL)
-        if crl.last_update_utc > self._now:
-            text = (
-                f"it is not valid before {iso(crl.last_update_utc)}: every participant is refused"
-            )
+        if last_update(crl) > self._now:
+            text = f"it is not valid before {iso(last_update(crl))}: every participant is refused"
             self._add(CRL_FILE, text, Fault.CRL_NOT_YET_VALID)
-        if crl.next_update_utc and crl.next_update_utc < self._now:
-            text = f"it expired at {iso(crl.next_update_utc)}: every participant is refused"
+        expiry = next_update(crl)
+        if expiry and expiry < self._now:
+            text = f"it expired at {iso(expiry)}: every participant is refused"
             self._add(CRL_FILE, text, Fault.CRL_EXPIRED)
         if certificate and lists_as_revoked(crl, certificate.serial_number):
             self._add(CERTIFICATE_FILE, "it is revoked by crl.pem", Fault.REVOKED)

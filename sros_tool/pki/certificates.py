@@ -22,7 +22,6 @@ from cryptography.x509.oid import (
     ExtendedKeyUsageOID,
     ExtensionOID,
     NameOID,
-    PublicKeyAlgorithmOID,
     SignatureAlgorithmOID,
 )
 
@@ -180,7 +179,8 @@ def _builder(
 
 def validity_of(certificate: x509.Certificate) -> Window:
     """Return the validity of a certificate, in UTC."""
-    return Window(certificate.not_valid_before_utc, certificate.not_valid_after_utc)
+    begin = tolerant.date(certificate, "not_valid_before")
+    return Window(begin, tolerant.date(certificate, "not_valid_after"))
 
 
 def pem(certificate: x509.Certificate) -> bytes:
@@ -357,8 +357,7 @@ def _read_names(certificate: x509.Certificate) -> x509.Certificate:
     for name in (certificate.subject, certificate.issuer):
         read_name(name)
         subject_text(name)
-    if certificate.not_valid_after_utc <= certificate.not_valid_before_utc:
-        raise ValueError("it expires before its validity begins")
+    validity_of(certificate)  # raises an error if it expires before it begins
     return certificate
 
 
@@ -423,7 +422,7 @@ def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) ->
 
 def is_for_pss(certificate: x509.Certificate) -> bool:
     """Return whether the key of a certificate is an RSA key for RSA-PSS alone (RFC 4055, 1.2)."""
-    return certificate.public_key_algorithm_oid == PublicKeyAlgorithmOID.RSASSA_PSS
+    return _key_algorithm(certificate)[0].content == _RSA_PSS
 
 
 def _in_der(certificate: x509.Certificate, part: bytes) -> bytes:
@@ -431,15 +430,22 @@ def _in_der(certificate: x509.Certificate, part: bytes) -> bytes:
     return der.normalized(part) if tolerant.is_tolerated(certificate) else part
 
 
-@lru_cache(maxsize=256)
 def has_explicit_curve(certificate: x509.Certificate) -> bool:
     """Return whether the elliptic curve of a certificate's key is given by its parameters."""
-    if certificate.public_key_algorithm_oid != PublicKeyAlgorithmOID.EC_PUBLIC_KEY:
-        return False
+    kind, *parameters = _key_algorithm(certificate)
+    return kind.content == _EC and bool(parameters) and parameters[-1].tag == der.SEQUENCE
+
+
+_RSA_PSS = der.encode_oid("1.2.840.113549.1.1.10")
+_EC = der.encode_oid("1.2.840.10045.2.1")
+
+
+@lru_cache(maxsize=256)
+def _key_algorithm(certificate: x509.Certificate) -> list[der.Value]:
+    """Return the identifier and the parameters of the algorithm of a certificate's key."""
     parts = der.children(der.first(_in_der(certificate, certificate.tbs_certificate_bytes)).content)
     key = parts[6 if parts[0].tag == der.CONTEXT_0 else 5]
-    algorithm_of_key = der.children(der.first(key.content).content)
-    return algorithm_of_key[-1].tag == der.SEQUENCE
+    return der.children(der.first(key.content).content)
 
 
 @lru_cache(maxsize=256)

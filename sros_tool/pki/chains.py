@@ -220,7 +220,7 @@ def _issuer(
     valid = (issuer for issuer in certificates if validity_of(issuer).contains(at))
     return next(
         valid,
-        max(certificates, key=lambda certificate: certificate.not_valid_after_utc, default=None),
+        max(certificates, key=lambda issuer: validity_of(issuer).not_after, default=None),
     )
 
 

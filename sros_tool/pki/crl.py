@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager
 from datetime import datetime
 from enum import Enum
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -126,11 +126,21 @@ def load_crl(data: bytes, name: str) -> RevocationList:
         PkiError: the list cannot be read, or does not say when it expires.
     """
     crl = read_list(data, name)
-    next_update = crl.next_update_utc
-    if next_update is None:
+    expiry = next_update(crl)
+    if expiry is None:
         raise PkiError(f"the revocation list {name} does not say when it expires", "", _RESTORE)
     revoked = tuple(entry for entry in map(_revoked, crl) if entry.reason in REASONS)
-    return RevocationList(_number(crl), crl.last_update_utc, next_update, revoked, crl)
+    return RevocationList(_number(crl), last_update(crl), expiry, revoked, crl)
+
+
+def last_update(crl: x509.CertificateRevocationList) -> datetime:
+    """Return when a revocation list begins to be valid, in UTC."""
+    return cast(datetime, tolerant.date(crl, "last_update"))
+
+
+def next_update(crl: x509.CertificateRevocationList) -> datetime | None:
+    """Return when a revocation list expires, in UTC; None if it does not say so."""
+    return cast("datetime | None", tolerant.date(crl, "next_update"))
 
 
 def read_list(data: bytes, name: str) -> x509.CertificateRevocationList:
@@ -184,7 +194,7 @@ def _read(content: bytes) -> x509.CertificateRevocationList:
 def _read_in_full(crl: x509.CertificateRevocationList) -> x509.CertificateRevocationList:
     read_name(crl.issuer)
     subject_text(crl.issuer)
-    _ = crl.last_update_utc, crl.next_update_utc, crl.signature_hash_algorithm, _number(crl)
+    _ = last_update(crl), next_update(crl), crl.signature_hash_algorithm, _number(crl)
     for entry in crl:
         _revoked(entry)
     return crl
@@ -286,7 +296,7 @@ def _revoked(entry: x509.RevokedCertificate) -> Revoked:
         reason = entry.extensions.get_extension_for_class(x509.CRLReason).value.reason.value
     except x509.ExtensionNotFound:
         reason = "unspecified"
-    return Revoked(entry.serial_number, entry.revocation_date_utc, reason)
+    return Revoked(entry.serial_number, tolerant.date(entry, "revocation_date"), reason)
 
 
 # ── verification with lists (x509_vfy.c) ───────────────────────────────────────────────────
@@ -350,12 +360,13 @@ def list_refusal(
         return ListRefusal(Obstacle.USAGE, crl, text)
     if not score.in_scope:
         return ListRefusal(Obstacle.SCOPE, crl, "it is not for all certificates of its CA")
-    if crl.last_update_utc > at:
-        text = f"it is not valid before {iso(crl.last_update_utc)}"
+    if last_update(crl) > at:
+        text = f"it is not valid before {iso(last_update(crl))}"
         return ListRefusal(Obstacle.NOT_YET_VALID, crl, text)
     if _has_expired(crl, at):
-        assert crl.next_update_utc
-        return ListRefusal(Obstacle.EXPIRED, crl, f"it expired at {iso(crl.next_update_utc)}")
+        expiry = next_update(crl)
+        assert expiry
+        return ListRefusal(Obstacle.EXPIRED, crl, f"it expired at {iso(expiry)}")
     if not _is_signed(_Content(crl), issuer):
         return ListRefusal(Obstacle.SIGNATURE, crl, f"it is not signed with the key of {name}")
     if not score.only_known:
@@ -403,10 +414,10 @@ def _best(
         score = _Score(
             not _entries(_Content(crl)).has_unknown,
             _is_in_scope(chain[0], crl, point),
-            crl.last_update_utc <= at and not _has_expired(crl, at),
+            last_update(crl) <= at and not _has_expired(crl, at),
             issuer is chain[min(1, len(chain) - 1)],
         )
-        if best is None or (score, crl.last_update_utc) > (best[2], best[0].last_update_utc):
+        if best is None or (score, last_update(crl)) > (best[2], last_update(best[0])):
             best = (crl, issuer, score)
     return best
 
@@ -534,7 +545,8 @@ def _all_reasons(certificate: x509.Certificate, crl: x509.CertificateRevocationL
 
 
 def _has_expired(crl: x509.CertificateRevocationList, at: datetime) -> bool:
-    return crl.next_update_utc is not None and crl.next_update_utc <= at
+    expiry = next_update(crl)
+    return expiry is not None and expiry <= at
 
 
 def _value(crl: x509.CertificateRevocationList, kind: type[Extension]) -> Extension | None:

@@ -115,19 +115,20 @@ def load_any_key(
         PkiError: as `load_key`, but for the kind of the key.
     """
     pem = _key_block(pem, name)
-    try:
-        key = serialization.load_pem_private_key(pem, None, unsafe_skip_rsa_key_validation=True)
-    except TypeError as error:
+    if _TRADITIONAL in pem or _ENCRYPTED.match(pem):
         if passphrase is None:
             raise PkiError(
                 f"the private key {name} is protected by a passphrase",
                 "It is encrypted, so it cannot be used without the passphrase.",
                 "Decrypt it with `openssl pkey -in KEY -out KEY.plain`.",
-            ) from error
+            )
         _check_derivation(pem, name)
         key = _decrypted(pem, name, passphrase())
-    except Exception as error:  # of many classes: see `reading`
-        raise _unreadable(name) from error
+    else:
+        try:
+            key = serialization.load_pem_private_key(pem, None, unsafe_skip_rsa_key_validation=True)
+        except Exception as error:  # of many classes: see `reading`
+            raise _unreadable(name) from error
     return _validated(key, name) if isinstance(key, rsa.RSAPrivateKey) else key
 
 
@@ -148,6 +149,8 @@ def check_key(content: bytes, label: str = "") -> None:
     if len(content) > _MAX_BYTES:
         raise ValueError("too large")
     data, _ = der.split(content)
+    if der.first_part(data)[0] != der.INTEGER:
+        raise ValueError("an encrypted key, which `cryptography` 41 would try to decrypt")
     key = serialization.load_der_private_key(data, None, unsafe_skip_rsa_key_validation=True)
     if not isinstance(key, _KINDS.get(label, object)):
         raise ValueError("a key of another algorithm than its label says")

@@ -13,21 +13,23 @@ from __future__ import annotations
 
 import base64
 import re
+import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
+from hashlib import sha256
 from typing import NamedTuple, TypeVar
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, padding, rsa
-from cryptography.x509.oid import PublicKeyAlgorithmOID
+from cryptography.hazmat.primitives.serialization import Encoding
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki.certificates import digest as fingerprint
-from sros_tool.pki.certificates import load_der_certificate
+from sros_tool.pki.certificates import is_for_pss, load_der_certificate
 from sros_tool.pki.distinguished_names import canonical_der, canonical_issuer, read_name_der
 from sros_tool.pki.keys import PrivateKey
 from sros_tool.pki.pem import ENCRYPTED_MESSAGE, SIGNED_MESSAGE, kind_of
@@ -55,6 +57,9 @@ _PARTS = 4
 """Number of pieces between MIME boundaries: a preamble, two parts, and an epilogue."""
 _SIGNED_DATA = der.encode_oid("1.2.840.113549.1.7.2")
 _DATA = der.encode_oid("1.2.840.113549.1.7.1")
+_CONTENT_TYPE = der.encode_oid("1.2.840.113549.1.9.3")
+_SIGNING_TIME = der.encode_oid("1.2.840.113549.1.9.5")
+_SMIME_CAPABILITIES = der.encode_oid("1.2.840.113549.1.9.15")
 _MESSAGE_DIGEST = der.encode_oid("1.2.840.113549.1.9.4")
 _NULL = 0x05
 _ANY_VALUES = (
@@ -88,20 +93,11 @@ _DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
 
 def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
     """Return the S/MIME message of ``document``, signed with ``key`` of ``certificate``."""
-    import secrets  # reading needs none of these, and is frequent
+    import secrets  # reading does not need it, and is frequent
 
-    from cryptography.hazmat.primitives.serialization import Encoding, pkcs7
-
-    options = (pkcs7.PKCS7Options.DetachedSignature, pkcs7.PKCS7Options.Binary)
     content = _TEXT_HEADER + document.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n")
-    signature = (
-        pkcs7.PKCS7SignatureBuilder()
-        .set_data(content)
-        .add_signer(certificate, key, hashes.SHA256())
-        .sign(Encoding.DER, options)
-    )
     boundary = b"----" + secrets.token_hex(16).upper().encode()
-    encoded = base64.encodebytes(signature).replace(b"\n", b"\r\n")
+    encoded = base64.encodebytes(_cms(content, certificate, key)).replace(b"\n", b"\r\n")
     return b"".join((
         b"MIME-Version: 1.0\r\n"
         b'Content-Type: multipart/signed; protocol="application/x-pkcs7-signature"; '
@@ -115,6 +111,78 @@ def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> byt
         encoded,
         b"\r\n--", boundary, b"--\r\n\r\n",
     ))  # fmt: skip
+
+
+def _cms(content: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
+    """Return a detached CMS signature of ``content`` in DER (RFC 5652, 5.1 and 5.3).
+
+    It has the form that `cryptography` gives it from release 42 on: earlier ones write capabilities
+    that are not as RFC 8551, 2.5.2, has them.  The attributes are in the order of a DER set.
+    """
+    whole, issuer_and_serial = _signer_parts(certificate)
+    attributes = b"".join((
+        _TYPE_OF_DATA,
+        _attribute(_SIGNING_TIME, der.encode(der.UTC_TIME, _now())),
+        _attribute(_MESSAGE_DIGEST, der.encode(der.OCTET_STRING, sha256(content).digest())),
+        _CAPABILITIES,
+    ))  # fmt: skip
+    signed = der.encode(der.SET, attributes)
+    if isinstance(key, ec.EllipticCurvePrivateKey):
+        algorithm, value = _ECDSA_SHA256, key.sign(signed, ec.ECDSA(hashes.SHA256()))
+    else:
+        algorithm, value = _RSA, key.sign(signed, padding.PKCS1v15(), hashes.SHA256())
+    signer = der.encode(
+        der.SEQUENCE,
+        der.encode_integer(1),
+        issuer_and_serial,
+        _SHA256,
+        der.encode(der.CONTEXT_0, attributes),
+        algorithm,
+        der.encode(der.OCTET_STRING, value),
+    )
+    signed_data = der.encode(
+        der.SEQUENCE,
+        der.encode_integer(1),
+        der.encode(der.SET, _SHA256),
+        der.encode(der.SEQUENCE, der.encode(der.OID, _DATA)),
+        der.encode(der.CONTEXT_0, whole),
+        der.encode(der.SET, signer),
+    )
+    wrapped = der.encode(der.CONTEXT_0, signed_data)
+    return der.encode(der.SEQUENCE, der.encode(der.OID, _SIGNED_DATA), wrapped)
+
+
+def _now() -> bytes:
+    """Return the current time as a UTCTime; nothing reads when a document was signed."""
+    return time.strftime("%y%m%d%H%M%SZ", time.gmtime()).encode()
+
+
+@lru_cache(maxsize=16)
+def _signer_parts(certificate: x509.Certificate) -> tuple[bytes, bytes]:
+    """Return a signer's certificate in DER, and its IssuerAndSerialNumber."""
+    whole = certificate.public_bytes(Encoding.DER)
+    parts = der.children(der.first(certificate.tbs_certificate_bytes).content)
+    serial, _, issuer = parts[parts[0].tag == der.CONTEXT_0 :][:3]
+    return whole, der.encode(der.SEQUENCE, issuer.whole, serial.whole)
+
+
+def _algorithm(dotted: str, *parameters: bytes) -> bytes:
+    """Encode an AlgorithmIdentifier."""
+    return der.encode(der.SEQUENCE, der.encode(der.OID, der.encode_oid(dotted)), *parameters)
+
+
+def _attribute(kind: bytes, value: bytes) -> bytes:
+    """Encode an attribute with one value; ``kind`` is the content of its identifier."""
+    return der.encode(der.SEQUENCE, der.encode(der.OID, kind), der.encode(der.SET, value))
+
+
+_SHA256 = _algorithm("2.16.840.1.101.3.4.2.1", der.encode(_NULL))
+_ECDSA_SHA256 = _algorithm("1.2.840.10045.4.3.2")
+_RSA = _algorithm("1.2.840.113549.1.1.1", der.encode(_NULL))
+_TYPE_OF_DATA = _attribute(_CONTENT_TYPE, der.encode(der.OID, _DATA))
+_AES_CBC = [_algorithm(f"2.16.840.1.101.3.4.1.{number}") for number in (42, 22, 2)]
+_CAPABILITIES = _attribute(_SMIME_CAPABILITIES, der.encode(der.SEQUENCE, *_AES_CBC))
+"""AES with 256, 192 and 128 bits, in the mode CBC."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -252,9 +320,9 @@ def _other_signer(signer: x509.Certificate | None, authority: x509.Certificate) 
 
 
 def _padding(signer: x509.Certificate, digest: hashes.HashAlgorithm) -> padding.AsymmetricPadding:
-    if signer.public_key_algorithm_oid != PublicKeyAlgorithmOID.RSASSA_PSS:
-        return padding.PKCS1v15()
-    return padding.PSS(padding.MGF1(digest), padding.PSS.AUTO)
+    if is_for_pss(signer):
+        return padding.PSS(padding.MGF1(digest), padding.PSS.AUTO)
+    return padding.PKCS1v15()
 
 
 def _bits(algorithm: hashes.HashAlgorithm) -> int:

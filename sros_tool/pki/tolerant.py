@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
@@ -185,8 +185,7 @@ class _TolerantCertificate(_Signed):
         self.not_valid_before_utc = _date(begin) or datetime.min.replace(tzinfo=UTC)
         self.not_valid_after_utc = _date(end) or datetime.max.replace(tzinfo=UTC)
         algorithm, _ = _sequence(key)
-        oid = _sequence(algorithm)[0]
-        self.public_key_algorithm_oid = ObjectIdentifier(der.decode_oid(oid.content))
+        der.decode_oid(_sequence(algorithm)[0].content)  # raises an error if there is none
         self._key = _public_key(key.whole)
         while rest and rest[0].tag in _UNIQUE_IDENTIFIERS:
             rest.pop(0)
@@ -314,6 +313,20 @@ def unread_date(certificate: x509.Certificate) -> str:
     """Return the name of a date of a certificate that OpenSSL cannot compare, or ""."""
     tolerated = certificate if isinstance(certificate, _TolerantCertificate) else None
     return next(iter(tolerated.unread_dates), "") if tolerated else ""
+
+
+def date(
+    of: x509.Certificate | x509.CertificateRevocationList | x509.RevokedCertificate, name: str
+) -> Any:
+    """Return the date in the attribute ``name``, in UTC; None if a list does not have it.
+
+    `cryptography` 41 has the dates without a time zone.
+    """
+    try:
+        return getattr(of, f"{name}_utc")
+    except AttributeError:
+        moment = getattr(of, name)
+        return moment and moment.replace(tzinfo=UTC)
 
 
 def _name(data: bytes) -> x509.Name:

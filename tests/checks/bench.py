@@ -16,8 +16,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import load_certificate, pem
-from sros_tool.pki.crl import Revoked, sign_crl
+from sros_tool.pki.certificates import load_certificate, pem, validity_of
+from sros_tool.pki.crl import Revoked, last_update, next_update, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 
 SECRET = "open, sesame"
@@ -133,8 +133,8 @@ class Bench:
                 subject,
                 key.public_key() if key else old.public_key(),
                 serial,
-                old.not_valid_before_utc,
-                after or old.not_valid_after_utc,
+                validity_of(old).not_before,
+                after or validity_of(old).not_after,
             )
             .add_extension(x509.BasicConstraints(is_ca, None), critical=True)
             .sign(ca_key, digest or hashes.SHA256())
@@ -203,11 +203,12 @@ def _with_scope(data: bytes, key: PrivateKey, uri: str) -> bytes:
     builder = (
         x509.CertificateRevocationListBuilder()
         .issuer_name(like.issuer)
-        .last_update(like.last_update_utc)
+        .last_update(last_update(like))
         .add_extension(scope, critical=True)
     )
-    assert like.next_update_utc
-    signed = builder.next_update(like.next_update_utc).sign(key, hashes.SHA256())
+    expiry = next_update(like)
+    assert expiry
+    signed = builder.next_update(expiry).sign(key, hashes.SHA256())
     return signed.public_bytes(serialization.Encoding.PEM)
 
 

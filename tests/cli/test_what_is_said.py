@@ -11,6 +11,7 @@ import pytest
 
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.reader import Keystore
+from sros_tool.pki.certificates import validity_of
 from tests.support.harness import (
     Ended,
     certificate,
@@ -49,7 +50,7 @@ def test_what_still_works_after_taking_a_right_away(verb: str, root: Path) -> No
     ended = sros(*TAKES_AWAY[verb].split(), cwd=root.parent).ok()
     assert "/robot loses: publish topic /secret" in ended.err
     (line,) = [each for each in ended.err.splitlines() if "lost rights work until" in each]
-    assert f"{before.not_valid_after_utc:%Y-%m-%d}" in line
+    assert f"{validity_of(before).not_after:%Y-%m-%d}" in line
     assert "until they are restarted" in line
     # What it names as the remedy runs, and ends it.
     (command,) = commands(line)

@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.keystore.layout import REQUIRED_FILES
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem
+from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem, validity_of
 from sros_tool.pki.keys import key_pem, load_key
 from sros_tool.validity import Window, iso
 from tests.checks.bench import DAY, Bench, new_key
@@ -173,8 +173,8 @@ def leaf_key(bench: Bench, data: bytes, public: Public, digest: bool = True) -> 
     old, authority = bench.certificate(), bench.authority("identity")
     made = (
         x509.CertificateBuilder(
-            authority.subject, old.subject, public, 4711, old.not_valid_before_utc,
-            old.not_valid_after_utc,
+            authority.subject, old.subject, public, 4711, validity_of(old).not_before,
+            validity_of(old).not_after,
         )
         .add_extension(x509.BasicConstraints(False, None), critical=True)
         .sign(bench.key("identity"), hashes.SHA256() if digest else hashes.SHA384())

@@ -21,6 +21,7 @@ from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
+from sros_tool.pki.certificates import validity_of
 from sros_tool.policy.document import read_policy
 from tests.support.harness import (
     certificate,
@@ -74,10 +75,10 @@ def test_one_is_renewed_and_nothing_else_changes(
     assert new.serial_number != old.serial_number
     assert (new.public_key() == old.public_key()) is not new_key
     assert (new.subject == old.subject) is (template != "production")
-    end = certificate(root / "public/identity_ca.cert.pem").not_valid_after_utc
+    end = validity_of(certificate(root / "public/identity_ca.cert.pem")).not_after
     if template == "production":
         end = LATER + timedelta(days=365)
-    assert new.not_valid_after_utc == end
+    assert validity_of(new).not_after == end
     assert not problems(root, name, LATER)
     check_whole(root)
 
@@ -136,7 +137,7 @@ def test_nothing_outlives_its_authority(tmp_path: Path) -> None:
     late = NOW + timedelta(days=5 * 365 - 10)
     renew(root, ["/a"], now=late)
     (life,) = _lifetimes(Keystore(root))
-    end = certificate(root / "public/identity_ca.cert.pem").not_valid_after_utc
+    end = validity_of(certificate(root / "public/identity_ca.cert.pem")).not_after
     assert life.certificate.not_after == life.permissions.not_after == end
     assert not problems(root, "/a", end)
     before = snapshot(root)
@@ -336,7 +337,7 @@ def revoked(root: Path) -> dict[int, str]:
 
 def test_the_old_certificate_works_until_it_ends(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a", "/b")
-    end = certificate(enclave_path(root, "/a") / "cert.pem").not_valid_after_utc
+    end = validity_of(certificate(enclave_path(root, "/a") / "cert.pem")).not_after
     done = renew(root, ["/a", "/b"], now=LATER)
     assert (done.works_until, done.revoked, done.restart) == (end, 0, ())
     assert not (root / "public/identity_ca.crl.pem").exists()

@@ -31,7 +31,13 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
-from sros_tool.pki.certificates import common_name, key_digest, load_request, make_request
+from sros_tool.pki.certificates import (
+    common_name,
+    key_digest,
+    load_request,
+    make_request,
+    validity_of,
+)
 from sros_tool.pki.keys import generate_key
 from sros_tool.policy.document import read_policy
 from tests.support.children import run
@@ -196,7 +202,7 @@ def test_the_rights_are_those_of_the_policy_and_a_renewal_keeps_them(
     sign(home, robot, LATER, renew=True)
     assert topics_of(home / FOLDER) == {"rt/image", "ros_discovery_info"}
     second = certificate(home / FOLDER / "cert.pem")
-    assert second.not_valid_after_utc - first.not_valid_after_utc == timedelta(days=30)
+    assert validity_of(second).not_after - validity_of(first).not_after == timedelta(days=30)
     assert second.public_key() == first.public_key()
     entries = [entry for entry in Keystore(home).ledger.entries if entry.what == "permissions"]
     assert entries[-1].policy == entries[-2].policy != ""

@@ -23,6 +23,7 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import load_template
+from sros_tool.pki.certificates import validity_of
 from sros_tool.pki.crl import REASONS, RevocationList
 from tests.support.children import run
 from tests.support.harness import certificate, check_whole, policy_text, publish, snapshot, sros
@@ -228,7 +229,7 @@ def test_a_list_that_would_grow_stale_becomes_a_link(there: str, tmp_path: Path)
 def test_the_list_ends_with_its_authority(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a", "/b", authority_validity=100 * DAY)
     done = revoke(root, ["/a"], now=NOW)
-    end = certificate(root / "public/identity_ca.cert.pem").not_valid_after_utc
+    end = validity_of(certificate(root / "public/identity_ca.cert.pem")).not_after
     assert done.next_update == crl_of(root).next_update == end
 
 

@@ -41,6 +41,7 @@ from sros_tool.keystore.template import (
     load_template,
     with_values,
 )
+from sros_tool.pki.certificates import validity_of
 from sros_tool.policy.document import read_policy
 from sros_tool.translate import governance_for
 from tests.support import made_by_ros2
@@ -124,7 +125,7 @@ def until(root: Path, name: str) -> tuple[int, int]:
     state = open_enclave(enclave_path(root, name), now=LATER)
     assert state.certificate
     assert state.grant
-    ends = (state.certificate.not_valid_after_utc, state.grant.validity.not_after)
+    ends = (validity_of(state.certificate).not_after, state.grant.validity.not_after)
     one, other = ((each - LATER).days + 1 for each in ends)
     return one, other
 

@@ -13,10 +13,11 @@ from cryptography.x509.oid import NameOID
 
 from sros_tool.errors import PkiError
 from sros_tool.pki.certificates import Issuer, authority_identifier, common_name, issue_ca, pem
-from sros_tool.pki.crl import Revoked, lists_as_revoked, load_crl, refusal_of, sign_crl
+from sros_tool.pki.crl import Revoked, lists_as_revoked, load_crl, read_list, refusal_of, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key
 from sros_tool.validity import Window
 from tests.integration.forged_signatures import Node
+from tests.support import raw_pki
 from tests.support.children import run
 from tests.support.openssl import takes_changes_for_lists
 
@@ -137,9 +138,10 @@ def test_a_certificate_with_a_negative_serial_number(listed: bool, tmp_path: Pat
     if listed:
         entries = next(each for each in changed.children[0].children[::-1] if each.tag == 0x30)
         entries.children[0].children[0].content = b"\xfb"
-    crl = x509.load_der_x509_crl(signed_again(changed, key))
+    data = raw_pki.pem("X509 CRL", signed_again(changed, key))
+    crl = read_list(data, "")
     (tmp_path / "ca").write_bytes(pem(ca))
-    (tmp_path / "crl").write_bytes(crl.public_bytes(serialization.Encoding.PEM))
+    (tmp_path / "crl").write_bytes(data)
     (tmp_path / "certificate").write_bytes(pem(certificate))
     command = ["openssl", "verify", "-crl_check", "-CAfile", "ca", "-CRLfile", "crl", "certificate"]
     done = run(command, cwd=tmp_path, status=None)

@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, load_pem_priv
 from sros_tool.automata import Automaton, SearchLimit
 from sros_tool.errors import DocumentError
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import load_certificate
+from sros_tool.pki.certificates import load_certificate, validity_of
 from sros_tool.pki.crl import load_crl, sign_crl
 from sros_tool.pki.keys import load_key
 from sros_tool.proof.worlds import Side, Topics, named
@@ -357,8 +357,8 @@ def a_certificate_of_another_name(keystore: Path) -> None:
     present = load_certificate(file.read_bytes(), "")
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "/mux")])
     made = x509.CertificateBuilder(authority.subject, name, present.public_key(), 77)
-    made = made.not_valid_before(present.not_valid_before_utc)
-    made = made.not_valid_after(present.not_valid_after_utc)
+    made = made.not_valid_before(validity_of(present).not_before)
+    made = made.not_valid_after(validity_of(present).not_after)
     file.write_bytes(made.sign(key, SHA256()).public_bytes(Encoding.PEM))
 
 

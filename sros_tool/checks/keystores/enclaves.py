@@ -304,10 +304,10 @@ def _certificate(enclave: CheckedEnclave, certificate: x509.Certificate) -> Iter
         if isinstance(value, x509.BasicConstraints) and value.ca:
             yield IS_A_CA.found(name, "its BasicConstraints say CA:TRUE", file)
     ca = enclave.state.identity_ca
-    if ca and certificate.not_valid_after_utc > ca.not_valid_after_utc:
+    if ca and validity_of(certificate).not_after > validity_of(ca).not_after:
         text = (
-            f"it expires at {iso(certificate.not_valid_after_utc)}, its CA at "
-            f"{iso(ca.not_valid_after_utc)}"
+            f"it expires at {iso(validity_of(certificate).not_after)}, its CA at "
+            f"{iso(validity_of(ca).not_after)}"
         )
         yield OUTLIVES_CA.found(name, text, file)
     settings = enclave.keystore.settings

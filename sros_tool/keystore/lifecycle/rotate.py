@@ -81,6 +81,7 @@ from sros_tool.pki.certificates import (
     pem,
     same_key,
     subject_text,
+    validity_of,
 )
 from sros_tool.pki.keys import PublicKey, algorithm, is_weak
 from sros_tool.validity import Span, Window, span_text, window
@@ -439,10 +440,10 @@ class _Rotator:
         """
         if not (self._root / SETTINGS).exists():
             _check_later(old, new)
-        elif new.not_valid_after_utc < old.not_valid_after_utc:
+        elif validity_of(new).not_after < validity_of(old).not_after:
             text = (
-                f"the new CA expires at {new.not_valid_after_utc:%Y-%m-%d}, before the old one "
-                f"({old.not_valid_after_utc:%Y-%m-%d}): authorities.validity of the settings is "
+                f"the new CA expires at {validity_of(new).not_after:%Y-%m-%d}, before the old one "
+                f"({validity_of(old).not_after:%Y-%m-%d}): authorities.validity of the settings is "
                 f"{span_text(self._template.authority_validity)}. --ca-validity would choose "
                 "another one."
             )
@@ -826,10 +827,11 @@ def _distributed(change: KeystoreChange, rotation: Rotation) -> list[_Successor]
 
 def _check_later(old: x509.Certificate, new: x509.Certificate) -> None:
     """Raise `UsageError` if the new CA certificate expires before the old one."""
-    if new.not_valid_after_utc < old.not_valid_after_utc:
+    expiry, earlier = validity_of(old).not_after, validity_of(new).not_after
+    if earlier < expiry:
         raise UsageError(
             "the new CA would expire before the old one",
-            f"The old CA expires at {old.not_valid_after_utc:%Y-%m-%d}, the new CA would expire at "
-            f"{new.not_valid_after_utc:%Y-%m-%d}.",
+            f"The old CA expires at {expiry:%Y-%m-%d}, the new CA would expire at "
+            f"{earlier:%Y-%m-%d}.",
             "Choose a longer validity with --ca-validity.",
         )
