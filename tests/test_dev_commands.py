@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -293,6 +294,27 @@ def test_every_check_is_run_and_shown_and_the_worst_counts(
     assert all(line.startswith("ran 1:") is ("--long" in arguments) for line in ran)
     assert "mypy FAILED (3); " in lines[-1]
     assert lines[-1].startswith("ruff check ok; ruff format ok; ")
+
+
+def test_the_oldest_packages_are_those_that_the_package_asks_for_or_newer(
+    venv: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    python = venv / "python"
+    python.write_text('#!/bin/sh\necho "ran $PYTHONPATH: $*"\ncase "$*" in *==41*) exit 4;; esac\n')
+    python.chmod(0o755)
+    for name, value in (("PYTHON", python), ("VENV", venv), ("CHECKOUT", venv)):
+        monkeypatch.setattr(checks, name, value)
+    monkeypatch.setattr(steps, "LOG", venv / "log")
+    monkeypatch.setattr(checks, "read_record", Record)
+    with pytest.raises(steps.SetupError):
+        checks.run(["--oldest"], {}, with_tests=True)
+    python.write_text(python.read_text().replace("exit 4", "exit 0"))
+    assert checks.run(["--oldest", "-k", "x"], {}, with_tests=True) == 0
+    (ran,) = [line for line in capfd.readouterr().out.splitlines() if line.startswith("ran ")]
+    assert ran == f"ran {venv / 'oldest'}: -m pytest -k x"
+    needed = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]["dependencies"]
+    for least, oldest in zip(sorted(needed), sorted(checks.OLDEST_PACKAGES), strict=True):
+        assert oldest.replace("==", ">=").startswith(least)
 
 
 def test_every_test_on_a_real_dds_is_in_the_folders_that_are_searched_for_them() -> None:

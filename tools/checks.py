@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -13,7 +14,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from tools.record import PYTHON, read_record
-from tools.steps import CHECKOUT, VENV
+from tools.steps import CHECKOUT, VENV, SetupError, log_tail, say, succeeds
 
 _NOTHING_COLLECTED = 5
 """pytest's exit status when a selection matches no test."""
@@ -22,6 +23,12 @@ _PLUGINS = "xdist.plugin,_hypothesis_pytestplugin"
 
 LONG = "--long"
 """The argument for more random and exhaustive cases; like the variable SROS_LONG."""
+
+OLDEST = "--oldest"
+"""The argument for the oldest packages that sros works with, in place of those in .venv."""
+
+OLDEST_PACKAGES = ("click==8.1.6", "cryptography==41.0.7", "lxml==5.2.1")
+"""The packages of Ubuntu 24.04, which ROS 2 Jazzy and Kilted have."""
 
 WITH_DDS = ("tests/integration", "tests/explain")
 """The folders with tests that start DDS processes; pytest imports only these for them."""
@@ -39,6 +46,8 @@ LINT = {
 def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> int:
     """Run every check, even after failures; return the worst exit status.
 
+    With the oldest packages only the tests run: ruff and mypy check against the newest.
+
     Ruff and mypy run beside the tests; their output is shown after that of the tests.  Without
     ``arguments``, so do the tests that start DDS processes, with one process more than there are
     cores: each has a separate network and often waits.  With ``arguments``, pytest runs once, with
@@ -48,6 +57,10 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     if LONG in arguments:
         arguments = [each for each in arguments if each != LONG]
         env = {**env, "SROS_LONG": "1"}
+    lint = LINT
+    if OLDEST in arguments:
+        arguments = [each for each in arguments if each != OLDEST]
+        env, lint = _with_oldest_packages(env), {}
     if read_record().ros_around or not arguments:
         # ROS 2 installs pytest plugins that are made for other versions of pytest, and colcon some
         # that look at each test and that only arguments make use of.
@@ -55,7 +68,7 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     if not with_tests:
         return _conclude(_run_together(LINT, "mypy", env), Counter(), started)
     if arguments:
-        steps = LINT | {"pytest": ["-m", "pytest", *arguments]}
+        steps = lint | {"pytest": ["-m", "pytest", *arguments]}
         return _conclude(_run_together(steps, "pytest", env), Counter(), started)
     cores = len(os.sched_getaffinity(0))
     parts = {
@@ -69,7 +82,7 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     reports = {name: VENV / f"{name.replace(' ', '-')}.xml" for name in parts}
     for report in reports.values():
         report.unlink(missing_ok=True)
-    steps = LINT | {
+    steps = lint | {
         name: ["-m", "pytest", *words, f"--junit-xml={reports[name]}"]
         for name, words in parts.items()
     }
@@ -81,6 +94,21 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     for report in reports.values():
         counts += count(report)
     return _conclude(results, counts, started)
+
+
+def _with_oldest_packages(env: Mapping[str, str]) -> dict[str, str]:
+    """Install the oldest packages into a folder; return an environment that prefers them.
+
+    Raises:
+        SetupError: they cannot be installed.
+    """
+    folder = VENV / "oldest"
+    say(f"installing {', '.join(OLDEST_PACKAGES)} into {folder}")
+    shutil.rmtree(folder, ignore_errors=True)
+    words = ["-m", "pip", "install", "--progress-bar=off", "--no-deps", "--target", folder]
+    if not succeeds([PYTHON, *words, *OLDEST_PACKAGES]):
+        raise SetupError(f"pip cannot install them. {log_tail()}")
+    return {**env, "PYTHONPATH": str(folder)}
 
 
 def _run_together(

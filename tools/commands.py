@@ -18,7 +18,8 @@ Usage: ./dev COMMAND [ARGUMENTS…]
 
   demo [ARGUMENTS…]   show on a real DDS that secured nodes are closed to other nodes (sros demo)
   test [ARGUMENTS…]   run ruff, mypy and pytest; ARGUMENTS go to pytest, except --long: run more
-                      random and exhaustive cases, which takes much longer
+                      random and exhaustive cases, which takes much longer; and --oldest: run the
+                      tests with the oldest packages that sros works with, those of Ubuntu 24.04
   lint                run only ruff and mypy
   bench [ARGUMENTS…]  run the benchmarks (python -m benchmarks)
   sros ARGUMENTS…     run the sros of this checkout

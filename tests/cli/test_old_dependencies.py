@@ -10,7 +10,12 @@ import pytest
 from sros_tool.policy import document
 from tests.support.harness import sros
 
-NEEDED = ["click>=8.1", "cryptography>=43", "lxml>=5.0", "eclipse-zenoh>=1.10; extra == 'zenoh'"]
+NEEDED = [
+    "click>=8.1",
+    "cryptography>=41.0.7",
+    "lxml>=5.0",
+    "eclipse-zenoh>=1.10; extra == 'zenoh'",
+]
 NEW = {"click": "8.1.6", "cryptography": "50.0.2", "lxml": "5.2.1"}
 DEFECT = "this is a defect of sros"
 
@@ -19,11 +24,11 @@ DEFECT = "this is a defect of sros"
     ("installed", "error", "said"),
     [
         (
-            {**NEW, "cryptography": "41.0.7"},
+            {**NEW, "cryptography": "38.0.4"},
             AttributeError,
-            "cryptography 43 or newer, and version",
+            "cryptography 41.0.7 or newer, and version",
         ),
-        ({**NEW, "cryptography": ""}, ImportError, "cryptography 43 or newer, and none is"),
+        ({**NEW, "cryptography": ""}, ImportError, "cryptography 41.0.7 or newer, and none is"),
         ({**NEW, "click": "8.0.9"}, AttributeError, "click 8.1 or newer, and version 8.0.9"),
         ({**NEW, "lxml": "4.10"}, ImportError, "lxml 5.0 or newer"),
         (NEW, AttributeError, DEFECT),
