@@ -105,7 +105,7 @@ def _with_oldest_packages(env: Mapping[str, str]) -> dict[str, str]:
     folder = VENV / "oldest"
     say(f"installing {', '.join(OLDEST_PACKAGES)} into {folder}")
     shutil.rmtree(folder, ignore_errors=True)
-    words = ["-m", "pip", "install", "--progress-bar=off", "--no-deps", "--target", folder]
+    words = ["-m", "pip", "install", "--progress-bar=off", "--no-deps", "--target", str(folder)]
     if not succeeds([PYTHON, *words, *OLDEST_PACKAGES]):
         raise SetupError(f"pip cannot install them. {log_tail()}")
     return {**env, "PYTHONPATH": str(folder)}
