@@ -326,6 +326,7 @@ def explain_access(
     *,
     kind: Literal["topic", "service", "action"] | None = None,
     vendor: str = "fastdds",
+    distribution: str = "",
     policy: AnyPath | Policy | None = None,
     domain: int | None = None,
     now: datetime | None = None,
@@ -340,7 +341,10 @@ def explain_access(
         name: The absolute ROS name of the topic, service or action; "" for "join".
         kind: The kind of ``name``; without it, "call" and "serve" mean an action if the rights of
             the enclave, the policy or the keystore have an action and no service of that name.
-        vendor: "fastdds" (2.14), "fastdds-2.9", "cyclonedds", "standard", "opendds" or "connext".
+        vendor: "fastdds" (2.14, or that of ``distribution``), "cyclonedds" (0.10, likewise), or
+            another name that `sros explain --vendor` takes, such as "fastdds-3.2".
+        distribution: A distribution of ROS 2, such as "lyrical", whose release of ``vendor``
+            decides.
         policy: The policy of the enclave, or its file, in which to find the ``policy_lines``.
         domain: The ROS domain id; by default 0, or the first domain of the governance.
         now: The time of the access; the current time by default.
@@ -348,8 +352,8 @@ def explain_access(
 
     Raises:
         KeystoreError: The keystore or the enclave does not exist.
-        UsageError: The action is unknown or does not fit ``kind``, or the name, vendor or domain is
-            not valid.
+        UsageError: The action is unknown or does not fit ``kind``, or the name, vendor,
+            distribution or domain is not valid.
 
     Example:
         >>> answer = sros_tool.explain_access(keystore, "/talker", "publish", "/chatter")
@@ -368,6 +372,7 @@ def explain_access(
     vendors = [known.value for known in Vendor]
     if vendor not in vendors:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
+    (vendor,) = _vendors(vendor, distribution)
     opened = OpenedOnce(Path(keystore))
     opened.check()
     asking = AskingContext(_moment(now), zone, domain)
@@ -447,6 +452,7 @@ def check_requirements(
     fleet: AnyPath | None = None,
     template: str = "",
     vendor: str = "",
+    distribution: str = "",
     domain: int | None = None,
     now: datetime | None = None,
     zone: tzinfo = UTC,
@@ -462,6 +468,8 @@ def check_requirements(
             reports this.
         vendor: The only vendor of DDS to decide for, or "zenoh"; every measured one and Zenoh by
             default.
+        distribution: The distribution of ROS 2, such as "lyrical", whose DDS decides; without
+            ``vendor``, all that it ships.
         domain: The only ROS domain id to decide for; by default one of each group of domains that
             the keystore's documents treat alike.
         now: The time at which permissions have to be valid; the current time by default.
@@ -474,7 +482,7 @@ def check_requirements(
     Raises:
         DocumentError: A file cannot be read, or there are too many wildcards to decide a
             requirement.
-        UsageError: There is no such vendor, or ``domain`` is not a domain id.
+        UsageError: There is no such vendor or distribution, or ``domain`` is not a domain id.
 
     Example:
         >>> for finding in sros_tool.check_requirements("robot.xml", "robot.requirements.toml"):
@@ -489,7 +497,7 @@ def check_requirements(
 
     if vendor and vendor not in WORLDS:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(WORLDS)}.")
-    of = _domain(domain)
+    of, only = _domain(domain), _vendors(vendor, distribution)
     files = [requirements] if isinstance(requirements, str | PathLike) else requirements
     read = read_all_requirements(map(Path, files))
     system = load_system(
@@ -498,7 +506,7 @@ def check_requirements(
         zone=zone,
         domain=of,
         fleet=read_fleet(Path(fleet)) if fleet else None,
-        only=(vendor,) if vendor else (),
+        only=only,
         template=load_template(template) if template else None,
     )
     findings = requirement_findings(read, system)
@@ -564,6 +572,18 @@ def _domain(given: int | None) -> int | None:
     from sros_tool.dds.domains import DomainSet
 
     return None if given is None else DomainSet.parse(str(given), "domain").only()
+
+
+def _vendors(vendor: str, distribution: str) -> tuple[str, ...]:
+    """Return the vendors that a caller selects; () for all.
+
+    Raises:
+        UsageError: there is no such distribution, or it does not ship the vendor.
+    """
+    from sros_tool.distributions import find_distribution, selected_vendors
+
+    named = (find_distribution(distribution),) if distribution else ()
+    return selected_vendors(vendor, named if vendor != "zenoh" else ())
 
 
 def _policy(given: AnyPath | Policy) -> Policy:

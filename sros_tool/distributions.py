@@ -170,6 +170,21 @@ def shipped_title(vendor: Vendor, distributions: Sequence[Distribution]) -> str:
     return enumerated(titles) if titles else vendor.title
 
 
+def selected_vendors(vendor: str, distributions: Sequence[Distribution]) -> tuple[str, ...]:
+    """Return the vendor with a name, or those of distributions; () if neither is given.
+
+    Of a vendor and distributions, the vendor is in the releases that they ship.
+
+    Raises:
+        UsageError: a distribution does not ship the vendor.
+    """
+    if not vendor or not distributions:
+        chosen = [each for known in distributions for each in known.vendors]
+        return (vendor,) if vendor else tuple(dict.fromkeys(each.value for each in chosen))
+    shipped = (known.of_vendor(Vendor(vendor)).vendor.value for known in distributions)
+    return tuple(dict.fromkeys(shipped))
+
+
 def sourced(environment_value: str | None) -> Distribution | None:
     """Return the distribution that $ROS_DISTRO names; None if sros does not know it."""
     return find_distribution(environment_value) if environment_value in DISTRIBUTIONS else None

@@ -132,6 +132,11 @@ def test_an_answer_says_by_which_line_and_until_when(keystore: sros_tool.Keystor
     no = sros_tool.explain_access(keystore, TALKER, "subscribe", "/chatter", vendor="cyclonedds")
     assert not no.allowed
     assert no.outcome == "denied"
+    asked = keystore, TALKER, "publish", "/chatter"
+    lyrical = sros_tool.explain_access(*asked, distribution="lyrical")
+    assert (lyrical.allowed, lyrical.vendor) == (True, "fastdds-3.6")
+    lyrical = sros_tool.explain_access(*asked, vendor="cyclonedds", distribution="lyrical")
+    assert lyrical.vendor == "cyclonedds-11"
     later = sros_tool.explain_access(keystore, TALKER, "join", now=yes.until + timedelta(days=1))
     assert later.outcome == "refused"
     assert later.remedy
@@ -255,6 +260,18 @@ def test_a_short_passphrase_needs_insisting(tmp_path: Path) -> None:
                 lambda ks: sros_tool.check(ks, domain=231),
                 lambda ks: sros_tool.generate(ks, POLICY, domain=-1),
                 lambda ks: sros_tool.check_requirements(ks, ks, domain=-1),
+            )
+        ),
+        *(
+            (call, UsageError, text)
+            for name, text in (("lunar", "It knows ardent"), ("kilted", "ships"))
+            for call in (
+                lambda ks, of=name: sros_tool.explain_access(
+                    ks, TALKER, "join", vendor="fastdds-2.9", distribution=of
+                ),
+                lambda ks, of=name: sros_tool.check_requirements(
+                    ks, ks, vendor="fastdds-2.9", distribution=of
+                ),
             )
         ),
         (

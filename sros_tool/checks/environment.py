@@ -15,8 +15,10 @@ from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.zenoh import MALFORMED, document_findings
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance
+from sros_tool.distributions import ROS_DISTRO
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.faults import Fault
+from sros_tool.keystore.fleet import stated_distributions
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     IDENTITY,
@@ -124,6 +126,16 @@ KEYSTORE_RELATIVE = FindingKind(
     "in another folder.",
     _RCL,
     f"Write the absolute path. {_ENV}",
+)
+OTHER_DISTRIBUTION = FindingKind(
+    "runtime.other-distribution",
+    WARNING,
+    "ROS_DISTRO is none of the distributions that the keystore is for",
+    "`sros check` decided by the DDS of those distributions. Another one can open or close what "
+    "they do not, without any message.",
+    "sros: `distributions` in the settings of a keystore, `distribution` in its fleet file.",
+    "Source one of them, or add it after `sros check ROOT --upgrade-to NAME`: `sros "
+    "update_keystore ROOT --set distributions=NAME,...`, or `distribution` in the fleet file.",
 )
 ENCLAVE_NOT_FOUND = FindingKind(
     "runtime.enclave-not-found",
@@ -285,7 +297,15 @@ def _enclave(
         effect = "" if enforced else f"; nodes RUN UNSECURED, as {STRATEGY} is not 'Enforce'"
         yield ENCLAVE_NOT_FOUND.found(ENCLAVE, f"'{root}' has no enclave {name}{hint}{effect}")
         return
-    findings = keystore_findings(Keystore(root), now=now, zone=zone, domain=domain, only=(name,))
+    keystore = Keystore(root)
+    sourced = environment.get(ROS_DISTRO, "")
+    stated: tuple[str, ...] = ()
+    with suppress(SrosError):  # what cannot be read is a finding of the keystore
+        stated = stated_distributions(keystore, name)
+    if sourced and stated and sourced not in stated:
+        text = f"{value_text(environment, ROS_DISTRO)}; {name} is for {', '.join(stated)}"
+        yield OTHER_DISTRIBUTION.found(ROS_DISTRO, text)
+    findings = keystore_findings(keystore, now=now, zone=zone, domain=domain, only=(name,))
     for finding in findings:
         if finding.id == "enclave.governance-domain":
             yield DOMAIN_NOT_GOVERNED.found(DOMAIN, finding.text, finding.file)

@@ -23,6 +23,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     save,
+    unknown_distribution,
     verb,
 )
 from sros_tool.cli.observing import (
@@ -126,6 +127,8 @@ def audit(
         raise UsageError("--force is for --patch only", "", "Leave it out.")
     if patch is not None:
         check_output(patch, force=force)
+    if not (vendor or distro):
+        print_notes(unknown_distribution())
     everything = {**os.environ, **environment}
     enclaves = audits.audited_enclaves(
         source,

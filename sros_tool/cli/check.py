@@ -318,7 +318,10 @@ def check(
                 here=sourced(os.environ.get(ROS_DISTRO)),
                 vendor=vendor or "",
             )
-        chosen = selection.choose(map(_shown, changed))
+        chosen = selection.choose(map(_shown, changed.findings))
+        others = changed.enclaves - changed.compared
+        rest = f"; {others} of {upgrade_to.title} already" if others else ""
+        echo(f"compared {counted(changed.compared, 'enclave')}{rest}", err=True)
         _SHOW[form](chosen, selection)
         return _status(chosen, fail_on)
     if suggest:
@@ -489,15 +492,11 @@ def _vendors(
     vendor: str | None, distro: Distribution | None, *, all_distros: bool
 ) -> tuple[str, ...]:
     """Return the DDS vendors, or ``zenoh``, that options select; () for all."""
-    from sros_tool.dds.decision.vendors import Vendor
-    from sros_tool.distributions import SUPPORTED
+    from sros_tool.distributions import SUPPORTED, selected_vendors
 
-    if vendor and (distro is None or vendor == _ZENOH):
+    if vendor == _ZENOH:
         return (vendor,)
-    if vendor and distro:
-        return (distro.of_vendor(Vendor(vendor)).vendor.value,)
-    chosen = SUPPORTED if all_distros else (distro,) if distro else ()
-    return tuple(dict.fromkeys(each.value for known in chosen for each in known.vendors))
+    return selected_vendors(vendor or "", SUPPORTED if all_distros else (distro,) if distro else ())
 
 
 def _refuse_besides_upgrade() -> None:

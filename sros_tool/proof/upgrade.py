@@ -201,6 +201,18 @@ def _planned_files(policy: Policy, *, at: datetime, domain: int | None = None) -
 # ── the update ─────────────────────────────────────────────────────────────────────────────
 
 
+class UpgradeFindings(NamedTuple):
+    """What an update changes, and of how many enclaves.
+
+    ``compared`` is the number of enclaves that both distributions decide; ``enclaves`` also counts
+    those that are for the later distribution already.
+    """
+
+    findings: list[Finding]
+    compared: int
+    enclaves: int
+
+
 def check_upgrade(
     path: Path,
     later: Distribution,
@@ -209,7 +221,7 @@ def check_upgrade(
     present: Distribution | None = None,
     here: Distribution | None = None,
     vendor: str = "",
-) -> list[Finding]:
+) -> UpgradeFindings:
     """Return what the update to a distribution changes for a policy file or a keystore.
 
     Args:
@@ -229,12 +241,15 @@ def check_upgrade(
     else:
         files = _planned_files(read_policy_for(path, at.fleet), at=at.now, domain=at.domain)
     findings: list[Finding] = []
-    for before, enclaves in _present(files, present, here, later).items():
+    by_distribution = _present(files, present, here, later)
+    for before, enclaves in by_distribution.items():
         findings += _upgrade(files.only(enclaves), before, later, vendor)
         findings += _vulnerabilities(before, later, vendor, at.advisories)
         if not files.keystore:
             findings += _of_nodes_in_policy(path, at, before, later)
-    return joined(list(dict.fromkeys(findings)))
+    compared = {name for enclaves in by_distribution.values() for name in enclaves}
+    found = joined(list(dict.fromkeys(findings)))
+    return UpgradeFindings(found, len(compared), len(files.enclaves))
 
 
 def _present(

@@ -133,6 +133,12 @@ def _written_in_the_future(state: RuntimeState, bench: Bench) -> RuntimeState:
     return state
 
 
+def _for_lyrical(state: RuntimeState, bench: Bench) -> RuntimeState:
+    settings = bench.path("sros.toml")
+    settings.write_text(f'distributions = ["kilted", "lyrical"]\n{settings.read_text()}')
+    return having(**{KEYSTORE: str(bench.root)})(state, bench)
+
+
 def _written_since(state: RuntimeState, bench: Bench) -> RuntimeState:
     return changed(0, started=state.now - timedelta(days=2))(state, bench)
 
@@ -226,6 +232,7 @@ CASES: dict[str, Change] = {
     "runtime.ca-key-present": lambda state, bench: having(**{KEYSTORE: str(bench.root)})(
         state, bench
     ),
+    "runtime.other-distribution": _for_lyrical,
     "runtime.rmw-not-installed": having(**{RMW: "rmw_connextdds"}),
     "runtime.rmw-without-security": having(**{RMW: "rmw_email_cpp"}),
     "runtime.clock-behind": _written_in_the_future,

@@ -18,7 +18,7 @@ from sros_tool.checks.targets import Circumstances
 from sros_tool.cli.common import now
 from sros_tool.dds.advisories import parse_advisories
 from sros_tool.dds.decision.vendors import MEASURED
-from sros_tool.distributions import SUPPORTED, Shipped, find_distribution
+from sros_tool.distributions import SUPPORTED, Distribution, Shipped, find_distribution
 from sros_tool.errors import DocumentError
 from sros_tool.files import policies_dir
 from sros_tool.fleet.fleet_file import read_fleet
@@ -204,11 +204,12 @@ FOUND = {
 
 
 def changed(
-    bench: Bench, before: object = BEFORE, after: object = AFTER
+    bench: Bench, before: Distribution = BEFORE, after: Distribution = AFTER
 ) -> set[tuple[str, str, str]]:
     """The findings, each as its kind, the product that it is about, and how its text begins."""
     changes = set()
-    for finding in check_upgrade(bench.root, after, Circumstances(bench.now), present=before):  # type: ignore[arg-type]
+    found = check_upgrade(bench.root, after, Circumstances(bench.now), present=before)
+    for finding in found.findings:
         kind = finding.id.removeprefix("upgrade.")
         if kind in ("zenoh-release", "vulnerabilities"):
             continue
@@ -253,7 +254,7 @@ def test_an_update_changes_nothing_of_shipped_policies(tmp_path: Path) -> None:
         assert list(changes(files if alike else few, first, other)) == []
     at = Circumstances(now())
     for before, after in some(list(permutations(SUPPORTED, 2)), 2):
-        found = check_upgrade(root, after, at, present=before)
+        found = check_upgrade(root, after, at, present=before).findings
         assert {each.id for each in found} <= {"distribution.not-measured", VULNERABLE}
 
 
@@ -263,7 +264,7 @@ def test_an_update_mends_and_brings_known_vulnerabilities(bench: Bench) -> None:
     texts = [
         {
             finding.subject: finding.text
-            for finding in check_upgrade(bench.root, after, at, present=before)
+            for finding in check_upgrade(bench.root, after, at, present=before).findings
             if finding.id == VULNERABLE
         }
         for before, after in ((jazzy, lyrical), (lyrical, jazzy), (jazzy, jazzy._replace(until="")))
@@ -289,7 +290,7 @@ def test_an_update_mends_and_brings_known_vulnerabilities(bench: Bench) -> None:
         asked = replace(at, advisories=advisories)
         (finding,) = (
             finding
-            for finding in check_upgrade(bench.root, lyrical, asked, present=jazzy)
+            for finding in check_upgrade(bench.root, lyrical, asked, present=jazzy).findings
             if finding.id == VULNERABLE
         )
         assert finding.text == f"{said}CVE-2030-12345"
@@ -299,7 +300,7 @@ def test_what_an_update_cannot_show_is_said(bench: Bench) -> None:
     """A release that was not measured, and the versions of rmw_zenoh that the files need."""
     with_zenoh(bench)
     unknown = AFTER._replace(fast="99.1.0")
-    found = check_upgrade(bench.root, unknown, Circumstances(bench.now), present=BEFORE)
+    found = check_upgrade(bench.root, unknown, Circumstances(bench.now), present=BEFORE).findings
     ids = [each.id for each in found if each.id != VULNERABLE]
     assert ids == ["distribution.not-measured", "upgrade.zenoh-release"]
     assert "Fast DDS 99.1, taken to decide as Fast DDS" in found[0].text
@@ -311,7 +312,7 @@ def test_nodes_of_a_later_distribution_need_more(bench: Bench) -> None:
     assert changed(bench, same, jazzy) == set()
     service = "get_type_description"
     bench.permissions((service, "get_other"))
-    found = check_upgrade(bench.root, jazzy, Circumstances(bench.now), present=same)
+    found = check_upgrade(bench.root, jazzy, Circumstances(bench.now), present=same).findings
     assert {each.id for each in found} == {"upgrade.node-cannot-start"}
     assert f"in ROS 2 Jazzy, no node may offer ~/{service}" in found[0].text
     assert changed(bench, jazzy, same) == set()
@@ -366,7 +367,8 @@ def test_a_robot_of_a_fleet_has_a_distribution_of_its_own(tmp_path: Path) -> Non
     keystore = Keystore(root)
     assert stated_distributions(keystore, "/r1/base") == ("humble",)
     assert stated_distributions(keystore, "/r2/base") == ("jazzy",)
-    sros("check", root, "--upgrade-to", "jazzy", env={"ROS_DISTRO": None}).ok()
+    compared = sros("check", root, "--upgrade-to", "jazzy", env={"ROS_DISTRO": None}).ok()
+    assert compared.err.splitlines()[0] == "compared 1 enclave; 1 of Jazzy already"
     fleet.write_text('[robots]\nr1 = { distribution = "Humble" }\n')
     with pytest.raises(DocumentError, match="It is not a distribution of ROS 2 that sros knows"):
         read_fleet(fleet)
@@ -386,4 +388,11 @@ def test_an_update_that_cannot_be_compared(words: tuple[str, ...], why: str, ben
     here: dict[str, str | None] = {"ROS_DISTRO": None}
     refused = sros(*asked, *words, env=here)
     assert refused.status == 2 and why in refused.err
-    sros(*asked, "--distro", "jazzy", env=here).ok()
+    compared = sros(*asked, "--distro", "jazzy", env=here).ok()
+    assert re.match(r"compared [1-9]\d* enclaves\n", compared.err)
+
+
+def test_an_empty_keystore_says_how_many_enclaves_were_compared(tmp_path: Path) -> None:
+    sros("create_keystore", tmp_path / "ks").ok()
+    words = ("check", tmp_path / "ks", "--distro", "jazzy", "--upgrade-to", "kilted")
+    assert "compared 0 enclaves\n" in sros(*words).ok().err
