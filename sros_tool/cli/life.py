@@ -141,9 +141,10 @@ def _complete_reason(
     _ctx: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[str]:
     """Complete the revocation reasons of RFC 5280."""
-    from sros_tool.pki.crl import REASONS
+    from sros_tool.pki.crl import REASONS, SUPERSEDED
 
-    return [reason for reason in REASONS if reason.startswith(incomplete)]
+    chosen = (reason for reason in REASONS if reason != SUPERSEDED)
+    return [reason for reason in chosen if reason.startswith(incomplete)]
 
 
 @verb("revoke")
@@ -154,7 +155,7 @@ def _complete_reason(
     default="unspecified",
     shell_complete=_complete_reason,
     show_default=True,
-    help="Reason as in RFC 5280, such as key_compromise, superseded, cessation_of_operation.",
+    help="Reason as in RFC 5280, such as key_compromise or cessation_of_operation; not superseded.",
 )
 @click.option(
     "--until-retired",

@@ -76,11 +76,19 @@ def revoke(
     Raises:
         KeystoreError: an enclave does not exist, the identity CA did not issue its certificate, the
             key of a CA is missing, or vendors would refuse other enclaves with the list.
-        UsageError: ``reason`` is not in `REASONS`.
+        UsageError: ``reason`` is not in `REASONS`, or is `SUPERSEDED`.
     """
     if reason not in REASONS:
         raise UsageError(
             f"unknown reason {reason!r} for a revocation", "", f"Choose {', '.join(REASONS)}."
+        )
+    if reason == SUPERSEDED:
+        raise UsageError(
+            f"{SUPERSEDED} is no reason to revoke an enclave",
+            "It marks earlier certificates of renewed enclaves, which keep their rights: machines "
+            "that have only an export would still accept Zenoh files from before the revocation.",
+            "Choose another reason, such as cessation_of_operation; or replace the certificate "
+            "with `sros renew --revoke-old`.",
         )
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
@@ -97,8 +105,6 @@ def revoke(
         change.remarks += lists.remarks
         _drop_routers(change, gone)
         change.keep_zenoh({}, gone=gone)
-        if reason == SUPERSEDED and change.template.zenoh:
-            change.notes.append(_keeps_earlier_files())
         change.record()
         change.finish(aim="revoke")
     return change.result(
@@ -159,16 +165,6 @@ def _drop_routers(change: KeystoreChange, gone: Collection[str]) -> None:
             "connect to another router by their new files."
         )
         change.notes.append(Note("zenoh.router-revoked", text))
-
-
-def _keeps_earlier_files() -> Note:
-    text = (
-        "the reason superseded is that of renewed certificates, whose enclaves keep their rights: "
-        "earlier Zenoh files, which give the revoked enclaves rights, are refused by no machine "
-        "that has only an export. Whoever could bring one back there is stopped by another "
-        "reason, such as --reason cessation_of_operation."
-    )
-    return Note("zenoh.superseded", text)
 
 
 def _is_router(change: KeystoreChange, router: str) -> KeystoreError:
