@@ -251,7 +251,8 @@ def _status(
     A robot should have what an export from the keystore ROOT would give it now. A file is current;
     earlier (issued for this enclave before); another's (issued for another enclave); revoked;
     missing; or unknown (never issued by this keystore). Processes use new files only after a
-    restart, which a confirmation does not show. Then the known vulnerabilities of the DDS that the
+    restart: those that are due are in what the Ansible collection confirms, and not in what `sros
+    fleet report` does. Then the known vulnerabilities of the DDS that the
     robots reported are named, by the advisories of sros and of --advisories.
 
     Example:
@@ -265,8 +266,8 @@ def _status(
       $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
 
     The exit status is 0 if every robot confirmed that it has what an export would
-    give it now, and 1 if not, or if a robot has a DDS with known vulnerabilities that
-    a later release of the same major version mends.
+    give it now, and no restart that is due, and 1 if not, or if a robot has a DDS with
+    known vulnerabilities that a later release of the same major version mends.
     """
     from sros_tool.checks.vulnerabilities import is_mended_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
@@ -322,6 +323,7 @@ def _status(
 
 _WORDS = {
     "none": "no enclave",
+    "restart": "restart due",
     "missing": "files missing",
     "broken": "broken in the keystore",
     "never": "never confirmed",
@@ -397,6 +399,8 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
         yield f"{state} {', '.join(named)}{f' of {since}' if since else ''}"
     if len(groups) > _MOST_GROUPS:
         yield f"more, see --robot {robot.robot}"
+    if robot.restart:
+        yield f"processes of {first_few(robot.restart, _MOST_GROUPS)} run with earlier files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"CA files of the stage {robot.stage}"
     yield from robot.notes

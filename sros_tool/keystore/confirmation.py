@@ -55,7 +55,7 @@ CONFIRMED_FILES = (
 _CERTIFICATE_FILES = (CERTIFICATE_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
 _KEYS = {"format", "robot", "time", "files"}
-_OPTIONAL_KEYS = {"certificates", "dds"}
+_OPTIONAL_KEYS = {"certificates", "restart", "dds"}
 _CLOCK_TOLERANCE = timedelta(minutes=1)
 _MOST_CERTIFICATES = 32  # in a file
 _MOST_LIBRARIES, _MOST_UNSEEN = 100, 1_000_000
@@ -105,7 +105,8 @@ class Confirmation:
     ``files`` maps paths to the SHA-256 of the files.  ``certificates`` maps the paths of
     certificate and CA files to the SHA-256 of each certificate (DER) in the file, in order; without
     an entry, an earlier certificate in that file cannot be recognised.  ``dds`` is None if the
-    confirmation does not say it.
+    confirmation does not say it, and so is ``restart``: the enclaves whose processes still have
+    earlier files.
     """
 
     robot: str
@@ -113,6 +114,7 @@ class Confirmation:
     files: Mapping[str, str]
     certificates: Mapping[str, tuple[str, ...]]
     dds: RobotDds | None = None
+    restart: tuple[str, ...] | None = None
 
     def enclaves(self) -> tuple[str, ...]:
         """Return the names of the enclaves in the confirmation, sorted."""
@@ -189,6 +191,7 @@ def _value_of(confirmation: Confirmation) -> dict[str, Any]:
         "certificates": {
             path: list(digests) for path, digests in sorted(confirmation.certificates.items())
         },
+        **({} if confirmation.restart is None else {"restart": list(confirmation.restart)}),
         **({"dds": as_plain(dds)} if dds else {}),
     }
 
@@ -344,7 +347,24 @@ def _confirmation_from(value: Any, what: str) -> Confirmation:
             raise _refused(what, f"the certificates of {path} are not a list of SHA-256 digests")
         certificates[path] = tuple(digests)
     dds = _dds_from(value["dds"], what) if "dds" in value else None
-    return Confirmation(robot, _moment(value["time"], what), files, certificates, dds)
+    restart = _restart_from(value["restart"], what) if "restart" in value else None
+    return Confirmation(robot, _moment(value["time"], what), files, certificates, dds, restart)
+
+
+def _restart_from(value: Any, what: str) -> tuple[str, ...]:
+    """Return the names of enclaves in a JSON value.
+
+    Raises:
+        DocumentError: it is not a list of such names.
+    """
+    if not isinstance(value, list):
+        raise _refused(what, "its restart is no list")
+    for name in value:
+        try:
+            check_enclave_name(name if isinstance(name, str) else "")
+        except InvalidNameError:
+            raise _refused(what, f"{_short(name)} is not the name of an enclave") from None
+    return tuple(sorted(set(value)))
 
 
 def _dds_from(value: Any, what: str) -> RobotDds:

@@ -61,6 +61,8 @@ class State(StrEnum):
     CURRENT = "current"
     NONE = "none"
     """The robot has no enclave in the keystore."""
+    RESTART = "restart"
+    """The robot has the present files, and processes that still run with earlier ones."""
     EARLIER = "earlier"
     """An earlier file that the keystore issued for the same enclave."""
     DIFFERENT = "different"
@@ -134,7 +136,7 @@ class ConfirmedFile:
 
 @shows(
     *("robot", "state", "enclaves", "revoked", "unrecorded", "sharing_name", "received", "clock"),
-    *("stage", "files", "pending", "dds", "notes"),
+    *("stage", "files", "pending", "restart", "dds", "notes"),
     null_if_empty=("stage",),
 )
 @dataclass(frozen=True, slots=True)
@@ -147,8 +149,9 @@ class RobotStatus:
     robot: str
     """Name of the robot."""
     state: State
-    """The worst state of the robot's files; ``never``: it sent no confirmation; ``none``: it has no
-    enclave in the keystore."""
+    """The worst state of the robot's files; ``restart``: they are current, but processes still run
+    with earlier ones; ``never``: it sent no confirmation; ``none``: it has no enclave in the
+    keystore."""
     enclaves: int
     """Number of the robot's enclaves in the keystore."""
     revoked: tuple[str, ...]
@@ -166,6 +169,9 @@ class RobotStatus:
     """Number of the robot's files, by kind and state."""
     pending: tuple[ConfirmedFile, ...]
     """Files that differ from the keystore; empty if the robot sent no confirmation."""
+    restart: tuple[str, ...] | None
+    """The robot's enclaves whose processes still run with earlier files, by its last confirmation;
+    null if it does not say it."""
     dds: RobotDds | None
     """The DDS of the robot by its last confirmation; null if it does not say it."""
     notes: tuple[str, ...]
@@ -210,8 +216,8 @@ class FleetStatus:
 
     @property
     def complete(self) -> bool:
-        """Whether every robot that has enclaves confirmed the present files in time; if not, the
-        exit status is 1.
+        """Whether every robot that has enclaves confirmed the present files in time, and no restart
+        that is due; if not, the exit status is 1.
         """
         return not self.overdue and all(
             robot.state in (State.CURRENT, State.NONE) for robot in self.robots
@@ -281,6 +287,7 @@ class _ComparedRobot(NamedTuple):
     current: Mapping[str, int]
     different: tuple[_Difference, ...]
     authorities: Mapping[str, frozenset[tuple[str, ...]]]
+    restart: tuple[str, ...] | None
     dds: RobotDds | None
     notes: tuple[str, ...]
 
@@ -305,7 +312,7 @@ def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _Compare
     except SrosError as error:
         notes.append(f"its last confirmation cannot be used: {error}")
     if received is None:
-        return _ComparedRobot(robot, enclaves, None, None, {}, (), {}, None, tuple(notes))
+        return _ComparedRobot(robot, enclaves, None, None, {}, (), {}, None, None, tuple(notes))
     if note := received.clock_note():
         notes.append(note)
     confirmed = received.confirmation
@@ -339,6 +346,7 @@ def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _Compare
         current,
         tuple(different),
         {kind: frozenset(certificates) for kind, certificates in authorities.items()},
+        None if confirmed.restart is None else tuple({*confirmed.restart} & {*enclaves}),
         confirmed.dds,
         tuple(notes),
     )
@@ -503,6 +511,8 @@ def _status(
         state = max((file.state for file in different), key=_BADNESS.__getitem__)
     elif not compared.enclaves:
         state = State.NONE
+    elif compared.restart:
+        state = State.RESTART
     else:
         state = State.NEVER if compared.received is None else State.CURRENT
     return RobotStatus(
@@ -516,6 +526,7 @@ def _status(
         stages.of(compared),
         {kind: counts[kind] for kind in (*_KINDS.values(), _ZENOH) if kind in counts},
         different,
+        compared.restart and tuple(sorted(compared.restart)),
         compared.dds,
         compared.notes,
     )

@@ -346,7 +346,7 @@ def _demo_row(row: Json) -> Iterator[str]:
 # ── a fleet ──────────────────────────────────────────────────────────────────────────────────────
 
 _GOOD = ("current", "none")
-_OUT_OF_DATE = ("earlier", "different", "missing", "never")
+_OUT_OF_DATE = ("restart", "earlier", "different", "missing", "never")
 
 
 def render_fleet_page(status: Json) -> str:
@@ -394,13 +394,14 @@ def _fleet_row(robot: Json) -> str:
         f"{number} {kind} {state}{f' of {whose}' if whose else ''}{f', {since}' if since else ''}"
         for (kind, state, whose, since), number in differences.items()
     ]
+    due = [f"processes of {name} run with earlier files" for name in robot["restart"] or ()]
     cells = (
         f"<code>{escape(robot['robot'])}</code>",
         f'<span class="{_fleet_class(robot["state"])}">{escape(robot["state"])}</span>',
         escape(robot["received"] or ""),
         str(robot["enclaves"]),
         escape(robot["stage"] or ""),
-        "<br>".join(map(escape, (*what, *robot["notes"]))),
+        "<br>".join(map(escape, (*what, *due, *robot["notes"]))),
     )
     return f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
 

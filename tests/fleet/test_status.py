@@ -245,6 +245,10 @@ def test_a_rotation_goes_on_when_every_robot_has_confirmed_its_stage(field: Fiel
             assert told["unconfirmed"] == ["r2"]
             assert "not confirmed by r2: see" in field.run("rotate_ca", "ks", "--status").out
         field.deliver("r2")
+        if now == "distribute":
+            field.confirm("r2", restart=["/r2/base"])
+            assert ": r2. " in field.run("rotate_ca", "ks", "--next", status=2).err
+            field.confirm("r2", restart=[])
         assert field.states() == dict.fromkeys(ROBOTS, "current")
         assert {each["stage"] for each in field.status()["robots"].values()} == {now}
 
@@ -264,6 +268,21 @@ def test_a_rotation_goes_on_without_robots_if_that_is_chosen(field: Field) -> No
     assert "which robots confirmed this stage is unknown: " in told
     told = field.run("rotate_ca", "ks", "--status", "--json").out
     assert json.loads(told)["unconfirmed"] is None
+
+
+def test_a_restart_that_is_due(field: Field) -> None:
+    """The files are current, but processes run with those of before: that is not green."""
+    assert field.status()["robots"]["r1"]["restart"] is None, "not said"
+    field.confirm("r1", restart=["/r1/base", "/r9/base"])
+    field.confirm("r2", restart=[])
+    assert field.states() == {"r1": "restart", "r2": "current", "r3": "current"}
+    robots = field.status()["robots"]
+    assert [robots[name]["restart"] for name in ROBOTS] == [["/r1/base"], [], None]
+    told = field.run("fleet", "status", "ks", status=1).out
+    assert "3 robots: 2 current, 1 restart due" in told
+    assert "processes of /r1/base run with earlier files" in told
+    page = field.run("fleet", "status", "ks", "--html", status=1).out
+    assert "processes of /r1/base run with earlier files" in page
 
 
 @pytest.mark.parametrize(
@@ -331,8 +350,9 @@ def test_the_module_on_the_robot_confirms_the_same(field: Field) -> None:
         if path.is_file()
     }
     said = json.loads(field.run("fleet", "report", "r1", "--robot", "r1").out)
-    made = module.confirmation("r1", files, parse_iso(said["time"]).timestamp())
+    made = module.confirmation("r1", files, parse_iso(said["time"]).timestamp(), [])
     assert parse_confirmation(json.dumps(made).encode(), "it").dds
+    assert made.pop("restart") == [], "sros does not know which processes were restarted"
     assert {**made, "dds": 0} == {**said, "dds": 0}
     found = [
         {(each["product"], each["version"]) for each in dds["libraries"] if "/usr/" in each["path"]}

@@ -91,7 +91,7 @@ def assert_current(made: Fleet, *which: str, own: str = "") -> None:
             assert mode & 0o777 == (wanted if path.endswith((".pem", ".p7s")) else 0o700), path
         beside = os.listdir(made.robots[name].keystore.parent)
         due = {".keystore.sros-restart"} if own else set()
-        assert set(beside) - due <= {"keystore", ".keystore.sros-lock"}, beside
+        assert set(beside) - due == {"keystore", ".keystore.sros-lock", ".keystore.sros-delivered"}
 
 
 def restarts(made: Fleet) -> list[list[str]]:

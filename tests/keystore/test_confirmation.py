@@ -96,9 +96,10 @@ VALID: dict[str, Any] = {
     "time": "2027-05-21T12:50:48Z",
     "files": {PATH: DIGEST},
     "certificates": {PATH: [DIGEST]},
+    "restart": ["/r7"],
     "dds": DDS,
 }
-OPTIONAL = ("certificates", "dds")
+OPTIONAL = ("certificates", "restart", "dds")
 CONTROLS = "\x1b[2J\x9b\u202e\udc9b\x00\n"
 NO_LIBRARIES: Any = {
     "product": ("DDS", "", None, [], CONTROLS),
@@ -142,6 +143,7 @@ def hostile() -> list[tuple[str, bytes]]:
             [], None, {PATH: DIGEST}, {PATH: [1]}, {PATH: [DIGEST] * 33}, {PATH: [CONTROLS]},
             {"enclaves/r7/permissions.p7s": [DIGEST]}, {"enclaves/r8/cert.pem": [DIGEST]},
         ),
+        "restart": ({}, None, "/r7", [1], [[]], [""], ["r7"], ["/r7/.."], [CONTROLS]),
         "dds": (
             [], None, {}, {"libraries": []}, {**DDS, "more": 1}, {**DDS, "libraries": {}},
             *({**DDS, "unseen": wrong} for wrong in (-1, True, 1.0, "1", 10**9, None)),
@@ -170,7 +172,9 @@ def test_a_hostile_confirmation_is_refused_in_one_paragraph() -> None:
     without = parse_confirmation(
         _json({key: VALID[key] for key in VALID if key not in OPTIONAL}), "it"
     )
-    assert (without.certificates, without.dds) == ({}, None), "as earlier versions write it"
+    assert (without.certificates, without.restart, without.dds) == ({}, None, None), (
+        "as earlier versions write it"
+    )
     for name, data in hostile():
         with pytest.raises(DocumentError) as caught:
             parse_confirmation(data, "it")

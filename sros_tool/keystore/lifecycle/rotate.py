@@ -180,7 +180,8 @@ def robots_cut_off(keystore: Keystore, rotation: Rotation, to: RotationStage) ->
     """Return the sorted names of the robots that the stage ``to`` would cut off from the others.
 
     These are the robots with enclaves that have not confirmed the stage before: first that they
-    trust the new CA, then that they have the files it issued.  Without a fleet, or by the first
+    trust the new CA, then that they have the files it issued; and those where processes still run
+    with earlier files.  Without a fleet, or by the first
     stage, no robot is cut off.
 
     Raises:
@@ -204,6 +205,7 @@ def robots_cut_off(keystore: Keystore, rotation: Rotation, to: RotationStage) ->
         robot.robot
         for robot in robots
         if robot.received is None
+        or robot.restart
         or any(file.kind in needed and not file.surplus for file in robot.pending)
     )
 
@@ -226,8 +228,8 @@ def _would_cut_off(root: Path, rotation: Rotation, robots: Sequence[str]) -> Key
     return KeystoreError(
         f"not every robot has confirmed {stage}: {first_few(robots, _SHOWN)}",
         "After the next stage, they could not communicate with the other robots.",
-        f"Deliver the present files and confirm them; see `sros fleet status "
-        f"{quote(str(root))}`. --allow-unconfirmed goes on without them.",
+        "Deliver the present files, restart what runs with earlier ones, and confirm it; see `sros "
+        f"fleet status {quote(str(root))}`. --allow-unconfirmed goes on without them.",
     )
 
 

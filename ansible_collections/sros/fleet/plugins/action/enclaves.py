@@ -44,6 +44,7 @@ class ActionModule(RobotAction):
             time=name,
             files=map_of(name),
             certificates=map_of(list_of(name)),
+            restart=list_of(enclave),
             dds=record(
                 libraries=list_of(record(product=name, version=name, path=name, seen=name)),
                 unseen=number,

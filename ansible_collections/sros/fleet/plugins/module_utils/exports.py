@@ -183,13 +183,14 @@ def certificate_digests(content: bytes) -> list[str]:
     return found
 
 
-def confirmation(robot: str, files: Files, now: float) -> dict:
+def confirmation(robot: str, files: Files, now: float, due: list) -> dict:
     """Return what a robot confirms that it has (sros_tool/schemas/confirmation.json), with its DDS.
 
     Args:
         robot: the name of the robot.
         files: the files of its keystore.
         now: seconds since 1970 by the clock of the robot.
+        due: the enclaves whose processes still have earlier files.
     """
     confirmed = {
         path: content
@@ -207,6 +208,7 @@ def confirmation(robot: str, files: Files, now: float) -> dict:
             for path, each in confirmed.items()
             if path.rpartition("/")[2] in (CERTIFICATE_FILE, *AUTHORITY_FILES)
         },
+        "restart": sorted(due),
         "dds": _dds_here(),
     }
 

@@ -202,7 +202,7 @@ def main() -> None:
     except (RefusedError, OSError) as error:
         module.fail_json(msg="{}{}".format(error, " " + remark if remark else ""))
     said = result.get("verification", {}).get("remarks", [])
-    remarks = [*([remark] if remark else []), *result.pop("about_lists", []), *said]
+    remarks = [*([remark] if remark else []), *result.pop("about_change", []), *said]
     module.exit_json(remarks=remarks, **result)
 
 
@@ -227,7 +227,22 @@ def _run(module: AnsibleModule, now: float) -> dict:
             with tempfile.TemporaryDirectory(dir=module.tmpdir) as spare:
                 remarks = check_lists(before, after, spare)
         result = _install(place, before, after, asked, now, check=module.check_mode)
-    return {**result, **difference, "about_lists": remarks}
+    with_key = [
+        name
+        for name in result["removed_enclaves"]
+        if any(folder_of(name) + "/" + file in before for file in KEY_FILES)
+    ]
+    if with_key:
+        remarks.append(
+            "This robot had keys of {}, which the keystore has not for it; they {} removed. If they"
+            " are of another robot, give that one new keys: `sros renew KEYSTORE --robot ROBOT"
+            " --new-key --revoke-old`.".format(
+                ", ".join(with_key[:_MOST_PROBLEMS])
+                + (f" and {len(with_key) - _MOST_PROBLEMS} more" if with_key[3:] else ""),
+                "would be" if module.check_mode else "were",
+            )
+        )
+    return {**result, **difference, "about_change": remarks}
 
 
 def _look(place: Place, asked: dict, now: float) -> dict:
@@ -247,7 +262,7 @@ def _look(place: Place, asked: dict, now: float) -> dict:
         "restart": place.due(),
         "routers": _routers(present),
         "verification": found,
-        "confirmation": confirmation(asked["robot"], present, now),
+        "confirmation": confirmation(asked["robot"], present, now, place.due()),
     }
 
 
@@ -303,7 +318,8 @@ def _install(
     ran = has_certificate.union(place.delivered())
     due = sorted({*place.due(), *(ran & set(changed))} & set(enclaves_in(after)))
     if check and not present:
-        return {**result, "restart": due, "confirmation": confirmation(asked["robot"], before, now)}
+        confirmed = confirmation(asked["robot"], before, now, place.due())
+        return {**result, "restart": due, "confirmation": confirmed}
     if present:
         found = verify(place.path, names, asked["verifier"])
     else:
@@ -330,7 +346,7 @@ def _install(
         **result,
         "restart": place.due(),
         "verification": found,
-        "confirmation": confirmation(asked["robot"], after, now),
+        "confirmation": confirmation(asked["robot"], after, now, place.due()),
     }
 
 
