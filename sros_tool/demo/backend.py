@@ -91,6 +91,29 @@ class Backend:
         """Whether the nodes run on Zenoh instead of a DDS."""
         return self.name == ZENOH
 
+    @property
+    def checks_signers(self) -> bool:
+        """Whether the DDS accepts only the permissions CA as signer of permissions.
+
+        An unknown version of Fast DDS counts as recent.
+        """
+        if not self.dds.startswith("Fast DDS"):
+            return self.dds.startswith("Cyclone DDS 11.")
+        parts = self.dds.rpartition(" ")[2].split(".")
+        version = tuple(int(part) for part in parts if part.isdigit())
+        if len(version) < 3 or version >= (2, 10):
+            return True
+        return any(version[:2] == first[:2] and version >= first for first in _SIGNERS_CHECKED)
+
+    @property
+    def seconds_until_forgotten(self) -> float:
+        """The seconds for which peers still know a secured node that has ended.
+
+        Cyclone DDS 11 says only in clear that a participant leaves, which its peers do not believe:
+        they keep it until its lease expires (measured).
+        """
+        return 10.0 if self.dds.startswith("Cyclone DDS 11.") else 0.0
+
     def wire_name(self, topic: str, domain: int) -> str:
         """Return the name of a ROS topic as it stands in packets."""
         return f"{domain}{topic}/" if self.on_zenoh else f"rt{topic}"
@@ -263,24 +286,10 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
         Condition.UNAUTHENTICATED_SEE: unauthenticated and not rule.enable_discovery_protection,
         Condition.UNCONTROLLED: uncontrolled,
         Condition.OPEN_JOIN: not domain.enable_join_access_control,
-        Condition.EXACT_SIGNER: _checks_signers(backend.dds),
+        Condition.EXACT_SIGNER: backend.checks_signers,
     }
     vendor = {backend.vendor} if backend.vendor else set()
     return frozenset(name for name, holds in holding.items() if holds) | vendor
-
-
-def _checks_signers(dds: str) -> bool:
-    """Return whether a DDS accepts only the permissions CA as signer of permissions.
-
-    ``dds`` is its name and version ("Fast DDS 2.14.5"); an unknown version of Fast DDS counts as
-    recent.
-    """
-    if not dds.startswith("Fast DDS"):
-        return dds.startswith("Cyclone DDS 11.")
-    version = tuple(int(part) for part in dds.rpartition(" ")[2].split(".") if part.isdigit())
-    if len(version) < 3 or version >= (2, 10):
-        return True
-    return any(version[:2] == first[:2] and version >= first for first in _SIGNERS_CHECKED)
 
 
 _SILENCE = 5.0

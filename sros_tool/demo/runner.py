@@ -242,7 +242,9 @@ class _Runner:
             wire = tap.count(ports) if tap and row.wire else {}
             injected = None
             if tap and row.replay and window:
-                injected = await _replay_packets(processes[row.replay], tap)
+                secured = row.party(row.replay).identity.keystore is not None
+                lease = plan.backend.seconds_until_forgotten if secured else 0.0
+                injected = await _replay_packets(processes[row.replay], tap, lease)
             if tap and row.impersonate and window:
                 injected = await _forge_packets(processes[row.impersonate], tap)
         finally:
@@ -447,11 +449,14 @@ _CHANGED_PLACES = 8
 _AFTER_FORGERY = 1.0
 
 
-async def _replay_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
-    """End a talker, then send its captured packets again, with pauses shortened."""
+async def _replay_packets(talker: _PartyProcess, tap: Wiretap, lease: float) -> Injection:
+    """End a talker, then send its captured packets again, with pauses shortened.
+
+    A listener that still knows the talker, for up to ``lease`` seconds, takes them for duplicates.
+    """
     packets = tap.packets(talker.ports())
     await _end_softly([talker])
-    await asyncio.sleep(_GRACE)
+    await asyncio.sleep(lease + _GRACE)
     started = time.monotonic()
     # Twice, since the listener may use the first round only to discover the talker.
     for _ in range(_REPLAY_ROUNDS):

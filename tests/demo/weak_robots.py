@@ -18,8 +18,9 @@ from sros_tool.dds.governance import (
 )
 from sros_tool.dds.permissions import render_permissions
 from sros_tool.demo import forger
-from sros_tool.demo.backend import RCLPY
+from sros_tool.demo.backend import Backend
 from sros_tool.demo.forger import KeystoreCopy
+from sros_tool.demo.scenarios.model import Condition
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     GOVERNANCE_P7S,
@@ -59,6 +60,8 @@ WIDEST = (
     "the widest enclave calls a service that it was not given",
     "the widest enclave poses as the server",
 )
+SIGNED_BY_ITSELF = "permissions and governance signed by the enclave"
+"""A row that needs a DDS that accepts an enclave as signer, even as the attacker's own."""
 OWN_PART = ("a listener publishes", "a talker listens", "a client poses as the server")
 
 
@@ -168,9 +171,11 @@ class WeakRobot:
     on_fast: tuple[str, ...] | None = None
     """The rows that must fail on Fast DDS, where they differ."""
 
-    def broken_on(self, backend: str) -> tuple[str, ...]:
+    def broken_on(self, backend: Backend) -> set[str]:
         """The rows that must fail on a backend, without those of `joins`."""
-        return self.on_fast if backend == RCLPY and self.on_fast is not None else self.broken
+        if backend.vendor is Condition.FAST and self.on_fast is not None:
+            return set(self.on_fast)
+        return set(self.broken) - ({SIGNED_BY_ITSELF} if backend.checks_signers else set())
 
 
 _ELSEWHERE = "permissions for another domain"
@@ -194,7 +199,7 @@ _UNCHECKED = (
     "packets of a secured talker sent again",
     "certificate with the key of another enclave",
     "the attacker's own permissions CA",
-    "permissions and governance signed by the enclave",
+    SIGNED_BY_ITSELF,
 )
 """What whom peers refuse can do as if it were unsecured: on Cyclone DDS, not on Fast DDS."""
 WEAK: Mapping[str, WeakRobot] = {

@@ -135,7 +135,7 @@ def test_a_weak_robot_fails_in_the_rows_of_its_weakness(
     backend: str, name: str, robot: Path, tmp_path: Path
 ) -> None:
     """All attacks that keep their defences, in a robot of ROS nodes; a sound one fails in none."""
-    enforcing_backend(backend)
+    enforcing = enforcing_backend(backend)
     victim, other = "/mobile_robot/teleop", "/mobile_robot/monitor"
     broken: set[str] = set()
     if name:
@@ -143,7 +143,7 @@ def test_a_weak_robot_fails_in_the_rows_of_its_weakness(
         sros("create_keystore", foreign := tmp_path / "others", "--template", "production").ok()
         sros("create_enclave", foreign, victim).ok()
         weak.weaken(Place(robot, foreign, victim, other))
-        broken = set(weak.broken_on(backend))
+        broken = weak.broken_on(enforcing)
     names = [row.name for row in ATTACKS.rows if not row.removed] + [OTHERS, "the widest enclave"]
     words = [word for each in names for word in ("--only", each)]
     ended = sros(
