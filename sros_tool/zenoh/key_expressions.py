@@ -64,12 +64,13 @@ class KeyExpressions:
         self.all = frozenset(expressions)
 
     @cached_property
-    def _by_begin(self) -> Mapping[str, Mapping[str, list[str]]]:
-        """The expressions with wildcards, by the text before the wildcard, and then by `_form`."""
-        found: dict[str, dict[str, list[str]]] = {}
+    def _by_begin(self) -> Mapping[str, Mapping[str, Mapping[str, list[str]]]]:
+        """The expressions with wildcards, by the text before the wildcard, `_landmark`, `_form`."""
+        found: dict[str, dict[str, dict[str, list[str]]]] = {}
         for each in self.all:
             if (begin := _fixed_begin(each)) != each:
-                found.setdefault(begin, {}).setdefault(_form(each), []).append(each)
+                by_form = found.setdefault(begin, {}).setdefault(_landmark(each), {})
+                by_form.setdefault(_form(each), []).append(each)
         return found
 
     @cached_property
@@ -110,13 +111,17 @@ class KeyExpressions:
         )
 
     def _beginning_as(self, narrow: str) -> list[Mapping[str, list[str]]]:
-        """Return the expressions with wildcards that begin as ``narrow`` does, by their form."""
+        """Return the expressions that may include ``narrow``, by their form.
+
+        They have wildcards, begin as ``narrow`` does, and their landmark is a chunk of it.
+        """
         by_begin, found = self._by_begin, []
+        chunks = {*_chunks(narrow), ""}
         for size in self._sizes:
             if size > len(narrow):
                 break
-            if some := by_begin.get(narrow[:size]):
-                found.append(some)
+            if by_landmark := by_begin.get(narrow[:size]):
+                found += [by_landmark[chunk] for chunk in chunks & by_landmark.keys()]
         return found
 
 
@@ -124,6 +129,13 @@ class KeyExpressions:
 def _form(expression: str) -> str:
     """Return the wildcards of an expression and their places."""
     return _LITERAL.sub("", expression)
+
+
+@lru_cache(maxsize=_MANY)
+def _landmark(expression: str) -> str:
+    """Return the longest chunk without wildcards behind the first wildcard, or ""."""
+    rest = expression[len(_fixed_begin(expression)) :]
+    return max((chunk for chunk in rest.split("/") if "*" not in chunk), key=len, default="")
 
 
 def _without_wildcards(expression: str) -> str:
