@@ -13,16 +13,23 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from datetime import UTC, datetime
 from enum import Enum
+from random import Random
 from typing import Any
 from zoneinfo import ZoneInfo
 
 import pytest
 from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
 
 from sros_tool.dds.decision.answers import AccessVerb, Outcome, Refusal
 from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, MEASURED, Vendor, VendorTraits
+from sros_tool.dds.governance import render_governance
+from sros_tool.dds.permissions import Permissions, render_permissions
+from sros_tool.keystore.template import load_template, template_names
+from sros_tool.translate import governance_for
 from tests.dds.decision_documents import access_of
-from tests.dds.drawn_documents import documents
+from tests.dds.drawn_documents import Case as Drawn
+from tests.dds.drawn_documents import documents, portable_documents
 from tests.integration.drawn_cases import cases as drawn_cases
 from tests.integration.fastdds import fastdds_vendor, openssl
 from tests.integration.kept.replies import kept_replies
@@ -37,6 +44,7 @@ from tests.integration.vendor_oracle import (
     with_patience,
 )
 from tests.integration.vendor_rows import CRASHES, PEERS_CRASH, REFUSED, Row, rows
+from tests.policy.drawn_policies import DOMAINS, EVERYTHING, portable_permissions
 from tests.support.children import LONG
 
 pytestmark = pytest.mark.dds
@@ -45,6 +53,7 @@ COUNT = int(os.environ.get("SROS_DIFFERENTIAL", "2000" if LONG else "15"))
 SEED = int(os.environ.get("SROS_DIFFERENTIAL_SEED", "1"))
 Draw = Callable[[int, int, datetime], list[Case]]
 Asked = tuple[list[Case], list[str], datetime]
+QUESTIONS = sorted(EVERYTHING)
 ASK = {fastdds_vendor(): ask_fastdds, cyclone_vendor(): ask_cyclone}
 
 
@@ -162,22 +171,25 @@ def contradictions(vendor: Vendor) -> Iterator[str]:
 
 def draw_sensible(count: int, number: int, now: datetime) -> list[Case]:
     """Cases as people write documents, with one oddity at most."""
-    return [
-        apart(
-            Case(
-                each.governance_xml,
-                each.permissions_xml,
-                tuple(
-                    Question(*asked) for asked in each.questions if asked[0] is not AccessVerb.JOIN
-                ),
-                each.subject,
-                each.domain,
-                each.zone,
-                peer=place % 6 == 0,
-            )
+    return [asked_of(each, place) for place, each in enumerate(documents(number, count, now=now))]
+
+
+def asked_of(drawn: Drawn, place: int) -> Case:
+    """The case that asks a library what was drawn for the engine; every sixth has a peer."""
+    questions = tuple(
+        Question(*asked) for asked in drawn.questions if asked[0] is not AccessVerb.JOIN
+    )
+    return apart(
+        Case(
+            drawn.governance_xml,
+            drawn.permissions_xml,
+            questions,
+            drawn.subject,
+            drawn.domain,
+            drawn.zone,
+            peer=place % 6 == 0,
         )
-        for place, each in enumerate(documents(number, count, now=now))
-    ]
+    )
 
 
 def draw_odd(count: int, number: int, now: datetime) -> list[Case]:
@@ -198,6 +210,38 @@ def draw_odd(count: int, number: int, now: datetime) -> list[Case]:
 
     collect()
     return list(found)[:count]
+
+
+def draw_portable(count: int, number: int, now: datetime) -> list[Case]:
+    """Cases of the portable profile: documents, and what sros makes of drawn policies."""
+    drawn = list(portable_documents(number, (count + 1) // 2, now=now))
+    random = Random(number)
+
+    @seed(number)
+    @settings(
+        max_examples=count,
+        phases=[Phase.generate],
+        database=None,
+        deadline=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(portable_permissions(now), st.sampled_from(template_names()))
+    def collect(permissions: Permissions, template: str) -> None:
+        governance = governance_for(load_template(template).protection, DOMAINS)
+        asked = [(AccessVerb(verb), topic, ()) for verb, topic in random.sample(QUESTIONS, 5)]
+        drawn.append(
+            Drawn(
+                render_governance(governance),
+                render_permissions(permissions),
+                permissions.grants[0].subject,
+                next(iter(DOMAINS)),
+                random.choice(("UTC", "Asia/Tokyo", "America/Los_Angeles")),
+                tuple(asked),
+            )
+        )
+
+    collect()
+    return [asked_of(each, place) for place, each in enumerate(drawn[:count])]
 
 
 def apart(case: Case) -> Case:
@@ -231,6 +275,25 @@ def test_drawn_documents(vendor: Vendor, draw: Draw, workshop: Workshop) -> None
     )
     said = Counter(answer for reply in replies for answer in (reply.end, *reply.answers))
     assert all(said[word] > COUNT / 50 for word in ("joined", "refused", "created", "denied"))
+
+
+@pytest.mark.parametrize("vendor", ASK)
+def test_the_portable_profile_is_what_all_vendors_decide_alike(
+    vendor: Vendor, workshop: Workshop
+) -> None:
+    """Each library is compared with the standard, so that all of them decide the same."""
+    now = datetime.now(UTC).replace(microsecond=0)
+    drawn = draw_portable(max(COUNT // 3, 6), SEED, now)
+    replies = ask(Vendor.STANDARD, workshop, drawn, now, of=vendor)
+    wrong = [
+        f"{vendor.title}: {text}\n{shown(case)}"
+        for case, reply in zip(drawn, replies, strict=True)
+        for text in disagreements(Vendor.STANDARD, case, reply, now)
+    ]
+    print(f"{vendor.title}: {len(drawn)} portable, {summary(replies)}; {len(wrong)} disagreements")
+    assert not wrong, "\n".join(wrong[:3])
+    said = Counter(answer for reply in replies for answer in reply.answers)
+    assert said["created"] + said["matched"] and said["denied"]
 
 
 KEPT = (
@@ -269,9 +332,13 @@ def test_what_a_release_that_is_not_at_hand_replied(
     assert len(cases) - kept.count(None) > 0.9 * len(cases)
 
 
-def ask(vendor: Vendor, workshop: Workshop, asked: list[Case], at: datetime) -> list[Reply]:
+def ask(
+    vendor: Vendor, workshop: Workshop, asked: list[Case], at: datetime, of: Vendor | None = None
+) -> list[Reply]:
+    """Ask the library of a vendor, or ``of`` another one, for longer where a match is missing."""
+    library = ASK[of or vendor]
     return with_patience(
-        lambda some, seconds: ASK[vendor](workshop, some, at_once=6, seconds=seconds),
+        lambda some, seconds: library(workshop, some, at_once=6, seconds=seconds),
         asked,
         lambda place, reply: any(disagreements(vendor, asked[place], reply, at)),
     )

@@ -8,9 +8,10 @@ from fnmatch import fnmatchcase
 from hypothesis import strategies as st
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import Grant
+from sros_tool.dds.permissions import Grant, Permissions, outside
 from sros_tool.names import dds_names
 from sros_tool.policy.model import RIGHTS, Enclave, Group, Policy, Profile, Profiles, Qualifier
+from sros_tool.policy.patterns import Names
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
@@ -108,3 +109,23 @@ def effective(policy: Policy, path: str) -> frozenset[tuple[str, str]]:
 
 
 PATHS = ("/a", "/b")
+DOMAINS = DomainSet.of((42, 42))
+
+
+def portable_permissions(now: datetime) -> st.SearchStrategy[Permissions]:
+    """What sros makes of drawn policies, where it is in the portable profile and allows anything.
+
+    Sets of characters are in it, though a note advises against them: vendors read plain ones alike.
+    """
+
+    def made(policy: Policy, path: str) -> Permissions:
+        enclave = policy.enclave(path) or Enclave(path, ())
+        validity = window(now, timedelta(days=90))
+        return permissions_for(enclave, subject=f"CN={path}", validity=validity, domains=DOMAINS)
+
+    def fits(permissions: Permissions) -> bool:
+        notes = outside(permissions, 0, lambda names: Names(names).meets)
+        allows = any(rule.allow for rule in permissions.grants[0].rules)
+        return allows and all(identity == "portable.character-set" for identity, _ in notes)
+
+    return st.builds(made, policies(), st.sampled_from(PATHS)).filter(fits)
