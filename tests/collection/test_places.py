@@ -64,6 +64,19 @@ def test_what_somebody_else_put_there_gives_way(place: Place) -> None:
     assert not beside(place)
 
 
+def test_what_appears_during_a_change_gives_way(place: Place) -> None:
+    """After what is too much was removed; the change is ended by whoever comes next."""
+    place.prepare(NEW)
+    os.rename(place.stage, place._beside("apply"))
+    top = Path(place.path, "enclaves")
+    (top / "a/cert.pem").unlink()
+    (top / "a/cert.pem").mkdir()
+    (top / "b").symlink_to("/etc")
+    with place.locked():
+        assert place.read() == {**NEW, "enclaves/a/key.pem": b"key"}
+    assert not beside(place)
+
+
 class Killed(BaseException):
     pass
 

@@ -69,6 +69,11 @@ class Place:
             )
 
     @property
+    def _uid(self) -> int:
+        """The user id of the owner of the enclaves."""
+        return self._owner[0] if self._owner else os.geteuid()
+
+    @property
     def stage(self) -> str:
         """The path of the folder in which new files are prepared."""
         return self._beside("new")
@@ -126,14 +131,13 @@ class Place:
 
     def is_closed(self) -> bool:
         """Return whether owners and modes are as `replace` leaves them."""
-        wanted = self._owner[0] if self._owner else os.geteuid()
         for _folder, _, files, handle in os.fwalk(self.path):
             state = os.fstat(handle)
-            if state.st_uid != wanted or stat.S_IMODE(state.st_mode) != 0o700:
+            if state.st_uid != self._uid or stat.S_IMODE(state.st_mode) != 0o700:
                 return False
             for name in files:
                 state = os.stat(name, dir_fd=handle, follow_symlinks=False)
-                if state.st_uid != wanted or stat.S_IMODE(state.st_mode) != _mode(name):
+                if state.st_uid != self._uid or stat.S_IMODE(state.st_mode) != _mode(name):
                     return False
         return True
 
@@ -259,20 +263,25 @@ class Place:
 
     def _move_in(self, new: int, present: int) -> None:
         """Move the files of the open folder ``new`` to those of the same name in ``present``."""
+        if os.fstat(present).st_uid != self._uid:
+            raise RefusedError(f"Somebody is changing '{self.path}' meanwhile. Run it again.")
         os.fchmod(present, 0o700)
+        there = set(os.listdir(present))
         for name in os.listdir(new):
-            if _is_folder(name, new) and name in os.listdir(present):
+            is_folder = _is_folder(name, new)
+            if is_folder and name in there and self._is_kept(name, present):
                 with _opened(name, new) as below_new, _opened(name, present) as below:
                     self._move_in(below_new, below)
-            elif _is_folder(name, new) or not _are_same(name, new, present):
+            elif is_folder or not _are_same(name, new, present):
+                if name in there and (is_folder or _is_folder(name, present)):
+                    self._put_away(name, present)
                 os.rename(name, name, src_dir_fd=new, dst_dir_fd=present)
         os.fsync(present)
 
     def _is_kept(self, name: str, where: int) -> bool:
         """Return whether something is a folder of the owner of the enclaves."""
-        wanted = self._owner[0] if self._owner else os.geteuid()
         state = os.stat(name, dir_fd=where, follow_symlinks=False)
-        return stat.S_ISDIR(state.st_mode) and state.st_uid == wanted
+        return stat.S_ISDIR(state.st_mode) and state.st_uid == self._uid
 
     def _put_away(self, name: str, where: int) -> None:
         """Move something out of an open folder, to where it is removed."""

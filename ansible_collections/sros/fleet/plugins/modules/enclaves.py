@@ -233,12 +233,13 @@ def _run(module: AnsibleModule, now: float) -> dict:
         if any(folder_of(name) + "/" + file in before for file in KEY_FILES)
     ]
     if with_key:
+        more = len(with_key) - _MOST_PROBLEMS
         remarks.append(
-            "This robot had keys of {}, which the keystore has not for it; they {} removed. If they"
-            " are of another robot, give that one new keys: `sros renew KEYSTORE --robot ROBOT"
+            "This robot had keys of {}{}, which the keystore has not for it; they {} removed. If"
+            " they are of another robot, give that one new keys: `sros renew KEYSTORE --robot ROBOT"
             " --new-key --revoke-old`.".format(
-                ", ".join(with_key[:_MOST_PROBLEMS])
-                + (f" and {len(with_key) - _MOST_PROBLEMS} more" if with_key[3:] else ""),
+                ", ".join(with_key[:_MOST_PROBLEMS]),
+                f" and {more} more" if more > 0 else "",
                 "would be" if module.check_mode else "were",
             )
         )
