@@ -300,6 +300,10 @@ class RightsBetween:
         for each in rights:
             self._rules[each.common_name] = _RuleOfPeer.of_all(each)
             self._mirrored[each.common_name] = _RuleOfPeer.of_all(each.mirrored(each.common_name))
+        self._plain = {
+            name: frozenset().union(*(rule_of_peer.keys.plain for rule_of_peer in rules))
+            for name, rules in self._rules.items()
+        }
 
     def of_all(self, own: str) -> Iterator[RemoteRights]:
         """Yield what a process of the enclave ``own`` allows to processes of all enclaves.
@@ -312,6 +316,7 @@ class RightsBetween:
         meeting: dict[_Place, list[tuple[tuple[Message, ...], RuleKeys]]] = {}
         for remote, theirs in self._rules.items():
             shared: dict[_Place, tuple[str, ...]] = {}
+            are_apart = self._plain[own].isdisjoint(self._plain[remote])
             for place, _, keys in theirs:
                 if place not in meeting:
                     meeting[place] = [
@@ -320,6 +325,8 @@ class RightsBetween:
                         if (messages := _shared(place, rule_of_peer.place))
                     ]
                 for messages, others in meeting[place]:
+                    if are_apart and keys.is_plain and others.is_plain:
+                        continue
                     if both := keys.common(others):
                         same = (place[0], messages, True)
                         shared[same] = _sorted(shared.get(same, ()), both)

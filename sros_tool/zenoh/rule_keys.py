@@ -94,7 +94,8 @@ class RuleKeys:
     """The keys of a rule: what its expressions include.
 
     ``plain`` are keys of one name, with wildcards only in and below the type and its hash.
-    ``tokens`` are graph tokens with wildcards; ``differences`` are all other keys.
+    ``tokens`` are graph tokens with wildcards; ``differences`` are all other keys.  ``is_plain``
+    says that there are none of these.
     """
 
     def __init__(self, expressions: frozenset[str], made_of: tuple[Difference, ...]) -> None:
@@ -103,6 +104,8 @@ class RuleKeys:
         self.plain = expressions.difference(wide)
         self.tokens = KeyExpressions(each for each in wide if each.startswith("@"))
         self.differences = made_of or _differences(wide)
+        self.is_plain = not wide and not made_of
+        self._has_plain_tokens = any(each.startswith("@") for each in self.plain)
 
     def include(self, key: str) -> bool:
         """Return whether the differences of the rule have all keys of an expression."""
@@ -117,15 +120,27 @@ class RuleKeys:
             TooManyExpressions: there are too many.
         """
         found = self.plain & other.plain
-        if self.plain and (other.differences or other.tokens.all):
+        if self.is_plain and other.is_plain:
+            return _in_order(found) if found else ()
+        if self._plain_may_be_in(other):
             found |= _plain_in(self.plain, other)
-        if other.plain and (self.differences or self.tokens.all):
+        if other._plain_may_be_in(self):
             found |= _plain_in(other.plain, self)
         if self.tokens.all and other.tokens.all:
             found |= _common_of_tokens(self.tokens, other.tokens)
         if self.differences and other.differences:
             found |= _common_of_differences(self.differences, other.differences)
-        return tuple(sorted(found))
+        return _in_order(found) if found else ()
+
+    def _plain_may_be_in(self, wide: RuleKeys) -> bool:
+        return bool(
+            (self.plain and wide.differences) or (self._has_plain_tokens and wide.tokens.all)
+        )
+
+
+@lru_cache(maxsize=_MANY)
+def _in_order(expressions: frozenset[str]) -> tuple[str, ...]:
+    return tuple(sorted(expressions))
 
 
 @lru_cache(maxsize=_MANY)
