@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from inspect import cleandoc
+from itertools import chain
 from pathlib import Path
 from shlex import quote
 from types import FrameType
@@ -98,7 +99,7 @@ def dry_run_option(function: Decorated) -> Decorated:
 
 
 class _MeasuredVendors(click.Choice):  # type: ignore[type-arg]  # generic from click 8.2 on
-    """An option type: the measured DDS vendors, imported only when the option is used."""
+    """An option type: measured DDS vendors and products, imported only when the option is used."""
 
     def __init__(self) -> None:
         self.case_sensitive = True
@@ -106,18 +107,19 @@ class _MeasuredVendors(click.Choice):  # type: ignore[type-arg]  # generic from 
     def __getattr__(self, name: str) -> tuple[str, ...]:
         if name != "choices":
             raise AttributeError(name)
-        from sros_tool.dds.decision.vendors import MEASURED
+        from sros_tool.dds.decision.vendors import MEASURED, WHOLE_PRODUCTS
 
-        self.choices = tuple(vendor.value for vendor in MEASURED)
+        self.choices = (*WHOLE_PRODUCTS, *(vendor.value for vendor in MEASURED))
         return self.choices
 
 
 def _as_vendors(_ctx: click.Context, _option: click.Parameter, words: tuple[str, ...]) -> object:
     if not words:
         return ()
-    from sros_tool.dds.decision.vendors import Vendor
+    from sros_tool.dds.decision.vendors import WHOLE_PRODUCTS, Vendor
 
-    return tuple(map(Vendor, words))
+    named = (WHOLE_PRODUCTS.get(word) or (Vendor(word),) for word in words)
+    return tuple(dict.fromkeys(chain.from_iterable(named)))
 
 
 def allow_refusal_option(function: Decorated) -> Decorated:
@@ -128,8 +130,8 @@ def allow_refusal_option(function: Decorated) -> Decorated:
         type=_MeasuredVendors(),
         metavar="VENDOR",
         callback=_as_vendors,
-        help="Make the change even if this DDS vendor, such as fastdds-2.6, will then refuse "
-        "enclaves that it accepts now.  Can be repeated.",
+        help="Make the change even if this DDS vendor, such as fastdds-2.6, or all-fastdds, will "
+        "then refuse enclaves that it accepts now.  Can be repeated.",
     )(function)
 
 

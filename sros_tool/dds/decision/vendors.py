@@ -386,6 +386,26 @@ CYCLONE_DDS = _releases("Cyclone DDS")
 """All releases of Cyclone DDS."""
 
 
+WHOLE_PRODUCTS = {
+    f"all-{vendor.value}": tuple(
+        each for each in MEASURED if each.traits.product == vendor.traits.product
+    )
+    for vendor in PRINCIPAL
+}
+"""Words for all measured releases of a product, such as ``all-fastdds``."""
+
+
+def words_of(vendors: Iterable[Vendor]) -> list[str]:
+    """Return the fewest words of options that name the vendors."""
+    left = list(vendors)
+    words = []
+    for word, releases in WHOLE_PRODUCTS.items():
+        if set(releases) <= set(left):
+            words.append(word)
+            left = [vendor for vendor in left if vendor not in releases]
+    return [*words, *(vendor.value for vendor in left)]
+
+
 def together(titles: Iterable[str]) -> list[str]:
     """Return titles of vendors with the releases of each product together, for messages.
 

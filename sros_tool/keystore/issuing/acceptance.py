@@ -21,7 +21,7 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.dds.decision.answers import Decision
-from sros_tool.dds.decision.vendors import MEASURED, Vendor, together
+from sros_tool.dds.decision.vendors import MEASURED, Vendor, together, words_of
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import render_permissions
 from sros_tool.errors import KeystoreError, Note, SrosError
@@ -226,7 +226,7 @@ def _would_stop(root: Path, refused: Mapping[Vendor, _Refusals], remedy: str) ->
     names = tuple(sorted({name for refusals in refused.values() for name in refusals.enclaves}))
     why = {vendor: "; ".join(refusals.reasons[:_SHOWN]) for vendor, refusals in refused.items()}
     whose = "its" if len(names) == 1 else "their"
-    options = " ".join(f"--allow-refusal {vendor.value}" for vendor in refused)
+    options = " ".join(f"--allow-refusal {word}" for word in words_of(refused))
     return KeystoreError(
         f"no node could start in {_some(names)} of '{root}'",
         f"{_clauses(why, f'{whose} files after the change')}. Nothing was changed.",
@@ -265,7 +265,7 @@ def _would_be_shut_out(
     titles = together(vendor.title for vendor in vendors)
     demand = f"{enumerated(titles)} {'demands' if len(titles) == 1 else 'demand'}"
     name = subject_text(old.subject)
-    options = " ".join(f"--allow-refusal {vendor.value}" for vendor in vendors)
+    options = " ".join(f"--allow-refusal {word}" for word in words_of(vendors))
     return KeystoreError(
         f"processes that still have certificates of {name} would be refused in '{root}'",
         f"With any revocation list, {demand} a list of each CA, and the keyUsage of "
