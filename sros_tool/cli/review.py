@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     from sros_tool.proof.repository import Repository
     from sros_tool.proof.review import Review, ReviewRequest, ReviewStep
 
+    _PathsType = click.ParamType[tuple[str, ...]]
+else:  # generic from click 8.2 on
+    _PathsType = click.ParamType
+
 _MOST = 60_000
 """Maximum length of the Markdown, in characters: a comment on GitHub has at most 65,536."""
 _SIGNS = {0: "🟢", 1: "🔴", 2: "⚪"}
@@ -49,7 +53,7 @@ _TITLES = {
 """Titles of the kinds of steps, the most important first: a comment is cut at its end."""
 
 
-class _Lines(click.ParamType[tuple[str, ...]]):
+class _Lines(_PathsType):
     """Paths from the top of the repository, one on each line, as code hosts pass lists."""
 
     name = "paths"

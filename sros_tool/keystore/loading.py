@@ -46,6 +46,7 @@ from sros_tool.pki.certificates import (
     load_certificate,
     load_certificates,
     subject_text,
+    validity_of,
 )
 from sros_tool.pki.chains import Checks, build_chain, chain_fault
 from sros_tool.pki.crl import Obstacle, list_refusal, read_list, read_lists, refusal_of
@@ -425,7 +426,7 @@ def _identity_faults(
     if traits.crashes_on_empty_subject and not certificate.subject.rdns:
         text = "its subject is empty, which crashes the process"
         yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_CRASH)
-    remaining = certificate.not_valid_after_utc - at
+    remaining = validity_of(certificate).not_after - at
     if traits.expiry_overflows and remaining // _LONGEST_TIMER % 2:
         text = "it expires more than 292 years from now, which counts as expired, or crashes"
         yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_LASTS)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.metadata
+import re
 from importlib.metadata import PackageNotFoundError
+from pathlib import Path
 
 import pytest
 
@@ -56,3 +58,23 @@ def test_it_is_named(
     ended = sros("run", *words)
     assert ended.status == 2 and said in ended.err, ended
     assert said == DEFECT or DEFECT not in ended.err
+
+
+NEWER = re.compile(
+    r"\.(not_valid_(before|after)|(last|next)_update|revocation_date)_utc|public_key_algorithm_oid|"
+    r"PublicKeyAlgorithmOID|NoArgsIsHelpError|\(click\.ParamType\["
+)
+"""What cryptography 41 and click 8.1 do not have."""
+
+
+def test_nothing_is_used_that_the_oldest_packages_do_not_have() -> None:
+    assert NEWER.search("certificate.not_valid_after_utc") and NEWER.search(
+        "(click.ParamType[int])"
+    )
+    users = {
+        str(path)
+        for folder in ("sros_tool", "tests")
+        for path in Path(folder).rglob("*.py")
+        if NEWER.search(path.read_text()) and path.name != Path(__file__).name
+    }
+    assert users == {"sros_tool/pki/tolerant.py"}  # it gives these names to its own certificates
