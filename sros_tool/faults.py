@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import Enum
 
 _RCL = "rcl 9 (security.c) and the RMWs of ROS 2 Jazzy."
-_MEASURED = "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured."
+_MEASURED = "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured."
 _CLOCK_BEHIND = "Often the clock of the robot is behind."
 
 _RESTORE = "Restore {path} from a backup."
@@ -131,14 +131,14 @@ class Fault(Enum):
         "certificate-issuer",
         "a certificate that another CA issued",
         "The node itself refuses it; Fast DDS with an empty reason.",
-        "DDS-Security 1.1, 9.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+        "DDS-Security 1.1, 9.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
         REPLACE,
     )
     CA_EXPIRED = (
         "ca-expired",
         "a CA that an enclave trusts has expired",
         "Nothing that it issued or signed is accepted any more (Fast DDS: Error '10' verifying "
-        "CA certificate).",
+        "CA certificate), but Cyclone DDS 11 still accepts documents of a permissions CA.",
         _MEASURED,
         _AUTHORITY,
     )
@@ -192,14 +192,14 @@ class Fault(Enum):
         "crl-malformed",
         "a revocation list that cannot be read",
         "With Fast DDS the node does not start, and its log has an empty reason.",
-        "Fast DDS 2.14.5 (PKIDH.cpp); measured.",
+        "Fast DDS 2.6 to 3.6 (PKIDH.cpp); measured.",
         _CRL,
     )
     CRL_ISSUER = (
         "crl-issuer",
         "a revocation list of another CA",
         "No certificate can be verified with it, so every participant is refused.",
-        "RFC 5280, 6.3.3; Fast DDS 2.14.5; measured.",
+        "RFC 5280, 6.3.3; Fast DDS 2.6 to 3.6; measured.",
         _CRL,
     )
     CRL_USAGE = (
@@ -233,14 +233,14 @@ class Fault(Enum):
         "crl-expired",
         "a revocation list that has expired",
         "Every participant is refused, and Fast DDS does not report it.",
-        "RFC 5280, 5.1.2.5; Fast DDS 2.14.5; measured.",
+        "RFC 5280, 5.1.2.5; Fast DDS 2.6 to 3.6; measured.",
         _CRL,
     )
     REVOKED = (
         "revoked",
         "an enclave whose certificate is revoked",
         "Every participant with this crl.pem refuses it; Fast DDS does not report it.",
-        "RFC 5280, 5; Fast DDS 2.14.5; measured.",
+        "RFC 5280, 5; Fast DDS 2.6 to 3.6; measured.",
         "This is intended after a revocation. If not, give the enclave a new key and certificate: "
         "`sros renew {root} {enclave} --new-key`.",
     )
@@ -265,10 +265,10 @@ class Fault(Enum):
     SIGNER_NO_CA = (
         "signer-no-ca",
         "a document that no CA signed, and that vendors accept",
-        "Cyclone DDS 0.10.2 and Fast DDS 2.9.1 accept every signer whose certificate the "
+        "Cyclone DDS 0.10 and Fast DDS 2.9.1 accept every signer whose certificate the "
         "permissions CA issued. If that CA also issues identities, each enclave can sign rights "
         "for itself: whoever has its key signed these.",
-        "CVE-2023-24011; Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+        "CVE-2023-24011; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
         "Unless you signed it so on purpose, take the key of the signer for stolen: `sros revoke "
         "{root} {enclave}`. If one CA is for both, use separate CAs for identities and documents, "
         "as keystore.one-authority says.",
@@ -335,15 +335,15 @@ class Fault(Enum):
         "a file of certificates that a vendor cannot read",
         "Fast DDS reads a CA file to its end, and refuses it for any part that is damaged; Cyclone "
         "DDS reads its first certificate, and no 'TRUSTED CERTIFICATE'.",
-        "OpenSSL 3.0 (pem_info.c); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+        "OpenSSL 3.0 (pem_info.c); Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
         "Keep only the certificates in the file, as '-----BEGIN CERTIFICATE-----'.",
     )
     CA_CRASH = (
         "ca-crash",
         "a CA file that crashes a vendor",
-        "Fast DDS 2.14 frees the first certificate of a CA file, if it is not signed with SHA-256, "
-        "and then verifies it.",
-        "Fast DDS 2.14.5 (FileProvider.cpp); measured.",
+        "Fast DDS, but not 2.9.1, frees the first certificate of a CA file, if it is not signed "
+        "with SHA-256, and then verifies it.",
+        "Fast DDS 2.6 to 3.6 (FileProvider.cpp); measured.",
         "Put a CA that is signed with SHA-256 first in the file.",
     )
     CERTIFICATE_CRASH = (
@@ -351,7 +351,7 @@ class Fault(Enum):
         "a certificate that crashes a vendor",
         "Fast DDS crashes on a certificate with an empty subject: its own, or that of a peer "
         "before it is verified.",
-        "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp); measured.",
+        "Fast DDS 2.6 to 3.6 (PKIDH.cpp); measured.",
         "Issue a certificate with the common name of the enclave.",
     )
     CERTIFICATE_LASTS = (
@@ -365,15 +365,16 @@ class Fault(Enum):
     CA_CHAIN = (
         "ca-chain",
         "a CA certificate that a vendor refuses",
-        "Fast DDS 2.14 also verifies the CA certificate, by the strict rules of OpenSSL.",
-        "RFC 5280, 6.1; Fast DDS 2.14.5 (FileProvider.cpp); measured.",
+        "Fast DDS, but not 2.9.1, also verifies the CA certificate, by the strict rules of "
+        "OpenSSL.",
+        "RFC 5280, 6.1; Fast DDS 2.6 to 3.6 (FileProvider.cpp); measured.",
         "Use a self-signed CA with keyCertSign, first in its file.",
     )
     SIGNATURE_HASH = (
         "signature-hash",
         "a certificate that is not signed with SHA-256",
         "Fast DDS refuses other digests, and RSA-PSS, in a CA and in an enclave's certificate.",
-        "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp); measured.",
+        "Fast DDS 2.6 to 3.6 (PKIDH.cpp); measured.",
         "Issue the certificate again with SHA-256, which every vendor accepts.",
     )
     KEY_ALGORITHM = (
@@ -381,7 +382,7 @@ class Fault(Enum):
         "a key that not every vendor accepts",
         "Cyclone DDS accepts only EC prime256v1 and RSA of exactly 2048 bits; with Ed25519, the "
         "handshake of Fast DDS fails.",
-        "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5; measured.",
+        "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10 and 11.0, Fast DDS 2.6 to 3.6; measured.",
         "Use EC prime256v1 keys, which every vendor accepts.",
     )
     KEY_ON_TOKEN = (

@@ -564,7 +564,7 @@ LONG_NAME = FindingKind(
     "a topic whose name is too long for Fast DDS",
     "If the DDS topic name has 252 bytes or more (with prefix and suffix), Fast DDS creates the "
     "endpoint and never matches it; Cyclone DDS matches it.",
-    "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Use shorter namespaces and names.",
     vendors=FAST_DDS,
 )
@@ -574,7 +574,7 @@ DENY_BLOCKS = FindingKind(
     "a topic that is denied in one direction and allowed in the other",
     "Cyclone DDS 0.10 checks whether the topic may be created at all, and a denial of either "
     "direction forbids it; Fast DDS and Cyclone DDS 11 allow it.",
-    "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c), Fast DDS 2.9.1 and 2.14.5; measured.",
+    "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c), Fast DDS 2.6 to 3.6; measured.",
     "Remove the denial: everything that no rule allows is denied anyway.",
     vendors=(Vendor.CYCLONE,),
 )
@@ -583,7 +583,7 @@ CHARACTER_SET = FindingKind(
     NOTE,
     "a [set] of characters in a name",
     "Vendors read plain sets alike, but only * and ? are part of the portable profile.",
-    "Fast DDS 2.14.5 (fnmatch), Cyclone DDS 0.10.2 (its own matching); measured.",
+    "Fast DDS 2.6 to 3.6 (fnmatch), Cyclone DDS 0.10 and 11.0 (its own matching); measured.",
     "Use * or ?, or write the names out.",
 )
 ENCLAVE_NAMES = FindingKind(

@@ -30,7 +30,7 @@ from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.vulnerabilities import vulnerability_metrics
 from sros_tool.dds.advisories import Advisory
 from sros_tool.dds.decision.grants import read_moment
-from sros_tool.dds.decision.vendors import Moments, Vendor
+from sros_tool.dds.decision.vendors import FAST_DDS, Moments, Vendor
 from sros_tool.dds.permissions import Grant, parse_permissions
 from sros_tool.errors import SrosError
 from sros_tool.faults import Fault
@@ -106,9 +106,9 @@ PROCESS_LOCAL_TIME = FindingKind(
     "a process whose permissions Fast DDS refuses in its time zone",
     'Fast DDS reads their dates in the local time of the process, and says "Not found the '
     'identity subject name in permissions file".',
-    "Fast DDS 2.9.1 and 2.14.5 (mktime); measured.",
+    "Fast DDS 2.6 to 3.6 (mktime); measured.",
     "Run `sros renew ROOT NAME`, or start the process with TZ=UTC.",
-    vendors=(Vendor.FAST,),
+    vendors=FAST_DDS,
 )
 PROCESS_REPLACEABLE = FindingKind(
     "runtime.process-files-replaceable",

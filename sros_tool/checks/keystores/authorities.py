@@ -72,7 +72,7 @@ INTERMEDIATE = FindingKind(
     "verifies a chain of identity CAs; 2.14 requires keyUsage and key identifiers in each of "
     "them. For an intermediate permissions CA, Fast DDS 2.14 requires keyUsage, 2.9 a purpose "
     "that allows signing documents.",
-    "Fast DDS 2.9.1 and 2.14.5 (FileProvider.cpp), Cyclone DDS 0.10.2; measured.",
+    "Fast DDS 2.6 to 3.6 (FileProvider.cpp), Cyclone DDS 0.10 and 11.0; measured.",
     "Use a separate root CA for robots, unless all of them run a Fast DDS that accepts it.",
 )
 CA_PURPOSE = FindingKind(
@@ -93,7 +93,7 @@ KEY_ALGORITHM = FindingKind(
     "a key that not every vendor accepts",
     "Cyclone DDS accepts only EC prime256v1 and RSA of exactly 2048 bits. Fast DDS also accepts "
     "larger keys of both kinds, but not Ed25519, which fails in its handshake.",
-    "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5; measured.",
+    "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10 and 11.0, Fast DDS 2.6 to 3.6; measured.",
     "Use EC prime256v1, as sros does.",
 )
 SIGNATURE_HASH = FindingKind(
@@ -101,7 +101,7 @@ SIGNATURE_HASH = FindingKind(
     WARNING,
     "a certificate that is not signed with SHA-256",
     "Fast DDS refuses SHA-384 in a CA and in an enclave's certificate; Cyclone DDS accepts it.",
-    "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp), Cyclone DDS 0.10.2; measured.",
+    "Fast DDS 2.6 to 3.6 (PKIDH.cpp), Cyclone DDS 0.10 and 11.0; measured.",
     "Issue the certificate again with SHA-256, as sros does.",
     vendors=FAST_DDS,
 )
@@ -320,7 +320,7 @@ CRL_EXPIRES_SOON = FindingKind(
     ERROR,
     "a revocation list that expires soon, or has expired",
     "Once it has expired, DDS refuses every participant.",
-    "RFC 5280, 5.1.2.5; Fast DDS 2.14.5; measured.",
+    "RFC 5280, 5.1.2.5; Fast DDS 2.6 to 3.6; measured.",
     "Run `sros crl ROOT --refresh`.",
 )
 CRL_ISSUER = FindingKind(

@@ -47,7 +47,7 @@ SEVERAL_GRANTS = FindingKind(
     "several grants in one document",
     "Fast DDS uses the first grant of the subject that is valid now; Cyclone DDS uses the first "
     "one, valid or not, and also takes a grant whose subject merely contains the certificate's.",
-    "Fast DDS 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
+    "Fast DDS 2.6 to 3.6 (Permissions.cpp), Cyclone DDS 0.10 and 11.0; measured.",
     "Write one document with one grant for each enclave.",
 )
 DEFAULT_ALLOW = FindingKind(
@@ -55,7 +55,7 @@ DEFAULT_ALLOW = FindingKind(
     WARNING,
     "a grant that allows by default",
     "Fast DDS ignores <default>, and denies; Cyclone DDS allows everything that no rule names.",
-    "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Write <default>DENY</default>, and an allow rule for the topics that are meant.",
 )
 ALLOW_RULES = FindingKind(
@@ -64,7 +64,7 @@ ALLOW_RULES = FindingKind(
     "several allow rules in one grant",
     "Fast DDS decides by the first rule whose topic matches, and denies if its partitions do not; "
     "Cyclone DDS goes on to a rule in which both match.",
-    "Fast DDS 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
+    "Fast DDS 2.6 to 3.6 (Permissions.cpp), Cyclone DDS 0.10 and 11.0; measured.",
     "Put all topics into one allow rule.",
     vendors=FAST_DDS,
 )
@@ -75,7 +75,7 @@ PARTITIONS = FindingKind(
     "Fast DDS ignores partitions in deny rules, and denies if an allow rule matches the topic and "
     "not the partition; Cyclone DDS goes on to the next rule. ROS 2 uses only the default "
     "partition.",
-    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Leave partitions out.",
 )
 DEFAULT_FIRST = FindingKind(
@@ -84,7 +84,7 @@ DEFAULT_FIRST = FindingKind(
     "rules after the <default> of a grant",
     "Fast DDS ends a grant at its <default>, and ignores the rules that follow; Cyclone DDS reads "
     "them.",
-    "omg_shared_ca_permissions.xsd; Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "omg_shared_ca_permissions.xsd; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Put <default> behind the rules.",
     vendors=FAST_DDS,
 )
@@ -94,7 +94,7 @@ DOMAIN_RANGE = FindingKind(
     "a range of domains that vendors read differently",
     "Fast DDS and Cyclone DDS read a range without <max> as a single domain. Cyclone DDS crashes "
     "on a range without <min>, and refuses domains above 230.",
-    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Write <id>, or <min> and <max> up to 230.",
 )
 GRANT_NAME = FindingKind(
@@ -102,7 +102,7 @@ GRANT_NAME = FindingKind(
     WARNING,
     "a grant without a name",
     "Fast DDS refuses the document; Cyclone DDS accepts it.",
-    "omg_shared_ca_permissions.xsd; Fast DDS 2.14.5; measured.",
+    "omg_shared_ca_permissions.xsd; Fast DDS 2.6 to 3.6; measured.",
     'Write <grant name="...">.',
     vendors=FAST_DDS,
 )
@@ -113,7 +113,7 @@ SUBJECT = FindingKind(
     "Cyclone DDS splits subjects at commas, slashes and vertical bars, and compares characters "
     "beyond ASCII in their escaped form; Fast DDS 2.6 and 2.9 treat spaces around = as part of the "
     "name.",
-    "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Write it in the form of RFC 4514, CN=/name, without , | and quotes in the name.",
 )
 TIME_FORMAT = FindingKind(
@@ -122,7 +122,8 @@ TIME_FORMAT = FindingKind(
     "a date that vendors read differently",
     "Fast DDS ignores the offset and reads local time; Cyclone DDS refuses dates without a time, "
     "and years from 2263 on.",
-    "DDS-Security 1.1, 9.4.1.3.2.2; Fast DDS 2.14.5 (mktime), Cyclone DDS 0.10.2; measured.",
+    "DDS-Security 1.1, 9.4.1.3.2.2; Fast DDS 2.6 to 3.6 (mktime), Cyclone DDS 0.10 and 11.0; "
+    "measured.",
     "Write CCYY-MM-DDThh:mm:ssZ.",
 )
 TIME_WINDOW = FindingKind(
@@ -131,7 +132,7 @@ TIME_WINDOW = FindingKind(
     "a validity that in some time zones begins too late or expires too early",
     "Fast DDS reads the dates of permissions in the host's local time: they begin up to 12 hours "
     "late in the west, and expire up to 14 hours early in the east.",
-    "Fast DDS 2.9.1 and 2.14.5 (mktime); measured in Los Angeles and Tokyo.",
+    "Fast DDS 2.6 to 3.6 (mktime); measured in Los Angeles and Tokyo.",
     "Sign permissions with a not_before at least 14 hours in the past, as sros does, and renew "
     "them in time.",
     vendors=FAST_DDS,
@@ -142,7 +143,7 @@ LOCAL_TIME = FindingKind(
     "permissions that Fast DDS refuses in the time zone of this host",
     'Fast DDS reads their dates in local time, and says "Not found the identity subject name in '
     'permissions file".',
-    "Fast DDS 2.9.1 and 2.14.5 (mktime); measured.",
+    "Fast DDS 2.6 to 3.6 (mktime); measured.",
     "Run `sros renew ROOT NAME`, or let the host run in UTC.",
     vendors=FAST_DDS,
 )
@@ -152,7 +153,7 @@ CHARACTER_CLASS = FindingKind(
     "a [class] of characters that vendors read differently",
     "Cyclone DDS reads [^...] and [[:class:]] as plain characters; Fast DDS supports negation and "
     "classes.",
-    "Fast DDS 2.14.5 (fnmatch), Cyclone DDS 0.10.2; measured.",
+    "Fast DDS 2.6 to 3.6 (fnmatch), Cyclone DDS 0.10 and 11.0; measured.",
     "Use * or ?, or write the names out.",
 )
 BLANKS = FindingKind(
@@ -161,7 +162,7 @@ BLANKS = FindingKind(
     "spaces or line ends around the name of a topic",
     "Fast DDS takes them for a part of the name, so the rule matches no topic of a node; Cyclone "
     "DDS strips them.",
-    "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Write the name alone between the tags: <topic>rt/chatter</topic>.",
     vendors=FAST_DDS,
 )
@@ -178,7 +179,7 @@ NO_EFFECT = FindingKind(
     ERROR,
     "a deny rule after an allow rule for the same topic",
     "The first rule that matches decides, so the denial has no effect.",
-    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Put deny rules first, as sros does.",
 )
 UNREACHABLE = FindingKind(
@@ -186,7 +187,7 @@ UNREACHABLE = FindingKind(
     WARNING,
     "a rule that never decides, because an earlier rule matches first",
     "The first rule that matches decides, so this rule never decides on these topics.",
-    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Remove the topic, or put the narrower rule first.",
 )
 DOMAINS = FindingKind(
@@ -452,7 +453,7 @@ UNAUTHENTICATED = FindingKind(
     "on Cyclone DDS every topic without protection, whatever its access control. With RTPS "
     "protection too, Fast DDS refuses the document; only 2.9 ignores the attribute.",
     f"{_GOVERNANCE} (allow_unauthenticated_participants); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS "
-    "0.10.2; measured.",
+    "0.10 and 11.0; measured.",
     "Run `sros update_keystore ROOT --set protection.allow_unauthenticated_participants=false`.",
 )
 UNAUTHENTICATED_KEPT_OUT = FindingKind(
@@ -529,7 +530,7 @@ NO_TOPIC_RULE = FindingKind(
     "topics without a topic rule",
     "If no topic rule matches, the endpoint cannot be created; without a rule for "
     "ros_discovery_info no node of ROS 2 starts.",
-    f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    f"{_GOVERNANCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Add a rule for * at the end.",
 )
 NO_OTHER_TOPIC_RULE = FindingKind(
@@ -537,7 +538,7 @@ NO_OTHER_TOPIC_RULE = FindingKind(
     NOTE,
     "topic rules for the names of ROS alone",
     "A program that uses DDS without ROS can create no endpoint.",
-    f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    f"{_GOVERNANCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "None is needed if all programs are nodes of ROS 2. Otherwise add a rule for * at the end.",
 )
 UNREACHABLE_TOPIC_RULE = FindingKind(
@@ -553,7 +554,7 @@ GOVERNANCE_DOMAIN_RANGE = FindingKind(
     ERROR,
     "a range of domains that vendors read differently",
     "Cyclone DDS refuses a range without <min>, and domains above 230; Fast DDS accepts them.",
-    "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Write <id>, or <min> and <max> up to 230.",
 )
 GOVERNANCE_OPEN_RANGE = FindingKind(
@@ -562,7 +563,7 @@ GOVERNANCE_OPEN_RANGE = FindingKind(
     "a range of domains without an end, which counts as one domain",
     "Fast DDS and Cyclone DDS read a range without <max> as the domain <min> alone; by the "
     "standard it has no end.",
-    "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Write <id>, or <min> and <max> up to 230.",
 )
 DIFFERS = FindingKind(

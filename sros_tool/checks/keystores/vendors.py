@@ -44,9 +44,7 @@ from sros_tool.names import (
 from sros_tool.policy.patterns import common_name, overlap
 from sros_tool.wording import counted, enumerated, first_few
 
-_ENGINE = (
-    "sros: its decision engine, compared with Fast DDS 2.9.1 and 2.14.5 and Cyclone DDS 0.10.2."
-)
+_ENGINE = "sros: its decision engine, compared with Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0."
 _SEE = "`sros explain --all-vendors` shows the answer of each vendor."
 
 REFUSED = FindingKind(
