@@ -270,24 +270,26 @@ def _refused(
     reasons: dict[str, list[str]] = {}
     for vendor, decision in decisions.items():
         reasons.setdefault(decision.reason(verb, topic), []).append(vendor.title)
-    if len({topic in decision.topics(verb) for decision in decisions.values()}) > 1:
+    denying = [
+        number
+        for number, rule in enumerate(grant.rules, 1)
+        if not rule.allow and any(matches(each, topic) for each in _topics(getattr(rule, verb)))
+    ]
+    are_alike = len({topic in decision.topics(verb) for decision in decisions.values()}) == 1
+    if not are_alike or not denying:
         differing = "; ".join(
             f"{reason} ({', '.join(together(of))})" for reason, of in reasons.items()
         )
         return PolicyError(
-            f"{what}, because vendors of DDS do not decide alike",
+            f"{what}, because vendors of DDS do not {'read its rules' if are_alike else 'decide'} "
+            "alike",
             f"{differing[:1].upper()}{differing[1:]}.",
             _REMEDY,
         )
-    denying = next(
-        number
-        for number, rule in enumerate(grant.rules, 1)
-        if not rule.allow and any(matches(each, topic) for each in _topics(getattr(rule, verb)))
-    )
     return PolicyError(
         f"{what}, because the order of its rules counts",
-        f"On DDS {next(iter(reasons))}, and rule {denying} comes too late to deny it. On Zenoh, as "
-        "in a policy, a denial wins wherever it stands.",
+        f"On DDS {next(iter(reasons))}, and rule {denying[0]} comes too late to deny it. On Zenoh, "
+        "as in a policy, a denial wins wherever it stands.",
         f"List the names to {verb} in a policy, without that denial, and sign it with `sros "
         "create_permission`.",
     )

@@ -97,6 +97,16 @@ def test_what_every_vendor_decides_is_said(rules: list[Rule], names: list[str]) 
         ([rule("deny", "rt/[^a]"), rule("allow", "rt/*")], NO_AGREEMENT),
         ([rule("deny", "rt/a "), rule("allow", "rt/*")], NO_AGREEMENT),
         (
+            [
+                rule("allow", "rt/[^a]", domains=DomainSet.of((0, 9)))._replace(
+                    publish=(Criteria(("rt/[^a]",), ("p", "")), Criteria(("rt/*",), ("p",)))
+                ),
+                rule("allow", "rt/a*", "*", domains=DomainSet((DomainRange(0, None),))),
+            ],
+            "publish rt/a cannot be expressed in Zenoh, because vendors of DDS do not read its "
+            "rules alike. Rule 1 allows publish rt/a by rt/* (Fast DDS); rule 1 allows",
+        ),
+        (
             [rule("allow", "rt/c/a"), rule("deny", "rt/c/*"), rule("allow", "rt/*")],
             f"publish rt/c/a cannot be expressed in Zenoh, {ORDER}. On DDS rule 1 allows publish "
             "rt/c/a by rt/c/a, and rule 2 comes too late to deny it.",
