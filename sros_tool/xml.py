@@ -143,6 +143,8 @@ def parse(
             "Remove the <!DOCTYPE ...> line.",
         )
     encoding = root.getroottree().docinfo.encoding or "UTF-8"
+    if b"\0" in data and encoding.upper() in _UTF_8:  # libxml2 before 2.14 says what is declared
+        encoding = "UTF-16"
     if as_bytes and encoding.upper() not in _UTF_8:
         raise DocumentError(
             f"{name} is not in UTF-8",

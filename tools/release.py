@@ -27,6 +27,7 @@ EXTRAS = {
     "fleet": "ansible",
     "pkcs11": "pkcs11",
     "ros": "rclpy",
+    "ros-kilted": "rclpy",
     "zenoh": "zenoh",
 }
 """The extras of the package, with a module that each of them brings."""
