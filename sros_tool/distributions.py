@@ -28,6 +28,12 @@ class Shipped(NamedTuple):
     product: str
     latest: str
     vendor: Vendor
+    distribution: Distribution
+
+    @property
+    def title(self) -> str:
+        """Text such as ``Kilted with Fast DDS 3.2``."""
+        return f"{self.distribution.title} with {self.release}"
 
     @property
     def release(self) -> str:
@@ -72,7 +78,7 @@ class Distribution(NamedTuple):
         """The DDS products that it ships, its default first."""
         products = (("Fast DDS", self.fast), ("Cyclone DDS", self.cyclone))
         return tuple(
-            Shipped(product, version, _decided_as(product, version))
+            Shipped(product, version, _decided_as(product, version), self)
             for product, version in products
         )
 

@@ -83,8 +83,7 @@ VERBS: Mapping[str, str | Shapes] = {
         "What DDS or Zenoh decides, by which rule, and why.",
         {
             "a question": "sros_tool.explain.vendors:VendorExplanation",
-            "--all-vendors": "sros_tool.explain.vendors:VendorComparison",
-            "--all-distros": "sros_tool.explain.vendors:DistributionComparison",
+            "--all-vendors, --all-distros": "sros_tool.explain.vendors:Comparison",
             "--vendor zenoh": "sros_tool.explain.zenoh:ZenohExplanation",
             "--who": "sros_tool.explain.vendors:WhoByVendor",
             "--who --vendor zenoh": "sros_tool.explain.zenoh:WhoOnZenoh",

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.asking import AskedEnclave, AskingContext
     from sros_tool.explain.log import LogFinding
     from sros_tool.explain.question import Question
-    from sros_tool.explain.vendors import DdsExplanation, DistributionComparison, ZenohBeside
+    from sros_tool.explain.vendors import Comparison, DdsExplanation, ZenohBeside
     from sros_tool.explain.who import Decider, Everybody, FollowedReach
     from sros_tool.explain.zenoh import CheckedLink, ZenohAnswer, ZenohExplanation
     from sros_tool.fleet.robots import Fleet
@@ -439,14 +439,12 @@ def _row(label: str, text: str) -> str:
 
 def _vendor_lines(explanation: DdsExplanation) -> Iterator[str]:
     """Yield the answer for one vendor, or the question with a line for each answer."""
-    from sros_tool.explain.vendors import DistributionComparison, VendorExplanation
+    from sros_tool.explain.vendors import VendorExplanation
 
     if isinstance(explanation, VendorExplanation):
         yield from _answer_lines(explanation.answer, explanation.vendor_why)
-    elif isinstance(explanation, DistributionComparison):
-        yield from _distribution_lines(explanation)
     else:
-        yield from _table_lines(explanation.vendors)
+        yield from _table_lines(explanation)
     yield from _beside_lines(explanation.beside)
 
 
@@ -559,31 +557,20 @@ def _change_lines(change: PolicyChange) -> Iterator[str]:
         yield from (f"      {line}" for line in change.document.splitlines())
 
 
-def _table_lines(answers: Sequence[Answer]) -> Iterator[str]:
-    """Yield the question, one line for each vendor, and the vendors that differ."""
-    from sros_tool.explain.vendors import differences
-
-    yield f"may {answers[0].enclave.name} {answers[0].question}?"
-    width = max(len(answer.vendor.title) for answer in answers)
-    for answer in answers:
-        remark = " (as documented)" if answer.as_documented else ""
-        reason = answer.decision.clause
-        yield f"  {answer.vendor.title:{width}}  {answer.outcome:11}  {reason}{remark}"
-    yield differences(answers)
-
-
-def _distribution_lines(compared: DistributionComparison) -> Iterator[str]:
-    """Yield the question, one line for each DDS of each distribution, and those that differ."""
-    answers = compared.distributions
+def _table_lines(compared: Comparison) -> Iterator[str]:
+    """Yield the question, one line for each answer, and who decides differently."""
     yield f"may {compared.asked.enclave} {compared.asked.question}?"
-    widths = (
-        max(len(answer.title) for answer in answers),
-        max(len(answer.release) for answer in answers),
-    )
-    for answer in answers:
-        remark = "" if answer.measured else f" (taken to decide as {answer.answer.vendor.title})"
-        row = f"{answer.title:{widths[0]}}  {answer.release:{widths[1]}}"
-        yield f"  {row}  {answer.outcome:11}  {answer.answer.decision.clause}{remark}"
+    rows = [
+        (answer.vendor.title, "", answer, " (as documented)" if answer.as_documented else "")
+        for answer in compared.vendors or ()
+    ]
+    for each in compared.distributions or ():
+        remark = "" if each.measured else f" (taken to decide as {each.decided_as.title})"
+        rows.append((each.shipped.distribution.title, f"  {each.release}", each.answer, remark))
+    widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
+    for name, release, answer, remark in rows:
+        row = f"{name:{widths[0]}}{release:{widths[1]}}"
+        yield f"  {row}  {answer.outcome:11}  {answer.decision.clause}{remark}"
     yield compared.sentence
 
 

@@ -56,39 +56,17 @@ class VendorExplanation(NamedTuple):
         return self.answer.allowed
 
 
-@shows("asked", "vendors", "differ", "beside", spread=("asked", "beside"))
-class VendorComparison(NamedTuple):
-    """The decisions of all DDS vendors.
-
-    ``allowed`` is the decision of the chosen vendor.
-    """
-
-    asked: Asked
-    vendors: Sequence[Answer]
-    """The decision of each vendor."""
-    beside: ZenohBeside | None
-    allowed: bool
-    notes: tuple[Note, ...]
-
-    @property
-    def differ(self) -> bool:
-        """Whether the vendors decide differently."""
-        return len({vendor.outcome for vendor in self.vendors}) > 1
-
-
 @shows("distribution", "release", "measured", "decided_as", "outcome", "reason", "text")
 class DistributionAnswer(NamedTuple):
     """The decision of a DDS that a distribution of ROS 2 ships."""
 
-    distribution: str
-    """Name of the distribution, such as ``jazzy``."""
     shipped: Shipped
     answer: Answer
 
     @property
-    def title(self) -> str:
-        """Name of the distribution for messages."""
-        return self.distribution.capitalize()
+    def distribution(self) -> str:
+        """Name of the distribution, such as ``jazzy``."""
+        return self.shipped.distribution.name
 
     @property
     def release(self) -> str:
@@ -121,16 +99,23 @@ class DistributionAnswer(NamedTuple):
         return self.answer.text
 
 
-@shows("asked", "distributions", "differ", "beside", spread=("asked", "beside"))
-class DistributionComparison(NamedTuple):
-    """The decisions in all supported distributions of ROS 2.
+@shows(
+    *("asked", "vendors", "distributions", "differ", "beside"),
+    optional=("vendors", "distributions"),
+    spread=("asked", "beside"),
+)
+class Comparison(NamedTuple):
+    """The decisions of all DDS vendors, or of the DDS of all supported distributions.
 
     ``allowed`` is the decision of the chosen vendor.
     """
 
     asked: Asked
-    distributions: Sequence[DistributionAnswer]
-    """The decision of each DDS of each distribution, the earliest distribution first."""
+    vendors: Sequence[Answer] | None
+    """The decision of each vendor; present only with ``--all-vendors``."""
+    distributions: Sequence[DistributionAnswer] | None
+    """The decision of each DDS of each distribution, the earliest distribution first; present only
+    with ``--all-distros``."""
     beside: ZenohBeside | None
     allowed: bool
     notes: tuple[Note, ...]
@@ -138,21 +123,18 @@ class DistributionComparison(NamedTuple):
     @property
     def differ(self) -> bool:
         """Whether the decisions differ."""
-        return len({answer.outcome for answer in self.distributions}) > 1
+        return len({answer.outcome for answer in self.vendors or self.distributions or ()}) > 1
 
     @property
     def sentence(self) -> str:
-        """Which distributions decide differently than the earliest one, as a sentence."""
-        first = self.distributions[0]
-        others = [answer for answer in self.distributions if answer.outcome != first.outcome]
-        if not others:
-            return "all distributions decide alike"
-        texts = [f"{answer.title} with {answer.release} ({answer.outcome})" for answer in others]
-        begin = f"{first.title} with {first.release} ({first.outcome})"
-        return f"DISTRIBUTIONS DIFFER: {begin}, but {', '.join(texts)}"
+        """Who decides differently than the first vendor or distribution, as a sentence."""
+        if self.vendors:
+            return _vendor_differences(self.vendors)
+        decided = [(each.shipped.title, each.outcome) for each in self.distributions or ()]
+        return _differences("distributions", decided)
 
 
-DdsExplanation = VendorExplanation | VendorComparison | DistributionComparison
+DdsExplanation = VendorExplanation | Comparison
 
 
 class Compared(Enum):
@@ -193,33 +175,37 @@ def explain_on_dds(
     if every is Compared.VENDORS:
         others = {v: Evaluator(v, enclave, context) for v in Vendor if v is not vendor}
         answers = [answer if v is vendor else explain(others[v], question) for v in Vendor]
-        return VendorComparison(what, answers, beside, answer.allowed, notes)
+        return Comparison(what, answers, None, beside, answer.allowed, notes)
     if every is Compared.DISTRIBUTIONS:
         deciding = {v for distribution in SUPPORTED for v in distribution.vendors}
         by_vendor = {v: Evaluator(v, enclave, context).answer(question) for v in deciding}
         by_distribution = [
-            DistributionAnswer(distribution.name, shipped, by_vendor[shipped.vendor])
+            DistributionAnswer(shipped, by_vendor[shipped.vendor])
             for distribution in SUPPORTED
             for shipped in distribution.shipped
         ]
-        return DistributionComparison(what, by_distribution, beside, answer.allowed, notes)
+        return Comparison(what, None, by_distribution, beside, answer.allowed, notes)
     measured = [
         answer if v is vendor else Evaluator(v, enclave, context).answer(question)
         for v in PRINCIPAL
     ]
     if len({each.outcome for each in measured}) > 1:
-        notes = (*notes, Note("explain.vendors-differ", f"{differences(measured)}."))
+        notes = (*notes, Note("explain.vendors-differ", f"{_vendor_differences(measured)}."))
     return VendorExplanation(what, answer, why, beside, notes)
 
 
-def differences(answers: Sequence[Answer]) -> str:
+def _vendor_differences(answers: Sequence[Answer]) -> str:
     """Return a sentence that names the vendors whose outcome differs from the first vendor's."""
-    first = answers[0]
-    others = [answer for answer in answers if answer.outcome is not first.outcome]
+    return _differences("vendors", [(answer.vendor.title, answer.outcome) for answer in answers])
+
+
+def _differences(who: str, decided: Sequence[tuple[str, Outcome]]) -> str:
+    """Return a sentence on those that decide otherwise than the first; all with their titles."""
+    title, first = decided[0]
+    others = [f"{other} ({outcome})" for other, outcome in decided if outcome != first]
     if not others:
-        return "all vendors decide alike"
-    listed = ", ".join(f"{answer.vendor.title} ({answer.outcome})" for answer in others)
-    return f"VENDORS DIFFER: {first.vendor.title} ({first.outcome}), but {listed}"
+        return f"all {who} decide alike"
+    return f"{who.upper()} DIFFER: {title} ({first}), but {', '.join(others)}"
 
 
 # ── notes ──────────────────────────────────────────────────────────────────────────────────

@@ -6,6 +6,7 @@ as the DDS vendors match.
 
 `overlap` and `covers` compare two expressions, `Names` searches many.  `common_name` compares any
 number, also with exceptions, and returns an example; it only considers valid absolute ROS names.
+`listed` writes an expression as several without ``?`` and sets of characters.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import translate
 from functools import cache, cached_property, lru_cache, reduce
+from itertools import product
+from math import prod
 from operator import and_
+from string import ascii_letters, digits
 from typing import TYPE_CHECKING
 
 from sros_tool.errors import DocumentError
@@ -32,6 +36,9 @@ _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
 _ALPHABET = frozenset(map(chr, range(33, 127)))  # wider than ROS names: DDS topics may be foreign
 _ANY = frozenset([""])
 """The pattern piece for ``*``."""
+_ROS_LETTERS = f"_{digits}{ascii_letters}/"
+_CHOICE = re.compile(r"\[(!?)([^\]]+)\]|(\?)|([^?\[]+)")
+_STARS = re.compile(r"\*\*+")
 
 
 @lru_cache(maxsize=_MANY)
@@ -446,3 +453,38 @@ def _search(wanted: tuple[str, ...], unwanted: tuple[str, ...], absolute: bool) 
 
     both = reduce(and_, map(_names_of, wanted), _ros_names(absolute))
     return (both - NameSet.union(map(_names_of, unwanted))).example()
+
+
+# ── what characters stand for ──────────────────────────────────────────────────────────────
+
+
+class TooManyNames(Exception):  # noqa: N818 - the caller makes an error of it
+    """An expression stands for too many others."""
+
+
+def listed(expression: str, most: int) -> list[str]:
+    """Return expressions whose only wildcard is ``*`` and that match the same ROS names.
+
+    A ``?`` is any character of ROS names.
+
+    Raises:
+        TooManyNames: there are more than ``most``.
+    """
+    if "?" not in expression and "[" not in expression:
+        return [_STARS.sub("*", expression)]
+    pieces = [_choices(*match.groups()) for match in _CHOICE.finditer(expression)]
+    if prod(map(len, pieces)) > most:
+        raise TooManyNames
+    names = ("".join(choice) for choice in product(*pieces))
+    # "/" next to another one or at the end is in no name.
+    found = (_STARS.sub("*", name) for name in names if "//" not in name and name[-1:] != "/")
+    return list(dict.fromkeys(found))
+
+
+def _choices(negated: str, members: str, one: str, text: str) -> Sequence[str]:
+    if text:
+        return [text]
+    if one:
+        return _ROS_LETTERS
+    chosen = _members(members)
+    return [letter for letter in _ROS_LETTERS if (letter in chosen) is not bool(negated)]

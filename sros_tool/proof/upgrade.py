@@ -89,23 +89,6 @@ _ZENOH = "zenoh"
 _KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 
 
-class Stage(NamedTuple):
-    """A DDS of a distribution, by which a keystore is decided."""
-
-    distribution: Distribution
-    shipped: Shipped
-
-    @property
-    def vendor(self) -> Vendor:
-        """The vendor by whose rules it decides."""
-        return self.shipped.vendor
-
-    @property
-    def title(self) -> str:
-        """Text such as ``Kilted with Fast DDS 3.2``."""
-        return f"{self.distribution.title} with {self.shipped.release}"
-
-
 @dataclass(frozen=True, slots=True)
 class DecidedFiles:
     """The enclaves of a keystore or policy, which two distributions decide.
@@ -285,9 +268,8 @@ def _upgrade(
         if distribution.assumption:
             yield NOT_MEASURED.found(f"ROS 2 {distribution.title}", distribution.assumption)
     for old, new in _products(before, after, vendor):
-        stages = Stage(before, old), Stage(after, new)
-        yield from _not_measured(*stages)
-        for change in changes(files, *stages):
+        yield from _not_measured(old, new)
+        for change in changes(files, old, new):
             kind = _KINDS[change.kind]
             yield kind.found(change.enclave, change.text, change.file, remedy=change.remedy)
     yield from _nodes(files, before, after)
@@ -360,14 +342,14 @@ def check_distributions(
     return joined(findings)
 
 
-def _pairs(distributions: Sequence[Distribution]) -> Iterator[tuple[Stage, Stage]]:
+def _pairs(distributions: Sequence[Distribution]) -> Iterator[tuple[Shipped, Shipped]]:
     """Yield the first release of each product with each other one that decides differently."""
-    by_product: dict[str, dict[Vendor, Stage]] = {}
+    by_product: dict[str, dict[Vendor, Shipped]] = {}
     for distribution in distributions:
         for shipped in distribution.shipped:
-            stages = by_product.setdefault(shipped.product, {})
-            stages.setdefault(shipped.vendor, Stage(distribution, shipped))
-    for first, *others in (list(stages.values()) for stages in by_product.values()):
+            releases = by_product.setdefault(shipped.product, {})
+            releases.setdefault(shipped.vendor, shipped)
+    for first, *others in (list(releases.values()) for releases in by_product.values()):
         yield from ((first, other) for other in others)
 
 
@@ -390,7 +372,7 @@ class DecisionChange(NamedTuple):
     remedy: str = ""
 
 
-def changes(files: DecidedFiles, before: Stage, after: Stage) -> Iterator[DecisionChange]:
+def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[DecisionChange]:
     """Yield the decisions in which two distributions differ; on the first domain that has some.
 
     Raises:
@@ -399,15 +381,15 @@ def changes(files: DecidedFiles, before: Stage, after: Stage) -> Iterator[Decisi
     if before.vendor is after.vendor:
         return
     by_vendors = AccessByVendors(files.source)
-    lenders = {stage.vendor: files.lenders(stage.vendor) for stage in (before, after)}
+    lenders = {each.vendor: files.lenders(each.vendor) for each in (before, after)}
     for name, enclave in files.decided():
         numbers = files.domains(enclave)
         for number in numbers:
             context = JoinContext(number, files.at, files.zone)
             where = f"on domain {number}, " if len(numbers) > 1 else ""
             sides = [
-                _Decided(stage, files, name, context, lenders[stage.vendor].get(name, ()))
-                for stage in (before, after)
+                _Decided(shipped, files, name, context, lenders[shipped.vendor].get(name, ()))
+                for shipped in (before, after)
             ]
             if found := list(_of_enclave(files, name, sides, number, where, by_vendors)):
                 yield from found
@@ -419,15 +401,15 @@ class _Decided:
 
     def __init__(
         self,
-        stage: Stage,
+        shipped: Shipped,
         files: DecidedFiles,
         name: str,
         context: JoinContext,
         lenders: Sequence[str],
     ) -> None:
         own = files.enclaves[name]
-        self.stage = stage
-        participant = VendorParticipant(stage.vendor, own, context)
+        self.shipped = shipped
+        participant = VendorParticipant(shipped.vendor, own, context)
         self.causes = participant.causes()
         lent = (
             own._replace(
@@ -437,7 +419,7 @@ class _Decided:
             )
             for lender in lenders
         )
-        others = (VendorParticipant(stage.vendor, each, context).access for each in lent)
+        others = (VendorParticipant(shipped.vendor, each, context).access for each in lent)
         usable = (participant.access, *others) if participant.access else ()
         self.access: tuple[Access, ...] = tuple(filter(None, usable))
 
@@ -473,11 +455,13 @@ def _of_enclave(
     file = files.place(name, PERMISSIONS_FILE)
     for kind, one, other in ((_MORE, old, new), (_LESS, new, old)):
         gains = list(
-            by_vendors.added(name, one.access, other.access, other.stage.vendor, domain, names)
+            by_vendors.added(name, one.access, other.access, other.shipped.vendor, domain, names)
         )
         if gains:
             accesses = first_few(list(dict.fromkeys(map(_words, gains))), _SHOWN, "; ", "; and ")
-            opened = f"{where}{accesses}: open on {other.stage.title}, closed on {one.stage.title}"
+            opened = (
+                f"{where}{accesses}: open on {other.shipped.title}, closed on {one.shipped.title}"
+            )
             yield DecisionChange(kind, name, opened, file)
 
 
@@ -489,8 +473,8 @@ def _words(gain: Gain) -> str:
 
 
 def _verdict(side: _Decided) -> str:
-    clauses = [refusal_clause(cause, [side.stage.title]) for cause in side.causes]
-    return "; ".join(clauses) or f"{side.stage.title} accepts it"
+    clauses = [refusal_clause(cause, [side.shipped.title]) for cause in side.causes]
+    return "; ".join(clauses) or f"{side.shipped.title} accepts it"
 
 
 def _refusal(
@@ -504,13 +488,13 @@ def _refusal(
     return DecisionChange(kind, name, text, files.place(name, cause.file), remedy)
 
 
-def _not_measured(before: Stage, after: Stage) -> Iterator[Finding]:
-    for stage in dict.fromkeys((before, after)):
-        if not stage.shipped.measured:
+def _not_measured(before: Shipped, after: Shipped) -> Iterator[Finding]:
+    for shipped in dict.fromkeys((before, after)):
+        if not shipped.measured:
             same = before.vendor is after.vendor
             blind = ", so that no difference between both can be seen" if same else ""
-            text = f"{stage.shipped}{blind}"
-            yield NOT_MEASURED.found(f"ROS 2 {stage.distribution.title}", text)
+            text = f"{shipped}{blind}"
+            yield NOT_MEASURED.found(f"ROS 2 {shipped.distribution.title}", text)
 
 
 def _nodes(files: DecidedFiles, before: Distribution, after: Distribution) -> Iterator[Finding]:

@@ -19,9 +19,8 @@ from string import ascii_lowercase
 from typing import NamedTuple
 
 from sros_tool.names import is_expression
-from sros_tool.policy.choices import TooManyNames, listed
 from sros_tool.policy.model import ALLOW
-from sros_tool.policy.patterns import Names, covers, overlap
+from sros_tool.policy.patterns import Names, TooManyNames, covers, listed, overlap
 from sros_tool.policy.rights import (
     CHANGING_NODES,
     OWN_SERVICES,

@@ -18,10 +18,6 @@ from typing import NamedTuple
 
 from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
 from sros_tool.names import check_enclave_name, expression_problem, is_expression
-from sros_tool.policy.choices import (
-    TooManyNames,
-    listed,
-)
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
@@ -33,7 +29,14 @@ from sros_tool.policy.model import (
     Profiles,
     Source,
 )
-from sros_tool.policy.patterns import ComparisonLimit, Names, covers, overlap
+from sros_tool.policy.patterns import (
+    ComparisonLimit,
+    Names,
+    TooManyNames,
+    covers,
+    listed,
+    overlap,
+)
 from sros_tool.policy.rights import (
     KIND_OF,
     RIGHT_ORDER,

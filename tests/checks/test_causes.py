@@ -182,3 +182,11 @@ def test_a_folder_of_an_enclave_alone_can_be_checked_as_the_message_says(
     assert steps and steps[1] == str(alone)
     shutil.copytree(alone, tmp_path / "robot/enclaves/robot7")
     assert sros("check", tmp_path / "robot").status in (0, 1)
+
+
+def test_enclaves_without_the_revocation_list_share_one_finding(bench: Bench) -> None:
+    bench.revoke(linked=False)
+    found = keystore_findings(Keystore(bench.root), now=bench.now)
+    assert [finding.subject for finding in found if finding.id == "enclave.crl-missing"] == [
+        "/arm, /base"
+    ]

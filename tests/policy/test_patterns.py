@@ -15,7 +15,9 @@ from sros_tool.names import is_expression
 from sros_tool.policy.patterns import (
     ComparisonLimit,
     Names,
+    TooManyNames,
     covers,
+    listed,
     literal_prefix,
     matches,
     overlap,
@@ -169,3 +171,25 @@ def test_too_many_comparisons_are_refused() -> None:
     with pytest.raises(DocumentError, match=r"too many .* to be compared"):
         for each in names:
             list(found.covering(each + "c"))
+
+
+NAMES = ("/a", "/b", "/ab", "/az", "/a9", "/a/b", "/aab", "/ac", "/a9b", "/bZ", "/c_")
+
+
+@pytest.mark.parametrize(
+    ("expression", "count"),
+    [("/a", 1), ("/a*", 1), ("/a?", 63), ("/a?b", 64), ("/[ab][!a-z]", 2 * 37), ("/[a/]b", 1)],
+)
+def test_choices_of_characters_are_listed(expression: str, count: int) -> None:
+    found = listed(expression, 4096)
+    assert len(found) == count
+    for name in NAMES:
+        if name not in ("/a/b",):  # a "/" in a set stands for itself
+            assert any(matches(each, name) for each in found) == matches(expression, name), name
+
+
+def test_too_many_choices_are_refused() -> None:
+    assert len(listed("/[a-h][a-h]", 64)) == 64
+    for expression in ("/[a-h][a-i]", "/???", "/" + "?" * 900):
+        with pytest.raises(TooManyNames):
+            listed(expression, 64)

@@ -24,7 +24,7 @@ from sros_tool.files import policies_dir
 from sros_tool.fleet.fleet_file import read_fleet
 from sros_tool.keystore.fleet import stated_distributions
 from sros_tool.keystore.reader import Keystore
-from sros_tool.proof.upgrade import Stage, changes, check_distributions, check_upgrade, signed_files
+from sros_tool.proof.upgrade import changes, check_distributions, check_upgrade, signed_files
 from tests.checks.bench import DAY, SECRET, Bench, name_of
 from tests.checks.keystore_cases import IS_CA, own_signature, with_zenoh
 from tests.checks.test_vendor_refusals import (
@@ -243,8 +243,7 @@ def test_an_update_changes_nothing_of_shipped_policies(tmp_path: Path) -> None:
     keystore = Keystore(root)
     assert len(keystore.names) > 20
     first, *others = (
-        Stage(SUPPORTED[0], Shipped(vendor.traits.product, vendor.release, vendor))
-        for vendor in MEASURED
+        Shipped(vendor.traits.product, vendor.release, vendor, SUPPORTED[0]) for vendor in MEASURED
     )
     files = signed_files(keystore, at=now())
     # Many wildcards take long, unless both vendors have the same style of them.

@@ -23,6 +23,7 @@ from sros_tool.checks.keystores.documents import (
     governance_findings,
 )
 from sros_tool.checks.keystores.enclaves import (
+    CRL_MISSING,
     EVERYTHING,
     LONG_PERMISSIONS,
     NOT_UNIQUE,
@@ -72,9 +73,9 @@ _NAMES_SHOWN = 3
 _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
 """Ids of findings that a setting of the keystore causes in all enclaves."""
 _OF_SEVERAL_FILES = frozenset(
-    {REFUSED.id, SOME_REFUSE.id, *(kind.id for kind in upgrade.OF_ENCLAVES)}
+    {REFUSED.id, SOME_REFUSE.id, CRL_MISSING.id, *(kind.id for kind in upgrade.OF_ENCLAVES)}
 )
-"""Ids of findings that have one cause if their texts are equal, such as a shared CA."""
+"""Ids of findings that have one cause if their texts are equal, such as a shared CA or list."""
 
 
 @of_one_state
