@@ -93,7 +93,7 @@ def focused(
     focuses = tuple(system.focus(kind, name) for kind, name in wanted)
     if routers > 1:
         left_out = f"; what passes between the {routers} routers of Zenoh is not considered"
-        focuses = tuple(replace(each, sentence=f"{each.sentence}{left_out}") for each in focuses)
+        focuses = tuple(replace(focus, sentence=f"{focus.sentence}{left_out}") for focus in focuses)
     picture = system.with_shortest_paths(replace(picture, focus=focuses))
     flow = FocusFlow.of(picture)
     edges = tuple(edge for edge in picture.edges if flow.has(edge))
@@ -152,7 +152,7 @@ class FocusFlow:
             ):
                 for enclave, hops in (
                     *((enclave, 1) for enclave in near),
-                    *((one.enclave, one.hops) for one in far),
+                    *((enclave.enclave, enclave.hops) for enclave in far),
                 ):
                     hops_of[enclave] = min(hops, hops_of.get(enclave, hops))
         for edge in picture.edges:
@@ -165,8 +165,8 @@ class FocusFlow:
             for side in (0, 1):
                 ends[edge.kind, edge.name][side].update(flow._stages(edge)[side])
         stages = {
-            key: tuple(sorted((one & other) | ({0} if key in targets else set())))
-            for key, (one, other) in ends.items()
+            key: tuple(sorted((sent & received) | ({0} if key in targets else set())))
+            for key, (sent, received) in ends.items()
         }
         return replace(flow, stages={key: stage for key, stage in stages.items() if stage})
 

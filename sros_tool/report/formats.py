@@ -137,8 +137,8 @@ def render_svg(picture: Picture, scene: Scene) -> str:
     rank = {OverlaySide.BOTH: 0, OverlaySide.FIRST: 1, OverlaySide.SECOND: 2}
     for link in sorted(
         scene.links,
-        key=lambda each: (
-            *(each.violates, each.qualifier is not ALLOW, each.differs, rank[each.mark]),
+        key=lambda link: (
+            *(link.violates, link.qualifier is not ALLOW, link.differs, rank[link.mark]),
         ),
     ):
         lines.append(_link(link, cards, picture.overlay))
@@ -370,8 +370,8 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
         colour = _DENIED if red else _COLOURS[link.mark]
         styles[colour].append(number)
     lines += [
-        f"  linkStyle {','.join(map(str, found))} stroke:{colour}"
-        for colour, found in sorted(styles.items())
+        f"  linkStyle {','.join(map(str, links))} stroke:{colour}"
+        for colour, links in sorted(styles.items())
     ]
     return "\n".join((*lines, ""))
 
@@ -406,19 +406,19 @@ def _title(picture: Picture) -> str:
 
 def _once(scene: Scene) -> Mapping[str, Card]:
     """Map node ids to cards; the two cards of an enclave become one node."""
-    found: dict[str, Card] = {}
-    for card in sorted(scene.cards, key=lambda each: (each.role, each.members, each.column)):
-        found.setdefault(_key(card.id), card)
-    return found
+    cards: dict[str, Card] = {}
+    for card in sorted(scene.cards, key=lambda card: (card.role, card.members, card.column)):
+        cards.setdefault(_key(card.id), card)
+    return cards
 
 
 def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
     """Map groups to the node ids of their enclaves; empty if there is only one group."""
-    found: dict[str, list[str]] = defaultdict(list)
+    groups: dict[str, list[str]] = defaultdict(list)
     for key, card in cards.items():
         if card.role == "enclave":
-            found[card.group].append(key)
-    return dict(sorted(found.items())) if len(found) > 1 else {}
+            groups[card.group].append(key)
+    return dict(sorted(groups.items())) if len(groups) > 1 else {}
 
 
 def _key(card: str) -> str:
@@ -461,7 +461,7 @@ def _link_label(picture: Picture, link: Link) -> str:
 
 
 def _dot_node(scene: Scene, key: str, card: Card) -> str:
-    texts = [_escaped(each) for each in _texts(scene, card)]
+    texts = [_escaped(text) for text in _texts(scene, card)]
     label = r"\l".join((*texts, "") if len(texts) > 1 else texts)
     shape = ", style=filled, fillcolor=white, shape=note" if card.role == "names" else ""
     return f'{_quoted(key)} [label="{label}"{shape}]'
@@ -507,14 +507,14 @@ def _end(card: str) -> str:
 def _id(key: str) -> str:
     """Return a unique identifier of ASCII letters and digits for a key."""
     plain = "".join(
-        each if each.isalnum() and each.isascii() else f"_{ord(each):x}_" for each in key
+        letter if letter.isalnum() and letter.isascii() else f"_{ord(letter):x}_" for letter in key
     )
     return f"{plain}_"
 
 
 def _entities(text: str) -> str:
     """Return ``text`` with all markup characters escaped as Mermaid's numbered entities."""
-    return re.sub(r"[^A-Za-z0-9 /_.,:+-]", lambda found: f"#{ord(found[0])};", visible_line(text))
+    return re.sub(r"[^A-Za-z0-9 /_.,:+-]", lambda letter: f"#{ord(letter[0])};", visible_line(text))
 
 
 def _yaml(text: str) -> str:

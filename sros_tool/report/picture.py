@@ -423,8 +423,8 @@ class DifferentUnit(NamedTuple):
     def sentence(self) -> str:
         """Return the difference as a sentence without a full stop."""
         parts = []
-        for has, found in (("it has", self.more), ("it lacks", self.fewer)):
-            parts += [f"{has} {first_few(found, _SHOWN, '; ')}"] if found else []
+        for has, rights in (("it has", self.more), ("it lacks", self.fewer)):
+            parts += [f"{has} {first_few(rights, _SHOWN, '; ')}"] if rights else []
         usual = self.usual.strip("{}").replace("…", " … ")
         return f"{self.unit.strip('{}')} differs from {usual}: {', and '.join(parts)}"
 
@@ -466,12 +466,12 @@ class Picture:
     @property
     def headlines(self) -> tuple[str, ...]:
         """The answers of the picture, as sentences without a full stop."""
-        found = self.requirements.sentences() if self.requirements else ()
+        requirements = self.requirements.sentences() if self.requirements else ()
         equal = (f"{units.title} are drawn as one" for units in self.equal)
         more = len(self.different) - _SAID
         different = [unit.sentence() for unit in self.different[:_SAID]]
         different += [f"{more} more differ"] if more > 0 else []
-        return (*(each.sentence for each in self.focus), *found, *equal, *different)
+        return (*(focus.sentence for focus in self.focus), *requirements, *equal, *different)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -547,9 +547,9 @@ def fold(
     bundles: dict[tuple[str, Protection, frozenset[Tie], bool, Lack], list[str]]
     bundles = defaultdict(list)
     for name in names:
-        if found := ties.get((name.kind, name.name)):
+        if name_ties := ties.get((name.kind, name.name)):
             asking = apart and asks(name)
-            bundles[name.kind, name.protection, frozenset(found), asking, name.lacks].append(
+            bundles[name.kind, name.protection, frozenset(name_ties), asking, name.lacks].append(
                 name.name
             )
     folded = (
@@ -557,13 +557,13 @@ def fold(
             kind,
             protection,
             tuple(sorted(members)),
-            tuple(sorted(found, key=_order)),
+            tuple(sorted(bundle_ties, key=_order)),
             asks=asking,
             lacks=lacks,
         )
-        for (kind, protection, found, asking, lacks), members in bundles.items()
+        for (kind, protection, bundle_ties, asking, lacks), members in bundles.items()
     )
-    return tuple(sorted(folded, key=lambda each: (_KINDS.index(each.kind), each.names)))
+    return tuple(sorted(folded, key=lambda bundle: (_KINDS.index(bundle.kind), bundle.names)))
 
 
 def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
@@ -571,13 +571,13 @@ def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
 
     Denials and differences stay separate, because users look for them.
     """
-    found: dict[tuple[object, ...], list[Bundle]] = defaultdict(list)
+    alike: dict[tuple[object, ...], list[Bundle]] = defaultdict(list)
     for bundle in bundles:
         plain = all(map(is_plain, bundle.ties))
         senders = frozenset((tie.node, tie.right) for tie in bundle.ties if tie.sends)
         apart = None if plain and senders else bundle.ties
-        found[bundle.kind, bundle.protection, senders, apart, bundle.lacks].append(bundle)
-    return tuple(_joined(each) for each in found.values())
+        alike[bundle.kind, bundle.protection, senders, apart, bundle.lacks].append(bundle)
+    return tuple(_joined(bundles) for bundles in alike.values())
 
 
 def _joined(bundles: Sequence[Bundle]) -> Bundle:

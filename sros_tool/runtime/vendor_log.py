@@ -660,7 +660,7 @@ RUNS_OPEN = _text(
     "it does not start",
     f"If it runs, stop it. Then {_NAMED}", weak=4,
 )  # fmt: skip
-"""The meaning of the line in which rcl names the enclave /, where no error follows."""
+"""The meaning of rcl's line about the enclave /, in a log without an error after it."""
 
 _STYLES = (
     (Vendor.CYCLONE, re.compile(r"\A\d+\.\d+ \[\d*\]\s+\S+: ")),
@@ -749,7 +749,7 @@ def endpoint_refusal(text: str) -> str:
 
 
 def _first_refusal(refused: Refused, text: str) -> str:
-    patterns = [each.pattern for each in LOG_TEXTS if each.refuses is refused]
+    patterns = [text.pattern for text in LOG_TEXTS if text.refuses is refused]
     for line in plain_text(text).splitlines():
         if any(pattern.search(line) for pattern in patterns):
             return plain_refusal(line)
@@ -765,7 +765,7 @@ def denied_topic(line: str) -> tuple[Vendor, re.Match[str]] | None:
 
 
 _TOPIC_DENIED = [
-    (each.vendor, each.pattern) for each in LOG_TEXTS if each.id == "topic-denied" and each.vendor
+    (text.vendor, text.pattern) for text in LOG_TEXTS if text.id == "topic-denied" and text.vendor
 ]
 
 
@@ -1025,7 +1025,7 @@ def dropped_messages(lines: Iterable[tuple[int, str, str]]) -> Iterator[DroppedM
     lines, which contain "Declare/Undeclare", report no message; the lines "Using cached result",
     and lines for keys that were not declared, do.
     """
-    found = []
+    declarations = []
     names: dict[tuple[str, str], str] = {}
     declared: set[tuple[str, str, str]] = set()
     for number, process, text in lines:
@@ -1037,8 +1037,8 @@ def dropped_messages(lines: Iterable[tuple[int, str, str]]) -> Iterator[DroppedM
         if match["message"].startswith(_BOTH):
             declared.add(place)
         else:
-            found.append((number, place, match))
-    for number, (process, zid, key), match in found:
+            declarations.append((number, place, match))
+    for number, (process, zid, key), match in declarations:
         if match["cached"] or (process, zid, key) not in declared:
             name, ingress = names.get((process, zid), ""), match["flow"] == "ingress"
             yield DroppedMessage(number, process, zid, name, match["message"], ingress, key)

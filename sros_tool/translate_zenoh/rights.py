@@ -82,9 +82,9 @@ _UNTYPED = ("*", "*")
 """Type and hash in rules that sros did not write."""
 ANY_TYPE = "any::type/hash"
 """An example of a type and its hash: the rules of sros decide the same for every type."""
-_BELOW_TOPICS = (ANY_CHUNKS,) if any(each.below_topics for each in RELEASES) else ()
+_BELOW_TOPICS = (ANY_CHUNKS,) if any(release.below_topics for release in RELEASES) else ()
 _BELOW = {"publish": _BELOW_TOPICS, "subscribe": _BELOW_TOPICS}
-"""Further keys of a right, below its keys, in any release of rmw_zenoh."""
+"""Chunks that some release of rmw_zenoh adds to the keys of a right."""
 _ADVANCED = f"@adv/{ANY_CHUNKS}"
 """Further keys of a topic with history (TRANSIENT_LOCAL), below its key."""
 _M = Message
@@ -157,7 +157,7 @@ def remote_of(
     rules: list[AccessRule] = []
     made_of: dict[tuple[Flow, tuple[Message, ...]], list[Difference]] = {}
     for domain, rights in stated.items():
-        of_names = [each.right for each in rights]
+        of_names = [named.right for named in rights]
         rules += graph_rules(enclave, domain, of_names, nodes)
         for right, keys, difference in _allowed_keys(domain, rights):
             below = tuple([f"{key}/{_ADVANCED}" for key in keys])
@@ -277,7 +277,7 @@ def _allowed_keys(
         wild = {name: place for name, place in places.items() if is_expression(name)}
         difference = Difference(str(domain), end, _forms(wild), _forms(never))
         names = _with_what_is_below(exact | _names_of(difference, right, wild, never))
-        keys = tuple([canonical((str(domain), *each)) + end for each in names])
+        keys = tuple([canonical((str(domain), *name)) + end for name in names])
         # Names of which one is now within a wildcard's expression are part of what makes that.
         made_of = difference._replace(allowed=difference.allowed | exact.difference(names))
         yield right, keys, made_of if wild else None
@@ -288,8 +288,8 @@ def _forms(places: Mapping[str, Source]) -> frozenset[Chunks]:
     return frozenset(
         chunks
         for name, place in places.items()
-        for one in _listed(name, place)
-        for chunks in chunks_of(one)
+        for listed_name in _listed(name, place)
+        for chunks in chunks_of(listed_name)
     )
 
 
@@ -332,14 +332,14 @@ def _cannot_deny(
     )
 
 
-def _with_what_is_below(found: frozenset[Chunks] | set[Chunks]) -> set[Chunks] | frozenset[Chunks]:
+def _with_what_is_below(names: frozenset[Chunks] | set[Chunks]) -> set[Chunks] | frozenset[Chunks]:
     """Return the same names, where a name and all names below it are one expression."""
     below = ("*", ANY_CHUNKS)
-    if not any(each[-1] == ANY_CHUNKS for each in found):
-        return found
-    both = {each for each in found if (*each, *below) in found}
-    return found - both - {(*each, *below) for each in both} | {
-        (*each, ANY_CHUNKS) for each in both
+    if not any(name[-1] == ANY_CHUNKS for name in names):
+        return names
+    both = {name for name in names if (*name, *below) in names}
+    return names - both - {(*name, *below) for name in both} | {
+        (*name, ANY_CHUNKS) for name in both
     }
 
 
@@ -395,10 +395,12 @@ def chunks_of(name: str) -> list[Chunks]:
     if name.startswith("*"):  # a namespace with a wildcard: the star may also stand for nothing
         rest = name[1:]
         return (chunks_of(rest) if rest.startswith("/") else []) + chunks_of(f"/{name}")
-    found: list[list[str]] = [[]]
+    expressions: list[list[str]] = [[]]
     for begin, *others in (part.split("*") for part in name[1:].split("/")):
-        found = [before + each for before in found for each in _chunks_of_part([begin, *others])]
-    return [tuple(canonical(each).split("/")) for each in found]
+        expressions = [
+            before + part for before in expressions for part in _chunks_of_part([begin, *others])
+        ]
+    return [tuple(canonical(chunks).split("/")) for chunks in expressions]
 
 
 def _chunks_of_part(texts: list[str]) -> list[list[str]]:
@@ -406,19 +408,22 @@ def _chunks_of_part(texts: list[str]) -> list[list[str]]:
     if texts == ["", ""]:
         return [["*", ANY_CHUNKS]]
     first, *others = texts
-    found: list[list[str]] = [[first]]
+    expressions: list[list[str]] = [[first]]
     for number, text in enumerate(others):
         if number == 0 and not first:
-            found = [[ANY_CHUNKS, ANY_PART + text]]
+            expressions = [[ANY_CHUNKS, ANY_PART + text]]
         elif number == len(others) - 1 and not text:
-            found = [[*each[:-1], each[-1] + ANY_PART, ANY_CHUNKS] for each in found]
-        else:
-            within = [[*each[:-1], each[-1] + ANY_PART + text] for each in found]
-            across = [
-                [*each[:-1], each[-1] + ANY_PART, ANY_CHUNKS, ANY_PART + text] for each in found
+            expressions = [
+                [*chunks[:-1], chunks[-1] + ANY_PART, ANY_CHUNKS] for chunks in expressions
             ]
-            found = within + across
-    return found
+        else:
+            within = [[*chunks[:-1], chunks[-1] + ANY_PART + text] for chunks in expressions]
+            across = [
+                [*chunks[:-1], chunks[-1] + ANY_PART, ANY_CHUNKS, ANY_PART + text]
+                for chunks in expressions
+            ]
+            expressions = within + across
+    return expressions
 
 
 # ── rules of Zenoh in ROS terms ────────────────────────────────────────────────────────────
@@ -474,9 +479,9 @@ def rights_in_rules(access: Enforcement) -> RightsInRules:
             for rule in access.rules_of(subject.id):
                 for right, key in _uses(rule):
                     qualifier = ALLOW if rule.allows else DENY
-                    found = ros_names(key)
-                    rights |= {Right(enclave, qualifier, right, name) for name in found}
-                    left_out |= set() if found else {key}
+                    of_key = ros_names(key)
+                    rights |= {Right(enclave, qualifier, right, name) for name in of_key}
+                    left_out |= set() if of_key else {key}
     return RightsInRules(frozenset(rights), frozenset(names), tuple(sorted(left_out)))
 
 
@@ -505,9 +510,9 @@ def ros_names(key: str) -> tuple[str, ...]:
             names += [f"{name}/*" for name in names if not name.endswith("*")]
         else:
             names = [f"{name}/{chunk.replace(ANY_PART, '*')}" for name in names]
-    found = sorted({each for each in names if each and not expression_problem(each)})
+    valid = sorted({name for name in names if name and not expression_problem(name)})
     return tuple(
-        each for each in found if not any(one != each and covers(one, each) for one in found)
+        name for name in valid if not any(wide != name and covers(wide, name) for wide in valid)
     )
 
 
@@ -622,7 +627,7 @@ def is_self_limiting(document: ConfigurationDocument) -> bool:
     return (
         document.mode is not Mode.ROUTER
         and bool(used)
-        and not any(each.is_named() for each in used)
+        and not any(subject.is_named() for subject in used)
     )
 
 
@@ -640,7 +645,7 @@ def _rights(
     rules: Sequence[AclRule],
     limit: ComparisonLimit,
 ) -> RightsBehindRules:
-    found: list[StatedName] = []
+    of_subject: list[StatedName] = []
     unsaid: list[tuple[str, str]] = []
     denied: list[tuple[str, str]] = []
 
@@ -652,7 +657,7 @@ def _rights(
             if rule.allows is allows and seen in rule.flows and message in rule.messages
             for key in rule.key_expressions
         )
-        return [each for each in dict.fromkeys(stated) if _BELOW_KEYS not in each.split("/")]
+        return [key for key in dict.fromkeys(stated) if _BELOW_KEYS not in key.split("/")]
 
     for right, place in _DECIDING_MESSAGES.items():
         allowed = keys(place.flow, place.message)
@@ -665,10 +670,12 @@ def _rights(
                 for message, others in needed
                 if not all(others.any(key, includes) for key in _keys_of(domain, name))
             )
-            found.append(StatedName(right, name, domain, lacks))
+            of_subject.append(StatedName(right, name, domain, lacks))
         unsaid += [(right, key) for key in names_of.unsaid()]
         denied += [(right, key) for key in taken]
-    order = sorted(found, key=lambda each: (RIGHT_ORDER[each.right], each.name, each.domain))
+    order = sorted(
+        of_subject, key=lambda stated: (RIGHT_ORDER[stated.right], stated.name, stated.domain)
+    )
     return RightsBehindRules(subject, names, own, tuple(order), tuple(unsaid), tuple(denied))
 
 
@@ -688,18 +695,20 @@ class _ByPrefix:
 
     def __init__(self, expressions: Iterable[str], limit: ComparisonLimit) -> None:
         self._limit = limit
-        self._found: dict[str, list[str]] = {}
+        self._by_begin: dict[str, list[str]] = {}
         for expression in expressions:
             # "/**" and "/*" may stand for nothing, or for a part without the slash.
-            self._found.setdefault(expression.partition("*")[0].rstrip("$/"), []).append(expression)
+            self._by_begin.setdefault(expression.partition("*")[0].rstrip("$/"), []).append(
+                expression
+            )
 
     def any(self, text: str, holds: Callable[[str, str], bool]) -> bool:
         """Return whether ``holds(expression, text)`` for any expression that may match the text."""
         for end in range(len(text) + 1):
-            for each in self._found.get(text[:end], ()):
-                if holds(each, text):
+            for expression in self._by_begin.get(text[:end], ()):
+                if holds(expression, text):
                     return True
-                self._limit.spend(len(each) + len(text))
+                self._limit.spend(len(expression) + len(text))
         return False
 
 
@@ -731,13 +740,15 @@ class _Names:
         return [
             (domain, name)
             for domain, name in sound
-            if not wild[domain].any(name, lambda one, of: one != of and covers(one, of))
+            if not wild[domain].any(
+                name, lambda wide, narrow: wide != narrow and covers(wide, narrow)
+            )
         ]
 
     def _is_sound(self, domain: str, name: str) -> bool:
         return all(
             self._including.any(key, includes)
-            and not any(intersects(each, key) for each in self._denied)
+            and not any(intersects(denied, key) for denied in self._denied)
             for key in _keys_of(domain, name)
         )
 
@@ -759,15 +770,15 @@ def _candidates(key: str) -> Iterator[tuple[str, str]]:
     if not _DOMAIN.fullmatch(domain) or not chunks:
         return
     if chunks[-1] != ANY_CHUNKS:
-        yield from ((domain, each) for each in _texts(chunks[: -len(_UNTYPED)]))
+        yield from ((domain, name) for name in _texts(chunks[: -len(_UNTYPED)]))
         return
     body = chunks[:-1]
     for dropped in range(len(_UNTYPED) + 1):
         base = body[: len(body) - dropped]
         if dropped > len(body) or set(body[len(base) :]) - {"*"}:
             break
-        yield from ((domain, each) for each in _texts(base))
-        yield from ((domain, f"{each}/*") for each in _texts(base) or [""])
+        yield from ((domain, name) for name in _texts(base))
+        yield from ((domain, f"{name}/*") for name in _texts(base) or [""])
 
 
 def _texts(chunks: Sequence[str]) -> list[str]:
@@ -777,8 +788,8 @@ def _texts(chunks: Sequence[str]) -> list[str]:
     text = "/".join(chunks)
     joined = text.replace("$*/**/$*", "*").replace("**/$*", "*").replace("*/**", "*")
     apart = text.replace("**/", "")
-    found = (each.replace("$*", "*").replace("**", "*") for each in (joined, text, apart))
-    return list(dict.fromkeys(f"/{each}" for each in found))
+    names = (name.replace("$*", "*").replace("**", "*") for name in (joined, text, apart))
+    return list(dict.fromkeys(f"/{name}" for name in names))
 
 
 def _pieces(key: str) -> list[str]:
@@ -805,7 +816,7 @@ def enclave_of(rights: RightsBehindRules) -> tuple[str, ...]:
     the node's name there, and uses the enclave of that name.
     """
     named = rights.names or ((f"/{rights.subject}",) if rights.own else ())
-    return tuple(each for each in named if _is_enclave(each))
+    return tuple(name for name in named if _is_enclave(name))
 
 
 def _is_enclave(name: str) -> bool:
@@ -815,27 +826,27 @@ def _is_enclave(name: str) -> bool:
         return False
 
 
-def policy_of(found: Iterable[RightsBehindRules]) -> Policy:
+def policy_of(subjects: Iterable[RightsBehindRules]) -> Policy:
     """Return a policy with the rights of subjects with names; it never has more rights.
 
     The node of each profile is the last part of the enclave's name, as rules name no nodes; all
     names are absolute.
     """
     rights: dict[str, set[Right]] = {}
-    for each in found:
-        for enclave in enclave_of(each):
+    for subject in subjects:
+        for enclave in enclave_of(subject):
             rights.setdefault(enclave, set()).update(
-                Right(enclave, ALLOW, stated.right, stated.name) for stated in each.rights
+                Right(enclave, ALLOW, stated.right, stated.name) for stated in subject.rights
             )
     return Policy(tuple(_enclave(name, folded(of)) for name, of in sorted(rights.items()) if of))
 
 
 def _enclave(name: str, rights: Iterable[Right]) -> Enclave:
     names: dict[str, list[str]] = {}
-    for each in sorted(rights, key=lambda each: (RIGHT_ORDER[each.right], each.name)):
-        names.setdefault(each.right, []).append(each.name)
+    for right in sorted(rights, key=lambda right: (RIGHT_ORDER[right.right], right.name)):
+        names.setdefault(right.right, []).append(right.name)
     groups = tuple(
-        Group(KIND_OF[right], ((right, ALLOW),), tuple(of)) for right, of in names.items()
+        Group(KIND_OF[action], ((action, ALLOW),), tuple(of)) for action, of in names.items()
     )
     node = name.rpartition("/")[2] or "node"
     return Enclave(name, (Profiles((Profile("/", node, groups),)),))

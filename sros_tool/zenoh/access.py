@@ -246,19 +246,19 @@ def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     Rules of the same direction and messages become one rule.  It has no key expression that another
     of its key expressions includes.
     """
-    found: dict[tuple[Flow, tuple[Message, ...], bool], list[tuple[str, ...]]] = {}
+    keys_of_use: dict[tuple[Flow, tuple[Message, ...], bool], list[tuple[str, ...]]] = {}
     for flow, messages, keys, allows in rules:
-        found.setdefault((flow, messages, allows), []).append(keys)
+        keys_of_use.setdefault((flow, messages, allows), []).append(keys)
     return in_order(
         AccessRule(flow, messages, _joined_keys(keys), allows)
-        for (flow, messages, allows), keys in found.items()
+        for (flow, messages, allows), keys in keys_of_use.items()
     )
 
 
 def _joined_keys(keys: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
     if len(keys) == 1 and len(keys[0]) > _FEW:
         return tuple(sorted(keys[0]))
-    return _needed(frozenset(each for some in keys for each in some))
+    return _needed(frozenset(key for some_keys in keys for key in some_keys))
 
 
 @lru_cache(maxsize=16)  # several messages of a right have the same keys
@@ -277,11 +277,11 @@ def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
     """Return the rights of all enclaves together, for a process named ``name``."""
     of_all = list(rights)
     made_of: dict[_Use, dict[Difference, None]] = {}
-    for use, of in (item for each in of_all for item in each.made_of.items()):
+    for use, of in (item for rights in of_all for item in rights.made_of.items()):
         made_of.setdefault(use, {}).update(dict.fromkeys(of))
     return RemoteRights(
         name,
-        joined(rule for each in of_all for rule in each.rules),
+        joined(rule for rights in of_all for rule in rights.rules),
         {use: tuple(of) for use, of in made_of.items()},
     )
 
@@ -297,9 +297,10 @@ class RightsBetween:
         """Take the rights of all enclaves, whose processes connect to each other."""
         self._rules: dict[str, list[_RuleOfPeer]] = {}
         self._mirrored: dict[str, list[_RuleOfPeer]] = {}
-        for each in rights:
-            self._rules[each.common_name] = _RuleOfPeer.of_all(each)
-            self._mirrored[each.common_name] = _RuleOfPeer.of_all(each.mirrored(each.common_name))
+        for peer in rights:
+            name = peer.common_name
+            self._rules[name] = _RuleOfPeer.of_all(peer)
+            self._mirrored[name] = _RuleOfPeer.of_all(peer.mirrored(name))
         self._plain = {
             name: frozenset().union(*(rule_of_peer.keys.plain for rule_of_peer in rules))
             for name, rules in self._rules.items()
@@ -312,7 +313,7 @@ class RightsBetween:
             TooManyExpressions: that takes too many key expressions.
         """
         mine = self._mirrored[own]
-        denied = [each for each in mine if not each.rule.allows]
+        denied = [own for own in mine if not own.rule.allows]
         meeting: dict[_Place, list[tuple[tuple[Message, ...], RuleKeys]]] = {}
         for remote, theirs in self._rules.items():
             shared: dict[_Place, tuple[str, ...]] = {}
@@ -393,9 +394,9 @@ def is_within(remote: RemoteRights, own: RemoteRights) -> bool:
         mine.allows(own.common_name, rule.flow.opposite(), message, key)
         or not theirs.allows(remote.common_name, rule.flow, message, key)
         or any(
-            message in each.messages and own.keys_of(each).include(key)
-            for each in own.rules
-            if each.flow is rule.flow.opposite()
+            message in answering.messages and own.keys_of(answering).include(key)
+            for answering in own.rules
+            if answering.flow is rule.flow.opposite()
         )
         for rule in remote.rules
         if rule.allows
@@ -464,8 +465,9 @@ class AclSubject:
         Two subjects with the same properties do not count: Zenoh joins their common values to one.
         """
         pairs = [(getattr(self, name), getattr(other, name)) for name in PROPERTIES]
-        return any((one is None) is not (two is None) for one, two in pairs) and all(
-            one is None or two is None or not set(one).isdisjoint(two) for one, two in pairs
+        return any((first is None) is not (second is None) for first, second in pairs) and all(
+            first is None or second is None or not set(first).isdisjoint(second)
+            for first, second in pairs
         )
 
 
@@ -680,7 +682,7 @@ class Enforcement:
             values = (getattr(subject, name) or (None,) for name in PROPERTIES)
             for combination in product(*values):
                 ids_of.setdefault(combination, []).append(subject.id)
-        return {one: _once(subjects) for one, subjects in ids_of.items()}
+        return {values: _once(subjects) for values, subjects in ids_of.items()}
 
     @cached_property
     def _rules_of(self) -> Mapping[str, tuple[AclRule, ...]]:

@@ -117,19 +117,21 @@ class ZenohNetwork:
         Raises:
             UsageError: neither of two routers can reach the other.
         """
-        found: dict[str, tuple[str, ...]] = {router.name: () for router in self.every_router()}
-        for one, other in combinations(self.every_router(), 2):
-            for listening, connecting in ((one, other), (other, one)):
+        connections: dict[str, tuple[str, ...]] = {
+            router.name: () for router in self.every_router()
+        }
+        for first, second in combinations(self.every_router(), 2):
+            for listening, connecting in ((first, second), (second, first)):
                 if reachable := _far(listening):
-                    found[connecting.name] += reachable[:1]
+                    connections[connecting.name] += reachable[:1]
                     break
             else:
                 raise UsageError(
-                    f"the routers {one.name} and {other.name} cannot connect to each other",
+                    f"the routers {first.name} and {second.name} cannot connect to each other",
                     "The endpoints of both are on their own host, or they listen there alone.",
                     "Name an endpoint by which another host reaches one of them.",
                 )
-        return found
+        return connections
 
 
 _REVOKED = "last_revocation"
@@ -174,7 +176,7 @@ class Configuration:
 
         The file does not name the files of TLS: a session needs them from elsewhere to open.
         """
-        rights = [render_rights(each) for each in self.access_control.remotes]
+        rights = [render_rights(remote) for remote in self.access_control.remotes]
         return render_configuration(
             self.mode, self.listen, self.connect, rights, self.revoked, settings
         )
@@ -207,11 +209,11 @@ def _control(every: Sequence[RenderedRights], *, once: bool) -> str:
     """Return the access control of a file, with shared rules ``once`` or once for each enclave."""
     rules: dict[str, str] = {}
     lines: dict[str, list[str]] = {"rules": [], "subjects": [], "policies": []}
-    names = [each.name for each in every]
-    every_ids = rule_ids([each.rules for each in every], names, once=once)
-    for each, ids in zip(every, every_ids, strict=True):
-        rules.update(zip(ids, each.rules, strict=True))
-        own = _list([each.name])
+    names = [rights.name for rights in every]
+    every_ids = rule_ids([rights.rules for rights in every], names, once=once)
+    for rights, ids in zip(every, every_ids, strict=True):
+        rules.update(zip(ids, rights.rules, strict=True))
+        own = _list([rights.name])
         lines["subjects"].append(f'   {{"id": {own[1:-1]}, "cert_common_names": {own}}}')
         lines["policies"].append(f'   {{"rules": {_list(ids)}, "subjects": {own}}}')
     lines["rules"] = [f'   {{"id": {_list([name])[1:-1]}, {rule}' for name, rule in rules.items()]
@@ -414,8 +416,8 @@ class RenderedReader:
             by_id[json.loads(begin.removeprefix('   {"id": '))] = f"{mark[2:]}{rest}"
         rights = []
         for name, ids in map(self._policy, policies):
-            rights.append(RenderedRights(name, tuple([by_id[each] for each in ids])))
-        if len({each.name for each in rights}) != len(rights):
+            rights.append(RenderedRights(name, tuple([by_id[rule_id] for rule_id in ids])))
+        if len({rendered.name for rendered in rights}) != len(rights):
             raise ValueError("a subject twice")
         return rights
 
@@ -452,8 +454,8 @@ _MOST_PORT = 65535
 
 def is_endpoint(text: str) -> bool:
     """Return whether ``text`` is ``HOST:PORT``, with a name or an address and a port from 1."""
-    found = _ENDPOINT.match(text)
-    return bool(found and 0 < int(found[1]) <= _MOST_PORT)
+    endpoint = _ENDPOINT.match(text)
+    return bool(endpoint and 0 < int(endpoint[1]) <= _MOST_PORT)
 
 
 def check_network(network: ZenohNetwork) -> None:
@@ -464,7 +466,10 @@ def check_network(network: ZenohNetwork) -> None:
     """
     if network.routers:
         _check_routers(network)
-    connect, listen = ({_place(each) for each in of} for of in (network.endpoints, network.listen))
+    connect, listen = (
+        {_place(endpoint) for endpoint in endpoints}
+        for endpoints in (network.endpoints, network.listen)
+    )
     hosts = {host for host, _ in connect}
     far = sorted(hosts - {_LOOPBACK})
     if network.mode is Mode.PEER and far:
@@ -515,8 +520,8 @@ def _check_routers(network: ZenohNetwork) -> None:
 
 def _far(router: ZenohRouter) -> tuple[str, ...]:
     """Return the endpoints at which other hosts reach a router."""
-    listens = {_place(each)[0] for each in router.listening()}
-    far = tuple(each for each in router.endpoints if _place(each)[0] != _LOOPBACK)
+    listens = {_place(endpoint)[0] for endpoint in router.listening()}
+    far = tuple(endpoint for endpoint in router.endpoints if _place(endpoint)[0] != _LOOPBACK)
     return () if listens == {_LOOPBACK} else far
 
 

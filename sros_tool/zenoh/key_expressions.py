@@ -33,20 +33,20 @@ def canonical(chunks: Iterable[str]) -> str:
     text = "/".join(chunks)
     if ANY_PART not in text and ANY_CHUNKS not in text:
         return text
-    found: list[str] = []
+    ordered: list[str] = []
     for chunk in chunks:
         while ANY_PART + ANY_PART in chunk:
             chunk = chunk.replace(ANY_PART + ANY_PART, ANY_PART)
         if chunk == ANY_PART:
             chunk = ANY_CHUNK
-        if found and found[-1] == ANY_CHUNKS:
+        if ordered and ordered[-1] == ANY_CHUNKS:
             if chunk == ANY_CHUNKS:
                 continue
             if chunk == ANY_CHUNK:
-                found.insert(-1, chunk)
+                ordered.insert(-1, chunk)
                 continue
-        found.append(chunk)
-    return "/".join(found)
+        ordered.append(chunk)
+    return "/".join(ordered)
 
 
 def includes(wide: str, narrow: str) -> bool:
@@ -66,16 +66,16 @@ class KeyExpressions:
     @cached_property
     def _by_begin(self) -> Mapping[str, Mapping[str, Mapping[str, list[str]]]]:
         """The expressions with wildcards, by the text before the wildcard, `_landmark`, `_form`."""
-        found: dict[str, dict[str, dict[str, list[str]]]] = {}
-        for each in self.all:
-            if (begin := _fixed_begin(each)) != each:
-                by_form = found.setdefault(begin, {}).setdefault(_landmark(each), {})
-                by_form.setdefault(_form(each), []).append(each)
-        return found
+        groups: dict[str, dict[str, dict[str, list[str]]]] = {}
+        for expression in self.all:
+            if (begin := _fixed_begin(expression)) != expression:
+                by_form = groups.setdefault(begin, {}).setdefault(_landmark(expression), {})
+                by_form.setdefault(_form(expression), []).append(expression)
+        return groups
 
     @cached_property
     def _sizes(self) -> list[int]:
-        return sorted({len(each) for each in self._by_begin})
+        return sorted({len(begin) for begin in self._by_begin})
 
     def include(self, narrow: str) -> bool:
         """Return whether one of the expressions includes all of ``narrow``."""
@@ -84,29 +84,34 @@ class KeyExpressions:
         return any(
             _includes(wide, narrow)
             for by_form in self._beginning_as(narrow)
-            for some in by_form.values()
-            for wide in some
+            for same_form in by_form.values()
+            for wide in same_form
         )
 
     def needed(self) -> list[str]:
         """Return the sorted expressions that no other one includes; all if there are too many."""
-        forms = {each: _form(each) for each in self.all}
+        forms = {expression: _form(expression) for expression in self.all}
         if len(set(forms.values())) == 1:
             return sorted(self.all)
-        wider = {each: self._beginning_as(each) for each in self.all}
-        compared = sum(len(some) for of in wider.values() for each in of for some in each.values())
+        wider = {expression: self._beginning_as(expression) for expression in self.all}
+        compared = sum(
+            len(same_form)
+            for candidates in wider.values()
+            for by_form in candidates
+            for same_form in by_form.values()
+        )
         if compared > _MOST_COMPARED:
             return sorted(self.all)
         return sorted(
-            each
-            for each, own in forms.items()
+            expression
+            for expression, own_form in forms.items()
             if not any(
-                _includes(wide, each)
-                for by_form in wider[each]
-                for form, some in by_form.items()
+                _includes(wide, expression)
+                for by_form in wider[expression]
+                for form, same_form in by_form.items()
                 # With the same wildcards at the same places, none includes another.
-                if form != own
-                for wide in some
+                if form != own_form
+                for wide in same_form
             )
         )
 
@@ -115,14 +120,14 @@ class KeyExpressions:
 
         They have wildcards, begin as ``narrow`` does, and their landmark is a chunk of it.
         """
-        by_begin, found = self._by_begin, []
+        by_begin, candidates = self._by_begin, []
         chunks = {*_chunks(narrow), ""}
         for size in self._sizes:
             if size > len(narrow):
                 break
             if by_landmark := by_begin.get(narrow[:size]):
-                found += [by_landmark[chunk] for chunk in chunks & by_landmark.keys()]
-        return found
+                candidates += [by_landmark[chunk] for chunk in chunks & by_landmark.keys()]
+        return candidates
 
 
 @lru_cache(maxsize=_MANY)
@@ -153,25 +158,25 @@ def _chunks(expression: str) -> tuple[str, ...]:
 
 
 def _includes(wide: str, narrow: str) -> bool:
-    some, others = _chunks(wide), _chunks(narrow)
-    anywhere = some.count(ANY_CHUNKS)
+    wide_chunks, narrow_chunks = _chunks(wide), _chunks(narrow)
+    anywhere = wide_chunks.count(ANY_CHUNKS)
     if anywhere > 1:
-        return sequence_includes(some, others)
+        return sequence_includes(wide_chunks, narrow_chunks)
     if not anywhere:
-        if len(some) != len(others):
+        if len(wide_chunks) != len(narrow_chunks):
             return False
-        for one, other in zip(some, others, strict=True):
-            if one != other and not _chunk_includes(one, other):
+        for wide_chunk, narrow_chunk in zip(wide_chunks, narrow_chunks, strict=True):
+            if wide_chunk != narrow_chunk and not _chunk_includes(wide_chunk, narrow_chunk):
                 return False
         return True
-    before = some.index(ANY_CHUNKS)
-    after = len(some) - before - 1
-    between = len(others) - after
+    before = wide_chunks.index(ANY_CHUNKS)
+    after = len(wide_chunks) - before - 1
+    between = len(narrow_chunks) - after
     return (
         before <= between
-        and all(map(_chunk_includes, some[:before], others))
-        and all(map(_chunk_includes, some[before + 1 :], others[between:]))
-        and not any(each.startswith("@") for each in others[before:between])
+        and all(map(_chunk_includes, wide_chunks[:before], narrow_chunks))
+        and all(map(_chunk_includes, wide_chunks[before + 1 :], narrow_chunks[between:]))
+        and not any(chunk.startswith("@") for chunk in narrow_chunks[before:between])
     )
 
 
@@ -193,12 +198,12 @@ def sequence_includes(wide: Sequence[str], narrow: Sequence[str]) -> bool:
 
 def _onward(reached: set[int], wide: Sequence[str]) -> set[int]:
     """Return ``reached``, and the places after each ``**``, which may stand for no chunk."""
-    found = set(reached)
+    places = set(reached)
     for at in sorted(reached):
         while at < len(wide) and wide[at] == ANY_CHUNKS:
             at += 1
-            found.add(at)
-    return found
+            places.add(at)
+    return places
 
 
 def _chunk_includes(wide: str, narrow: str) -> bool:
@@ -217,7 +222,7 @@ def _chunk_includes(wide: str, narrow: str) -> bool:
 def widest(expression: str) -> str:
     """Return an expression with ``**`` in place of each chunk that does not begin with ``@``."""
     chunks = expression.split("/")
-    return canonical(each if each.startswith("@") else ANY_CHUNKS for each in chunks)
+    return canonical(chunk if chunk.startswith("@") else ANY_CHUNKS for chunk in chunks)
 
 
 def intersects(one: str, other: str) -> bool:
@@ -244,7 +249,7 @@ def chunks_intersect(one: str, other: str) -> bool:
     if "*" not in one and "*" not in other:
         return False
     # "\0" is no character of a key: here it stands for any characters.
-    left, right = (each.replace(ANY_PART, "\0") for each in (one, other))
+    left, right = (chunk.replace(ANY_PART, "\0") for chunk in (one, other))
     return _sequences_intersect(left, right, "\0", lambda a, b: "\0" in (a, b) or a == b)
 
 
@@ -298,8 +303,8 @@ def common(one: str, other: str) -> list[str]:
         return [one]
     if not intersects(one, other):
         return []
-    found = _common(one.split("/"), other.split("/"), ANY_CHUNKS, common_chunks)
-    return KeyExpressions(canonical(each) for each in found).needed()
+    shared = _common(one.split("/"), other.split("/"), ANY_CHUNKS, common_chunks)
+    return KeyExpressions(canonical(chunks) for chunks in shared).needed()
 
 
 _ANY_LETTERS = "\0"
@@ -318,12 +323,12 @@ def common_chunks(one: str, other: str) -> tuple[str, ...]:
         return ()
     if ANY_CHUNK in (one, other):
         return (other if one == ANY_CHUNK else one,)
-    left, right = (each.replace(ANY_PART, _ANY_LETTERS) for each in (one, other))
-    found = {
-        "".join(each).replace(_ANY_LETTERS, ANY_PART)
-        for each in _common(left, right, _ANY_LETTERS, _common_letters)
+    left, right = (chunk.replace(ANY_PART, _ANY_LETTERS) for chunk in (one, other))
+    shared = {
+        "".join(letters).replace(_ANY_LETTERS, ANY_PART)
+        for letters in _common(left, right, _ANY_LETTERS, _common_letters)
     }
-    return tuple(sorted(found))
+    return tuple(sorted(shared))
 
 
 def _common_letters(one: str, other: str) -> tuple[str, ...]:
@@ -348,23 +353,23 @@ def _common(
         left, right = one[at : at + 1], other[there : there + 1]
         if not left and not right:
             return frozenset({()})
-        found: set[tuple[str, ...]] = set()
-        first, second = (each[0] if each else "" for each in (left, right))
+        sequences: set[tuple[str, ...]] = set()
+        first, second = (members[0] if members else "" for members in (left, right))
         if first == many == second:
             # One of them stands for no more than the other, which goes on.
             for rest in following(at + 1, there) | following(at, there + 1):
-                found.add(rest if rest[:1] == (many,) else (many, *rest))
+                sequences.add(rest if rest[:1] == (many,) else (many, *rest))
         elif many in (first, second):
-            found |= following(at + 1, there) if first == many else following(at, there + 1)
+            sequences |= following(at + 1, there) if first == many else following(at, there + 1)
             if left and right:
                 more = following(at, there + 1) if first == many else following(at + 1, there)
-                found |= {(each, *rest) for each in meet(first, second) for rest in more}
+                sequences |= {(member, *rest) for member in meet(first, second) for rest in more}
         elif left and right:
             more = following(at + 1, there + 1)
-            found |= {(each, *rest) for each in meet(first, second) for rest in more}
-        if len(found) > _MOST_COMMON:
+            sequences |= {(member, *rest) for member in meet(first, second) for rest in more}
+        if len(sequences) > _MOST_COMMON:
             raise TooManyExpressions
-        return frozenset(found)
+        return frozenset(sequences)
 
     return set(following(0, 0))
 
@@ -386,7 +391,7 @@ def _automaton(expression: str) -> Automaton | None:
     between = [0]  # the positions where a chunk may end
     for chunk in _chunks(expression):
         begin = next(number)
-        edges += [(each, _SLASH, begin) for each in between]
+        edges += [(position, _SLASH, begin) for position in between]
         if chunk in (ANY_CHUNK, ANY_CHUNKS):
             inside = next(number)
             edges += [(begin, _BEGINS_CHUNK, inside), (inside, _IN_CHUNK, inside)]
@@ -399,7 +404,7 @@ def _automaton(expression: str) -> Automaton | None:
             between = [_chunk(chunk, begin, number, edges)]
     # The edges begin as if there was a "/" before the key.
     first = {to for at, _, to in edges if at == 0}
-    edges = [each for each in edges if each[0]]
+    edges = [edge for edge in edges if edge[0]]
     edges += [(0, letters, to) for at, letters, to in edges if at in first]
     return Automaton(tuple(edges), frozenset(between) - {0})
 
@@ -436,9 +441,10 @@ def _chunk(
 
 def names_of(expressions: Iterable[str]) -> NameSet:
     """Return the keys that any of the expressions includes."""
-    made = {each: _automaton(each) for each in expressions}
+    automata = {expression: _automaton(expression) for expression in expressions}
     return NameSet(
-        (each for each, wild in made.items() if wild is None), filter(None, made.values())
+        (expression for expression, automaton in automata.items() if automaton is None),
+        filter(None, automata.values()),
     )
 
 

@@ -52,8 +52,8 @@ class Difference(NamedTuple):
         return (
             begin == self.begin
             and _common_end(end, self.end) == end
-            and any(covers(each, name) for each in self.allowed)
-            and not any(meet(each, name) for each in self.denied)
+            and any(covers(expression, name) for expression in self.allowed)
+            and not any(meet(expression, name) for expression in self.denied)
         )
 
     def common(self, other: Difference) -> list[str]:
@@ -67,7 +67,7 @@ class Difference(NamedTuple):
         if self.begin != other.begin or end is None:
             return []
         names = subtract_all(_common(self.allowed, other.allowed), self.denied | other.denied)
-        return [canonical((self.begin, *each)) + end for each in names]
+        return [canonical((self.begin, *name)) + end for name in names]
 
 
 def _common_end(one: str, other: str) -> str | None:
@@ -78,7 +78,7 @@ def _common_end(one: str, other: str) -> str | None:
 
 @lru_cache(maxsize=_FEW)
 def _searched(expressions: frozenset[Chunks]) -> KeyExpressions:
-    return KeyExpressions("/".join(each) for each in expressions)
+    return KeyExpressions("/".join(chunks) for chunks in expressions)
 
 
 @lru_cache(maxsize=_FEW)
@@ -86,8 +86,12 @@ def _common(some: frozenset[Chunks], others: frozenset[Chunks]) -> frozenset[Chu
     """Return expressions for what some expressions and others match."""
     if some == others:
         return some
-    both = (common("/".join(one), "/".join(other)) for one in some for other in others)
-    return frozenset(tuple(each.split("/")) for found in both for each in found)
+    return frozenset(
+        tuple(expression.split("/"))
+        for first in some
+        for second in others
+        for expression in common("/".join(first), "/".join(second))
+    )
 
 
 class RuleKeys:
@@ -100,18 +104,20 @@ class RuleKeys:
 
     def __init__(self, expressions: frozenset[str], made_of: tuple[Difference, ...]) -> None:
         """Take the expressions, and the differences from which they were made, if known."""
-        wide = [each for each in expressions if "*" in _ENDS.sub("", each)]
+        wide = [expression for expression in expressions if "*" in _ENDS.sub("", expression)]
         self.plain = expressions.difference(wide)
-        self.tokens = KeyExpressions(each for each in wide if each.startswith("@"))
+        self.tokens = KeyExpressions(
+            expression for expression in wide if expression.startswith("@")
+        )
         self.differences = made_of or _differences(wide)
         self.is_plain = not wide and not made_of
-        self._has_plain_tokens = any(each.startswith("@") for each in self.plain)
+        self._has_plain_tokens = any(expression.startswith("@") for expression in self.plain)
 
     def include(self, key: str) -> bool:
         """Return whether the differences of the rule have all keys of an expression."""
         begin, name, end = _parted(key)
         chunks = tuple(name.split("/"))
-        return any(each.include_all(begin, chunks, end) for each in self.differences)
+        return any(difference.include_all(begin, chunks, end) for difference in self.differences)
 
     def common(self, other: RuleKeys) -> tuple[str, ...]:
         """Return expressions that together include the keys of both, and no others, sorted.
@@ -119,18 +125,18 @@ class RuleKeys:
         Raises:
             TooManyExpressions: there are too many.
         """
-        found = self.plain & other.plain
+        shared = self.plain & other.plain
         if self.is_plain and other.is_plain:
-            return _in_order(found) if found else ()
+            return _in_order(shared) if shared else ()
         if self._plain_may_be_in(other):
-            found |= _plain_in(self.plain, other)
+            shared |= _plain_in(self.plain, other)
         if other._plain_may_be_in(self):
-            found |= _plain_in(other.plain, self)
+            shared |= _plain_in(other.plain, self)
         if self.tokens.all and other.tokens.all:
-            found |= _common_of_tokens(self.tokens, other.tokens)
+            shared |= _common_of_tokens(self.tokens, other.tokens)
         if self.differences and other.differences:
-            found |= _common_of_differences(self.differences, other.differences)
-        return _in_order(found) if found else ()
+            shared |= _common_of_differences(self.differences, other.differences)
+        return _in_order(shared) if shared else ()
 
     def _plain_may_be_in(self, wide: RuleKeys) -> bool:
         return bool(
@@ -164,9 +170,9 @@ def _parted(expression: str) -> tuple[str, str, str]:
 def _differences(expressions: Iterable[str]) -> tuple[Difference, ...]:
     """Return the keys of expressions that are not graph tokens."""
     names: dict[tuple[str, str], set[Chunks]] = {}
-    for each in expressions:
-        if not each.startswith("@"):
-            begin, name, end = _parted(each)
+    for expression in expressions:
+        if not expression.startswith("@"):
+            begin, name, end = _parted(expression)
             names.setdefault((begin, end), set()).add(tuple(name.split("/")))
     return tuple(
         Difference(*place, frozenset(of), frozenset()) for place, of in sorted(names.items())
@@ -175,17 +181,17 @@ def _differences(expressions: Iterable[str]) -> tuple[Difference, ...]:
 
 @lru_cache(maxsize=_MANY)
 def _plain_in(plain: frozenset[str], wide: RuleKeys) -> frozenset[str]:
-    found: set[str] = set()
+    keys: set[str] = set()
     for key in plain:
         begin, name, end = _parted(key)
         if begin.startswith("@"):
-            found.update([key] if wide.tokens.include(key) else _common_with_all(key, wide.tokens))
+            keys.update([key] if wide.tokens.include(key) else _common_with_all(key, wide.tokens))
             continue
         for difference in wide.differences:
-            shared = _common_end(end, difference.end)
-            if begin == difference.begin and shared is not None and difference.include(name):
-                found.add(f"{begin}/{name}{shared}")
-    return frozenset(found)
+            common_end = _common_end(end, difference.end)
+            if begin == difference.begin and common_end is not None and difference.include(name):
+                keys.add(f"{begin}/{name}{common_end}")
+    return frozenset(keys)
 
 
 @lru_cache(maxsize=_MANY)
@@ -193,27 +199,28 @@ def _common_of_differences(
     some: tuple[Difference, ...], others: tuple[Difference, ...]
 ) -> frozenset[str]:
     try:
-        both = [each for one in some for other in others for each in one.common(other)]
+        shared = [key for first in some for second in others for key in first.common(second)]
     except CannotSubtract:
         raise TooManyExpressions from None
-    return frozenset(both)
+    return frozenset(shared)
 
 
 @lru_cache(maxsize=_MANY)
 def _common_of_tokens(one: KeyExpressions, other: KeyExpressions) -> frozenset[str]:
     if one.all == other.all:
         return one.all
-    found = {each for each in one.all if other.include(each)}
-    left = [each for each in one.all if each not in found]
-    for each in other.all if left else ():
-        if one.include(each):
-            found.add(each)
+    shared = {token for token in one.all if other.include(token)}
+    not_included = [token for token in one.all if token not in shared]
+    for token in other.all if not_included else ():
+        if one.include(token):
+            shared.add(token)
         else:
-            # Of the others, those that are included as they are have been found.
-            found.update(*(common(each, wide) for wide in left if intersects(each, wide)))
-    return frozenset(KeyExpressions(found).needed())
+            # Tokens of `one` that `other` includes are shared as they are.
+            overlapping = (wide for wide in not_included if intersects(token, wide))
+            shared.update(*(common(token, wide) for wide in overlapping))
+    return frozenset(KeyExpressions(shared).needed())
 
 
 @lru_cache(maxsize=_MANY)
 def _common_with_all(key: str, wide: KeyExpressions) -> tuple[str, ...]:
-    return tuple(shared for each in wide.all for shared in common(key, each))
+    return tuple(shared for token in wide.all for shared in common(key, token))

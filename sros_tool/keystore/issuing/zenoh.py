@@ -62,10 +62,10 @@ def keep_zenoh(
     existing = transaction.enclaves
     wanted = zenoh_documents(keystore, network, domains, authority, now, change, existing=existing)
     drifts = drifted(keystore, wanted, authority, change.gone)
-    for each in drifts:
-        if each.kind is Drift.STALE:
-            _remove(transaction, each.path)
-    changed = [each for each in drifts if each.kind is not Drift.STALE]
+    for drift in drifts:
+        if drift.kind is Drift.STALE:
+            _remove(transaction, drift.path)
+    changed = [drift for drift in drifts if drift.kind is not Drift.STALE]
     written = _stage(transaction, wanted.files, changed, signer()) if changed else {}
     names = tuple(wanted.enclaves.values())
     return KeptZenoh(
@@ -73,7 +73,7 @@ def keep_zenoh(
         wanted.nodes,
         {name: why.rstrip(".") for name, why in wanted.left_out.items()},
         written,
-        tuple(sorted({each.enclave for each in drifts if each.kind is not Drift.UNSIGNED})),
+        tuple(sorted({drift.enclave for drift in drifts if drift.kind is not Drift.UNSIGNED})),
         (
             *_left_out_notes(wanted.left_out),
             *_revoked_names(wanted.ledger, names, now, change.replaced),
@@ -90,37 +90,37 @@ def _stage(
     """Stage changed configurations and their signed documents on all cores; map them to content."""
 
     def stage(part: Sequence[Drifted]) -> list[bytes]:
-        documents = [files[each.path] for each in part]
+        documents = [files[drift.path] for drift in part]
         messages = [b""] * len(part)
         if not transaction.dry_run:
             messages = authority.sign_all(documents, "a Zenoh configuration")
-        for each, document, message in zip(part, documents, messages, strict=True):
-            if each.kind is not Drift.UNSIGNED:
-                transaction.write(each.path, document)
-            transaction.write(signed_path(each.path), message)
+        for drift, document, message in zip(part, documents, messages, strict=True):
+            if drift.kind is not Drift.UNSIGNED:
+                transaction.write(drift.path, document)
+            transaction.write(signed_path(drift.path), message)
         return messages
 
     written: dict[str, bytes] = {}
     for part, signed in transaction.on_all_cores(changed, stage, alone=authority.on_token):
-        for each, message in zip(part, signed, strict=True):
-            if each.kind is not Drift.UNSIGNED:
-                written[each.path] = files[each.path]
-            written[signed_path(each.path)] = message
+        for drift, message in zip(part, signed, strict=True):
+            if drift.kind is not Drift.UNSIGNED:
+                written[drift.path] = files[drift.path]
+            written[signed_path(drift.path)] = message
     return written
 
 
 def remove_zenoh(transaction: Transaction) -> tuple[str, ...]:
     """Stage the removal of all configurations of a keystore; return their enclaves."""
     stale = list(stale_files(transaction.root, (), transaction.enclaves))
-    for each in stale:
-        _remove(transaction, each.path)
-    return tuple(dict.fromkeys(each.enclave for each in stale))
+    for drift in stale:
+        _remove(transaction, drift.path)
+    return tuple(dict.fromkeys(drift.enclave for drift in stale))
 
 
 def _remove(transaction: Transaction, path: str) -> None:
-    for each in (path, signed_path(path)):
-        if (transaction.root / each).is_file():
-            transaction.remove(each)
+    for file in (path, signed_path(path)):
+        if (transaction.root / file).is_file():
+            transaction.remove(file)
 
 
 # ── notes ──────────────────────────────────────────────────────────────────────────────────
@@ -140,15 +140,15 @@ def _revoked_names(
 ) -> Iterable[Note]:
     """Yield a note on names that revoked certificates have, too, until they expire."""
     entries = ledger.entries
-    revoked = {each.serial for each in entries if each.what == "revocation"}
+    revoked = {entry.serial for entry in entries if entry.what == "revocation"}
     again = sorted(
         {
-            each.enclave
-            for each in entries
-            if each.what == "certificate"
-            and each.serial in revoked
-            and each.enclave in names
-            and each.not_after >= iso(now)
+            entry.enclave
+            for entry in entries
+            if entry.what == "certificate"
+            and entry.serial in revoked
+            and entry.enclave in names
+            and entry.not_after >= iso(now)
         }
         | {*replaced}
     )
