@@ -25,7 +25,7 @@ from tests.checks import (
 from tests.checks.bench import Bench
 from tests.cli import test_requirements
 from tests.fleet import test_status
-from tests.proof import test_upgrade
+from tests.proof import test_crossing, test_upgrade
 from tests.support.harness import sros
 
 pytest_plugins = ["tests.checks.sound_keystore"]
@@ -40,6 +40,7 @@ def test_every_finding_has_a_test_that_brings_it_about() -> None:
         *runtime_cases.CASES,
         *zenoh_cases.CASES,
         *test_requirements.CASES,
+        *test_crossing.FOUND,
         *test_upgrade.FOUND,
         *test_status.FOUND,
     }

@@ -114,6 +114,10 @@ publish = ["/r1/scan"]
 """
 
 
+FOUND = frozenset({"requirement.not-crossing"})
+"""The kind of finding that the next test brings about."""
+
+
 def test_requirements_and_pictures_know_of_routers(routed: Path, tmp_path: Path) -> None:
     """On DDS, and with all names crossing, the one influences the other; with none, it does not."""
     (tmp_path / "robot.toml").write_text(REQUIRED)
@@ -130,6 +134,7 @@ def test_requirements_and_pictures_know_of_routers(routed: Path, tmp_path: Path)
         out = sros(*words, cwd=tmp_path).out
         assert all(text in out for text in said), out
         assert not any(text in out for text in not_said), out
+        assert all((f"[{identity}]" in out) is (kept in said) for identity in FOUND), out
     drawn = sros("view", str(routed / "wide"), "--focus", "/r1/scan", "-o", tmp_path / "wide.svg")
     assert "what passes between the 2 routers of Zenoh is not considered" in drawn.err
 
