@@ -76,10 +76,15 @@ def pytest_report_header() -> str:
     return f"what is drawn: SROS_SEED={SEED}"
 
 
+# Importing and collecting the tests makes millions of objects, of which hardly any is garbage.
+gc.disable()
+
+
 def pytest_collection_finish() -> None:
     """Take what stays until the end from the garbage collector, which looked at it every time."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 for each in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import gc
 import re
 import tomllib
 from collections import defaultdict
@@ -47,6 +48,17 @@ ROS_PACKAGES = {"graph", "demo"}
 ROS_MODULES = {"runtime/stacks.py"}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def no_search_for_garbage() -> Iterator[None]:
+    """The millions of nodes of all modules stay, and going through them again takes as long."""
+    gc.disable()
+    yield
+    tree_of.cache_clear()
+    nodes_of.cache_clear()
+    modules_of.cache_clear()
+    gc.enable()
+
+
 @cache
 def tree_of(source: str) -> ast.Module:
     """Return the syntax of a module, which several tests look at; it is not changed."""
@@ -55,8 +67,16 @@ def tree_of(source: str) -> ast.Module:
 
 @cache
 def nodes_of(tree: ast.AST) -> tuple[ast.AST, ...]:
-    """Return all nodes of a tree, which several tests go through."""
-    return tuple(ast.walk(tree))
+    """Return the nodes of a tree, which several tests go through, but for `Load` and `Store`."""
+    nodes = [tree]
+    for node in nodes:  # which grows: `ast.walk` does the same in twice the time
+        for name in node._fields:
+            value = getattr(node, name, None)
+            if isinstance(value, list):
+                nodes += [each for each in value if isinstance(each, ast.AST)]
+            elif isinstance(value, ast.AST) and name != "ctx":
+                nodes.append(value)
+    return tuple(nodes)
 
 
 def imported(source: str, module: tuple[str, ...]) -> Iterator[tuple[int, str]]:
@@ -541,7 +561,7 @@ def meanings(modules: Modules) -> dict[str, list[str]]:
     """Return the public class names that are defined in several places, with the modules."""
     found = defaultdict(list)
     for name, tree in modules.items():
-        for node in ast.walk(tree):
+        for node in nodes_of(tree):
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 found[node.name].append(name)
     return {name: places for name, places in found.items() if len(places) > 1}

@@ -28,7 +28,7 @@ from sros_tool.runtime.environment import render_refusal
 from sros_tool.validity import Window
 from tests.support.children import LONG
 from tests.support.harness import Ended, forked, policy_text, publish, snapshot, sros, with_includes
-from tests.support.long_form import drawn
+from tests.support.long_form import drawn, some
 
 Words = list[object]
 Files = dict[str, tuple[int, bytes]]
@@ -911,13 +911,16 @@ def test_run_of_a_file_that_is_no_program(keystore: Path, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     "line",
-    [
-        "create_keystore {}/new",
-        "create_enclave {}/ks /c",
-        "generate_artifacts -k {}/ks -p {}/p.xml",
-        "distribute_key {}/ks /a {}/out",
-        "distribute_key {}/ks /a {}/out.tar.gz",
-    ],
+    some(
+        [
+            "create_keystore {}/new",
+            "create_enclave {}/ks /c",
+            "generate_artifacts -k {}/ks -p {}/p.xml",
+            "distribute_key {}/ks /a {}/out",
+            "distribute_key {}/ks /a {}/out.tar.gz",
+        ],
+        2,
+    ),
 )
 @pytest.mark.parametrize("size", [0, 300])
 def test_files_that_may_not_grow(line: str, size: int, keystore: Path, tmp_path: Path) -> None:
@@ -936,16 +939,19 @@ def test_files_that_may_not_grow(line: str, size: int, keystore: Path, tmp_path:
 @pytest.mark.skipif(os.geteuid() != 0, reason="becomes another user; needs root")
 @pytest.mark.parametrize(
     ("line", "mode"),
-    [
-        ("create_keystore {}/dir/new", 0o555),
-        ("create_enclave {}/dir /c", 0o555),
-        ("generate_artifacts -k {}/dir -p {}/p.xml", 0o555),
-        ("create_enclave {}/dir /c", 0o000),
-        ("list_enclaves {}/dir", 0o000),
-        ("inspect {}/dir", 0o000),
-        ("env {}/dir /a", 0o000),
-        ("distribute_key {}/dir /a {}/out", 0o000),
-    ],
+    some(
+        [
+            ("create_keystore {}/dir/new", 0o555),
+            ("create_enclave {}/dir /c", 0o555),
+            ("generate_artifacts -k {}/dir -p {}/p.xml", 0o555),
+            ("create_enclave {}/dir /c", 0o000),
+            ("list_enclaves {}/dir", 0o000),
+            ("inspect {}/dir", 0o000),
+            ("env {}/dir /a", 0o000),
+            ("distribute_key {}/dir /a {}/out", 0o000),
+        ],
+        3,
+    ),
 )
 def test_folder_without_permission(line: str, mode: int, made_keystore: Path) -> None:
     with tempfile.TemporaryDirectory() as name:  # pytest's own folders are closed to others

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -31,7 +32,7 @@ OLDEST_PACKAGES = ("click==8.1.6", "cryptography==41.0.7", "lxml==5.2.1")
 """The packages of Ubuntu 24.04, which ROS 2 Jazzy and Kilted have."""
 
 WITH_DDS = ("tests/integration", "tests/explain")
-"""The folders with tests that start DDS processes; pytest imports only these for them."""
+"""The folders with tests that start DDS processes; see `modules_with_dds`."""
 
 COLLECT = ["-m", "pytest", "--collect-only", "-qq", "-p", "tools.import_tests"]
 """pytest compiles the tests for its messages; once, before five processes would do it each."""
@@ -76,7 +77,7 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
         # One file runs in one process; `tests/conftest.py` puts the slowest files first.
         "tests on a real DDS": [
             *("-m", "dds", "-n", str(cores + 1), "--dist", "loadfile", "--no-loadscope-reorder"),
-            *WITH_DDS,
+            *modules_with_dds(),
         ],
     }
     reports = {name: VENV / f"{name.replace(' ', '-')}.xml" for name in parts}
@@ -136,6 +137,16 @@ def _run_together(
     return {name: ended[name] for name in steps}
 
 
+def modules_with_dds() -> list[str]:
+    """Return the paths of the modules that have tests on a real DDS: only these are imported."""
+    paths = [path for folder in WITH_DDS for path in (CHECKOUT / folder).glob("**/test_*.py")]
+    return [
+        str(path.relative_to(CHECKOUT))
+        for path in sorted(paths)
+        if "pytest.mark.dds" in path.read_text(encoding="utf-8")
+    ]
+
+
 def _quietly(words: Sequence[str], env: Mapping[str, str]) -> None:
     """Run Python without output; what fails is shown by the steps that follow."""
     nowhere = subprocess.DEVNULL
@@ -146,8 +157,18 @@ def _conclude(results: Mapping[str, int], counts: Counter[str], started: float) 
     verdicts = [f"{name} {_verdict(status)}" for name, status in results.items()]
     if counts:
         verdicts.append(", ".join(f"{number} {word}" for word, number in counts.items()))
-    print(f"\n{'; '.join(verdicts)} ({time.monotonic() - started:.0f} s)", flush=True)
+    took = f"{time.monotonic() - started:.0f} s, {_cpu_seconds():.0f} s of CPU with the set-up"
+    print(f"\n{'; '.join(verdicts)} ({took})", flush=True)
     return max(results.values(), default=0)
+
+
+def _cpu_seconds() -> float:
+    """Return the CPU time, in seconds, of all processes that this one has started and that ended.
+
+    Unlike the time on the clock, it grows with the tests and hardly with other work of the machine.
+    """
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def count(report: Path) -> Counter[str]:

@@ -174,7 +174,9 @@ def _install(group: str, now: Record, lock: int) -> bool:
     if optional and (now.ros_around or not _rclpy_fits(group, now)):
         return True
     say(f"installing {_TITLES[group]}")
-    command = [str(PYTHON), "-m", "pip", "install", "--progress-bar=off", *_requirements(group)]
+    # Python compiles what is imported, which is a small part of what is installed.
+    options = ["--progress-bar=off", "--no-compile"]
+    command = [str(PYTHON), "-m", "pip", "install", *options, *_requirements(group)]
     if succeeds(command, env=_quiet_environment(), keep_open=lock):
         return True
     if not optional:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import gc
+
+gc.disable()  # this process ends soon, and the syntax trees of the tests are no garbage
+
 
 def pytest_pycollect_makeitem() -> list[object]:
     """Say that nothing in a module is a test."""

@@ -192,7 +192,7 @@ def variables(verb: str, output: str) -> Iterator[tuple[str, str]]:
         yield name, "".join(shlex.split(value)) if verb == "env" else value
 
 
-@pytest.mark.parametrize("name", STARTED)
+@pytest.mark.parametrize("name", some(STARTED, 8))
 def test_what_starts_with_the_variables_of_a_remedy_is_mended(
     name: str, robot: tuple[Bench, RuntimeState], tmp_path: Path
 ) -> None:

@@ -42,6 +42,7 @@ from sros_tool.pki.keys import generate_key
 from sros_tool.policy.document import read_policy
 from tests.support.children import run
 from tests.support.harness import certificate, policy_text, publish, remains, snapshot, topics_of
+from tests.support.long_form import some
 
 NOW = datetime.now(UTC)
 LATER = NOW + timedelta(days=30)
@@ -611,7 +612,7 @@ TAMPERED: dict[str, tuple[Callable[[Files], bytes], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", TAMPERED)
+@pytest.mark.parametrize("case", some(list(TAMPERED), 9))
 def test_a_tampered_answer_changes_nothing(
     case: str, home: Path, robot: Path, tmp_path: Path
 ) -> None:

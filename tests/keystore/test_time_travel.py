@@ -34,6 +34,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.validity import Window
 from tests.support.children import LONG
 from tests.support.harness import certificate, policy_text, publish, topics_of
+from tests.support.long_form import sometimes
 
 BEGIN = datetime(2026, 1, 31, 12, 30, tzinfo=UTC)
 MONTH = timedelta(days=30)
@@ -262,6 +263,7 @@ def permit(root: Path, names: list[str], version: int, now: datetime) -> None:
     generate_artifacts(root, policies=[read_policy(file)], now=now)
 
 
+@sometimes("years of a keystore")
 def test_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Nobody pulls the plug here, and 500 flushes of the disk would wait for everybody's files.
     monkeypatch.setattr("sros_tool.folders.flush_file_system", lambda _: None)

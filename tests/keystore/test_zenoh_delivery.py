@@ -19,6 +19,7 @@ from sros_tool.keystore.layout import PERMISSIONS, SEAL
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.keys import load_key
 from tests.support.harness import Ended, policy_text, publish, snapshot, sros
+from tests.support.long_form import sometimes
 
 SESSION, SIGNED = "session.json5", "session.p7s"
 
@@ -220,6 +221,7 @@ def test_a_sealed_answer_with_files_that_do_not_fit(
         check_answer(answer, key, now=now)
 
 
+@sometimes("an answer with the rights of a large robot")
 def test_an_answer_with_the_rights_of_a_large_robot(folder: Path) -> None:
     """In peer mode each file has the rights of all enclaves, so it may be larger than a MiB."""
     names = [f"/{'part' * 5}/n{number}" for number in range(4)]

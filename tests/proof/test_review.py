@@ -19,6 +19,7 @@ from sros_tool.proof.repository import Repository
 from tests.support.code_host import PROJECT
 from tests.support.code_host import policy as policy_text
 from tests.support.harness import Ended, publish, sros
+from tests.support.long_form import some
 
 ROBOT = {"/a": publish("/x"), "/b": publish("/y")}
 WIDER = {"/a": publish("/x"), "/b": publish("/y", "/x")}
@@ -114,34 +115,37 @@ def test_what_a_partial_clone_lacks_is_not_passed_over(change: Change) -> None:
 
 @pytest.mark.parametrize(
     ("name", "content"),
-    [
-        ("evil.XML", policy_text(WIDER).encode()),
-        ("robots/deep/evil.txt", policy_text(WIDER).encode()),
-        ("evil.xml", b"\xff\xfe" + policy_text(WIDER).encode("utf-16-le")),
-        (
-            "seven.xml",
-            b'<?xml version="1.0" encoding="UTF-7"?>'
-            + policy_text(WIDER).replace("<", "+ADw-").replace(">", "+AD4-").encode(),
-        ),
-        (
-            "padded.xml",
-            b'<?xml version="1.%s" encoding="UTF-7"?>' % (b"0" * 300)
-            + policy_text(WIDER).replace("<", "+ADw-").replace(">", "+AD4-").encode(),
-        ),
-        ("ebcdic.xml", f'<?xml version="1.0" encoding="IBM037"?>{ROBOT}'.encode("cp037")),
-        ("part.xml", b'<profile ns="/" node="n"/>'),
-        ("rights.xml", b"<x><topics publish='&#65;LLOW'><topic>/x</topic></topics></x>"),
-        ("names.xml", b"<x><topic>/x</topic></x>"),
-        (
-            "outer.xml",
-            b"<profiles><xi:include href='x' xmlns:xi='http://www.w3.org/2001/XInclude'/>"
-            b"</profiles>",
-        ),
-        (
-            "common/Node.xml",
-            b'<profile>\n<topics publish="ALLOW"><topic>/x</topic></topics></profile>',
-        ),
-    ],
+    some(
+        [
+            ("evil.XML", policy_text(WIDER).encode()),
+            ("robots/deep/evil.txt", policy_text(WIDER).encode()),
+            ("evil.xml", b"\xff\xfe" + policy_text(WIDER).encode("utf-16-le")),
+            (
+                "seven.xml",
+                b'<?xml version="1.0" encoding="UTF-7"?>'
+                + policy_text(WIDER).replace("<", "+ADw-").replace(">", "+AD4-").encode(),
+            ),
+            (
+                "padded.xml",
+                b'<?xml version="1.%s" encoding="UTF-7"?>' % (b"0" * 300)
+                + policy_text(WIDER).replace("<", "+ADw-").replace(">", "+AD4-").encode(),
+            ),
+            ("ebcdic.xml", f'<?xml version="1.0" encoding="IBM037"?>{ROBOT}'.encode("cp037")),
+            ("part.xml", b'<profile ns="/" node="n"/>'),
+            ("rights.xml", b"<x><topics publish='&#65;LLOW'><topic>/x</topic></topics></x>"),
+            ("names.xml", b"<x><topic>/x</topic></x>"),
+            (
+                "outer.xml",
+                b"<profiles><xi:include href='x' xmlns:xi='http://www.w3.org/2001/XInclude'/>"
+                b"</profiles>",
+            ),
+            (
+                "common/Node.xml",
+                b'<profile>\n<topics publish="ALLOW"><topic>/x</topic></topics></profile>',
+            ),
+        ],
+        4,
+    ),
 )
 def test_a_policy_that_is_not_named_is_said(change: Change, name: str, content: bytes) -> None:
     change.commit({name: content})
@@ -260,17 +264,20 @@ def test_a_policy_that_is_included_in_part_is_said(change: Change) -> None:
 
 @pytest.mark.parametrize(
     ("path", "target", "status"),
-    [
-        ("deploy/robot.xml", "../tests/robot.xml", 1),  # a policy that is left out
-        ("deploy", "tests", 1),
-        ("deploy.xml", "/etc/robot.xml", 1),
-        ("deploy.xml", "tests/notes", 1),  # which the next change can make a policy, unseen
-        ("tests/link.xml", "robot.xml", 0),  # left out
-        ("NOTES", "robot.toml", 0),
-        ("robots/sub", "../tests", 2),  # in a folder that is reviewed
-        ("robots/sub", "", 2),
-        ("vendor", "", 1),
-    ],
+    some(
+        [
+            ("deploy/robot.xml", "../tests/robot.xml", 1),  # a policy that is left out
+            ("deploy", "tests", 1),
+            ("deploy.xml", "/etc/robot.xml", 1),
+            ("deploy.xml", "tests/notes", 1),  # which the next change can make a policy, unseen
+            ("tests/link.xml", "robot.xml", 0),  # left out
+            ("NOTES", "robot.toml", 0),
+            ("robots/sub", "../tests", 2),  # in a folder that is reviewed
+            ("robots/sub", "", 2),
+            ("vendor", "", 1),
+        ],
+        4,
+    ),
 )
 def test_links_and_submodules_hide_no_policy(
     change: Change, path: str, target: str, status: int
