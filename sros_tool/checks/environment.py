@@ -134,8 +134,9 @@ OTHER_DISTRIBUTION = FindingKind(
     "`sros check` decided by the DDS of those distributions. Another one can open or close what "
     "they do not, without any message.",
     "sros: `distributions` in the settings of a keystore, `distribution` in its fleet file.",
-    "Source one of them, or add it after `sros check ROOT --upgrade-to NAME`: `sros "
-    "update_keystore ROOT --set distributions=NAME,...`, or `distribution` in the fleet file.",
+    "Source one of them. Or compare the other one, by `--upgrade-to` of `sros check ROOT`, and add "
+    "it: `sros update_keystore ROOT --set distributions=NAME,...`, or `distribution` in the fleet "
+    "file.",
 )
 ENCLAVE_NOT_FOUND = FindingKind(
     "runtime.enclave-not-found",
