@@ -25,6 +25,7 @@ from tests.integration.test_generate_policy import live, process, stopped
 from tests.integration.test_nodes_fit_their_enclaves import nodes_of
 from tests.integration.test_policies_live import without
 from tests.support.harness import sros
+from tests.support.long_form import sometimes
 
 pytestmark = [
     pytest.mark.dds,
@@ -56,6 +57,7 @@ def poorer(policy: Policy) -> Policy:
     return Policy(tuple(enclaves.values()))
 
 
+@sometimes("missing rights of a live robot")
 def test_ten_missing_rights_of_a_live_robot_are_found_and_added(tmp_path: Path) -> None:
     full = read_policy(policies_dir() / "mobile_robot.xml")
     (tmp_path / "full.xml").write_bytes(write_policy(full))

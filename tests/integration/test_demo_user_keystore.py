@@ -157,6 +157,7 @@ def test_a_weak_robot_fails_in_the_rows_of_its_weakness(
     assert ended.status == bool(broken | joining)
 
 
+@sometimes("a robot without the keys of its authorities")
 @needs_isolation
 def test_a_robot_without_the_keys_of_its_authorities(robot: Path) -> None:
     """What needs a signature of the CA is skipped with the reason, and so nothing is proved."""
@@ -249,6 +250,7 @@ claim = { party = "stranger", expected = "started" }
 """
 
 
+@sometimes("a scenario of a user")
 def test_a_scenario_of_a_user(tmp_path: Path) -> None:
     policy = policy_text({"/arm/camera": publish("/image"), "/arm/viewer": HEARS})
     (tmp_path / "robot.xml").write_text(policy)

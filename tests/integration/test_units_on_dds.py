@@ -24,6 +24,7 @@ from sros_tool.runtime.units import Job, job_units, node_settings, node_template
 from tests.integration.converse import converse, listener, talker
 from tests.support.children import python, run
 from tests.support.harness import policy_text, publish, sros
+from tests.support.long_form import sometimes
 
 pytestmark = [
     pytest.mark.dds,
@@ -104,6 +105,7 @@ def test_the_restrictions_are_in_force(robot: Path, units: Path) -> None:
     assert {name for name, error in held.items() if not error} == NEEDED, held
 
 
+@sometimes("jobs under their restrictions")
 def test_the_jobs_do_their_work_under_their_restrictions(robot: Path, tmp_path: Path) -> None:
     keystore, metrics = tmp_path / "ks", tmp_path / "metrics"
     metrics.mkdir()
