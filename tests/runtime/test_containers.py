@@ -6,7 +6,7 @@ import base64
 import json
 from dataclasses import replace
 from functools import cache
-from importlib.resources import files
+from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,9 @@ ARM = Container("/arm", "arm", VARIABLES, FOLDER, "robot/arm:1")
 @cache
 def compose_schema() -> Draft202012Validator:
     """The schema of the Compose Specification, which check-jsonschema ships."""
-    path = files("check_jsonschema") / "builtin_schemas/vendor/compose-spec.json"
+    place = find_spec("check_jsonschema")  # importing it needs a newer click than sros does
+    assert place and place.origin
+    path = Path(place.origin).parent / "builtin_schemas/vendor/compose-spec.json"
     return Draft202012Validator(json.loads(path.read_text("utf-8")))
 
 
