@@ -154,7 +154,7 @@ def shows(
 
 
 def shown(kind: type) -> ShownKeys | None:
-    """Return the keys that the JSON object of a class has; None if it becomes no object."""
+    """Return the keys of a class's JSON object; None if its values are not JSON objects."""
     if kind not in _SHOWN:
         names = _public_fields(kind)
         _SHOWN[kind] = ShownKeys(names) if names else None

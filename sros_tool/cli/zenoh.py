@@ -101,7 +101,7 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     metavar="FILE",
     help="Show what an existing Zenoh configuration allows to whom, and where it lets anybody in.",
 )
-@output_option("With --from: write what it allows as a policy to FILE.")
+@output_option("With --from: write the allowed rights to FILE, as a policy.")
 @force_option
 @dry_run_option
 @json_option

@@ -87,7 +87,10 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
         help="another topic whose publishers an observer counts",
     )
     parser.add_argument(
-        "--size", type=int, default=NodeOptions.size, help="bytes of a message on Zenoh, at least"
+        "--size",
+        type=int,
+        default=NodeOptions.size,
+        help="minimum size of a message on Zenoh, in bytes",
     )
     parser.add_argument(
         "--patience",

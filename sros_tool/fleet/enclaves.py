@@ -270,9 +270,9 @@ def _with_placeholders(text: str, enclave: str, robot: Robot) -> str:
     of_robot = "{robot}"  # noqa: RUF027 - a placeholder of policies
     own = _whole(robot.name).sub(of_robot, enclave)
     parts = re.split(rf"(?<![A-Za-z0-9_]){re.escape(enclave)}(?![A-Za-z0-9_/])", text)
-    for value, place in ((robot.namespace, "{namespace}"), (robot.name, of_robot)):
+    for value, placeholder in ((robot.namespace, "{namespace}"), (robot.name, of_robot)):
         if value != "/":
-            parts = [_whole(value).sub(place, part) for part in parts]
+            parts = [_whole(value).sub(placeholder, part) for part in parts]
     return own.join(parts)
 
 

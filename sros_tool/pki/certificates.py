@@ -425,8 +425,8 @@ def is_for_pss(certificate: x509.Certificate) -> bool:
     return _key_algorithm(certificate)[0].content == _RSA_PSS
 
 
-def _in_der(certificate: x509.Certificate, part: bytes) -> bytes:
-    """Return a part of a certificate in DER."""
+def _normalized(certificate: x509.Certificate, part: bytes) -> bytes:
+    """Return a part of a certificate, converted to DER if the certificate is not in DER."""
     return der.normalized(part) if tolerant.is_tolerated(certificate) else part
 
 
@@ -443,7 +443,9 @@ _EC = der.encode_oid("1.2.840.10045.2.1")
 @lru_cache(maxsize=256)
 def _key_algorithm(certificate: x509.Certificate) -> list[der.Value]:
     """Return the identifier and the parameters of the algorithm of a certificate's key."""
-    parts = der.children(der.first(_in_der(certificate, certificate.tbs_certificate_bytes)).content)
+    parts = der.children(
+        der.first(_normalized(certificate, certificate.tbs_certificate_bytes)).content
+    )
     key = parts[6 if parts[0].tag == der.CONTEXT_0 else 5]
     return der.children(der.first(key.content).content)
 
@@ -455,7 +457,9 @@ def _algorithms(certificate: x509.Certificate) -> tuple[der.Value, der.Value]:
     OpenSSL compares them when it verifies the signature, but does not verify the signature of a
     self-signed CA.
     """
-    whole = der.first(_in_der(certificate, certificate.public_bytes(serialization.Encoding.DER)))
+    whole = der.first(
+        _normalized(certificate, certificate.public_bytes(serialization.Encoding.DER))
+    )
     signed, outer, _ = der.children(whole.content)
     parts = der.children(signed.content)
     return parts[2 if parts[0].tag == der.CONTEXT_0 else 1], outer

@@ -123,18 +123,18 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
     Raises:
         ValueError: it has another placeholder; the message is a sentence.
     """
-    owner = placeholders_of(path)
+    of_path = placeholders_of(path)
     for placeholder in placeholders_of(name):
         if placeholder.plural:
             if not several:
                 raise ValueError(f"{placeholder} is several names, and only one can be here.")
-        elif not owner:
+        elif not of_path:
             instead = f" For a name for each robot write {placeholder._replace(plural=True)}."
             raise ValueError(
                 f"{placeholder} is one robot, and the enclave's path does not say which one."
                 f"{instead if several else ''}"
             )
-        elif placeholder.group not in ("", owner[0].group):
+        elif placeholder.group not in ("", of_path[0].group):
             raise ValueError(f"{placeholder} is not the robot of the enclave: leave out the group.")
 
 

@@ -102,7 +102,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class KeptUse:
-    """A use of an enclave with which ``others``, at other routers of Zenoh, have nothing to do."""
+    """A use that does not pass to or from ``others``, enclaves at other routers of Zenoh."""
 
     use: Use
     others: tuple[str, ...]

@@ -229,8 +229,8 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
         if kind not in _READERS:
             line = next((n for n, each in _headers(text) if each == kind), 0)
             raise DocumentError(
-                f"{Source(file, line)}: {_short(kind)} is no kind of requirement",
-                f"There are {', '.join(_READERS)}.",
+                f"{Source(file, line)}: {_short(kind)} is not a kind of requirement",
+                f"The kinds are {', '.join(_READERS)}.",
             )
         lines = places.get(kind, [])
         plain = isinstance(requirements, list) and all(
@@ -262,8 +262,8 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
         left -= _pairs(requirement)
         if left < 0:
             raise DocumentError(
-                f"{requirement.source}: there are more than {_MOST_PAIRS} pairs of two names "
-                "up to here",
+                f"{requirement.source}: the requirements up to this line compare more than "
+                f"{_MOST_PAIRS} pairs of names",
                 "Every name of one list is compared with every name of the other.",
                 "Write patterns in place of names, or divide the file.",
             )

@@ -412,7 +412,7 @@ def _keystore_system(
 
 
 def _possible(enclave: LoadedEnclave, grants: Sequence[Grant], governance: bytes) -> LoadedEnclave:
-    """Return an enclave with its permissions, and with nothing that keeps it from starting."""
+    """Return an enclave whose files have no fault, so that only permissions decide."""
     subject = enclave.subject or next((grant.subject for grant in grants), "")
     return enclave._replace(subject=subject, governance=governance, state=None)
 
@@ -479,7 +479,7 @@ def _enforced(
     stated: Mapping[str, TopicAccess],
     crossing: Crossing | None,
 ) -> World:
-    """Return the world of a domain on Zenoh, of enclaves and of all other names in the rules."""
+    """Return the Zenoh world of a domain, with all enclaves and other names in the rules."""
     names = {*enclaves, *(name for enforcer in enforcers for name in enforcer.names())}
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
@@ -507,7 +507,7 @@ class Place:
 
 
 class Places:
-    """Where rights are stated, to find the one that lets an enclave use a topic."""
+    """The places of rights, to find the right that lets an enclave use a topic."""
 
     def __init__(self, stated: Mapping[str, Iterable[Place]]) -> None:
         """Create an index of rights by enclave."""

@@ -1,7 +1,7 @@
-"""What changes for a keystore or policy on the day of the update to another distribution of ROS 2.
+"""Find what the update to another distribution of ROS 2 changes for a keystore or policy.
 
-The signed files stay, and another DDS reads them.  Each enclave is decided by the rules of both,
-for all names at once: whether it joins, and which topics it may use.
+The signed files stay the same, but another DDS reads them.  The rules of both DDS releases decide
+for each enclave, and for all names at once, whether it joins and which topics it may use.
 """
 
 from __future__ import annotations
@@ -91,11 +91,11 @@ _KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 
 @dataclass(frozen=True, slots=True)
 class DecidedFiles:
-    """The enclaves of a keystore or policy, which two distributions decide.
+    """The enclaves of a keystore or policy, on which two distributions decide.
 
     ``domains`` are the ROS domains to decide for, None for examples of those in the documents of
     each enclave.  ``keystore`` is None for a policy, whose file is ``file``.  ``chosen`` are the
-    enclaves that are decided; None for all.
+    enclaves to decide on; None for all.
     """
 
     file: str
@@ -115,10 +115,12 @@ class DecidedFiles:
         return example_domains(enclave.state) if enclave.state else (0,)
 
     def lenders(self, vendor: Vendor) -> Mapping[str, tuple[str, ...]]:
-        """Map enclaves to those whose permissions fit their certificate, too."""
+        """Map each enclave to the other enclaves whose permissions fit its certificate."""
         if self.unique_subjects:
             return {}
-        subjects = {name: each.subject for name, each in self.enclaves.items() if each.subject}
+        subjects = {
+            name: enclave.subject for name, enclave in self.enclaves.items() if enclave.subject
+        }
         granted = {
             name: [grant.subject for grant in permissions.grants]
             for name, permissions in self.source.permissions.items()
@@ -126,13 +128,13 @@ class DecidedFiles:
         return also_fitting(vendor.traits, subjects, granted)
 
     def decided(self) -> Iterator[tuple[str, LoadedEnclave]]:
-        """Yield the enclaves that are decided, with their names."""
+        """Yield the names and files of the enclaves to decide on."""
         for name, enclave in self.enclaves.items():
             if self.chosen is None or name in self.chosen:
                 yield name, enclave
 
     def only(self, enclaves: Iterable[str]) -> DecidedFiles:
-        """Return the same with some of the enclaves; permissions of others still count."""
+        """Return the files to decide only on ``enclaves``; permissions of others still count."""
         return replace(self, chosen=frozenset(enclaves))
 
     def place(self, enclave: str, file: str) -> str:
@@ -185,10 +187,10 @@ def _planned_files(policy: Policy, *, at: datetime, domain: int | None = None) -
 
 
 class UpgradeFindings(NamedTuple):
-    """What an update changes, and of how many enclaves.
+    """The findings on an update, and the number of enclaves.
 
-    ``compared`` is the number of enclaves that both distributions decide; ``enclaves`` also counts
-    those that are for the later distribution already.
+    ``compared`` is the number of enclaves on which both distributions decide; ``enclaves`` also
+    counts enclaves that are for the later distribution already.
     """
 
     findings: list[Finding]
@@ -280,7 +282,7 @@ def _upgrade(
 def _products(
     before: Distribution, after: Distribution, vendor: str
 ) -> Iterator[tuple[Shipped, Shipped]]:
-    """Yield what both distributions ship of each DDS product, or of that of ``vendor``."""
+    """Yield the releases of each DDS product in both distributions, or only of ``vendor``'s."""
     product = Vendor(vendor).traits.product if vendor not in ("", _ZENOH) else ""
     for old in before.shipped if vendor != _ZENOH else ():
         if (new := after.of_product(old.product)) and product in ("", old.product):
@@ -290,7 +292,7 @@ def _products(
 def _vulnerabilities(
     before: Distribution, after: Distribution, vendor: str, advisories: Sequence[Advisory] | None
 ) -> Iterator[Finding]:
-    """Yield the known vulnerabilities in which the latest releases of two distributions differ."""
+    """Yield findings on vulnerabilities that only one distribution's latest release has."""
     for releases in _products(before, after, vendor):
         known = [known_vulnerabilities(each.product, each.latest, advisories) for each in releases]
         if None in known or releases[0].latest == releases[1].latest:
@@ -312,7 +314,7 @@ def _vulnerabilities(
 def _of_nodes_in_policy(
     path: Path, at: Circumstances, before: Distribution, after: Distribution
 ) -> Iterator[Finding]:
-    """Yield what nodes of one distribution need and a policy denies, and those of another not."""
+    """Yield rights that a policy denies and that nodes need only after the update."""
     now, then = (
         policy_findings(path, replace(at, distribution=distribution.named))
         for distribution in (before, after)
@@ -323,7 +325,7 @@ def _of_nodes_in_policy(
 def check_distributions(
     keystore: Keystore, *, at: datetime, zone: tzinfo = UTC, domain: int | None = None
 ) -> list[Finding]:
-    """Return where enclaves are decided differently on the distributions that they are for.
+    """Return findings on enclaves whose distributions decide differently.
 
     Raises:
         DocumentError: a file cannot be read, or there are too many wildcards to decide.
@@ -343,7 +345,7 @@ def check_distributions(
 
 
 def _pairs(distributions: Sequence[Distribution]) -> Iterator[tuple[Shipped, Shipped]]:
-    """Yield the first release of each product with each other one that decides differently."""
+    """Yield pairs of a product's first release and another release that decides differently."""
     by_product: dict[str, dict[Vendor, Shipped]] = {}
     for distribution in distributions:
         for shipped in distribution.shipped:
@@ -363,7 +365,7 @@ _KINDS: Mapping[str, FindingKind] = {
 
 
 class DecisionChange(NamedTuple):
-    """A decision on an enclave in which two distributions differ."""
+    """A decision on an enclave that differs between two distributions."""
 
     kind: str
     enclave: str
@@ -373,10 +375,10 @@ class DecisionChange(NamedTuple):
 
 
 def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[DecisionChange]:
-    """Yield the decisions in which two distributions differ; on the first domain that has some.
+    """Yield the decisions that differ between two distributions, on the first domain with any.
 
     Raises:
-        DocumentError: it cannot be decided for so many wildcards.
+        DocumentError: there are too many wildcards to decide.
     """
     if before.vendor is after.vendor:
         return
@@ -397,7 +399,10 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
 
 
 class _Decided:
-    """What a DDS makes of an enclave, and of permissions of others that fit its certificate."""
+    """The decision of one DDS release on an enclave: causes of refusal, and access.
+
+    The access includes permissions of other enclaves (``lenders``) that fit its certificate.
+    """
 
     def __init__(
         self,
@@ -498,7 +503,7 @@ def _not_measured(before: Shipped, after: Shipped) -> Iterator[Finding]:
 
 
 def _nodes(files: DecidedFiles, before: Distribution, after: Distribution) -> Iterator[Finding]:
-    """Yield enclaves in which nodes of one distribution start, and those of the other do not."""
+    """Yield enclaves in which nodes start on only one of two distributions."""
     if has_type_descriptions(before.name) or files.keystore is None:
         return
     for name, enclave in files.decided():

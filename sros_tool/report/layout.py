@@ -362,7 +362,10 @@ class _Draft:
             yield self._names_card(number, bundle)
 
     def _side_card(self, side: str, *, first: bool) -> Card:
-        """Return the card of an enclave or group; its ``first`` card counts the private names."""
+        """Return the card of a sender or receiver.
+
+        The ``first`` card of an enclave also counts the names that no other enclave uses.
+        """
         node, sends = side[1:], side[0] == "s"
         members = tuple(self._members[node])
         is_group = node.startswith(":")

@@ -128,7 +128,7 @@ class ZenohNetwork:
             else:
                 raise UsageError(
                     f"the routers {first.name} and {second.name} cannot connect to each other",
-                    "The endpoints of both are on their own host, or they listen there alone.",
+                    "The endpoints of each are on its own host, or it listens only there.",
                     "Name an endpoint by which another host reaches one of them.",
                 )
         return connections
@@ -333,7 +333,7 @@ def parse_rendered(data: bytes, name: str) -> Configuration:
     if configuration is None:
         raise DocumentError(
             f"{name} is not a Zenoh configuration as sros writes it",
-            "Something else wrote it, or somebody changed it by hand.",
+            "Another program wrote it, or somebody changed it by hand.",
         )
     return configuration
 
@@ -474,17 +474,17 @@ def check_network(network: ZenohNetwork) -> None:
     far = sorted(hosts - {_LOOPBACK})
     if network.mode is Mode.PEER and far:
         raise UsageError(
-            f"sessions in peer mode cannot reach a router at {far[0]} and each other",
-            "They listen on their own host alone, and the router passes no data on between peers: "
-            "those of different hosts would hear nothing.",
-            "Take client mode for several hosts: `--mode client`. For one host, leave the endpoint "
+            f"sessions in peer mode cannot reach both a router at {far[0]} and each other",
+            "They listen only on their own host, and the router forwards no data between peers: "
+            "peers on different hosts would receive nothing.",
+            "Use client mode for several hosts: `--mode client`. For one host, leave the endpoint "
             "at localhost.",
         )
     if len(hosts) > 1 and not listen:
         raise UsageError(
             f"the router cannot listen at {' and '.join(sorted(hosts))}",
-            "Without --listen it listens at each endpoint, and it does not start if one of them is "
-            "another host.",
+            "Without --listen the router listens at each endpoint, and does not start if one of "
+            "them is on another host.",
             f"Say where it listens, such as `--listen [::]:{min(connect)[1]}`.",
         )
     if not listen:
@@ -498,7 +498,7 @@ def check_network(network: ZenohNetwork) -> None:
         )
     if hosts == set(far) and {host for host, _ in listen} == {_LOOPBACK}:
         raise UsageError(
-            f"the router listens on its own host alone, and sessions connect to {far[0]}",
+            f"the router listens only on its own host, but sessions connect to {far[0]}",
             "Another host cannot reach a router that listens at localhost.",
             f"Let it listen for other hosts, such as `--listen [::]:{min(listen)[1]}`.",
         )
@@ -508,9 +508,9 @@ def _check_routers(network: ZenohNetwork) -> None:
     """Raise `UsageError` if several routers do not fit together."""
     if network.mode is Mode.PEER:
         raise UsageError(
-            "several routers are for client mode",
-            "Sessions in peer mode would look for those of other hosts at their own.",
-            "Take client mode: `--mode client`.",
+            "several routers need client mode",
+            "A session in peer mode would look for sessions of other hosts on its own host.",
+            "Use client mode: `--mode client`.",
         )
     network.connects()
     for router in network.routers:

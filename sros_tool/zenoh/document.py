@@ -211,7 +211,7 @@ def _override(root: _Section, path: str, value: str) -> None:
         inner.lines[last] = 0
     except Json5Error as error:
         raise DocumentError(
-            f"ZENOH_CONFIG_OVERRIDE sets {path[:80]!r} to what Zenoh does not accept",
+            f"ZENOH_CONFIG_OVERRIDE sets {path[:80]!r} to a value that Zenoh refuses",
             f"In {value[:80]!r}: {error.problem}.",
         ) from error
 

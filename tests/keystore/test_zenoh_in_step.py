@@ -285,7 +285,7 @@ def test_what_permissions_allow_by_default_is_refused() -> None:
         ("--endpoint one:7447 --endpoint two:7447 --listen [::]:7447", ""),
         ("--endpoint localhost:7447 --endpoint robot:7447", "cannot listen at localhost and robot"),
         ("--endpoint robot:7447 --listen [::]:7448", "no session connects to port 7448"),
-        ("--endpoint robot:7447 --listen localhost:7447", "on its own host alone"),
+        ("--endpoint robot:7447 --listen localhost:7447", "only on its own host"),
         ("--endpoint robot:7447 --endpoint localhost:1 --listen localhost:1", ""),
     ],
 )

@@ -32,9 +32,9 @@ class Subjects(Enum):
     ANY_ORDER = auto()
     """The same attributes in any order (Fast DDS 2.14)."""
     SUBSET = auto()
-    """Each part of the certificate's subject, split at ``, / |``, is in the grant's (Cyclone)."""
+    """The grant's subject has all parts of the certificate's, split at ``, / |`` (Cyclone)."""
     TRIMMED_SUBSET = auto()
-    """Each part of the certificate's subject is in the grant's, whatever the blanks (11)."""
+    """The grant's subject has all parts of the certificate's, spaces around them aside (11)."""
 
 
 class Moments(Enum):
@@ -45,7 +45,7 @@ class Moments(Enum):
     LOCAL = auto()
     """A date is in the host's standard time; its offset is ignored (Fast DDS)."""
     CYCLONE = auto()
-    """A date has its offset, or is in UTC; before 1970, after 2262 or incomplete, it has passed."""
+    """As in the standard, but before 1970, after 2262 or without all parts it is in the past."""
 
 
 class OpenRange(Enum):
@@ -64,9 +64,9 @@ class TopicNames(Enum):
 
     ANY = auto()
     WORDS = auto()
-    """Letters, digits, ``_`` and ``/``, beginning with no digit (Cyclone DDS 0.10)."""
+    """Letters, digits, ``_`` and ``/``; the first is not a digit (Cyclone DDS 0.10)."""
     PRINTABLE = auto()
-    """Printable ASCII characters but blanks, quotes and ``* ? [ ] # $`` (Cyclone DDS 11)."""
+    """Printable ASCII characters except spaces, quotes and ``* ? [ ] # $`` (Cyclone DDS 11)."""
 
 
 class DenyPartitions(Enum):
@@ -77,7 +77,7 @@ class DenyPartitions(Enum):
     ANY_OR_DEFAULT = auto()
     """At least one partition; a rule without any applies to the default partition (Cyclone DDS)."""
     IGNORED = auto()
-    """A deny rule applies in all partitions, whatever it names (Fast DDS)."""
+    """No partition: a deny rule applies in all, even if it names some (Fast DDS)."""
 
 
 class Signers(Enum):
@@ -88,7 +88,7 @@ class Signers(Enum):
     LISTED = auto()
     """Anyone with a certificate in the file of the permissions CA; no chain is verified (2.14)."""
     CHAIN = auto()
-    """Anyone whose certificate in the message has a chain to that CA, and the S/MIME purpose."""
+    """Anyone with a certificate for S/MIME in the message that has a chain to that CA."""
 
 
 class Hashes(Enum):
@@ -170,8 +170,8 @@ class VendorTraits:
     honours_default: bool = True
     """Where no rule matches, the ``<default>`` of the grant decides."""
     crashes_on_missing_content: bool = False
-    """An empty ``<topic_expression>``, ``<not_after>`` or document of permissions is a crash, and
-    otherwise refused (Fast DDS before 3)."""
+    """An empty ``<topic_expression>``, ``<not_after>`` or document of permissions crashes the
+    process, where others refuse it (Fast DDS before 3)."""
     crashes_on_empty_texts: bool = False
     """An expression or a default without text crashes the process when a decision reaches it."""
     topic_names: TopicNames = TopicNames.ANY
@@ -194,7 +194,7 @@ class VendorTraits:
     Access control in the direction of the participant prevents this.
     """
     ignores_unauthenticated: bool = False
-    """Participants without an identity are kept out, whatever the governance says (2.9)."""
+    """Participants without an identity are refused, even if the governance allows them (2.9)."""
     refuses_open_rtps: bool = False
     """Unauthenticated participants together with RTPS protection are refused."""
     signers: Signers = Signers.AUTHORITY

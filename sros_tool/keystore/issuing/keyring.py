@@ -85,7 +85,7 @@ class Keyring:
         root, place = keystore.root, self.place(role, template)
         try:
             if is_token_uri(place):
-                token_key = open_token_key(place, self.secrets, named=self._is_named(role))
+                token_key = open_token_key(place, self.secrets, named=self._is_from_user(role))
                 _LOG.info("opened the key of the %s CA, on the token at %s", role, place)
                 return token_key
             path = key_path(root, place)
@@ -130,7 +130,7 @@ class Keyring:
             parse_token_uri(place)
             if transaction.dry_run and not compared:
                 return generate_key()
-            named = self._is_named(role)
+            named = self._is_from_user(role)
             if holds_token_key(place, self.secrets, named=named):
                 self._check_chosen(role, place, compared=compared)
                 return open_token_key(place, self.secrets, named=named)
@@ -150,7 +150,7 @@ class Keyring:
 
     def _check_chosen(self, role: str, place: str, *, compared: bool) -> None:
         """Raise `KeystoreError` unless the user chose the existing key for a new CA."""
-        if not (compared or self._is_named(role)):
+        if not (compared or self._is_from_user(role)):
             raise KeystoreError(
                 f"the template names an existing key for the {role} CA: '{place}'",
                 "Files that the new keystore signs would be valid wherever a CA with that key is "
@@ -179,7 +179,7 @@ class Keyring:
         """
         what, root = f"{role} CA key", keystore.root
         owner = root.stat().st_uid if root.exists() else os.geteuid()
-        if self._is_named(role) or owner in (0, os.geteuid()):
+        if self._is_from_user(role) or owner in (0, os.geteuid()):
             return keystore.read(path, what)
         try:
             return read_bytes(path, what, owner=owner)
@@ -191,7 +191,7 @@ class Keyring:
                 f"set SROS_{role.upper()}_KEY=file:{path}; otherwise find out who changed it.",
             ) from error
 
-    def _is_named(self, role: str) -> bool:
+    def _is_from_user(self, role: str) -> bool:
         """Return whether the key location came from the user rather than from keystore settings."""
         return bool(self.places.get(role))
 

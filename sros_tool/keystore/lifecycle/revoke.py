@@ -152,10 +152,10 @@ def _check_names(change: KeystoreChange, names: Sequence[str]) -> None:
             raise no_such_enclave(change.keystore, name, change.names, may_create=False)
 
 
-def _drop_routers(change: KeystoreChange, gone: Collection[str]) -> None:
-    """Take further routers whose enclaves are ``gone`` out of the Zenoh network."""
+def _drop_routers(change: KeystoreChange, revoked: Collection[str]) -> None:
+    """Remove routers from the settings of the Zenoh network if their enclaves are ``revoked``."""
     network = change.template.zenoh
-    dropped = [router for router in network.routers if router.name in gone] if network else []
+    dropped = [router for router in network.routers if router.name in revoked] if network else []
     if network and dropped:
         left = tuple(router for router in network.routers if router not in dropped)
         change.set_network(replace(network, routers=left))

@@ -711,7 +711,7 @@ def trust_records(
         names = [name for name in change.names if name in last]
         if not names:
             raise KeystoreError(
-                f"no enclave of '{root}' has rights that only ledger lines without a chain record"
+                f"'{root}' has no enclave with rights that are only in ledger lines without a chain"
             )
         entries: list[Entry] = []
         others: list[str] = []
