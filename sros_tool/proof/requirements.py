@@ -187,9 +187,9 @@ def _said(rights: RightNames, link: str = "or") -> str:
 
 def _those(enclaves: Iterable[str]) -> str:
     """Return a list of enclaves as text, with the excepted enclaves."""
-    every = list(enclaves)
-    excepted = [name[len(EXCEPT) :] for name in every if name.startswith(EXCEPT)]
-    text = _listed(name for name in every if not name.startswith(EXCEPT))
+    names = list(enclaves)
+    excepted = [name[len(EXCEPT) :] for name in names if name.startswith(EXCEPT)]
+    text = _listed(name for name in names if not name.startswith(EXCEPT))
     return f"{text} (but not {_listed(excepted)})" if excepted else text
 
 

@@ -455,7 +455,7 @@ class RightsInRules:
 
 
 class RouterLinks(NamedTuple):
-    """The routers of a Zenoh network with several, and what passes from one to another.
+    """The links between the routers of a Zenoh network, and the rights that may pass over them.
 
     ``router_of`` maps enclaves to the routers that they connect to, and each router to itself.
     ``passing`` maps each router to the rights that it gives the other routers.

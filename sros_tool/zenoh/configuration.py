@@ -474,7 +474,7 @@ def check_network(network: ZenohNetwork) -> None:
     far = sorted(hosts - {_LOOPBACK})
     if network.mode is Mode.PEER and far:
         raise UsageError(
-            f"sessions in peer mode cannot reach both a router at {far[0]} and each other",
+            f"sessions in peer mode cannot reach a router at {far[0]} and each other",
             "They listen only on their own host, and the router forwards no data between peers: "
             "peers on different hosts would receive nothing.",
             "Use client mode for several hosts: `--mode client`. For one host, leave the endpoint "

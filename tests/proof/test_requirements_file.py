@@ -169,7 +169,7 @@ WRONG = {
     '[[protected]]\nlevel = "sign"': "r.toml:1: [[protected]] names nothing",
     '[[apart]]\nfrom = ["/x"]': "r.toml:1: to is missing in [[apart]]",
     f"{NOBODY * 1001}": "more than 1000 requirements",
-    f"[[apart]]\nfrom = [{MANY}]\nto = [{MANY}]\n": "r.toml:1: the requirements up to this line compare",
+    f"[[apart]]\nfrom = [{MANY}]\nto = [{MANY}]\n": "r.toml:1: the requirements up to this",
     f"[[not_both]]\nfirst.call = [{MANY}]\nsecond.call = [{MANY}]": "more than 20000 pairs",
     f"a = {'[' * 1500}{']' * 1500}": "not valid TOML",
     f"{'x.' * 3000}y = 1": "not valid TOML",

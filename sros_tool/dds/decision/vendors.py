@@ -45,7 +45,7 @@ class Moments(Enum):
     LOCAL = auto()
     """A date is in the host's standard time; its offset is ignored (Fast DDS)."""
     CYCLONE = auto()
-    """As in the standard, but before 1970, after 2262 or without all parts it is in the past."""
+    """As in the standard; a date before 1970, after 2262 or incomplete is in the past."""
 
 
 class OpenRange(Enum):
