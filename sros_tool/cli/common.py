@@ -860,15 +860,29 @@ def _read_at_most(path: Path, count: int) -> bytes:
     """
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        begin = _first_of_pipe(handle, path) if stat.S_ISFIFO(os.fstat(handle).st_mode) else b""
-        os.set_blocking(handle, True)
-        with open(handle, "rb", closefd=False) as file:
-            return begin + file.read(count - len(begin))
+        is_pipe = stat.S_ISFIFO(os.fstat(handle).st_mode)
+        data = bytearray(_first_of_pipe(handle, path) if is_pipe else b"")
+        poll = select.poll()
+        poll.register(handle, select.POLLIN)
+        while len(data) < count:
+            poll.poll(_SIGNALS_WITHIN)
+            with suppress(BlockingIOError):
+                part = os.read(handle, min(count - len(data), _PART))
+                if not part:
+                    break
+                data += part
+        return bytes(data)
     except OSError as error:
         error.filename = str(path)  # not the number of the descriptor
         raise
     finally:
         os.close(handle)
+
+
+_SIGNALS_WITHIN = 100
+"""Milliseconds after which a signal is seen that came just before a wait began."""
+_PART = 1024 * 1024
+"""Number of bytes that are read at a time."""
 
 
 def _first_of_pipe(handle: int, path: Path) -> bytes:
