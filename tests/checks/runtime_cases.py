@@ -26,8 +26,9 @@ from sros_tool.runtime.processes import (
 )
 from sros_tool.validity import parse_iso
 from tests.checks import zenoh_cases
-from tests.checks.bench import DAY, Bench
+from tests.checks.bench import DAY, SECRET, Bench
 from tests.support import zenoh_configurations
+from tests.support.harness import sros
 
 Change = Callable[[RuntimeState, Bench], RuntimeState]
 
@@ -134,8 +135,8 @@ def _written_in_the_future(state: RuntimeState, bench: Bench) -> RuntimeState:
 
 
 def _for_lyrical(state: RuntimeState, bench: Bench) -> RuntimeState:
-    settings = bench.path("sros.toml")
-    settings.write_text(f'distributions = ["kilted", "lyrical"]\n{settings.read_text()}')
+    words = ("update_keystore", bench.root, "--set", "distributions=kilted,lyrical")
+    sros(*words, env={"SROS_CA_PASSPHRASE": SECRET}).ok()
     return having(**{KEYSTORE: str(bench.root)})(state, bench)
 
 

@@ -67,6 +67,7 @@ def commands(finding: Finding, policy: Path, target: Path, **others: object) -> 
         "TARGET": target,
         "NAME": name,
         "NAME...": name,
+        "distributions=NAME,...": "distributions=kilted",
         "IDS": 0,
         "ID": 0,
         **others,
