@@ -296,6 +296,7 @@ def test_processes_of_a_folder_that_was_lost_have_to_be_restarted(
         return due
 
     assert deliver(OLD) == []
+    assert place.delivered() == ["/a"], "also where nothing changes"
     assert deliver(NEW) == ["/a"]
     shutil.rmtree(place.path)
     changed = {**NEW, "enclaves/b/c/cert.pem": b"changed", "enclaves/d/cert.pem": b"new"}

@@ -235,9 +235,9 @@ def _run(module: AnsibleModule, now: float) -> dict:
     if with_key:
         more = len(with_key) - _MOST_PROBLEMS
         remarks.append(
-            "This robot had keys of {}{}, which the keystore has not for it; they {} removed. If"
-            " they are of another robot, give that one new keys: `sros renew KEYSTORE --robot ROBOT"
-            " --new-key --revoke-old`.".format(
+            "This robot had keys of {}{}, which are not its enclaves in the keystore; they {}"
+            " removed. If they are enclaves of another robot, give that one new keys: `sros renew"
+            " KEYSTORE --robot ROBOT --new-key --revoke-old`.".format(
                 ", ".join(with_key[:_MOST_PROBLEMS]),
                 f" and {more} more" if more > 0 else "",
                 "would be" if module.check_mode else "were",
@@ -323,6 +323,8 @@ def _install(
         return {**result, "restart": due, "confirmation": confirmed}
     if present:
         found = verify(place.path, names, asked["verifier"])
+        if found["ok"] and not check and place.delivered() != names:
+            place.set_delivered(names)  # an earlier version delivered them
     else:
         try:
             place.prepare(after)
