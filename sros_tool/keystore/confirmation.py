@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
@@ -55,15 +55,26 @@ CONFIRMED_FILES = (
 _CERTIFICATE_FILES = (CERTIFICATE_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
 _KEYS = {"format", "robot", "time", "files"}
-_OPTIONAL_KEYS = {"certificates", "restart", "dds"}
+_OF_AGENT = ("sequence", "release", "expiry", "running", "clock", "problems", "requests")
+"""Keys that only `sros agent` writes."""
+_OPTIONAL_KEYS = {"certificates", "restart", "dds", *_OF_AGENT}
 _CLOCK_TOLERANCE = timedelta(minutes=1)
 _MOST_CERTIFICATES = 32  # in a file
 _MOST_LIBRARIES, _MOST_UNSEEN = 100, 1_000_000
+_MOST_NUMBER = 2**53 - 1  # what every reader of JSON takes exactly
+MOST_PROBLEMS, LONGEST_PROBLEM = 50, 300
+"""Problems in a confirmation, and characters of a problem."""
+MOST_REQUESTS = 500
+"""Signing requests in a confirmation; the agent makes further requests in later ones."""
+_LONGEST_REQUEST = 16 * 1024
 _LIBRARY_VERSION = re.compile(r"\d{1,6}\.\d{1,6}\.\d{1,6}\Z", re.ASCII)
 _LIBRARY_PATH = re.compile(r"/[\w.+/ ?-]{1,199}\Z")
 """Paths as a robot makes them plain; they are shown, and never opened."""
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 _MOMENT = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z\Z")
+_REQUEST = re.compile(
+    r"-----BEGIN CERTIFICATE REQUEST-----\n[A-Za-z0-9+/=\n]+-----END CERTIFICATE REQUEST-----\n\Z"
+)
 _PEM = re.compile(rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERTIFICATE-----")
 
 
@@ -98,6 +109,37 @@ class RobotDds(NamedTuple):
     """Number of processes that could not be looked at, so that other libraries may be in use."""
 
 
+class EnclaveExpiry(NamedTuple):
+    """When the files of an enclave on a robot expire; None for a file that cannot be read."""
+
+    certificate: datetime | None
+    permissions: datetime | None
+
+
+class RunningFiles(StrEnum):
+    """The files that the running processes of an enclave have loaded, as the robot saw it."""
+
+    CURRENT = "current"
+    """All processes of the enclave that were seen have loaded the installed files."""
+    EARLIER = "earlier"
+    """At least one process still has earlier files."""
+    NOT_SEEN = "not_seen"
+    """No process of the enclave was seen: none runs, or it cannot be looked at."""
+
+
+class RobotClock(StrEnum):
+    """What a robot knows of its own clock."""
+
+    SYNCHRONIZED = "synchronized"
+    """The clock is set by a time service, as the kernel says."""
+    UNSYNCHRONIZED = "unsynchronized"
+    """No time service has set the clock since the robot started."""
+    BEHIND = "behind"
+    """The clock is earlier than documents that the robot has already verified."""
+    UNKNOWN = "unknown"
+    """The kernel does not say it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Confirmation:
     """The enclave files that a robot says it has, its DDS, and the time of the robot's clock.
@@ -107,6 +149,12 @@ class Confirmation:
     an entry, an earlier certificate in that file cannot be recognised.  ``dds`` is None if the
     confirmation does not say it, and so is ``restart``: the enclaves whose processes still have
     earlier files.
+
+    The other parts come from `sros agent`, and are None in a confirmation of another program.
+    ``sequence`` is higher in each message of a robot.  ``release`` is the number of the release
+    that is installed; 0 for none.  ``expiry`` and ``running`` map enclaves to when their files
+    expire, and to what their processes have loaded.  ``problems`` are short sentences, and
+    ``requests`` signing requests (PEM) for certificates that expire.
     """
 
     robot: str
@@ -115,6 +163,13 @@ class Confirmation:
     certificates: Mapping[str, tuple[str, ...]]
     dds: RobotDds | None = None
     restart: tuple[str, ...] | None = None
+    sequence: int | None = None
+    release: int | None = None
+    expiry: Mapping[str, EnclaveExpiry] | None = None
+    running: Mapping[str, RunningFiles] | None = None
+    clock: RobotClock | None = None
+    problems: tuple[str, ...] | None = None
+    requests: tuple[str, ...] | None = None
 
     def enclaves(self) -> tuple[str, ...]:
         """Return the names of the enclaves in the confirmation, sorted."""
@@ -193,6 +248,11 @@ def _value_of(confirmation: Confirmation) -> dict[str, Any]:
         },
         **({} if confirmation.restart is None else {"restart": list(confirmation.restart)}),
         **({"dds": as_plain(dds)} if dds else {}),
+        **{
+            key: as_plain(value)
+            for key in _OF_AGENT
+            if (value := getattr(confirmation, key)) is not None
+        },
     }
 
 
@@ -348,7 +408,9 @@ def _confirmation_from(value: Any, what: str) -> Confirmation:
         certificates[path] = tuple(digests)
     dds = _dds_from(value["dds"], what) if "dds" in value else None
     restart = _restart_from(value["restart"], what) if "restart" in value else None
-    return Confirmation(robot, _moment(value["time"], what), files, certificates, dds, restart)
+    time = _moment(value["time"], what)
+    agent = {key: _AGENT_READERS[key](value[key], what) for key in _OF_AGENT if key in value}
+    return Confirmation(robot, time, files, certificates, dds, restart, **agent)
 
 
 def _restart_from(value: Any, what: str) -> tuple[str, ...]:
@@ -359,12 +421,95 @@ def _restart_from(value: Any, what: str) -> tuple[str, ...]:
     """
     if not isinstance(value, list):
         raise _refused(what, "its restart is no list")
-    for name in value:
-        try:
-            check_enclave_name(name if isinstance(name, str) else "")
-        except InvalidNameError:
-            raise _refused(what, f"{_short(name)} is not the name of an enclave") from None
-    return tuple(sorted(set(value)))
+    return tuple(sorted({_enclave_from(name, what) for name in value}))
+
+
+def _enclave_from(name: Any, what: str) -> str:
+    """Return the name of an enclave in a JSON value.
+
+    Raises:
+        DocumentError: it is none.
+    """
+    try:
+        return check_enclave_name(name if isinstance(name, str) else "")
+    except InvalidNameError:
+        raise _refused(what, f"{_short(name)} is not the name of an enclave") from None
+
+
+# The readers of the keys that `sros agent` writes; each raises `DocumentError` for another form.
+
+
+def _sequence_from(value: Any, what: str) -> int:
+    if type(value) is not int or not 1 <= value <= _MOST_NUMBER:
+        raise _refused(what, "its sequence is no positive number")
+    return value
+
+
+def _release_from(value: Any, what: str) -> int:
+    if type(value) is not int or not 0 <= value <= _MOST_NUMBER:
+        raise _refused(what, "its release is no number")
+    return value
+
+
+def _expiry_from(value: Any, what: str) -> dict[str, EnclaveExpiry]:
+    if not isinstance(value, dict):
+        raise _refused(what, "its expiry is not an object")
+    expiry = {}
+    for name, times in value.items():
+        if not isinstance(times, dict) or times.keys() != set(EnclaveExpiry._fields):
+            raise _refused(what, "an expiry has not the keys certificate and permissions")
+        moments = (
+            None if times[file] is None else _moment(times[file], what)
+            for file in EnclaveExpiry._fields
+        )
+        expiry[_enclave_from(name, what)] = EnclaveExpiry(*moments)
+    return expiry
+
+
+def _running_from(value: Any, what: str) -> dict[str, RunningFiles]:
+    if not isinstance(value, dict):
+        raise _refused(what, "its running is not an object")
+    for state in value.values():
+        if state not in tuple(RunningFiles):
+            raise _refused(what, f"{_short(state)} does not say what processes have loaded")
+    return {_enclave_from(name, what): RunningFiles(state) for name, state in value.items()}
+
+
+def _clock_from(value: Any, what: str) -> RobotClock:
+    if value not in tuple(RobotClock):
+        raise _refused(what, f"{_short(value)} is not the state of a clock")
+    return RobotClock(value)
+
+
+def _problems_from(value: Any, what: str) -> tuple[str, ...]:
+    if not isinstance(value, list) or len(value) > MOST_PROBLEMS:
+        raise _refused(what, f"its problems are no list of at most {MOST_PROBLEMS}")
+    for text in value:
+        if not (isinstance(text, str) and text.isprintable() and 0 < len(text) <= LONGEST_PROBLEM):
+            raise _refused(
+                what, f"a problem is no printable text of at most {LONGEST_PROBLEM} characters"
+            )
+    return tuple(value)
+
+
+def _requests_from(value: Any, what: str) -> tuple[str, ...]:
+    if not isinstance(value, list) or len(value) > MOST_REQUESTS:
+        raise _refused(what, f"its requests are no list of at most {MOST_REQUESTS}")
+    for text in value:
+        if not (isinstance(text, str) and len(text) <= _LONGEST_REQUEST and _REQUEST.match(text)):
+            raise _refused(what, "a request of it is not one signing request in PEM")
+    return tuple(value)
+
+
+_AGENT_READERS: Mapping[str, Callable[[Any, str], Any]] = {
+    "sequence": _sequence_from,
+    "release": _release_from,
+    "expiry": _expiry_from,
+    "running": _running_from,
+    "clock": _clock_from,
+    "problems": _problems_from,
+    "requests": _requests_from,
+}
 
 
 def _dds_from(value: Any, what: str) -> RobotDds:

@@ -15,7 +15,10 @@ from jsonschema import Draft202012Validator
 from sros_tool.errors import DocumentError, KeystoreError
 from sros_tool.keystore.confirmation import (
     CONFIRMED_FILES,
+    LONGEST_PROBLEM,
     MAX_BYTES,
+    MOST_PROBLEMS,
+    MOST_REQUESTS,
     RobotDds,
     RobotLibrary,
     Seen,
@@ -98,8 +101,16 @@ VALID: dict[str, Any] = {
     "certificates": {PATH: [DIGEST]},
     "restart": ["/r7"],
     "dds": DDS,
+    "sequence": 7,
+    "release": 0,
+    "expiry": {"/r7": {"certificate": "2027-06-21T12:50:48Z", "permissions": None}},
+    "running": {"/r7": "not_seen"},
+    "clock": "synchronized",
+    "problems": ["The disk is full."],
+    "requests": ["-----BEGIN CERTIFICATE REQUEST-----\nMA==\n-----END CERTIFICATE REQUEST-----\n"],
 }
-OPTIONAL = ("certificates", "restart", "dds")
+OF_AGENT = ("sequence", "release", "expiry", "running", "clock", "problems", "requests")
+OPTIONAL = ("certificates", "restart", "dds", *OF_AGENT)
 CONTROLS = "\x1b[2J\x9b\u202e\udc9b\x00\n"
 NO_LIBRARIES: Any = {
     "product": ("DDS", "", None, [], CONTROLS),
@@ -154,6 +165,21 @@ def hostile() -> list[tuple[str, bytes]]:
                 for wrong in wrongs
             ),
         ),
+        "sequence": (0, -1, True, 1.0, "1", 2**53, 10**400, None, []),
+        "release": (-1, True, 1.0, "1", 2**53, None, []),
+        "expiry": (
+            [], None, {"/r7": None}, {"/r7": {}}, {"r7": VALID["expiry"]["/r7"]},
+            {"/r7": {"certificate": None}}, {"/r7": {"certificate": None, "permissions": 0}},
+            {"/r7": {"certificate": CONTROLS, "permissions": None}},
+        ),
+        "running": ([], None, {"/r7": "running"}, {"/r7": []}, {"/r7": None}, {"r7": "current"}),
+        "clock": ("right", "", None, [], {}, 1),
+        "problems": ({}, None, "it", [1], [""], [CONTROLS], ["a" * (LONGEST_PROBLEM + 1)], ["a"] * (MOST_PROBLEMS + 1)),
+        "requests": (
+            {}, None, [1], [""], ["x"], VALID["requests"] * (MOST_REQUESTS + 1),
+            ["".join(VALID["requests"] * 2)], [VALID["requests"][0] + "\n"], [CONTROLS],
+            [VALID["requests"][0].replace("MA==", "MA==" * 5000)],
+        ),
         CONTROLS: (1,),
     }  # fmt: skip
     for key, values in faults.items():
@@ -168,13 +194,18 @@ def _json(value: object) -> bytes:
 
 
 def test_a_hostile_confirmation_is_refused_in_one_paragraph() -> None:
-    assert parse_confirmation(_json(VALID), "it").certificates == {PATH: (DIGEST,)}
+    valid = parse_confirmation(_json(VALID), "it")
+    assert valid.certificates == {PATH: (DIGEST,)}
+    assert json.loads(render_confirmation(valid)) == VALID, "all of it is written again"
+    schema = json.loads((SCHEMAS / "confirmation.json").read_text())
+    Draft202012Validator(schema).validate(VALID)
     without = parse_confirmation(
         _json({key: VALID[key] for key in VALID if key not in OPTIONAL}), "it"
     )
     assert (without.certificates, without.restart, without.dds) == ({}, None, None), (
         "as earlier versions write it"
     )
+    assert not any(getattr(without, key) for key in OF_AGENT)
     for name, data in hostile():
         with pytest.raises(DocumentError) as caught:
             parse_confirmation(data, "it")
