@@ -174,7 +174,10 @@ def hostile() -> list[tuple[str, bytes]]:
         ),
         "running": ([], None, {"/r7": "running"}, {"/r7": []}, {"/r7": None}, {"r7": "current"}),
         "clock": ("right", "", None, [], {}, 1),
-        "problems": ({}, None, "it", [1], [""], [CONTROLS], ["a" * (LONGEST_PROBLEM + 1)], ["a"] * (MOST_PROBLEMS + 1)),
+        "problems": (
+            {}, None, "it", [1], [""], [CONTROLS], ["a" * (LONGEST_PROBLEM + 1)],
+            ["a"] * (MOST_PROBLEMS + 1),
+        ),
         "requests": (
             {}, None, [1], [""], ["x"], VALID["requests"] * (MOST_REQUESTS + 1),
             ["".join(VALID["requests"] * 2)], [VALID["requests"][0] + "\n"], [CONTROLS],
