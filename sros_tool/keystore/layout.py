@@ -85,6 +85,9 @@ Without this list, anyone who transports an answer could exchange the governance
 the robot the list stays next to the files: its number tells which answer they came from.
 """
 
+RELEASE_SEAL = "release.p7s"
+"""The name of a robot and the list of all files of its release, signed by the permissions CA."""
+
 
 def confirmation_file(robot: str) -> str:
     """Return the path of a robot's last confirmation, relative to the keystore."""

@@ -3,24 +3,37 @@
 from __future__ import annotations
 
 import gzip
+import hashlib
 import io
 import tarfile
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import PurePosixPath
+from typing import NamedTuple
 
 from sros_tool.errors import DocumentError
 from sros_tool.keystore.layout import folder_mode
 
 SUFFIXES = (".tar.gz", ".tgz")
-_MAX_PACKED = 16 * 1024 * 1024
 MAX_UNPACKED = 40 * 1024 * 1024
 MAX_MEMBER = 17 * 1024 * 1024
-"""Maximum size in bytes of a packed archive, of its unpacked content, and of a file in it.
+"""Maximum size in bytes of the unpacked content of an answer, and of a file in any archive.
 
 A Zenoh configuration of the largest size that sros reads fits, with its signed document.
 """
-_MOST_MEMBERS = 200
+
+
+class ArchiveLimits(NamedTuple):
+    """Maximum size in bytes of an archive, packed and unpacked, and its number of entries."""
+
+    packed: int
+    unpacked: int
+    members: int
+
+
+OF_ONE_ENCLAVE = ArchiveLimits(16 * 1024 * 1024, MAX_UNPACKED, 200)
+OF_ONE_ROBOT = ArchiveLimits(64 * 1024 * 1024, 256 * 1024 * 1024, 20_000)
+"""Limits of the archive of one enclave, and of all enclaves of a robot."""
 _GZIP = 16 + zlib.MAX_WBITS
 
 
@@ -56,7 +69,13 @@ def pack(files: Mapping[str, bytes]) -> bytes:
     return buffer.getvalue()
 
 
-def unpack(data: bytes) -> dict[str, bytes]:
+def listed_digests(files: Mapping[str, bytes]) -> bytes:
+    """Return the file list for a seal: a line "SHA-256, two spaces, path" per file, sorted."""
+    digests = (f"{hashlib.sha256(data).hexdigest()}  {path}" for path, data in files.items())
+    return "\n".join([*sorted(digests), ""]).encode()
+
+
+def unpack(data: bytes, limits: ArchiveLimits = OF_ONE_ENCLAVE) -> dict[str, bytes]:
     """Map the paths in a ``.tar.gz`` archive to the content of the files, without writing them.
 
     The paths are not checked: the caller must do that.
@@ -66,19 +85,19 @@ def unpack(data: bytes) -> dict[str, bytes]:
             data after its end, or anything other than regular files and folders.
     """
     try:
-        with tarfile.open(fileobj=io.BytesIO(_unzip(data)), mode="r:") as tar:
-            return dict(_members(tar))
+        with tarfile.open(fileobj=io.BytesIO(_unzip(data, limits)), mode="r:") as tar:
+            return dict(_members(tar, limits.members))
     except (tarfile.TarError, zlib.error, EOFError, OSError, ValueError, OverflowError) as error:
         raise DocumentError("it is not a .tar.gz archive, or it is damaged") from error
 
 
-def _unzip(data: bytes) -> bytes:
-    if len(data) > _MAX_PACKED:
-        raise DocumentError(f"it is too large: more than {_MAX_PACKED // 1024**2} MiB")
+def _unzip(data: bytes, limits: ArchiveLimits) -> bytes:
+    if len(data) > limits.packed:
+        raise DocumentError(f"it is too large: more than {limits.packed // 1024**2} MiB")
     stream = zlib.decompressobj(_GZIP)
-    plain = stream.decompress(data, MAX_UNPACKED + 1)
-    if len(plain) > MAX_UNPACKED:
-        raise DocumentError(f"it unpacks to more than {MAX_UNPACKED // 1024**2} MiB")
+    plain = stream.decompress(data, limits.unpacked + 1)
+    if len(plain) > limits.unpacked:
+        raise DocumentError(f"it unpacks to more than {limits.unpacked // 1024**2} MiB")
     if not stream.eof:
         raise EOFError
     if stream.unused_data:
@@ -86,15 +105,15 @@ def _unzip(data: bytes) -> bytes:
     return plain
 
 
-def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, bytes]]:
+def _members(tar: tarfile.TarFile, most: int) -> Iterator[tuple[str, bytes]]:
     seen: set[str] = set()
     for entry in tar:
         name = entry.name
-        if name in seen or len(seen) >= _MOST_MEMBERS:
+        if name in seen or len(seen) >= most:
             raise DocumentError(
                 f"it contains {name!r} twice"
                 if name in seen
-                else f"it contains more than {_MOST_MEMBERS} entries"
+                else f"it contains more than {most} entries"
             )
         seen.add(name)
         if entry.isdir():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,7 +16,7 @@ from cryptography import x509
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError, UsageError
 from sros_tool.files import write_new_file
-from sros_tool.keystore.delivery.archive import unpack
+from sros_tool.keystore.delivery.archive import listed_digests, unpack
 from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.authority import Authority
 from sros_tool.keystore.issuing.keyring import no_secrets
@@ -308,13 +307,7 @@ def seal(files: dict[str, bytes], number: int, authority: Authority) -> bytes:
     ``number`` is from `sros_tool.keystore.ledger.Ledger.next_number`.
     """
     head = f"sros answer 2\nnumber {number}\n".encode()
-    return authority.sign(head + _listed(files), "the file list of the answer")
-
-
-def _listed(files: dict[str, bytes]) -> bytes:
-    """Return the file list for the seal: a line "SHA-256, two spaces, path" per file, sorted."""
-    digests = (f"{hashlib.sha256(data).hexdigest()}  {path}" for path, data in files.items())
-    return "\n".join([*sorted(digests), ""]).encode()
+    return authority.sign(head + listed_digests(files), "the file list of the answer")
 
 
 def _number_of(message: bytes) -> int:
@@ -400,7 +393,7 @@ def _broken_seal(answer: RequestAnswer, authorities: Iterable[x509.Certificate])
     except SrosError as error:
         return str(error)
     head = _SEALED.match(document := signed.text)
-    if not head or document[head.end() :] != _listed(answer.files):
+    if not head or document[head.end() :] != listed_digests(answer.files):
         return "the files differ from the signed list"
     problem = ""
     for authority in authorities:

@@ -1,0 +1,165 @@
+"""The release of a robot: what its security folder is to have, sealed by the permissions CA.
+
+A release is an archive (``.tar.gz``) with all files of the robot's enclaves except their keys, and
+with the seal ``release.p7s``: a signed message of the lines ::
+
+    sros release 1
+    robot NAME
+    number N
+    SHA-256  PATH      (a line for each file, sorted)
+
+The number rises with each new content, so that a robot notices an older release.  Whoever carries
+a release, or has the keys of the metadata that lead to it, can therefore neither change it, nor
+give it to another robot, nor bring back an earlier one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from cryptography import x509
+
+from sros_tool.errors import DocumentError, SrosError
+from sros_tool.fleet.robots import name_problem
+from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, listed_digests, pack, unpack
+from sros_tool.keystore.issuing.authority import Authority
+from sros_tool.keystore.layout import (
+    ENCLAVES,
+    KEY_FILE,
+    KEY_URI_FILE,
+    OPTIONAL_FILES,
+    RELEASE_SEAL,
+    REQUIRED_FILES,
+    ZENOH_FILES,
+)
+from sros_tool.names import check_enclave_name
+from sros_tool.pki import smime
+
+RELEASE_FILES = frozenset(
+    (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES),
+) - {KEY_FILE}
+"""Names of the files of an enclave that a release can have."""
+_SEALED = re.compile(rb"sros release 1\nrobot ([^\n]{1,255})\nnumber ([1-9][0-9]{0,11})\n")
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """What the security folder of ``robot`` is to have.
+
+    ``number`` is higher than those of all earlier releases of the robot.  ``files`` maps paths
+    (``enclaves/r1/base/cert.pem``) to contents, without private keys; an enclave of which it has no
+    file is no longer one of this robot.  ``seal`` is the signed message with robot, number and the
+    digests of all files; `seal_problem` verifies it.
+    """
+
+    robot: str
+    number: int
+    files: Mapping[str, bytes]
+    seal: bytes
+
+    def enclaves(self) -> dict[str, dict[str, bytes]]:
+        """Map the names of the enclaves to their files, by file name."""
+        found: dict[str, dict[str, bytes]] = {}
+        for path, data in self.files.items():
+            name, file = _enclave_and_file(path)
+            found.setdefault(name, {})[file] = data
+        return found
+
+
+class SealedRobot(NamedTuple):
+    """Robot and number in a seal, which is not verified."""
+
+    robot: str
+    number: int
+
+
+def seal_releases(
+    releases: Sequence[tuple[str, int, Mapping[str, bytes]]], authority: Authority
+) -> list[bytes]:
+    """Return the seals (S/MIME) of releases, each given as robot, number and files, in order."""
+    documents = [_text(robot, number, files) for robot, number, files in releases]
+    return authority.sign_all(documents, "the file list of a release")
+
+
+def pack_release(release: Release) -> bytes:
+    """Return the archive of a release; the same release always gives the same bytes."""
+    return pack({**release.files, RELEASE_SEAL: release.seal})
+
+
+def read_release(data: bytes) -> Release:
+    """Return the release in an archive, whose files are exactly those that its seal lists.
+
+    Who signed the seal is not verified: `seal_problem` does that.
+
+    Raises:
+        DocumentError: the archive is damaged or too large; it has a file that does not belong to an
+            enclave, such as a private key; or its files differ from the list in the seal.
+    """
+    try:
+        files = unpack(data, OF_ONE_ROBOT)
+        seal = files.pop(RELEASE_SEAL, b"")
+        if not seal:
+            raise DocumentError(f"it lacks {RELEASE_SEAL}")
+        for path in files:
+            _enclave_and_file(path)
+        sealed = sealed_robot(seal)
+        if smime.parse(seal).text != _text(sealed.robot, sealed.number, files):
+            raise DocumentError("its files differ from the signed list")
+    except SrosError as error:
+        raise DocumentError(f"the release cannot be used: {error.what}", error.why) from error
+    return Release(sealed.robot, sealed.number, files, seal)
+
+
+def sealed_robot(seal: bytes) -> SealedRobot:
+    """Return robot and number in a seal, without verifying it.
+
+    Raises:
+        DocumentError: it is not the seal of a release.
+    """
+    head = _SEALED.match(smime.parse(seal).text)
+    robot = head[1].decode("ascii", "replace") if head else ""
+    if not head or name_problem(robot):
+        raise DocumentError(f"{RELEASE_SEAL} is not the seal of a release")
+    return SealedRobot(robot, int(head[2]))
+
+
+def seal_problem(release: Release, authorities: Iterable[x509.Certificate]) -> str:
+    """Return why no CA in ``authorities`` sealed this release, as a clause; "" if a CA did.
+
+    On a robot, ``authorities`` are the permissions CAs that its folder trusts.
+    """
+    try:
+        signed = smime.parse(release.seal)
+    except SrosError as error:
+        return str(error)
+    if signed.text != _text(release.robot, release.number, release.files):
+        return "robot, number or files differ from the signed list"
+    problem = "no permissions CA is trusted"
+    for authority in authorities:
+        try:
+            signed.verify(authority)
+            return ""
+        except SrosError as error:
+            problem = str(error)
+    return problem
+
+
+def _text(robot: str, number: int, files: Mapping[str, bytes]) -> bytes:
+    """Return the text of a seal."""
+    head = f"sros release 1\nrobot {robot}\nnumber {number}\n"
+    return head.encode() + listed_digests(files)
+
+
+def _enclave_and_file(path: str) -> tuple[str, str]:
+    """Return the enclave and the file name in the path of a file in a release.
+
+    Raises:
+        SrosError: the path is not that of a file which a release can have.
+    """
+    folder, _, file = path.rpartition("/")
+    if file not in RELEASE_FILES or not f"{folder}/".startswith(f"{ENCLAVES}/"):
+        raise DocumentError(f"it contains {path!r}, which does not belong to a release")
+    return check_enclave_name(folder.removeprefix(ENCLAVES) or "/"), file
