@@ -31,7 +31,7 @@ class ArchiveLimits(NamedTuple):
     members: int
 
 
-OF_ONE_ENCLAVE = ArchiveLimits(16 * 1024 * 1024, MAX_UNPACKED, 200)
+_OF_ONE_ENCLAVE = ArchiveLimits(16 * 1024 * 1024, MAX_UNPACKED, 200)
 OF_ONE_ROBOT = ArchiveLimits(64 * 1024 * 1024, 256 * 1024 * 1024, 20_000)
 """Limits of the archive of one enclave, and of all enclaves of a robot."""
 _GZIP = 16 + zlib.MAX_WBITS
@@ -75,7 +75,7 @@ def listed_digests(files: Mapping[str, bytes]) -> bytes:
     return "\n".join([*sorted(digests), ""]).encode()
 
 
-def unpack(data: bytes, limits: ArchiveLimits = OF_ONE_ENCLAVE) -> dict[str, bytes]:
+def unpack(data: bytes, limits: ArchiveLimits = _OF_ONE_ENCLAVE) -> dict[str, bytes]:
     """Map the paths in a ``.tar.gz`` archive to the content of the files, without writing them.
 
     The paths are not checked: the caller must do that.
