@@ -5,11 +5,11 @@ Source: ``ros2.repos`` of the branches of ros2/ros2 and their release tags, Nove
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
-from sros_tool.errors import UsageError
+from sros_tool.errors import Note, UsageError
 from sros_tool.names import DISTRIBUTIONS, distribution_problem
 from sros_tool.wording import enumerated
 from sros_tool.zenoh.releases import RELEASES, RmwZenohRelease
@@ -194,6 +194,15 @@ def selected_vendors(vendor: str, distributions: Sequence[Distribution]) -> tupl
 def sourced(environment_value: str | None) -> Distribution | None:
     """Return the distribution that $ROS_DISTRO names; None if sros does not know it."""
     return find_distribution(environment_value) if environment_value in DISTRIBUTIONS else None
+
+
+def unknown_distribution(environment: Mapping[str, str]) -> list[Note]:
+    """Return a note if $ROS_DISTRO names no distribution, so that it chooses no vendor."""
+    name = environment.get(ROS_DISTRO, "")
+    if not name or not distribution_problem(name):
+        return []
+    text = f"{ROS_DISTRO} is {name!r}, which sros does not know: decided as if it were not set. "
+    return [Note("distribution.unknown", f"{text}Name the one that is sourced, such as jazzy.")]
 
 
 def _decided_as(product: str, version: str) -> Vendor:

@@ -81,6 +81,7 @@ def loadable_environment(
         KeystoreError: the enclave does not exist, a process cannot run in it, or others can read
             its private key.
     """
+    from sros_tool.distributions import unknown_distribution
     from sros_tool.keystore.issuing.tokens import pin_notes
     from sros_tool.keystore.layout import (
         KEY_FILE,
@@ -161,13 +162,14 @@ def loadable_environment(
         variables |= REFUSING_ZENOH  # what chooses it later, such as a launch file, starts no node
     if rmw:
         variables[RMW] = rmw
+    notes = () if target else tuple(unknown_distribution(environment))
     if not state.token:
-        return EnclaveEnvironment(variables)
+        return EnclaveEnvironment(variables, notes)
     # The module is only the one that the user names for this process: loading it runs its code.
     module = environment.get(MODULE_VARIABLE)
     if module and not target:
         variables[MODULE_VARIABLE] = module
-    notes = (_token_there(name, state.token),) if target else tuple(pin_notes(state.token))
+    notes += (_token_there(name, state.token),) if target else tuple(pin_notes(state.token))
     return EnclaveEnvironment(variables, notes, needs_pin=not state.token.pin_source)
 
 

@@ -23,7 +23,6 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     save,
-    unknown_distribution,
     verb,
 )
 from sros_tool.cli.observing import (
@@ -128,7 +127,9 @@ def audit(
     if patch is not None:
         check_output(patch, force=force)
     if not (vendor or distro):
-        print_notes(unknown_distribution())
+        from sros_tool.distributions import unknown_distribution
+
+        print_notes(unknown_distribution(os.environ))
     everything = {**os.environ, **environment}
     enclaves = audits.audited_enclaves(
         source,

@@ -170,19 +170,6 @@ def all_distros_option(help_text: str) -> Callable[[Decorated], Decorated]:
     return click.option("--all-distros", is_flag=True, help=help_text)
 
 
-def unknown_distribution() -> list[Note]:
-    """Return a note if $ROS_DISTRO names no distribution, so that it chooses no vendor."""
-    from sros_tool.distributions import ROS_DISTRO
-    from sros_tool.errors import Note
-    from sros_tool.names import distribution_problem
-
-    name = os.environ.get(ROS_DISTRO, "")
-    if not name or not distribution_problem(name):
-        return []
-    text = f"{ROS_DISTRO} is {name!r}, which sros does not know: decided as if it were not set. "
-    return [Note("explain.unknown-distribution", f"{text}Choose one with --distro.")]
-
-
 advisories_option = click.option(
     "--advisories",
     metavar="FILE",

@@ -30,7 +30,6 @@ from sros_tool.cli.common import (
     progress,
     read_log,
     ros_domain,
-    unknown_distribution,
     verb,
 )
 from sros_tool.dds.decision.vendors import Vendor
@@ -295,7 +294,9 @@ def explain(
         raise UsageError("--vendor zenoh takes no --distro", text, "Leave it out.")
     why_zenoh = "" if all_vendors or all_distros else _why_zenoh(vendor, root)
     if not (why_zenoh or vendor or distro or all_vendors or all_distros):
-        print_notes(unknown_distribution())
+        from sros_tool.distributions import unknown_distribution
+
+        print_notes(unknown_distribution(os.environ))
     if who:
         chosen = None if why_zenoh else chosen_vendor(vendor, distro, os.environ)
         only = patterns, robots

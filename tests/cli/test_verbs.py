@@ -605,6 +605,12 @@ def variables(keystore: Path, domain: int = 0) -> dict[str, str]:
     }
 
 
+def test_env_says_that_a_distribution_is_none(keystore: Path) -> None:
+    note = "note [distribution.unknown]: ROS_DISTRO is 'jazy', which sros does not know"
+    assert note in sros("env", keystore, "/a", env={"ROS_DISTRO": "jazy"}).ok().err
+    assert note not in sros("env", keystore, "/a", env={"ROS_DISTRO": "jazzy"}).ok().err
+
+
 def test_env_in_every_form(keystore: Path) -> None:
     wanted = variables(keystore)
     assert json.loads(sros("env", keystore, "/a", "--json").ok().out)["variables"] == wanted

@@ -266,7 +266,7 @@ def test_the_vendor_of_this_machine(whole: Path) -> None:
 
 def test_a_distribution_that_is_none_is_no_choice(whole: Path) -> None:
     asked = (whole, ENCLAVE, "publish", "/chatter")
-    text = "note [explain.unknown-distribution]: ROS_DISTRO is 'jazy', which sros does not know"
+    text = "note [distribution.unknown]: ROS_DISTRO is 'jazy', which sros does not know"
     for words in (asked, (whole, "--who", "publish", "/chatter")):
         assert text in explain(*words, env={"ROS_DISTRO": "jazy"}).ok().err
         assert text not in explain(*words, env={"ROS_DISTRO": "jazzy"}).ok().err
