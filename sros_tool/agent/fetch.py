@@ -7,18 +7,34 @@ Whether the permissions CA sealed the release is verified where it is installed.
 
 from __future__ import annotations
 
+import hashlib
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from sros_tool.errors import SrosError
-from sros_tool.keystore.delivery.release import Release
+from sros_tool.errors import SrosError, UnavailableError, UsageError
+from sros_tool.files import replace_file
+from sros_tool.fleet.robots import name_problem
+from sros_tool.folders import Folder
+from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
+from sros_tool.keystore.delivery.release import Release, read_release, release_target
+from sros_tool.validity import iso
+from sros_tool.xml import read_bytes
 
-METADATA = "metadata"
+if TYPE_CHECKING:
+    from tuf.api.metadata import TargetFile
+    from tuf.ngclient import Updater
+
+    from sros_tool.agent.transport import FolderTransport, HttpTransport
+
+_METADATA = "metadata"
 """The folder in the agent's folder with the trusted metadata, which `tuf` keeps."""
-PINNED_ROOT = "root.json"
+_PINNED_ROOT = "root.json"
 """The file in the agent's folder with the root metadata that `pin_root` trusted first."""
+_FETCHED = "release.tar.gz"
+"""The file in the agent's folder with the release that was transferred last."""
+_MOST_METADATA = 8 * 1024 * 1024
 
 
 class FetchProblem(StrEnum):
@@ -66,10 +82,37 @@ def pin_root(state: Path, data: bytes, *, now: datetime) -> str:
         now: the present time.
 
     Raises:
-        FetchError: it is no root metadata that its own keys signed.
+        FetchError: it is no root metadata that its own keys signed, or it expired.
         UnavailableError: the package ``tuf`` is not installed.
     """
-    raise NotImplementedError
+    _check_tuf()
+    from tuf.api.exceptions import RepositoryError
+    from tuf.api.metadata import Metadata, Root
+
+    try:
+        root = Metadata[Root].from_bytes(data)
+        if not isinstance(root.signed, Root):
+            raise RepositoryError("it is metadata of another kind")
+        root.verify_delegate(Root.type, root)
+    except (RepositoryError, ValueError) as error:
+        raise FetchError(
+            FetchProblem.NOT_SIGNED,
+            "the file is not the root metadata of a publishing folder",
+            f"{_sentence(error)}",
+            "Take root.json from PUB/metadata as `sros fleet publish` wrote it at home.",
+        ) from error
+    if root.signed.is_expired(now):
+        raise FetchError(
+            FetchProblem.EXPIRED,
+            f"the root metadata expired at {iso(root.signed.expires)}",
+            "",
+            "Take the present root.json of the publishing folder; or set the clock of this robot.",
+        )
+    with Folder(state) as folder:
+        if folder.is_folder(_METADATA):
+            folder.remove_tree(_METADATA)
+    replace_file(state / _PINNED_ROOT, data)
+    return hashlib.sha256(data).hexdigest()
 
 
 def fetch_release(
@@ -99,6 +142,187 @@ def fetch_release(
 
     Raises:
         FetchError: there is no such release that can be trusted; its ``problem`` says why.
+        UsageError: ``source`` is not an address, or ``robot`` not a name.
         UnavailableError: the package ``tuf`` is not installed.
     """
-    raise NotImplementedError
+    _check_tuf()
+    from tuf.api.exceptions import DownloadError, RepositoryError
+
+    if problem := name_problem(robot):
+        raise UsageError(f"{robot!r} is not the name of a robot", problem)
+    try:
+        with _transport(source, client_certificate, tls_ca) as transport:
+            updater = _updater(state, transport, now)
+            target = updater.get_targetinfo(release_target(robot))
+            number = _number(target, source, robot)
+            if target is None or number == installed:
+                return None
+            path = state / _FETCHED
+            if updater.find_cached_target(target, str(path)) is None:
+                updater.download_target(target, str(path))
+    except (DownloadError, RepositoryError, OSError, ValueError) as error:
+        raise _explained(error, source, now) from error
+    return _read(path, robot, number)
+
+
+def _check_tuf() -> None:
+    """Raise `UnavailableError` unless ``tuf`` is installed."""
+    try:
+        import tuf.ngclient  # noqa: F401
+    except ImportError as error:
+        raise UnavailableError(
+            "the Python package tuf is not installed",
+            "It verifies what is fetched.",
+            "Install it: `pip install 'sros_tool[fetch]'`.",
+        ) from error
+
+
+def _transport(
+    source: str, certificate: ClientCertificate | None, tls_ca: Path | None
+) -> HttpTransport | FolderTransport:
+    from sros_tool.agent.transport import FolderTransport, HttpTransport
+
+    if source.startswith(("https://", "http://")):
+        try:
+            return HttpTransport(source, certificate=certificate, tls_ca=tls_ca)
+        except OSError as error:
+            raise FetchError(
+                FetchProblem.UNREACHABLE,
+                "the certificates for TLS cannot be used",
+                _sentence(error),
+                "Look at the certificate, the key and the CAs that the agent is told to use.",
+            ) from error
+    if "://" in source:
+        raise UsageError(
+            f"{source!r} is neither an address of http or https nor a folder",
+            "",
+            "Write it as in https://HOST/fleet, or as the path of a folder.",
+        )
+    return FolderTransport(Path(source), most=OF_ONE_ROBOT.packed)
+
+
+def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datetime) -> Updater:
+    """Return the client of TUF, which begins with the pinned root and what it trusted since."""
+    from tuf.ngclient import Updater, UpdaterConfig
+
+    path = state / _PINNED_ROOT
+    if not path.exists():
+        raise FetchError(
+            FetchProblem.NOT_SIGNED,
+            f"'{state}' has no {_PINNED_ROOT}",
+            "Nothing says which keys sign what is published.",
+            "Name it to `sros agent init` with --root.",
+        )
+    with Folder(state) as folder:
+        if not folder.is_folder(_METADATA):
+            folder.mkdir(_METADATA, 0o700)
+    updater = Updater(
+        str(state / _METADATA),
+        f"{transport.base}/metadata/",
+        target_base_url=f"{transport.base}/targets/",
+        fetcher=transport,
+        config=UpdaterConfig(targets_max_length=_MOST_METADATA),
+        bootstrap=read_bytes(path, "root metadata", most=_MOST_METADATA),
+    )
+    # The present time is passed in; the client would ask the clock of the machine.
+    updater._trusted_set.reference_time = now
+    return updater
+
+
+def _number(target: TargetFile | None, source: str, robot: str) -> int:
+    """Return the number of the release that the metadata describes.
+
+    Raises:
+        FetchError: there is none for the robot, or it is too large.
+    """
+    if target is None:
+        raise FetchError(
+            FetchProblem.NOT_FOR_ROBOT,
+            f"nothing is published for the robot {robot} in {source}",
+            "It is not in the fleet, or all its enclaves were revoked.",
+            "Look at it at home with `sros fleet status KEYSTORE`.",
+        )
+    if target.length > OF_ONE_ROBOT.packed:
+        raise FetchError(
+            FetchProblem.TOO_LARGE,
+            f"the release of {robot} has {target.length} bytes",
+            f"The limit is {OF_ONE_ROBOT.packed} bytes.",
+        )
+    number = target.custom.get("number") if isinstance(target.custom, dict) else None
+    if not isinstance(number, int) or number < 1:
+        raise FetchError(FetchProblem.NOT_SIGNED, f"the metadata of {robot} states no number")
+    return number
+
+
+def _read(path: Path, robot: str, number: int) -> Release:
+    """Return the release in the verified archive at ``path``, which has to be this robot's."""
+    try:
+        release = read_release(read_bytes(path, "release", most=OF_ONE_ROBOT.packed))
+    except SrosError as error:
+        raise FetchError(FetchProblem.NOT_SIGNED, error.what, error.why, error.remedy) from error
+    if release.robot != robot:
+        raise FetchError(
+            FetchProblem.NOT_FOR_ROBOT,
+            f"what is published for {robot} is the release of {release.robot}",
+            "Somebody with the keys of the metadata put it there, or a robot was renamed.",
+            "Nothing was changed. Look into it at home.",
+        )
+    if release.number != number:
+        raise FetchError(
+            FetchProblem.NOT_SIGNED,
+            f"the release of {robot} has the number {release.number}, the metadata says {number}",
+        )
+    return release
+
+
+_CLOCK = "set the clock of this robot, if it is wrong"
+
+
+def _explained(error: Exception, source: str, now: datetime) -> FetchError:
+    """Return what an error of the client of TUF means for the robot."""
+    from tuf.api import exceptions
+
+    why = _sentence(error)
+    if isinstance(error, exceptions.ExpiredMetadataError):
+        return FetchError(
+            FetchProblem.EXPIRED,
+            f"what is published in {source} expired",
+            f"{why} It is {iso(now)} here. Home publishes no more, or somebody withholds it.",
+            f"Run `sros fleet publish` at home; {_CLOCK}.",
+        )
+    if isinstance(error, exceptions.BadVersionNumberError):
+        return FetchError(
+            FetchProblem.ROLLED_BACK,
+            f"what is published in {source} is older than what this robot has seen",
+            why,
+            "Nothing was changed. Bring the publishing folder, or the keystore at home, up to date "
+            "again.",
+        )
+    if isinstance(error, exceptions.DownloadLengthMismatchError):
+        return FetchError(
+            FetchProblem.TOO_LARGE, f"{source} sends more than is allowed", why, "Nothing was kept."
+        )
+    if isinstance(error, exceptions.DownloadError):
+        return FetchError(FetchProblem.UNREACHABLE, f"{source} cannot be fetched from", why)
+    if isinstance(error, OSError):
+        return FetchError(
+            FetchProblem.NOT_KEPT,
+            "what is fetched cannot be kept",
+            why,
+            "Make room on the disk, and let the agent write in its folder.",
+        )
+    return FetchError(
+        FetchProblem.NOT_SIGNED,
+        f"what is published in {source} is not what the trusted keys signed",
+        why,
+        "Nothing was changed.",
+    )
+
+
+def _sentence(error: Exception) -> str:
+    """Return an error as a sentence."""
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    text = text.strip().removesuffix(".") or type(error).__name__
+    return f"{text[:1].upper()}{text[1:]}."

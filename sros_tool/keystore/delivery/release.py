@@ -29,7 +29,6 @@ from sros_tool.keystore.issuing.authority import Authority
 from sros_tool.keystore.layout import (
     ENCLAVES,
     KEY_FILE,
-    KEY_URI_FILE,
     OPTIONAL_FILES,
     RELEASE_SEAL,
     REQUIRED_FILES,
@@ -38,10 +37,8 @@ from sros_tool.keystore.layout import (
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
 
-RELEASE_FILES = frozenset(
-    (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES),
-) - {KEY_FILE}
-"""Names of the files of an enclave that a release can have."""
+RELEASE_FILES = frozenset({*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES} - {KEY_FILE})
+"""Names of the files of an enclave that a release can have: no key, and no place of a key."""
 _SEALED = re.compile(rb"sros release 1\nrobot ([^\n]{1,255})\nnumber ([1-9][0-9]{0,11})\n")
 
 
@@ -67,6 +64,11 @@ class Release:
             name, file = _enclave_and_file(path)
             found.setdefault(name, {})[file] = data
         return found
+
+
+def release_target(robot: str) -> str:
+    """Return the path of a robot's release among the targets of a publishing folder."""
+    return f"robots/{robot}.tar.gz"
 
 
 class SealedRobot(NamedTuple):

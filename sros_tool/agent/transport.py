@@ -1,0 +1,227 @@
+"""How files of a publishing folder get to the robot: by https, http, or from a folder.
+
+Both classes are what `tuf` fetches with.  They allow neither endless nor slow answers, follow no
+redirect and no link, and leave it to `tuf` to verify what comes.
+"""
+
+from __future__ import annotations
+
+import errno
+import http.client
+import socket
+import ssl
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+from urllib.parse import urlsplit
+
+from tuf.api.exceptions import (
+    DownloadError,
+    DownloadHTTPError,
+    DownloadLengthMismatchError,
+    SlowRetrievalError,
+)
+from tuf.ngclient.fetcher import FetcherInterface
+
+from sros_tool.errors import SrosError, UsageError
+from sros_tool.folders import Folder
+
+_BLOCK = 1 << 16
+_SILENCE = 30.0
+"""Longest wait for the next byte of a server, in seconds."""
+MOST_SECONDS = 300.0
+"""Longest time in seconds that all files of one visit may take together."""
+
+
+class FolderTransport(FetcherInterface):
+    """Reads the files of a publishing folder in a folder of this machine, such as a USB stick."""
+
+    base = "folder:"
+
+    def __init__(self, folder: Path, *, most: int) -> None:
+        """Read from ``folder``, files of at most ``most`` bytes each."""
+        self._folder = folder
+        self._most = most
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Leave the folder, which is closed after each file."""
+
+    def _fetch(self, url: str) -> Iterator[bytes]:
+        path = url.removeprefix(f"{self.base}/")
+        try:
+            folder = Folder(self._folder)
+        except OSError as error:
+            raise DownloadError(f"'{self._folder}': {error.strerror}") from error
+        with folder:
+            try:
+                yield folder.read(path, most=self._most)
+            except FileNotFoundError as error:
+                raise DownloadHTTPError(f"'{self._folder / path}' does not exist", 404) from error
+            except OSError as error:
+                text = f"'{self._folder / path}': {error.strerror}"
+                if error.errno == errno.EFBIG:
+                    raise DownloadLengthMismatchError(text) from error
+                raise DownloadError(text) from error
+            except SrosError as error:
+                raise DownloadError(error.what) from error
+
+
+class HttpTransport(FetcherInterface):
+    """Gets the files of a publishing folder from a web server, over one connection.
+
+    A context manager: when `MOST_SECONDS` are over, what still goes on is cut off.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        certificate: tuple[Path, Path] | None = None,
+        tls_ca: Path | None = None,
+        seconds: float = MOST_SECONDS,
+    ) -> None:
+        """Prepare to get files below ``url``, without connecting.
+
+        Args:
+            url: ``http://HOST[:PORT][/PATH]`` or ``https://…``.
+            certificate: files (PEM) of the client's certificate and its key.
+            tls_ca: file (PEM) of the server's CAs; None: those of the system.
+            seconds: longest time for all files together.
+
+        Raises:
+            UsageError: ``url`` has another form.
+            OSError: a file of the certificates cannot be read, or is none.
+        """
+        parts = urlsplit(url)
+        self.base = url.rstrip("/")
+        self._path = parts.path.rstrip("/")
+        secure = parts.scheme == "https"
+        try:
+            port = parts.port or (443 if secure else 80)
+        except ValueError:
+            port = 0
+        if (
+            not parts.hostname
+            or not port
+            or parts.query
+            or parts.fragment
+            or "@" in parts.netloc
+            or not (url.isascii() and url.isprintable())
+            or " " in url
+        ):
+            raise UsageError(
+                f"{url!r} is not the address of a publishing folder",
+                "It has a host and a path, without user, '?' and '#'.",
+                "Write it as in https://HOST/fleet.",
+            )
+        context = ssl.create_default_context(cafile=tls_ca) if secure else None
+        if context and certificate:
+            context.load_cert_chain(*certificate)
+        self._connection = _GuardedConnection(parts.hostname, port, context)
+        self._timer = threading.Timer(seconds, self._connection.cut_off)
+        self._timer.daemon = True
+
+    def __enter__(self) -> Self:
+        self._timer.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._timer.cancel()
+        self._connection.close()
+
+    def _fetch(self, url: str) -> Iterator[bytes]:
+        path = f"{self._path}{url.removeprefix(self.base)}"
+        response = None
+        try:
+            response = self._answer(path)
+            if response.status != http.client.OK:
+                text = f"it answers {response.status} for {path}"
+                raise DownloadHTTPError(text, response.status)
+            while block := response.read1(_BLOCK):
+                yield block
+        except (OSError, http.client.HTTPException) as error:
+            if self._connection.is_cut_off:
+                raise SlowRetrievalError(f"{path} takes too long") from error
+            raise DownloadError(_clause(error)) from error
+        finally:
+            if response is None or not response.isclosed():
+                self._connection.close()
+        if self._connection.is_cut_off:  # the end may be that of the connection alone
+            raise SlowRetrievalError(f"{path} takes too long")
+
+    def _answer(self, path: str) -> http.client.HTTPResponse:
+        """Send the request; once more if the server has closed the kept connection meanwhile."""
+        kept = self._connection.sock is not None
+        try:
+            return self._request(path)
+        except (ConnectionError, http.client.RemoteDisconnected):
+            if not kept or self._connection.is_cut_off:
+                raise
+        self._connection.close()
+        return self._request(path)
+
+    def _request(self, path: str) -> http.client.HTTPResponse:
+        self._connection.request("GET", path, headers={"User-Agent": "sros"})
+        return self._connection.getresponse()
+
+
+class _GuardedConnection(http.client.HTTPConnection):
+    """A connection that another thread can cut off at any point, also in its handshake."""
+
+    def __init__(self, host: str, port: int, context: ssl.SSLContext | None) -> None:
+        super().__init__(host, port, timeout=_SILENCE)
+        self._context = context
+        self._guard: socket.socket | None = None
+        self.is_cut_off = False
+
+    def connect(self) -> None:
+        if self.is_cut_off:
+            raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
+        plain = socket.create_connection((self.host, self.port), _SILENCE)
+        self._guard = plain.dup()
+        self.sock = plain
+        if self._context:
+            self.sock = self._context.wrap_socket(plain, server_hostname=self.host)
+
+    def close(self) -> None:
+        super().close()
+        if self._guard:
+            self._guard.close()
+            self._guard = None
+
+    def cut_off(self) -> None:
+        """End all reading and writing now."""
+        self.is_cut_off = True
+        guard = self._guard
+        with suppress(OSError):
+            if guard:
+                guard.shutdown(socket.SHUT_RDWR)
+
+
+def _clause(error: Exception) -> str:
+    """Return why a server could not be asked, as a clause."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"its certificate is not valid: {error.verify_message}"
+    if isinstance(error, ssl.SSLError):
+        return f"TLS fails: {(error.reason or str(error)).lower().replace('_', ' ')}"
+    if isinstance(error, TimeoutError):
+        return "it does not answer"
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return f"it does not speak HTTP: {type(error).__name__}"
