@@ -138,6 +138,7 @@ VERBS: Mapping[str, str | Shapes] = {
         },
     ),
     "units": "sros_tool.runtime.units:WrittenUnits",
+    "fleet collect": "sros_tool.keystore.delivery.collect:CollectedInbox",
     "fleet confirm": "sros_tool.keystore.confirmation:KeptConfirmation",
     "metrics": "sros_tool.prometheus:KeystoreMetrics",
     "merge_policy": "sros_tool.policy.merge:MergedPolicy",

@@ -13,6 +13,7 @@ from sros_tool.cli.common import (
     Verb,
     advisories_of,
     advisories_option,
+    allow_refusal_option,
     check_metrics_file,
     check_output,
     complete_file,
@@ -21,6 +22,7 @@ from sros_tool.cli.common import (
     finding_lines,
     json_option,
     json_text,
+    keyring,
     keystore_argument,
     now,
     output_option,
@@ -34,7 +36,7 @@ from sros_tool.cli.common import (
     words_argument,
 )
 from sros_tool.cli.program import VerbGroup
-from sros_tool.errors import Note, UsageError
+from sros_tool.errors import NOT_DONE, Note, UsageError
 from sros_tool.terminal import echo, echo_document, visible_line
 from sros_tool.values import file_change, shows
 from sros_tool.wording import counted, first_few
@@ -43,7 +45,9 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from sros_tool.checks.kind import Finding
+    from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.keystore.confirmation import RobotDds
+    from sros_tool.keystore.delivery.collect import CollectedInbox
     from sros_tool.keystore.fleet_status import FleetStatus, RobotStatus
 
 
@@ -79,7 +83,8 @@ def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
     """Print the robots of the keystore ROOT as an inventory of Ansible.
 
     Robots are hosts and groups are groups. Variables of a host are ansible_host, ansible_user,
-    sros_robot, sros_namespace, sros_domain, sros_router, sros_crossing and sros_distribution.
+    sros_robot, sros_namespace, sros_domain, sros_router, sros_crossing,
+    sros_distribution, sros_renewal and sros_renewal_grace.
 
     Example:
       $ sros fleet inventory keystore > hosts.json
@@ -205,6 +210,92 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
             f"{counted(len(enclaves), 'enclave')}"
         )
     print_notes(notes)
+
+
+@fleet.command("collect")
+@words_argument("[ROOT] INBOX", shell_complete=complete_file)
+@click.option(
+    "--restored",
+    multiple=True,
+    metavar="ROBOT",
+    shell_complete=complete_robot,
+    help="Accept an earlier message from this robot, because its disk was restored.",
+)
+@allow_refusal_option
+@dry_run_option
+@json_option
+def _collect(
+    words: tuple[str, ...],
+    restored: tuple[str, ...],
+    allow_refusal: tuple[Vendor, ...],
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    """Take in what robots sent: keep their confirmations, and sign their requests for renewal.
+
+    INBOX is a folder with ROBOT/confirmation.p7s of each robot that runs `sros agent`. Only the
+    robots of the fleet of the keystore ROOT are read. A message counts if an enclave of the same
+    robot signed it with a certificate that this keystore issued and did not revoke, and if it is
+    later than the one before. Requests for renewal are signed for robots with renewal = "allowed"
+    in the fleet file; their rights stay as they are. One bad message stops no other one.
+
+    Example:
+      $ sros fleet collect keystore inbox
+      3 robots: 2 kept, 1 refused; 1 request renewed
+      r3: refused: it is signed by /r4/base, an enclave of r4
+      renewed /r1/base for the key 6f5bbd292e91c5d0...
+
+    The exit status is 0 if nothing was refused, 1 if a message or request was refused or the fleet
+    file does not allow a request, and 2 if the CAs cannot sign.
+    """
+    from sros_tool.keystore.delivery.collect import collect
+
+    root, inbox = root_and_file(words, "fleet collect takes a keystore and one folder")
+    with progress("collecting"):
+        collected = collect(
+            root,
+            inbox,
+            now=now(),
+            restored=restored,
+            allow_refusal=allow_refusal,
+            keyring=keyring(),
+            dry_run=dry_run,
+        )
+    if as_json:
+        print_json(collected)
+    else:
+        for line in _collected_lines(collected):
+            echo(line)
+    print_notes(collected.notes)
+    if collected.not_signed:
+        return NOT_DONE
+    return 0 if collected.complete else 1
+
+
+def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
+    """Yield the counts, and a line for everything that was refused, renewed or remarked."""
+    messages = Counter(robot.outcome for robot in collected.robots)
+    requests = Counter(request.outcome for robot in collected.robots for request in robot.requests)
+    would = "would be " if collected.dry_run else ""
+    counts = ", ".join(f"{number} {would}{outcome}" for outcome, number in messages.items())
+    line = f"{counted(len(collected.robots), 'robot')}: {counts}"
+    if requests:
+        words = (
+            f"{number} {would}{outcome.replace('_', ' ')}" for outcome, number in requests.items()
+        )
+        line += f"; {counted(requests.total(), 'request')}: {', '.join(words)}"
+    yield line
+    for robot in collected.robots:
+        if robot.why:
+            yield f"{robot.robot}: {robot.outcome}: {robot.why}"
+        for remark in robot.remarks:
+            yield f"{robot.robot}: {remark}"
+        for request in robot.requests:
+            if request.outcome == "renewed":
+                yield f"{would}renewed {request.enclave} for the key {request.key_sha256}"
+            else:
+                enclave = request.enclave or f"a request of {robot.robot}"
+                yield f"{enclave}: {request.outcome.replace('_', ' ')}: {request.why}"
 
 
 @shows(spread=("status",))

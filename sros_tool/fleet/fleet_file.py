@@ -32,8 +32,10 @@ from sros_tool.fleet.robots import (
     Robot,
     address_problem,
     crossing_problem,
+    grace_problem,
     name_problem,
     namespace_problem,
+    renewal_problem,
     router_problem,
     user_problem,
 )
@@ -50,6 +52,8 @@ _VALUES: Mapping[str, Callable[[str], str]] = {
     "user": user_problem,
     "router": router_problem,
     "distribution": distribution_problem,
+    "renewal": renewal_problem,
+    "renewal_grace": grace_problem,
 }
 """Text settings of a robot, with the function that returns what is wrong with a value."""
 _OF_GROUP = ("domain", *_VALUES, "crossing")
@@ -291,6 +295,8 @@ def _lines(fleet: Fleet) -> Iterator[str]:
             "router": robot.router,
             "crossing": list(robot.crossing),
             "distribution": robot.distribution,
+            "renewal": robot.renewal,
+            "renewal_grace": robot.renewal_grace,
         }
         usual: dict[str, object] = {
             "groups": [],
@@ -301,6 +307,8 @@ def _lines(fleet: Fleet) -> Iterator[str]:
             "router": "",
             "crossing": [],
             "distribution": "",
+            "renewal": "",
+            "renewal_grace": "",
         }
         shown = [
             f"{key} = {json.dumps(value)}" for key, value in values.items() if value != usual[key]
@@ -316,6 +324,8 @@ _VARIABLES = {
     "router": "sros_router",
     "crossing": "sros_crossing",
     "distribution": "sros_distribution",
+    "renewal": "sros_renewal",
+    "renewal_grace": "sros_renewal_grace",
 }
 """Robot setting → the Ansible host variable that has it."""
 _ROBOT = "sros_robot"
@@ -603,6 +613,8 @@ def _variables(robot: Robot) -> dict[str, Any]:
         "router": robot.router,
         "crossing": list(robot.crossing),
         "distribution": robot.distribution,
+        "renewal": robot.renewal,
+        "renewal_grace": robot.renewal_grace,
     }
     shown = {_VARIABLES[key]: value for key, value in values.items() if value not in (None, "", [])}
     return {_ROBOT: robot.name, **shown}

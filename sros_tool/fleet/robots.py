@@ -14,10 +14,12 @@ from ipaddress import ip_address
 from types import MappingProxyType
 from typing import NamedTuple
 
-from sros_tool.errors import DocumentError
+from sros_tool.errors import DocumentError, UsageError
 from sros_tool.names import expression_problem
+from sros_tool.validity import parse_duration
 
 MAX_ROBOTS = 10_000
+RENEWAL_ALLOWED, _RENEWAL_REFUSED = "allowed", "refused"
 ROUTERS = "/{robot}/router"
 """Default path of the enclave of each robot's Zenoh router."""
 _MAX_NAME = 64
@@ -43,7 +45,9 @@ class Robot(NamedTuple):
     are sorted.  ``router`` is where sessions and other routers connect to its Zenoh router, as
     ``HOST:PORT``, or "" if it has none of its own; ``crossing`` are the names that may pass between
     that router and others, if not all.  ``distribution`` is its distribution of ROS 2, or "" for
-    those of the keystore.
+    those of the keystore.  ``renewal`` is `RENEWAL_ALLOWED` if `sros fleet collect` may sign its
+    requests for renewal; ``renewal_grace`` is a duration, such as ``30d``, for which an expired
+    certificate still vouches for such a request, or "" for none.
     """
 
     name: str
@@ -55,6 +59,8 @@ class Robot(NamedTuple):
     router: str = ""
     crossing: tuple[str, ...] = ()
     distribution: str = ""
+    renewal: str = ""
+    renewal_grace: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,3 +201,18 @@ def crossing_problem(name: str) -> str:
 def user_problem(user: str) -> str:
     """Return why ``user`` is not the name of an account, as a sentence; "" if it is."""
     return "" if _USER.fullmatch(user) else "It is not the name of an account, such as ros."
+
+
+def renewal_problem(renewal: str) -> str:
+    """Return why ``renewal`` does not say whether renewals are allowed; "" if it does."""
+    known = (RENEWAL_ALLOWED, _RENEWAL_REFUSED)
+    return "" if renewal in known else f"It is neither {known[0]} nor {known[1]}."
+
+
+def grace_problem(grace: str) -> str:
+    """Return why ``grace`` is not a duration, as a sentence; "" if it is."""
+    try:
+        parse_duration(grace)
+    except UsageError as error:
+        return error.remedy
+    return ""

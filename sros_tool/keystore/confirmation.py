@@ -13,6 +13,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
@@ -280,12 +281,28 @@ def parse_confirmation(data: bytes, what: str) -> Confirmation:
     return _confirmation_from(value, what)
 
 
+class LastMessage(NamedTuple):
+    """The last message of a robot's agent that was verified."""
+
+    sequence: int
+    """Its sequence number; later messages have higher numbers."""
+    sha256: str
+    """SHA-256 of the message."""
+    enclave: str
+    """The enclave whose key signed it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A confirmation, and when the keystore received it, by the clock of the keystore's machine."""
+    """A confirmation, and when the keystore received it, by the clock of the keystore's machine.
+
+    ``message`` is the last message of the robot's agent, also if a later confirmation came without
+    one; None if there never was one.
+    """
 
     confirmation: Confirmation
     time: datetime
+    message: LastMessage | None = None
 
     def clock_note(self) -> str:
         """Return a clause on how far the robot's clock is off; "" for at most a minute."""
@@ -343,10 +360,18 @@ def receive(data: bytes, robot: str, what: str, *, now: datetime) -> Received:
 def keep(root: Path, received: Received) -> str:
     """Write a robot's confirmation to the keystore, replacing the previous one.
 
-    Return its path relative to the keystore.
+    What is known of the last message of its agent stays.  Return its path relative to the keystore.
     """
-    path = confirmation_file(received.confirmation.robot)
-    value = {"received": iso(received.time), "confirmation": _value_of(received.confirmation)}
+    robot = received.confirmation.robot
+    path, message = confirmation_file(robot), received.message
+    with suppress(DocumentError):  # a damaged file
+        if message is None and (before := last_confirmation(root, robot)):
+            message = before.message
+    value = {
+        "received": iso(received.time),
+        **({"message": as_plain(message)} if message else {}),
+        "confirmation": _value_of(received.confirmation),
+    }
     with Folder(root, for_owner=True) as folder:
         if not folder.is_folder(CONFIRMED):
             folder.mkdir(CONFIRMED, 0o755)
@@ -369,12 +394,27 @@ def last_confirmation(root: Path, robot: str) -> Received | None:
         value = parse_json(read_bytes(path, "confirmation", most=2 * MAX_BYTES))
     except ValueError as error:
         raise _refused(what, "it is not JSON") from error
-    if not isinstance(value, dict) or value.keys() != {"received", "confirmation"}:
+    if not isinstance(value, dict) or value.keys() - {"message"} != {"received", "confirmation"}:
         raise _refused(what, "its keys are not received and confirmation")
     confirmation = _confirmation_from(value["confirmation"], what)
     if confirmation.robot != robot:
         raise _refused(what, f"it is the confirmation of {confirmation.robot}")
-    return Received(confirmation, _moment(value["received"], what))
+    message = _message_from(value["message"], what) if "message" in value else None
+    return Received(confirmation, _moment(value["received"], what), message)
+
+
+def _message_from(value: Any, what: str) -> LastMessage:
+    """Return the last message of a robot's agent in a JSON value.
+
+    Raises:
+        DocumentError: it is not of that form.
+    """
+    if not isinstance(value, dict) or value.keys() != set(LastMessage._fields):
+        raise _refused(what, "its message has not the keys sequence, sha256 and enclave")
+    if not _is_digest(value["sha256"]):
+        raise _refused(what, "the digest of its message is not a SHA-256 digest")
+    sequence = _sequence_from(value["sequence"], what)
+    return LastMessage(sequence, value["sha256"], _enclave_from(value["enclave"], what))
 
 
 def _confirmation_from(value: Any, what: str) -> Confirmation:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
+from sros_tool.files import templates_dir
+from sros_tool.keystore.delivery.collect import MESSAGE_FILE
+from sros_tool.pki.certificates import make_request
 from tests.keystore.test_confirmation import DDS
 from tests.support.harness import policy_text, publish, sros
+from tests.support.messages import key_of, said_by, signed_message
 from tests.support.zenoh_configurations import denying, self_limiting
 
 WITHOUT_JSON = {
@@ -41,6 +47,7 @@ _DENIED = '<topics publish="DENY"><topic>/x</topic></topics>'
 _OLD = """<policy version="0.1.0"><profiles><profile ns="/" node="n">
 <topics publish="ALLOW"><topic>/x</topic></topics></profile></profiles></policy>"""
 POLICIES = {
+    "crew.xml": policy_text({"/{robot}": publish("/x")}),
     "policy.xml": policy_text({"/a": publish("/x"), "/b": publish("/y") + _SUBSCRIBE}),
     "other.xml": policy_text({"/a": publish("/x", "/z"), "/new": publish("/x")}),
     "protected.xml": policy_text({"/a": publish('/x<?sros protect="sign"?>')}),
@@ -59,6 +66,10 @@ def make_folder(folder: Path) -> None:
     """Fill a folder with what the cases name: keystores in several states, a robot, policies."""
     for name, text in POLICIES.items():
         (folder / name).write_text(text)
+    settings = (templates_dir() / "production.toml").read_text()
+    half_over = f'"{datetime.now(UTC).year - 8}-01-01T00:00:00Z/15y"'
+    (folder / "old.toml").write_text(re.sub('"[0-9]+[05][yd]"|"5y"', half_over, settings))
+    (folder / "crew.toml").write_text('[robots.a]\nrenewal = "allowed"\n[robots.b]\n')
     (folder / "required.toml").write_text('[[nobody]]\npublish = ["/x"]\n')
     (folder / "quiet.log").write_text("nothing to see\n")
     for line in (
@@ -77,6 +88,9 @@ def make_folder(folder: Path) -> None:
         "rotate_ca single --next",
         "generate_artifacts -k zenoh -p policy.xml -e /spare",
         "create_keystore elsewhere --identity-key file:identity.pem",
+        "create_keystore crew --template old.toml",
+        "generate_artifacts -k crew -p crew.xml --fleet crew.toml",
+        "generate_artifacts -k fresh -p crew.xml --fleet crew.toml",
     ):
         sros(*line.split(), cwd=folder).ok()
     for copy in ("turned", "broken", "lost", "wrecked", "partial", "fleet"):
@@ -92,6 +106,7 @@ def make_folder(folder: Path) -> None:
         said = sros("fleet", "report", "out", "--robot", robot, cwd=folder).ok()
         confirmed = {**json.loads(said.out), "dds": DDS}  # not that of this machine
         (folder / f"{robot}.json").write_text(json.dumps(confirmed, indent=1))
+    make_inboxes(folder)
     slow = (folder / "a.json").read_text().replace('"time": "20', '"time": "19')
     (folder / "slow.json").write_text(slow)
     (folder / "partial/enclaves/a/permissions.p7s").unlink()
@@ -117,6 +132,27 @@ def make_folder(folder: Path) -> None:
     for file in ("public/identity_ca.cert.pem", "public/permissions_ca.cert.pem"):
         (folder / "wrecked" / file).write_text("x")
     (folder / "wrecked/enclaves/governance.p7s").write_text("x")
+
+
+def make_inboxes(folder: Path) -> None:
+    """Make inboxes with what robots of the keystores `crew` and `fresh` say and ask for."""
+    for keystore in ("crew", "fresh"):
+        robot = folder / f"of_{keystore}"
+        sros("distribute_key", keystore, "/a", "/b", robot, cwd=folder).ok()
+        requests = tuple(make_request(key_of(robot, name), name).decode() for name in ("/a", "/b"))
+        for name in ("a", "b"):
+            said = said_by(robot, name, datetime(2026, 1, 1, tzinfo=UTC), requests=requests)
+            (folder / f"from_{keystore}" / name).mkdir(parents=True)
+            message = signed_message(robot, f"/{name}", said)
+            (folder / f"from_{keystore}" / name / MESSAGE_FILE).write_bytes(message)
+    (folder / "good/a").mkdir(parents=True)
+    message = signed_message(robot, "/a", said_by(robot, "a", datetime.now(UTC)))
+    (folder / "good/a" / MESSAGE_FILE).write_bytes(message)
+    (folder / "from_fresh/b" / MESSAGE_FILE).write_bytes(b"no message")
+    (folder / "from_fresh/stranger").mkdir()
+    shutil.copytree(folder / "crew", folder / "unable", symlinks=True)
+    for key in folder.glob("unable/private/*.key.pem"):
+        key.unlink()
 
 
 CASES: dict[str, tuple[Case, ...]] = {
@@ -378,6 +414,13 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("fleet slow.json --robot a"),
         Case("fleet a.json --robot a --dry-run"),
     ),
+    "fleet collect": (
+        Case("crew from_crew", 1),
+        Case("crew from_crew --dry-run", 1),
+        Case("fresh good", before=("fleet collect fresh good",)),
+        Case("fresh from_fresh", 1, before=("renew fresh /a",)),
+        Case("unable from_crew", 2),
+    ),
     "fleet status": (
         Case("fleet", 1),
         Case("fleet --robot a", before=("fleet confirm fleet a.json --robot a",)),
@@ -434,6 +477,7 @@ ERRORS = {
     "metrics": "none",
     "review": "--base none --policy policy.xml --repository ks",
     "fleet confirm": "fleet b.json --robot a",
+    "fleet collect": "ks good",
     "fleet status": "ks",
     "units": "none /a new",
     "check": "none",

@@ -92,6 +92,10 @@ def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "p.xml").write_text(POLICY)
     (folder / "wide.xml").write_text(policy_text({"/a": publish("*")}))
     (folder / "q.xml").write_text(policy_text({"/a": publish("new")}))
+    (folder / "crew.xml").write_text(policy_text({"/{robot}": publish("/x")}))
+    (folder / "crew.toml").write_text("[robots.a]\n[robots.b]\n")
+    (folder / "empty").mkdir()
+    (folder / "hostile/a/confirmation.p7s").mkdir(parents=True)
     (folder / "broken.xml").write_text("<policy")
     (folder / "log").write_text("[rcl]: couldn't find all security files!\n")
     for line in (
@@ -104,6 +108,7 @@ def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "sign_request ks asking/enclaves/r/request.pem -o answer.tar.gz",
         "generate_artifacts -k late -p p.xml",
         "generate_artifacts -k zenoh -p p.xml",
+        "generate_artifacts -k crew -p crew.xml --fleet crew.toml",
     ):
         sros(*line.split(), cwd=folder).ok()
     (folder / "damaged/enclaves/a/cert.pem").write_text("damaged")
@@ -159,6 +164,7 @@ STATUS: dict[str, tuple[str, str, str]] = {
     "fleet inventory": ("fleet", NEVER, "ks"),
     "fleet report": ("robot --robot a", NEVER, "nothing --robot a"),
     "fleet confirm": ("fleet b.json --robot b", NEVER, "fleet b.json --robot a"),
+    "fleet collect": ("crew empty", "crew hostile", "ks empty"),
     "fleet status": ("fleet --robot a", "fleet", "ks"),
     "completion": ("bash", NEVER, "powershell"),
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sros_tool.errors import DocumentError
-from sros_tool.fleet.fleet_file import parse_fleet
+from sros_tool.fleet.fleet_file import parse_fleet, render_fleet
 from sros_tool.fleet.robots import Fleet, Robot
 
 TEXT = """
@@ -44,6 +44,16 @@ def test_values_of_a_group_are_defaults_of_its_robots() -> None:
     assert found.enclaves == ("/{robot}/base", "/fleet{namespace:carriers}/arm")
     assert found.members("new") == (found.robot("r7"),)
     assert [each.name for each in found.members("")] == ["lone", "r1", "r7"]
+
+
+def test_a_robot_can_differ_from_its_group_in_whether_it_may_renew() -> None:
+    found = fleet(
+        '[groups.g]\nrenewal = "allowed"\nrenewal_grace = "30d"\n[robots]\n'
+        'a = { groups = ["g"] }\nb = { groups = ["g"], renewal = "refused" }\nc = {}'
+    )
+    values = [(robot.renewal, robot.renewal_grace) for robot in found.robots.values()]
+    assert values == [("allowed", "30d"), ("refused", "30d"), ("", "")]
+    assert parse_fleet(render_fleet(found).encode(), "it") == found
 
 
 @pytest.mark.parametrize("name", ["r 7", "<r7/>", "a/b", "{robot}", "r7'", "*", "7r", "a__b", ""])
@@ -101,6 +111,9 @@ def test_names(name: str) -> None:
         ('router = "r.local:7447"\ncrossing = ["/a b"]', "crossing has '/a b'"),
         ('router = "r.local:7447"\ncrossing = "/fleet"', "list of names"),
         ('crossing = ["/fleet"]', "router that the robot does not have"),
+        ('renewal = "yes"', "neither allowed nor refused"),
+        ("renewal = true", "not a text"),
+        ('renewal_grace = "30"', "and one of s, m, h, d, w, y"),
         ('groups = "carriers"', "list of names"),
         ("groups = [1]", "list of names"),
         ('groups = ["a/b"]', "not valid"),

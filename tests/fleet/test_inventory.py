@@ -18,7 +18,7 @@ HOSTS = """
 all:
   vars: {ansible_user: ros, other: "{{ not read }}"}
   hosts:
-    lone: {}
+    lone: {sros_renewal: allowed, sros_renewal_grace: 30d}
   children:
     carriers:
       vars: {sros_domain: 5, ansible_user: pilot}
@@ -35,7 +35,7 @@ TOML = """
 [groups.carriers]
 [groups.heavy]
 [robots]
-lone = { user = "ros" }
+lone = { user = "ros", renewal = "allowed", renewal_grace = "30d" }
 r1 = { user = "pilot", address = "10.0.0.1", domain = 5, groups = ["carriers", "heavy"] }
 r2 = { user = "pilot", address = "r2.example.com", domain = 7, namespace = "/hall/r2",
        groups = ["carriers"] }

@@ -214,6 +214,7 @@ def certify_requests(
     only: Sequence[str] = (),
     refuse_revoked: bool = False,
     renew: bool = False,
+    replace_keys: bool = False,
     domain: int | None = None,
     allow_refusal: Sequence[Vendor] = (),
     keyring: Keyring = IN_KEYSTORE,
@@ -224,7 +225,8 @@ def certify_requests(
     As `sign_request`, but no answers are made: an export without keys brings the enclaves to their
     robots.  Unless ``renew`` is set, an enclave whose key is certified already stays as it is.
     ``only`` has the names of the enclaves that the requests have to be for, in the same order;
-    empty for any.
+    empty for any.  With ``replace_keys``, the private key of an enclave in the keystore is removed
+    if the request has another key: the enclave's key is on its robot from then on.
 
     Raises:
         PkiError: a request is not valid.
@@ -254,7 +256,7 @@ def certify_requests(
                 for request in requests
                 if _is_certified(change.keystore, request, existing)
             )
-        signer = _Signer(change, domain, stated)
+        signer = _Signer(change, domain, stated, replace_keys=replace_keys)
         for request in requests:
             if request.name not in kept:
                 signer.certify(request, renew=renew, named=bool(only) and not refuse_revoked)
@@ -325,9 +327,15 @@ class _Signer:
     """The certification of requests within one change of a keystore."""
 
     def __init__(
-        self, change: KeystoreChange, domain: int | None, stated: Mapping[str, _Stated]
+        self,
+        change: KeystoreChange,
+        domain: int | None,
+        stated: Mapping[str, _Stated],
+        *,
+        replace_keys: bool = False,
     ) -> None:
         self._change = change
+        self._replace_keys = replace_keys
         self._root = change.root
         change.open_authorities()
         change.check_domain(domain)
@@ -378,7 +386,9 @@ class _Signer:
         if stated is not None:
             refuse_less_protected(root, change.governance, stated_protections([stated]))
         present = change.keystore.certificate_of(name) if renew else None
-        _check_key(change.keystore, request, known, present)
+        _check_key(request, known, present)
+        if not (self._replace_keys and self._keep_only_key_of(request)):
+            _check_file_of_key(change.keystore, request, present)
         if not renew and not named and name in known.revoked_enclaves:
             raise KeystoreError(
                 f"enclave {name} was revoked in keystore '{root}'",
@@ -412,6 +422,25 @@ class _Signer:
         change.notes += issued.notes()
         self._certified[name] = stated
         return issued
+
+    def _keep_only_key_of(self, request: SigningRequest) -> bool:
+        """Remove the enclave's private key if it is not the key of the request.
+
+        Return whether the keystore has such a file.
+        """
+        keystore, name = self._change.keystore, request.name
+        path = keystore.folder(name) / KEY_FILE
+        if not path.exists():
+            return False
+        key = load_key(keystore.read(path, "private key"), f"'{path}'")
+        if key.public_key() != request.public_key:
+            self._change.transaction.remove(f"{enclave_folder(name)}/{KEY_FILE}")
+            text = (
+                f"{name}: its new key was made on the robot and stays there; its earlier key was "
+                "removed from the keystore."
+            )
+            self._change.notes.append(Note("request.key-on-robot", text))
+        return True
 
     def keep_zenoh(self) -> None:
         """Stage the Zenoh configurations that follow from all certified requests."""
@@ -477,26 +506,29 @@ def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
         )
 
 
-def _check_key(
-    keystore: Keystore, request: SigningRequest, known: KnownKeys, present: x509.Certificate | None
-) -> None:
-    """Raise `KeystoreError` if the key of a request cannot be certified.
+def _check_key(request: SigningRequest, known: KnownKeys, present: x509.Certificate | None) -> None:
+    """Raise `KeystoreError` if the key of a request was revoked, or is that of another enclave.
 
-    These are revoked keys, keys of other enclaves, and keys other than the one in the keystore.  An
-    enclave that already shares its key with another enclave is renewed, with a note.
+    An enclave that already shares its key with another enclave is renewed, with a note.
     """
     remedy = "Create a new key on the robot, with `sros create_request` in another folder."
     same = present if present and present.public_key() == request.public_key else None
     known.refuse_revoked(request.public_key, f"the request for {request.name}", remedy, same)
     if not same:
         known.refuse_second(request.public_key, request.name, remedy)
+
+
+def _check_file_of_key(
+    keystore: Keystore, request: SigningRequest, present: x509.Certificate | None
+) -> None:
+    """Raise `KeystoreError` if the keystore has another key for the enclave of a request."""
     root, folder = keystore.root, keystore.folder(request.name)
     path, fits = folder / KEY_FILE, True
     if path.exists():
         key = load_key(keystore.read(path, "private key"), f"'{path}'")
         fits = key.public_key() == request.public_key
     elif (path := folder / KEY_URI_FILE).exists():
-        fits = same is not None
+        fits = bool(present and present.public_key() == request.public_key)
     if not fits:
         raise KeystoreError(
             f"enclave {request.name} has another key in keystore '{root}'",

@@ -1,0 +1,630 @@
+"""Messages of robots, taken in at home: verified, kept, and their requests for renewal signed.
+
+An inbox is a folder with ``<robot>/confirmation.p7s`` of each robot that fetches: its confirmation,
+signed with the key of one of its enclaves.  Whoever runs the web server or carries the folder can
+write anything into it, so that nothing is believed before the signature, the certificate, the robot
+and the sequence number of a message were verified.  A message that is refused stops no other one.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from cryptography import x509
+
+from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
+from sros_tool.fleet.enclaves import robot_of
+from sros_tool.fleet.robots import RENEWAL_ALLOWED, Fleet, Robot
+from sros_tool.folders import Folder
+from sros_tool.keystore.confirmation import (
+    MAX_BYTES,
+    Confirmation,
+    LastMessage,
+    Received,
+    keep,
+    last_confirmation,
+    parse_confirmation,
+)
+from sros_tool.keystore.delivery.signing import certify_requests
+from sros_tool.keystore.expiry import Lifetime, read_credentials
+from sros_tool.keystore.fleet import checked_fleet, recorded_fleet
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    IDENTITY,
+    confirmation_file,
+    enclave_folder,
+    has_enclave,
+)
+from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.lifecycle.change import KeystoreChange
+from sros_tool.keystore.outcomes import changes_below
+from sros_tool.keystore.reader import Keystore
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import (
+    SigningRequest,
+    digest,
+    key_digest,
+    load_request,
+    validity_of,
+)
+from sros_tool.pki.chains import chain_fault
+from sros_tool.validity import Window, elapsed, iso, parse_duration
+from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words
+from sros_tool.wording import counted, first_few
+
+MESSAGE_FILE = "confirmation.p7s"
+"""Name of a robot's message in its folder of the inbox."""
+_MOST_NAMES = 100_000
+"""Names in an inbox that are looked at, to name those of no robot of the fleet."""
+_SHOWN = 5
+_FEW = 4
+"""Number of certificates up to which the ledger is searched for each of them."""
+
+
+# ── what is done with messages and requests ────────────────────────────────────────────────
+
+
+class CollectedRequest(NamedTuple):
+    """A request for renewal, and what was done with it."""
+
+    enclave: str
+    """The enclave that the request is for; empty if the request cannot be read."""
+    key_sha256: str
+    """SHA-256 of the public key (DER) in the request, in hexadecimal; empty if it cannot be read.
+    """
+    outcome: Annotated[str, Words(("renewed", "answered", "not_allowed", "refused", "not_signed"))]
+    """``renewed``: the enclave has a new certificate; ``answered``: it had one already, which comes
+    with the next release; ``not_allowed``: the fleet file does not allow it; ``refused``: it must
+    not be signed; ``not_signed``: the CAs cannot sign now."""
+    why: str
+    """The reason as a clause; empty for ``renewed``."""
+
+
+class CollectedMessage(NamedTuple):
+    """What was done with the message of a robot."""
+
+    robot: str
+    """Name of the robot."""
+    outcome: Annotated[str, Words(("kept", "unchanged", "missing", "refused"))]
+    """``kept``: a new message, which is the robot's last confirmation now; ``unchanged``: the same
+    message as last time; ``missing``: the inbox has none; ``refused``: it proves nothing."""
+    why: str
+    """Why the message was refused, as a clause; else empty."""
+    enclave: str
+    """The enclave whose key signed the message; empty if it is missing or was refused."""
+    sequence: int | None
+    """Sequence number of the message; null if it is missing or was refused."""
+    remarks: Sequence[str]
+    """Remarks as clauses, such as on the robot's clock or an expired certificate."""
+    requests: Sequence[CollectedRequest]
+    """The requests for renewal in the message."""
+
+
+class CollectedInbox(NamedTuple):
+    """The messages of an inbox, and what was done with them."""
+
+    keystore: NamedKeystore
+    inbox: Path
+    """The folder with the messages, as it was named."""
+    robots: Sequence[CollectedMessage]
+    """The robots of the fleet, sorted by name."""
+    not_signed: str
+    """Why the CAs could not sign requests, as a clause: the exit status is 2; else empty."""
+    dry_run: DryRun
+    changes: FileChanges
+    notes: Notes
+
+    @property
+    def complete(self) -> bool:
+        """Whether no message and no request was refused, and all that are allowed were signed."""
+        requests = (request for robot in self.robots for request in robot.requests)
+        return all(robot.outcome != "refused" for robot in self.robots) and all(
+            request.outcome in ("renewed", "answered") for request in requests
+        )
+
+
+def collect(
+    root: Path,
+    inbox: Path,
+    *,
+    now: datetime,
+    restored: Collection[str] = (),
+    allow_refusal: Sequence[Vendor] = (),
+    keyring: Keyring = IN_KEYSTORE,
+    dry_run: bool = False,
+) -> CollectedInbox:
+    """Verify and keep the messages in ``inbox``, and sign the requests that the fleet file allows.
+
+    Args:
+        root: the keystore.
+        inbox: the folder with a folder for each robot.
+        now: the present time.
+        restored: robots whose disk was restored, so that one lower sequence number is accepted.
+        allow_refusal: vendors whose nodes may stop to work by the renewal.
+        keyring: opens the keys of the CAs.
+        dry_run: change nothing.
+
+    Raises:
+        KeystoreError: the keystore has no fleet, or cannot be read.
+        DocumentError: ``restored`` names no robot of the fleet; the inbox is no folder.
+    """
+    keystore = Keystore(root)
+    recorded_fleet(keystore)
+    fleet = checked_fleet(keystore)
+    assert fleet
+    for name in restored:
+        fleet.robot(name)
+    verifier = _Verifier(keystore, fleet, now, frozenset(restored))
+    taken = list(_read_inbox(inbox, fleet, verifier))
+    renewals = _Renewals(keystore, fleet, now)
+    for message in taken:
+        if message.verified:
+            message.requests = renewals.judge(message.robot, message.verified)
+    not_signed, notes, changes = _sign(
+        root,
+        taken,
+        now=now,
+        allow_refusal=allow_refusal,
+        keyring=keyring,
+        dry_run=dry_run,
+    )
+    for message in taken:
+        if message.received:
+            path = confirmation_file(message.robot.name)
+            action = "replace" if (root / path).exists() else "create"
+            changes.append(FileChange(action, str(root / path)))
+            if not dry_run:
+                keep(root, message.received)
+    return CollectedInbox(
+        root,
+        inbox,
+        [message.result() for message in taken],
+        not_signed,
+        dry_run,
+        changes,
+        [*_unknown_names(inbox, fleet), *notes],
+    )
+
+
+# ── reading the inbox ──────────────────────────────────────────────────────────────────────
+
+
+class _Verified(NamedTuple):
+    """A message whose signature, certificate and robot were verified."""
+
+    confirmation: Confirmation
+    enclave: str
+    certificate: x509.Certificate
+
+
+@dataclass(slots=True)
+class _Taken:
+    """The message of a robot on its way through the steps of `collect`."""
+
+    robot: Robot
+    outcome: str
+    why: str = ""
+    verified: _Verified | None = None
+    received: Received | None = None
+    remarks: list[str] = field(default_factory=list)
+    requests: list[_Judged] = field(default_factory=list)
+
+    def result(self) -> CollectedMessage:
+        """Return what was done with the message."""
+        verified = self.verified
+        return CollectedMessage(
+            self.robot.name,
+            self.outcome,
+            self.why,
+            verified.enclave if verified else "",
+            verified.confirmation.sequence if verified else None,
+            self.remarks,
+            [request.result for request in self.requests],
+        )
+
+
+class _RefusedError(SrosError):
+    """A message that proves nothing, or a request that must not be signed."""
+
+
+class _File(NamedTuple):
+    """The content of a message, and when its file was written."""
+
+    data: bytes
+    written: datetime
+
+
+def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Taken]:
+    """Yield the message of each robot of the fleet, verified."""
+    try:
+        folder = Folder(inbox)
+    except OSError as error:
+        raise DocumentError(
+            f"the inbox '{inbox}' cannot be opened",
+            f"{error.strerror}.",
+            "Name the folder that has a folder for each robot.",
+        ) from error
+    with folder:
+        for robot in fleet.robots.values():
+            try:
+                file = _read_message(folder, robot.name)
+                taken = verifier.take(robot, file) if file else _Taken(robot, "missing")
+            except _RefusedError as refusal:
+                taken = _Taken(robot, "refused", refusal.what)
+            yield taken
+
+
+def _read_message(inbox: Folder, robot: str) -> _File | None:
+    """Return the message of a robot, without following a link; None if there is none.
+
+    Raises:
+        _RefusedError: it is no regular file, too large, or cannot be read.
+    """
+    path = f"{robot}/{MESSAGE_FILE}"
+    try:
+        state = inbox.state(path)
+        if state is None:
+            return None
+        data = inbox.read(path, most=MAX_BYTES)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        if error.errno == errno.EFBIG:
+            raise _RefusedError(f"it has more than {MAX_BYTES // 1024**2} MiB") from error
+        if error.errno in (errno.ELOOP, errno.EINVAL, errno.ENXIO, errno.EISDIR):
+            raise _RefusedError("it is not a regular file") from error
+        raise _RefusedError(f"it cannot be read: {os.strerror(error.errno or 0)}") from error
+    except KeystoreError as error:  # a link or file in place of the robot's folder
+        raise _RefusedError(error.what) from error
+    return _File(data, datetime.fromtimestamp(state.st_mtime, UTC))
+
+
+def _unknown_names(inbox: Path, fleet: Fleet) -> Iterator[Note]:
+    """Yield a note on names in the inbox that are those of no robot."""
+    with os.scandir(inbox) as entries:
+        names = sorted(entry.name for entry in islice(entries, _MOST_NAMES))
+    unknown = [ascii(name)[1:-1] for name in names if name not in fleet.robots]
+    if unknown:
+        verb = "is" if len(unknown) == 1 else "are"
+        yield Note(
+            "fleet.unknown-in-inbox",
+            f"{counted(len(unknown), 'name')} in '{inbox}' {verb} that of no robot of the fleet, "
+            f"and {verb} not read: {first_few(unknown, _SHOWN)}.",
+        )
+
+
+# ── verifying ──────────────────────────────────────────────────────────────────────────────
+
+
+class _Verifier:
+    """Verifier of messages against the CAs, the ledger and the fleet of a keystore."""
+
+    def __init__(
+        self, keystore: Keystore, fleet: Fleet, now: datetime, restored: Collection[str]
+    ) -> None:
+        self._keystore = keystore
+        self._fleet = fleet
+        self._now = now
+        self._restored = restored
+        self._searched = 0
+        self._authorities = keystore.authority(IDENTITY)
+
+    def take(self, robot: Robot, file: _File) -> _Taken:
+        """Return a robot's message, verified, and what to keep of it.
+
+        Raises:
+            _RefusedError: it proves nothing.
+        """
+        remarks: list[str] = []
+        last = None
+        try:
+            last = last_confirmation(self._keystore.root, robot.name)
+        except SrosError as error:
+            remarks.append(f"its last confirmation cannot be used: {error.what}")
+        before = last.message if last else None
+        sha256 = hashlib.sha256(file.data).hexdigest()
+        verified = self._verify(robot, file.data)
+        remarks += self._expired(verified.certificate)
+        sequence = verified.confirmation.sequence
+        assert sequence
+        if before and before.sha256 == sha256:
+            return _Taken(robot, "unchanged", verified=verified, remarks=remarks)
+        if before and sequence <= before.sequence and robot.name not in self._restored:
+            raise _RefusedError(
+                f"its sequence number {sequence} is not higher than {before.sequence}, that of the "
+                "last message: it is an old one, or the disk of the robot was restored (then add "
+                f"--restored {robot.name})"
+            )
+        received = Received(
+            replace(verified.confirmation, requests=None),
+            self._arrival(file, last),
+            LastMessage(sequence, sha256, verified.enclave),
+        )
+        if note := received.clock_note():
+            remarks.append(note)
+        return _Taken(robot, "kept", verified=verified, received=received, remarks=remarks)
+
+    def _arrival(self, file: _File, last: Received | None) -> datetime:
+        """Return when a message arrived: when its file was written, but after the one before.
+
+        Messages may lie in the inbox for long before somebody takes them in.
+        """
+        earliest = last.time if last else file.written
+        return min(max(file.written, earliest), self._now).replace(microsecond=0)
+
+    def _verify(self, robot: Robot, data: bytes) -> _Verified:
+        try:
+            signed = smime.parse_new(data)
+            signer = signed.signer()
+            if signer is None or len(signed.signatures) != 1:
+                raise _RefusedError("it is not signed by exactly one certificate in it")
+            signed.verify(signer)
+            if weakness := signed.weakness():
+                raise _RefusedError(weakness)
+        except PkiError as error:
+            raise _RefusedError(error.what) from error
+        enclave = self._enclave(robot, signer)
+        try:
+            confirmation = parse_confirmation(signed.text, "it")
+        except SrosError as error:
+            raise _RefusedError(error.what) from error
+        if confirmation.robot != robot.name:
+            raise _RefusedError(f"it is the confirmation of {confirmation.robot}")
+        if confirmation.sequence is None:
+            raise _RefusedError("it has no sequence number, as `sros agent` gives it")
+        return _Verified(confirmation, enclave, signer)
+
+    def _enclave(self, robot: Robot, signer: x509.Certificate) -> str:
+        """Return the robot's enclave that the keystore issued the certificate to.
+
+        Raises:
+            _RefusedError: the keystore did not issue it, it was revoked, or it is not the robot's.
+        """
+        validity = validity_of(signer)
+        moment = min(max(self._now, validity.not_before), validity.not_after)
+        if fault := chain_fault(signer, self._authorities, at=moment):
+            raise _RefusedError(f"its certificate is of no identity CA of the keystore: {fault}")
+        if signer.serial_number in self._revoked:
+            raise _RefusedError(f"its certificate, {signer.serial_number:x}, was revoked")
+        issued = self._issued(digest(signer))
+        if issued is None:
+            raise _RefusedError("its certificate is not in the ledger of the keystore")
+        owner = robot_of(self._fleet, issued.enclave)
+        if owner != robot:
+            whose = f"an enclave of {owner.name}" if owner else "which is of no robot"
+            raise _RefusedError(f"it is signed by {issued.enclave}, {whose}")
+        return issued.enclave
+
+    def _issued(self, sha256: str) -> Entry | None:
+        """Return the ledger's entry of a certificate (SHA-256 of its DER), or None."""
+        if self._searched < _FEW:
+            self._searched += 1
+            entries = self._keystore.ledger_with("sha256", sha256).entries
+            entry = next((entry for entry in entries if entry.sha256 == sha256), None)
+        else:
+            entry = self._certificates.get(sha256)
+        return entry if entry and entry.what == "certificate" and entry.enclave else None
+
+    @cached_property
+    def _certificates(self) -> Mapping[str, Entry]:
+        """The entries of all certificates, by the SHA-256 of the certificate."""
+        entries = self._keystore.ledger_with("what", "certificate").entries
+        return {entry.sha256: entry for entry in entries if entry.what == "certificate"}
+
+    @cached_property
+    def _revoked(self) -> Collection[int]:
+        """Serial numbers of revoked certificates, by the ledger and the revocation lists."""
+        return _revoked_serials(self._keystore)
+
+    def _expired(self, certificate: x509.Certificate) -> Iterator[str]:
+        validity = validity_of(certificate)
+        if self._now > validity.not_after:
+            late = elapsed(self._now - validity.not_after)
+            yield f"its certificate expired {late} ago, at {iso(validity.not_after)}"
+        elif self._now < validity.not_before:
+            yield f"its certificate is valid only from {iso(validity.not_before)}"
+
+
+def _revoked_serials(keystore: Keystore) -> frozenset[int]:
+    """Return the serial numbers of all revoked certificates, also of those that were replaced."""
+    entries = keystore.ledger_with("what", "revocation").entries
+    recorded = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
+    listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}
+    return frozenset(recorded | listed)
+
+
+# ── requests for renewal ───────────────────────────────────────────────────────────────────
+
+
+@dataclass(slots=True)
+class _Judged:
+    """A request for renewal; ``request`` is None unless it is to be signed."""
+
+    result: CollectedRequest
+    request: SigningRequest | None = None
+
+    def done(self, outcome: str, why: str = "") -> None:
+        """Say what was done with the request."""
+        self.result = self.result._replace(outcome=outcome, why=why)
+
+
+class _Renewals:
+    """Decides which requests of robots may be signed: none that changes who has which rights."""
+
+    def __init__(self, keystore: Keystore, fleet: Fleet, now: datetime) -> None:
+        self._keystore = keystore
+        self._fleet = fleet
+        self._now = now
+
+    def judge(self, robot: Robot, message: _Verified) -> list[_Judged]:
+        """Return the requests of a message, and whether each one may be signed."""
+        judged: list[_Judged] = []
+        names: set[str] = set()
+        for text in message.confirmation.requests or ():
+            result = CollectedRequest("", "", "refused", "")
+            try:
+                request = load_request(text.encode(), f"of {robot.name}")
+                result = CollectedRequest(
+                    request.name, key_digest(request.public_key), "refused", ""
+                )
+                if request.name in names:
+                    raise _RefusedError("the message has another request for this enclave")
+                names.add(request.name)
+                outcome, why = self._judge(robot, message, request)
+            except SrosError as error:
+                outcome, why = "refused", error.what
+            result = result._replace(outcome=outcome, why=why)
+            judged.append(_Judged(result, request if outcome == "renewed" else None))
+        return judged
+
+    def _judge(self, robot: Robot, message: _Verified, request: SigningRequest) -> tuple[str, str]:
+        """Return the outcome of a request, and why; "renewed" means that it may be signed.
+
+        Raises:
+            SrosError: it must not be signed.
+        """
+        name, keystore = request.name, self._keystore
+        owner = robot_of(self._fleet, name)
+        if owner != robot:
+            whose = f"an enclave of {owner.name}" if owner else "no enclave of a robot"
+            raise _RefusedError(f"{name} is {whose}")
+        if not has_enclave(keystore.root, name):
+            raise _RefusedError("the keystore does not have this enclave, or it was revoked")
+        present = keystore.certificate_of(name)
+        if present.serial_number in self._revoked:
+            raise _RefusedError("its present certificate was revoked")
+        same_key = present.public_key() == request.public_key
+        on_robot = message.confirmation.certificates.get(
+            f"{enclave_folder(name)}/{CERTIFICATE_FILE}", ()
+        )
+        is_there = digest(present) in on_robot
+        if self._now < (due := _due(read_credentials(keystore, name).lifetime())):
+            if same_key and not is_there:
+                return "answered", "its new certificate comes with the next release"
+            raise _RefusedError(f"it is not due for renewal before {iso(due)}")
+        if robot.renewal != RENEWAL_ALLOWED:
+            return (
+                "not_allowed",
+                f'the fleet file does not say renewal = "allowed" for {robot.name}',
+            )
+        if not same_key and message.enclave != name:
+            raise _RefusedError(
+                f"it has a new key, which only {name} itself can vouch for, and {message.enclave} "
+                "signed the message"
+            )
+        for certificate in (message.certificate, present):
+            self._check_grace(robot, validity_of(certificate))
+        return "renewed", ""
+
+    def _check_grace(self, robot: Robot, validity: Window) -> None:
+        """Raise `_Refused` if a certificate expired longer ago than the fleet file accepts."""
+        late = self._now - validity.not_after
+        if late.total_seconds() <= 0:
+            return
+        if not robot.renewal_grace or late > parse_duration(robot.renewal_grace):
+            grace = robot.renewal_grace or "none"
+            raise _RefusedError(
+                f"its certificate expired {elapsed(late)} ago (renewal_grace of {robot.name}: "
+                f"{grace})"
+            )
+
+    @cached_property
+    def _revoked(self) -> Collection[int]:
+        return _revoked_serials(self._keystore)
+
+
+def _due(lifetime: Lifetime) -> datetime:
+    """Return from when an enclave may be renewed: from half of a validity.
+
+    Robots ask from two thirds; the rest is for clocks that are wrong.
+    """
+    return min(
+        validity.not_before + (validity.not_after - validity.not_before) / 2
+        for validity in (lifetime.certificate, lifetime.permissions)
+    )
+
+
+def _sign(
+    root: Path,
+    taken: Sequence[_Taken],
+    *,
+    now: datetime,
+    allow_refusal: Sequence[Vendor],
+    keyring: Keyring,
+    dry_run: bool,
+) -> tuple[str, list[Note], list[FileChange]]:
+    """Sign the requests that may be signed, all in one change of the keystore if that is possible.
+
+    Otherwise those of each robot are a change of their own, so that one robot stops no other.
+    Return why the CAs cannot sign ("" if they can), the notes, and the files that changed.
+    """
+    by_robot = [[request for request in message.requests if request.request] for message in taken]
+    by_robot = [requests for requests in by_robot if requests]
+    notes: list[Note] = []
+    changes: list[FileChange] = []
+
+    def sign(judged: Sequence[_Judged]) -> None:
+        requests = [request.request for request in judged if request.request]
+        signed = certify_requests(
+            root,
+            b"".join(request.pem for request in requests),
+            now=now,
+            only=[request.name for request in requests],
+            renew=True,
+            replace_keys=True,
+            allow_refusal=allow_refusal,
+            keyring=keyring,
+            dry_run=dry_run,
+        )
+        notes.extend(signed.notes)
+        changes.extend(changes_below(root, signed.changes))
+
+    if not by_robot:
+        return "", notes, changes
+    everything = [request for requests in by_robot for request in requests]
+    try:
+        sign(everything)
+    except SrosError as joint:
+        if problem := _cannot_sign(root, now, keyring):
+            for request in everything:
+                request.done("not_signed", problem)
+            return problem, notes, changes
+        for requests in by_robot:
+            error: SrosError | None = joint
+            if len(by_robot) > 1:
+                error = _failure(sign, requests)
+            for request in requests if error else ():
+                request.done("refused", error.what if error else "")
+    return "", notes, changes
+
+
+def _failure(
+    sign: Callable[[Sequence[_Judged]], None], requests: Sequence[_Judged]
+) -> SrosError | None:
+    """Sign the requests of a robot; return the error if that fails."""
+    try:
+        sign(requests)
+    except SrosError as error:
+        return error
+    return None
+
+
+def _cannot_sign(root: Path, now: datetime, keyring: Keyring) -> str:
+    """Return why the CAs of the keystore cannot sign, whatever is requested; "" if they can."""
+    try:
+        with KeystoreChange(root, now=now, keyring=keyring, dry_run=True) as change:
+            change.open_authorities()
+    except SrosError as error:
+        return error.what
+    return ""

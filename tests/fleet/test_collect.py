@@ -1,0 +1,498 @@
+"""What home takes in from an inbox: verified messages, and renewals that the fleet file allows."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+
+from sros_tool.errors import DocumentError
+from sros_tool.keystore.confirmation import (
+    MAX_BYTES,
+    Confirmation,
+    last_confirmation,
+    render_confirmation,
+)
+from sros_tool.keystore.delivery.collect import (
+    MESSAGE_FILE,
+    CollectedInbox,
+    CollectedMessage,
+    collect,
+)
+from sros_tool.keystore.layout import key_on_robot
+from sros_tool.keystore.reader import Keystore, read_certificate
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
+from sros_tool.pki.keys import PrivateKey, generate_key, load_key
+from sros_tool.validity import iso
+from tests.support.harness import policy_text, publish, sros
+from tests.support.messages import key_of, said_by, signed_message
+
+ROBOTS = ("r1", "r2", "r3")
+FLEET = """
+[groups.renewing]
+renewal = "allowed"
+renewal_grace = "30d"
+[robots]
+r1 = { groups = ["renewing"] }
+r2 = { groups = ["renewing"], renewal_grace = "1d" }
+r3 = {}
+"""
+NOW = datetime.now(UTC).replace(microsecond=0) + timedelta(days=1)
+"""After everything that the tests make, however long they take."""
+DUE = NOW + timedelta(days=150)
+"""More than half of the validity of permissions (180 days) is over."""
+LATE = NOW + timedelta(days=365 + 10)
+"""Certificates (365 days) expired ten days ago."""
+
+
+@dataclass
+class Home:
+    """A keystore with a fleet, an export for each robot, and an inbox."""
+
+    folder: Path
+    sequence: int = 0
+
+    @property
+    def root(self) -> Path:
+        return self.folder / "ks"
+
+    @property
+    def inbox(self) -> Path:
+        return self.folder / "inbox"
+
+    def run(self, *words: object) -> None:
+        sros(*words, cwd=self.folder).ok()
+
+    def key(self, robot: str, enclave: str) -> PrivateKey:
+        return key_of(self.folder / robot, enclave)
+
+    def request(self, robot: str, enclave: str = "", key: PrivateKey | None = None) -> str:
+        """Return a request for renewal, with the key of the robot's enclave or another one."""
+        enclave = enclave or f"/{robot}/base"
+        return make_request(key or self.key(robot, enclave), enclave).decode()
+
+    def said(self, robot: str, now: datetime, **changed: object) -> Confirmation:
+        """Return what the agent of a robot confirms, with the next sequence number."""
+        self.sequence += 1
+        values = {"sequence": self.sequence, **changed}
+        return said_by(self.folder / robot, robot, now, **values)
+
+    def message(self, robot: str, now: datetime, enclave: str = "", **changed: object) -> bytes:
+        """Return the message of a robot, signed with the key of one of its enclaves."""
+        said = self.said(robot, now, **changed)
+        return signed_message(self.folder / robot, enclave or f"/{robot}/base", said)
+
+    def put(self, robot: str, message: bytes, now: datetime = NOW) -> Path:
+        """Put a message into the folder of a robot at ``now``, as a web server does."""
+        file = self.inbox / robot / MESSAGE_FILE
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(message)
+        os.utime(file, (now.timestamp(),) * 2)
+        return file
+
+    def send(self, robot: str, now: datetime = NOW, enclave: str = "", **changed: object) -> Path:
+        return self.put(robot, self.message(robot, now, enclave, **changed), now)
+
+    def collect(self, now: datetime = NOW, **options: object) -> CollectedInbox:
+        return collect(self.root, self.inbox, now=now, **options)  # type: ignore[arg-type]
+
+    def outcomes(self, now: datetime = NOW) -> dict[str, str]:
+        return {robot.robot: robot.outcome for robot in self.collect(now).robots}
+
+    def of(self, robot: str, now: datetime = NOW, **options: object) -> CollectedMessage:
+        """Collect; return what was done with the message of a robot."""
+        found = self.collect(now, **options)
+        return next(message for message in found.robots if message.robot == robot)
+
+    def kept(self, robot: str) -> int | None:
+        """Return the sequence number of the message that is kept of a robot."""
+        last = last_confirmation(self.root, robot)
+        return last.message.sequence if last and last.message else None
+
+    def certificate(self, enclave: str) -> x509.Certificate:
+        return Keystore(self.root).certificate_of(enclave)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Home:
+    """A keystore and the exports of its robots; only to be copied."""
+    home = Home(tmp_path_factory.mktemp("collect"))
+    (home.folder / "fleet.toml").write_text(FLEET)
+    rights = {path: publish("/{robot}/x") for path in ("/{robot}/base", "/{robot}/arm")}
+    (home.folder / "policy.xml").write_text(policy_text(rights))
+    home.run("create_keystore", "ks", "--template", "production")
+    home.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    for robot in ROBOTS:
+        home.run("distribute_key", "ks", "--robot", robot, robot)
+    home.inbox.mkdir()
+    return home
+
+
+@pytest.fixture
+def home(made: Home, tmp_path: Path) -> Home:
+    return Home(shutil.copytree(made.folder, tmp_path / "home", symlinks=True))
+
+
+# ── messages ───────────────────────────────────────────────────────────────────────────────
+
+
+def test_messages_are_kept_once_each(home: Home) -> None:
+    assert home.outcomes() == dict.fromkeys(ROBOTS, "missing")
+    home.send("r1")
+    home.send("r2")
+    assert home.outcomes() == {"r1": "kept", "r2": "kept", "r3": "missing"}
+    assert (home.kept("r1"), home.kept("r2"), home.kept("r3")) == (1, 2, None)
+    assert home.outcomes() == {"r1": "unchanged", "r2": "unchanged", "r3": "missing"}
+    home.send("r1")
+    found = home.collect()
+    assert [robot.outcome for robot in found.robots] == ["kept", "unchanged", "missing"]
+    assert found.complete and found.robots[0].enclave == "/r1/base"
+    last = last_confirmation(home.root, "r1")
+    assert last and last.confirmation.sequence == 3 and last.time <= NOW
+
+
+def test_the_verb_says_what_it_did(home: Home) -> None:
+    now = datetime.now(UTC)
+    home.send("r1", now)
+    home.send("r2", now, requests=(home.request("r2"),))
+    home.put("r3", home.message("r1", now))
+    (home.inbox / "r9\x1b").mkdir()
+    before = (
+        sorted((home.root / "confirmed").glob("*")) if (home.root / "confirmed").exists() else []
+    )
+    ended = sros("fleet", "collect", "ks", "inbox", "--dry-run", cwd=home.folder)
+    assert ended.status == 1 and not (home.root / "confirmed").exists() and not before
+    ended = sros("fleet", "collect", "ks", "inbox", cwd=home.folder)
+    lines = ended.out.splitlines()
+    assert ended.status == 1
+    assert lines[0] == "3 robots: 2 kept, 1 refused; 1 request: 1 refused"
+    assert lines[1].startswith("/r2/base: refused: it is not due for renewal before ")
+    assert lines[2] == "r3: refused: it is signed by /r1/base, an enclave of r1"
+    assert "1 name in 'inbox' is that of no robot" in ended.err and "\x1b" not in ended.err
+    home.send("r3", now)
+    home.send("r2", now)
+    shutil.rmtree(home.inbox / "r9\x1b")
+    ended = sros("fleet", "collect", "ks", "inbox", "--json", cwd=home.folder)
+    assert ended.status == 0
+    assert [robot["outcome"] for robot in json.loads(ended.out)["robots"]] == [
+        "unchanged", "kept", "kept",
+    ]  # fmt: skip
+
+
+def test_a_robot_cannot_answer_for_another_one(home: Home) -> None:
+    """Neither with its key and the other's name, nor with the other's words, nor from its place."""
+    certificate = home.folder / "r2/enclaves/r2/base/cert.pem"
+    named_r1 = render_confirmation(home.said("r1", NOW))
+    of_r2 = smime.sign(named_r1, read_certificate(certificate), home.key("r2", "/r2/base"))
+    home.put("r1", of_r2)
+    assert home.of("r1").why == "it is signed by /r2/base, an enclave of r2"
+    home.put("r1", home.message("r2", NOW))
+    assert home.of("r1").why == "it is signed by /r2/base, an enclave of r2"
+    home.put("r2", of_r2)
+    assert home.of("r2").why == "it is the confirmation of r1"
+    # The certificate of r1 is no secret: with it, and the key of r2.
+    stolen = read_certificate(home.folder / "r1/enclaves/r1/base/cert.pem")
+    home.put("r1", smime.sign(named_r1, stolen, home.key("r2", "/r2/base")))
+    assert home.of("r1").why == "its signature does not match its content"
+    assert home.kept("r1") is None and home.kept("r2") is None
+    home.put("r1", smime.sign(named_r1, stolen, home.key("r1", "/r1/base")))
+    assert home.of("r1").outcome == "kept"
+
+
+def test_a_message_that_was_replayed(home: Home) -> None:
+    first = home.send("r1").read_bytes()
+    home.send("r1")
+    assert home.of("r1").outcome == "kept"
+    home.put("r1", first)
+    refused = home.of("r1")
+    assert refused.outcome == "refused" and "not higher than 2" in refused.why
+    assert "--restored r1" in refused.why and home.kept("r1") == 2
+    # Another message with the same number, and one after somebody confirmed without a number.
+    home.send("r1", sequence=2)
+    assert home.of("r1").outcome == "refused"
+    (home.folder / "said").write_bytes(render_confirmation(home.said("r1", NOW, sequence=None)))
+    home.run("fleet", "confirm", "ks", "said", "--robot", "r1")
+    home.put("r1", first)
+    assert home.of("r1").outcome == "refused" and home.kept("r1") == 2
+    assert home.of("r1", restored=("r1",)).outcome == "kept" and home.kept("r1") == 1
+    with pytest.raises(DocumentError, match="no robot 'r9'"):
+        home.collect(restored=("r9",))
+
+
+def test_a_certificate_that_proves_nothing(home: Home) -> None:
+    """One of an enclave that was revoked, of another CA, and of this CA but not in the ledger."""
+    document = render_confirmation(home.said("r1", NOW))
+    own, key = home.certificate("/r1/base"), home.key("r1", "/r1/base")
+    authority = read_certificate(home.root / "public/identity_ca.cert.pem")
+    of_authority = load_key((home.root / "private/identity_ca.key.pem").read_bytes(), "it")
+    issuer = Issuer(authority, of_authority)
+    forged = issuer.issue(own.subject, key.public_key(), validity_of(own))
+    home.put("r1", smime.sign(document, forged, key))
+    assert home.of("r1").why == "its certificate is not in the ledger of the keystore"
+    home.run("create_keystore", "other")
+    home.run("create_enclave", "other", "/r1/base")
+    foreign = home.folder / "other/enclaves/r1/base"
+    foreign_key = key_of(home.folder / "other", "/r1/base")
+    home.put("r1", smime.sign(document, read_certificate(foreign / "cert.pem"), foreign_key))
+    assert home.of("r1").why.startswith("its certificate is of no identity CA of the keystore")
+    home.put("r1", smime.sign(document, own, key))
+    assert home.of("r1").outcome == "kept"
+    home.send("r1")
+    home.run("revoke", "ks", "/r1/base")
+    assert "was revoked" in home.of("r1").why and home.kept("r1") == 1
+    home.send("r1", enclave="/r1/arm")
+    assert home.of("r1").outcome == "kept"
+
+
+def test_a_certificate_of_the_ca_that_a_rotation_replaces(home: Home) -> None:
+    home.run("rotate_ca", "ks", "--next")
+    home.run("rotate_ca", "ks", "--next", "--allow-unconfirmed")
+    home.send("r1")
+    assert home.of("r1").outcome == "kept", "the old CA is still trusted"
+    home.run("rotate_ca", "ks", "--next", "--allow-unconfirmed")
+    home.send("r1")
+    assert "of no identity CA" in home.of("r1").why
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda data: b"", "not an S/MIME signed message"),
+        (lambda data: b"{}", "not an S/MIME signed message"),
+        (lambda data: data[: len(data) // 2], "one signed part followed by one signature"),
+        (lambda data: data.replace(b'"r1"', b'"r2"'), "does not match its content"),
+        (lambda data: bytes(range(256)), "programs read in different ways"),
+    ],
+)
+def test_a_damaged_message(home: Home, change: Callable[[bytes], bytes], why: str) -> None:
+    message = home.message("r1", NOW)
+    home.put("r1", change(message))
+    home.send("r2")
+    found = home.collect()
+    assert [robot.outcome for robot in found.robots] == ["refused", "kept", "missing"]
+    assert why in found.robots[0].why
+    home.put("r1", message)
+    assert home.of("r1").outcome == "kept"
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"sequence": None}, "no sequence number"),
+        ({"files": {"../../etc/passwd": "0" * 64}}, "is not a confirmation"),
+    ],
+)
+def test_a_signed_message_that_is_none(home: Home, changed: dict[str, object], why: str) -> None:
+    home.send("r1", NOW, "", **changed)
+    assert why in home.of("r1").why
+
+
+# ── the inbox ──────────────────────────────────────────────────────────────────────────────
+
+
+def link_to_file(file: Path) -> None:
+    file.rename(file.with_name("other"))
+    file.symlink_to("other")
+
+
+def link_to_folder(file: Path) -> None:
+    file.parent.rename(file.parent.with_name("elsewhere"))
+    file.parent.symlink_to("elsewhere")
+
+
+def pipe(file: Path) -> None:
+    file.unlink()
+    os.mkfifo(file)
+
+
+def door(file: Path) -> None:
+    file.unlink()
+    os.chdir(file.parent)  # the path of a socket is short
+    with socket.socket(socket.AF_UNIX) as opened:
+        opened.bind(file.name)
+
+
+def folder(file: Path) -> None:
+    file.unlink()
+    file.mkdir()
+
+
+def huge(file: Path) -> None:
+    with file.open("r+b") as opened:
+        opened.truncate(MAX_BYTES + 1)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (link_to_file, "not a regular file"),
+        (link_to_folder, "is a symbolic link"),
+        (pipe, "not a regular file"),
+        (door, "not a regular file"),
+        (folder, "not a regular file"),
+        (huge, "more than 4 MiB"),
+    ],
+)
+def test_a_hostile_inbox(
+    home: Home, spoil: Callable[[Path], None], why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(home.folder)
+    spoil(home.send("r1"))
+    home.send("r2")
+    found = home.collect()
+    assert [robot.outcome for robot in found.robots] == ["refused", "kept", "missing"]
+    assert why in found.robots[0].why
+
+
+def test_an_inbox_that_is_none(home: Home) -> None:
+    home.inbox.rmdir()
+    ended = sros("fleet", "collect", "ks", "inbox", cwd=home.folder)
+    assert ended.status == 2 and "'inbox' cannot be opened" in ended.err
+
+
+def test_when_a_message_arrived(home: Home) -> None:
+    """It may lie there for long, and its time may be set; but it came after the one before."""
+
+    def arrived(written: datetime, now: datetime) -> datetime:
+        file = home.send("r1", now)
+        os.utime(file, (written.timestamp(),) * 2)
+        home.collect(now)
+        last = last_confirmation(home.root, "r1")
+        assert last
+        return last.time
+
+    day = timedelta(days=1)
+    assert arrived(NOW, NOW + day) == NOW
+    assert arrived(NOW - day, NOW + day) == NOW
+    assert arrived(NOW + 5 * day, NOW + 2 * day) == NOW + 2 * day
+
+
+def test_remarks_on_clocks(home: Home) -> None:
+    home.send("r1")
+    assert home.of("r1").remarks == []
+    home.send("r1", time=NOW + timedelta(hours=2))
+    assert home.of("r1").remarks == ["its clock is 2 h ahead"]
+    home.send("r1", LATE)
+    (remark,) = home.of("r1", LATE).remarks
+    assert remark.startswith("its certificate expired 10 d") and home.kept("r1") == 3
+
+
+# ── renewal ────────────────────────────────────────────────────────────────────────────────
+
+
+def test_renewals_are_signed_in_one_change(home: Home) -> None:
+    before = {name: home.certificate(name) for name in ("/r1/base", "/r1/arm", "/r2/base")}
+    rights = (home.root / "enclaves/r1/base/permissions.xml").read_text()
+    home.send("r1", DUE, requests=(home.request("r1"), home.request("r1", "/r1/arm")))
+    home.send("r2", DUE, requests=(home.request("r2"),))
+    home.send("r3", DUE, requests=(home.request("r3"),))
+    head = (home.root / "ledger.p7s").read_bytes()
+    dry = home.collect(DUE, dry_run=True)
+    assert (home.root / "ledger.p7s").read_bytes() == head and home.kept("r1") is None
+    found = home.collect(DUE)
+    assert [robot.requests for robot in found.robots] == [robot.requests for robot in dry.robots]
+    outcomes = [[request.outcome for request in robot.requests] for robot in found.robots]
+    assert outcomes == [["renewed", "renewed"], ["renewed"], ["not_allowed"]]
+    assert not found.complete and 'renewal = "allowed"' in found.robots[2].requests[0].why
+    issued = [entry for entry in Keystore(home.root).ledger.entries if entry.time > iso(NOW)]
+    assert len({entry.time for entry in issued}) == 1
+    assert sorted(entry.enclave for entry in issued if entry.what == "certificate") == sorted(
+        before
+    )
+    for name, old in before.items():
+        new = home.certificate(name)
+        assert new.public_key() == old.public_key() and new != old
+        assert new.not_valid_after_utc > old.not_valid_after_utc
+    after = (home.root / "enclaves/r1/base/permissions.xml").read_text()
+    assert without_times(after) == without_times(rights) and after != rights
+    # The agent repeats its request until it has the answer: nothing is signed again.
+    home.send("r1", DUE, requests=(home.request("r1"),))
+    (request,) = home.of("r1", DUE).requests
+    assert request.outcome == "answered" and home.certificate("/r1/base") != before["/r1/base"]
+    installed = "r1/enclaves/r1/base/cert.pem"
+    shutil.copy(home.root / installed.removeprefix("r1/"), home.folder / installed)
+    home.send("r1", DUE, requests=(home.request("r1"),))
+    (request,) = home.of("r1", DUE).requests
+    assert request.outcome == "refused" and "not due" in request.why
+
+
+def without_times(text: str) -> list[str]:
+    return [line for line in text.splitlines() if "<not_" not in line and "<subject" not in line]
+
+
+def refused(home: Home, robot: str, now: datetime = DUE, **sent: object) -> str:
+    """Return why the only request of a robot's message was refused; nothing is signed."""
+    head = (home.root / "ledger.p7s").read_bytes()
+    home.send(robot, now, "", **sent)
+    *_, request = home.of(robot, now).requests
+    assert request.outcome == "refused", request
+    assert (home.root / "ledger.p7s").read_bytes() == head
+    assert home.kept(robot) == home.sequence, "the message itself is good"
+    return request.why
+
+
+def test_requests_that_are_refused(home: Home) -> None:
+    new = generate_key()
+    of_r2 = home.request("r2")
+    assert refused(home, "r1", requests=(of_r2,)) == "/r2/base is an enclave of r2"
+    named_r2 = home.request("r2", key=home.key("r1", "/r1/base"))
+    assert refused(home, "r1", requests=(named_r2,)) == "/r2/base is an enclave of r2"
+    stranger = make_request(new, "/dispatcher").decode()
+    assert refused(home, "r1", requests=(stranger,)) == "/dispatcher is no enclave of a robot"
+    home.run("revoke", "ks", "/r1/arm")
+    gone = home.request("r1", "/r1/arm")
+    assert "or it was revoked" in refused(home, "r1", requests=(gone,))
+    garbage = "-----BEGIN CERTIFICATE REQUEST-----\nAAAA\n-----END CERTIFICATE REQUEST-----\n"
+    assert "cannot be read" in refused(home, "r1", requests=(garbage,))
+    assert "not due" in refused(home, "r1", NOW, requests=(home.request("r1"),))
+
+
+def test_only_an_enclave_itself_vouches_for_its_new_key(home: Home) -> None:
+    """Who has the key of one enclave of a robot does not get the rights of another one."""
+    new = generate_key()
+    request = home.request("r1", "/r1/arm", new)
+    why = refused(home, "r1", requests=(request,))
+    assert "new key" in why and "/r1/base" in why
+    home.send("r1", DUE, "/r1/arm", requests=(request,))
+    (done,) = home.of("r1", DUE).requests
+    assert done.outcome == "renewed" and done.key_sha256 == key_digest(new.public_key())
+    assert home.certificate("/r1/arm").public_key() == new.public_key()
+    assert key_on_robot(home.root / "enclaves/r1/arm")
+
+
+def test_the_grace_after_expiry(home: Home) -> None:
+    home.send("r1", LATE, requests=(home.request("r1"),))
+    home.send("r2", LATE, requests=(home.request("r2"),))
+    found = home.collect(LATE)
+    assert [robot.requests[0].outcome for robot in found.robots[:2]] == ["renewed", "refused"]
+    assert "renewal_grace of r2: 1d" in found.robots[1].requests[0].why
+
+
+def test_one_request_that_cannot_be_signed_stops_no_other(home: Home) -> None:
+    """Two robots ask for the same key: neither of them gets it, and the third robot is renewed."""
+    (home.root / "enclaves/r1/base/permissions.p7s").write_bytes(b"damaged")
+    home.send("r1", DUE, requests=(home.request("r1"),))
+    home.send("r2", DUE, requests=(home.request("r2"),))
+    found = home.collect(DUE)
+    assert [robot.requests[0].outcome for robot in found.robots[:2]] == ["refused", "renewed"]
+
+
+def test_cas_that_cannot_sign(home: Home) -> None:
+    home.send("r1", DUE, requests=(home.request("r1"),))
+    for key in (home.root / "private").glob("*.key.pem"):
+        key.rename(home.folder / key.name)
+    found = home.collect(DUE)
+    assert found.robots[0].outcome == "kept" and home.kept("r1") == 1
+    assert found.robots[0].requests[0].outcome == "not_signed" and found.not_signed
+    for key in home.folder.glob("*.key.pem"):
+        key.rename(home.root / "private" / key.name)
+    assert home.of("r1", DUE).requests[0].outcome == "renewed", "the same message is enough"
