@@ -144,7 +144,7 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
         text = f"its enclave cannot be looked at: {enclave.problem}"
         yield PROCESS_NOT_SEEN.found(process.label, text)
         return
-    newer = list(_newer(process, enclave))
+    newer = list(newer_files(process, enclave))
     loaded = _loaded(enclave, newer, process.started)
     if revoked := loaded.revoked:
         yield PROCESS_REVOKED.found(process.label, f"the certificate of {name} was {revoked}")
@@ -174,7 +174,7 @@ def _required(enclave: ProcessEnclave) -> Sequence[str]:
     return [file.name for file in enclave.files if file.name not in (CRL_FILE, KEY_URI_FILE)]
 
 
-def _newer(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
+def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
     """Yield the names of the files that changed, or were removed, since a process started."""
     files = enclave.files
     if process.is_zenoh:

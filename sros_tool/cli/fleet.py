@@ -129,21 +129,10 @@ def _report(folder: Path, robot: str) -> None:
 
 def _dds_here(moment: datetime) -> RobotDds:
     """Return the DDS libraries that processes of this machine have loaded, or that it has."""
-    from sros_tool.keystore.confirmation import RobotDds, RobotLibrary, Seen
-    from sros_tool.runtime.processes import ProcessTable, installed_dds, plain
+    from sros_tool.agent.running import robot_dds
+    from sros_tool.runtime.processes import ProcessTable
 
-    running = ProcessTable().look(moment)
-    loaded = [library for process in running.processes for library in process.dds]
-    seen = dict.fromkeys(installed_dds(), Seen.INSTALLED)
-    seen |= dict.fromkeys((library._replace(replaced=False) for library in loaded), Seen.PROCESS)
-    libraries = dict.fromkeys(
-        RobotLibrary(library.product, library.version, plain(library.path, _LONGEST_PATH), how)
-        for library, how in sorted(seen.items(), key=lambda pair: (pair[1] != "process", pair[0]))
-    )
-    return RobotDds(tuple(libraries), len(running.unseen) + bool(running.hidden))
-
-
-_LONGEST_PATH = 200
+    return robot_dds(ProcessTable().look(moment))
 
 
 # ── at home ────────────────────────────────────────────────────────────────────────────────

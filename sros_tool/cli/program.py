@@ -61,6 +61,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
             "deployment", "Install a signed answer on the robot.", attribute="import_verb"
         ),
         "fleet": VerbEntry("fleet", "Show what the robots of a fleet have."),
+        "agent": VerbEntry("agent", "On a robot: fetch what home publishes, install it, confirm."),
         "zenoh": VerbEntry("zenoh", "Write the files that make Zenoh enforce policies."),
     },
     "Policy": {

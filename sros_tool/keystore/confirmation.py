@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sros_tool.dds.advisories import PRODUCTS
-from sros_tool.errors import DocumentError, InvalidNameError
+from sros_tool.errors import DocumentError, InvalidNameError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.fleet.robots import name_problem
 from sros_tool.folders import Folder
@@ -38,6 +38,7 @@ from sros_tool.keystore.layout import (
     confirmation_file,
     enclave_folder,
     list_enclaves,
+    search_enclaves,
 )
 from sros_tool.names import check_enclave_name
 from sros_tool.validity import elapsed, iso, parse_iso
@@ -186,12 +187,20 @@ def enclave_of(path: str) -> str:
 
 
 def make_confirmation(
-    root: Path, robot: str, *, now: datetime, dds: RobotDds | None = None
+    root: Path,
+    robot: str,
+    *,
+    now: datetime,
+    dds: RobotDds | None = None,
+    unreadable: Callable[[str, Exception], None] | None = None,
 ) -> Confirmation:
     """Return a confirmation of all enclaves in ``root``, a keystore or a robot's installed folder.
 
     Folders that are not named like an enclave are left out: no process can run in them.
     Libraries in ``dds`` beyond the first 100 are counted as unseen processes.
+
+    ``unreadable`` gets the name of each enclave of which a file cannot be read, and the error; the
+    confirmation leaves the enclave out.  Without it, the error is raised.
 
     Raises:
         DocumentError: ``robot`` is not a robot's name.
@@ -202,20 +211,36 @@ def make_confirmation(
         raise DocumentError(f"{robot!r} is not the name of a robot", problem)
     files: dict[str, str] = {}
     certificates: dict[str, tuple[str, ...]] = {}
-    names = [name for name in list_enclaves(root) if name == "/" or _is_enclave_name(name)]
+    names = search_enclaves(root)[0] if unreadable else list_enclaves(root)
     with Folder(root) as folder:
         for name in names:
-            for file in CONFIRMED_FILES:
-                path = f"{enclave_folder(name)}/{file}"
-                if not os.path.lexists(root / path):
-                    continue
-                data = folder.read_inside(path)
+            if name != "/" and not _is_enclave_name(name):
+                continue
+            try:
+                contents = _confirmed_files(root, folder, name)
+            except (SrosError, OSError) as error:
+                if unreadable is None:
+                    raise
+                unreadable(name, error)
+                continue
+            for path, data in contents.items():
                 files[path] = hashlib.sha256(data).hexdigest()
-                if file in _CERTIFICATE_FILES:
+                if path.rpartition("/")[2] in _CERTIFICATE_FILES:
                     certificates[path] = certificate_digests(data)
     if dds and (more := len(dds.libraries) - _MOST_LIBRARIES) > 0:
         dds = RobotDds(dds.libraries[:_MOST_LIBRARIES], min(dds.unseen + more, _MOST_UNSEEN))
     return Confirmation(robot, now, files, certificates, dds)
+
+
+def _confirmed_files(root: Path, folder: Folder, name: str) -> dict[str, bytes]:
+    """Map the paths of an enclave's files, of those that a confirmation lists, to their content.
+
+    Raises:
+        KeystoreError: a file is a link that leads out of the keystore.
+        OSError: a file cannot be read.
+    """
+    paths = (f"{enclave_folder(name)}/{file}" for file in CONFIRMED_FILES)
+    return {path: folder.read_inside(path) for path in paths if os.path.lexists(root / path)}
 
 
 def certificate_digests(data: bytes) -> tuple[str, ...]:

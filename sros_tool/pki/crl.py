@@ -130,7 +130,7 @@ def load_crl(data: bytes, name: str) -> RevocationList:
     if expiry is None:
         raise PkiError(f"the revocation list {name} does not say when it expires", "", _RESTORE)
     revoked = tuple(entry for entry in map(_revoked, crl) if entry.reason in REASONS)
-    return RevocationList(_number(crl), last_update(crl), expiry, revoked, crl)
+    return RevocationList(list_number(crl), last_update(crl), expiry, revoked, crl)
 
 
 def last_update(crl: x509.CertificateRevocationList) -> datetime:
@@ -194,7 +194,7 @@ def _read(content: bytes) -> x509.CertificateRevocationList:
 def _read_in_full(crl: x509.CertificateRevocationList) -> x509.CertificateRevocationList:
     read_name(crl.issuer)
     subject_text(crl.issuer)
-    _ = last_update(crl), next_update(crl), crl.signature_hash_algorithm, _number(crl)
+    _ = last_update(crl), next_update(crl), crl.signature_hash_algorithm, list_number(crl)
     for entry in crl:
         _revoked(entry)
     return crl
@@ -284,7 +284,8 @@ def may_sign_lists(authority: x509.Certificate) -> bool:
     return usage is None or usage.crl_sign
 
 
-def _number(crl: x509.CertificateRevocationList) -> int:
+def list_number(crl: x509.CertificateRevocationList) -> int:
+    """Return the number of a revocation list; 0 if it has none."""
     try:
         return crl.extensions.get_extension_for_class(x509.CRLNumber).value.crl_number
     except x509.ExtensionNotFound:

@@ -356,23 +356,10 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
             another key or enclave, an invalid chain or signature, an expired or revoked
             certificate, weak cryptography, or a file changed in transit.
     """
-    with tempfile.TemporaryDirectory(prefix="sros-") as folder:
-        for path, data in answer.files.items():
-            write_new_file(Path(folder, path.rpartition("/")[2]), data)
-        opened = replace(open_enclave(Path(folder), now=now), key_on_robot=True)
-        evaluation = evaluated(answer.name, Path(folder), opened, at=now)
-        state = evaluation.state
-        zenoh = open_zenoh(Path(folder), answer.name, state)
-    problems = list(evaluation.problems)
-    if zenoh.files:
-        problems += [str(fault) for fault in zenoh.problems if fault.file != CERTIFICATE_FILE]
-    certificate = state.certificate
-    if certificate and certificate.public_key() != key:
-        problems.insert(0, "cert.pem: it does not belong to the enclave's key")
+    files = {path.rpartition("/")[2]: data for path, data in answer.files.items()}
+    state, problems = evaluate_delivered(answer.name, files, key, now=now)
     if state.permissions_ca and (problem := _broken_seal(answer, [state.permissions_ca])):
         problems.append(f"{SEAL}: {problem}")
-    if certificate and common_name_of(certificate.subject) != answer.name:
-        problems.insert(0, f"cert.pem: it is for {subject_text(certificate.subject)}")
     if problems:
         raise PkiError(
             f"the answer for enclave {answer.name} is not valid", "; ".join(problems) + ".", _AGAIN
@@ -384,6 +371,35 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
             "Replace the CA with `sros rotate_ca`, and have the request signed again.",
         )
     return state
+
+
+def evaluate_delivered(
+    name: str, files: Mapping[str, bytes], key: PublicKey, *, now: datetime
+) -> tuple[OpenedEnclave, list[str]]:
+    """Return the enclave ``name`` made of delivered files, and clauses on why it cannot be used.
+
+    Args:
+        name: the name of the enclave.
+        files: its files by their names, without its key.
+        key: the public key of the enclave, which has to be the key of the certificate.
+        now: the time at which it has to be valid.
+    """
+    with tempfile.TemporaryDirectory(prefix="sros-") as folder:
+        for file, data in files.items():
+            write_new_file(Path(folder, file), data)
+        opened = replace(open_enclave(Path(folder), now=now), key_on_robot=True)
+        evaluation = evaluated(name, Path(folder), opened, at=now)
+        state = evaluation.state
+        zenoh = open_zenoh(Path(folder), name, state)
+    problems = list(evaluation.problems)
+    if zenoh.files:
+        problems += [str(fault) for fault in zenoh.problems if fault.file != CERTIFICATE_FILE]
+    certificate = state.certificate
+    if certificate and certificate.public_key() != key:
+        problems.insert(0, "cert.pem: it does not belong to the enclave's key")
+    if certificate and common_name_of(certificate.subject) != name:
+        problems.insert(0, f"cert.pem: it is for {subject_text(certificate.subject)}")
+    return state, problems
 
 
 def _broken_seal(answer: RequestAnswer, authorities: Iterable[x509.Certificate]) -> str:

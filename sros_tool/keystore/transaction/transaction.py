@@ -35,6 +35,7 @@ from sros_tool.keystore.layout import (
     STAGE,
     folder_mode,
     readable_enclaves,
+    search_enclaves,
 )
 from sros_tool.keystore.transaction.recovery import KeystoreLock, complete, lock_new, recover
 from sros_tool.keystore.transaction.stage import (
@@ -72,15 +73,18 @@ class Transaction:
     Use it as a context manager; without `commit` nothing changes.  With ``fresh``, the keystore may
     be new; otherwise it must exist.  With ``dry_run`` nothing is written, and ``changes`` lists the
     changes that would be made.  ``enclaves`` are the sorted names of the enclaves before the
-    change.
+    change.  With ``partial``, the caller may leave out enclaves: some may be unreadable.
     """
 
-    def __init__(self, root: Path, *, fresh: bool = False, dry_run: bool = False) -> None:
+    def __init__(
+        self, root: Path, *, fresh: bool = False, dry_run: bool = False, partial: bool = False
+    ) -> None:
         self.root = root
         self.changes = Changes()
         self.enclaves: tuple[str, ...] = ()
         self.dry_run = dry_run
         self._fresh = fresh
+        self._partial = partial
         self._new_root = fresh and not root.exists()
         self._made_parents: list[Path] = []
         self._folder: Folder | None = None
@@ -125,7 +129,7 @@ class Transaction:
             if self._fresh and not self._new_root:
                 self._refuse_folder_of_stranger()
             if self.dry_run:
-                self.enclaves = readable_enclaves(self.root)
+                self.enclaves = self._readable_enclaves()
             else:
                 self._begin()
         except BaseException:
@@ -148,10 +152,13 @@ class Transaction:
         self._lock = KeystoreLock(self._in)
         self._lock.acquire()
         recover(self._in)
-        self.enclaves = readable_enclaves(self.root)
+        self.enclaves = self._readable_enclaves()
         for path in (STAGE, f"{STAGE}/{ADDED}", f"{STAGE}/{AFTER}"):
             self._in.mkdir(path, 0o700)
         _LOG.info("began a transaction in the keystore '%s'", self.root)
+
+    def _readable_enclaves(self) -> tuple[str, ...]:
+        return search_enclaves(self.root)[0] if self._partial else readable_enclaves(self.root)
 
     def _refuse_folder_of_stranger(self) -> None:
         """Refuse, as root, to write keys into a folder that another user may have prepared."""

@@ -1,0 +1,494 @@
+"""A round of a robot's agent: fetch, install, restart, look, and send what it finds to home.
+
+Each part that fails is a problem of the round, and does not keep the other parts from their work:
+a robot whose source is away still confirms, and one whose inbox is away still installs.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta, tzinfo
+from pathlib import Path
+from typing import NamedTuple
+
+from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
+from sros_tool.agent.inbox import send
+from sros_tool.agent.install import Installation, install_release
+from sros_tool.agent.renewal import (
+    drop_installed_keys,
+    enclave_key,
+    renewal_requests,
+    waiting_keys,
+)
+from sros_tool.agent.running import (
+    EnclaveProcesses,
+    Systemd,
+    kernel_clock,
+    look_at_processes,
+    restart_units,
+    still_due,
+)
+from sros_tool.agent.settings import AgentSettings, agent_folder
+from sros_tool.agent.state import read_seal, read_state, write_seal, write_state
+from sros_tool.errors import SrosError
+from sros_tool.folders import Folder
+from sros_tool.keystore.confirmation import (
+    LONGEST_PROBLEM,
+    MOST_PROBLEMS,
+    Confirmation,
+    EnclaveExpiry,
+    RobotClock,
+    make_confirmation,
+    render_confirmation,
+)
+from sros_tool.keystore.delivery.archive import listed_digests
+from sros_tool.keystore.delivery.release import Release
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    KEY_FILE,
+    ROUTER_FILE,
+    enclave_path,
+    search_enclaves,
+)
+from sros_tool.keystore.participant import evaluated
+from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, open_enclave, read_certificate
+from sros_tool.keystore.transaction.recovery import tidy
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import validity_of
+from sros_tool.pki.token import Secrets
+from sros_tool.runtime.processes import RunningProcesses
+from sros_tool.validity import elapsed, iso
+
+_TOLERANCE = timedelta(minutes=2)
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+class Round(NamedTuple):
+    """What a round of the agent did, and what it found."""
+
+    release: int
+    """The number of the release that is installed."""
+    fetched: bool
+    """Whether the source was reached and could be trusted."""
+    changed: Sequence[str]
+    """Enclaves of which a file changed."""
+    removed: Sequence[str]
+    """Enclaves that were removed, because the release does not have them."""
+    restart: Sequence[str]
+    """Enclaves whose processes were not yet seen with the installed files."""
+    requests: int
+    """Number of signing requests in the message."""
+    sent: bool
+    """Whether the message reached the inbox."""
+    problems: Sequence[str]
+    """What could not be done, and what is wrong, as sentences."""
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """What a round takes from outside: the time, the zone, the processes, and programs."""
+
+    now: datetime
+    zone: tzinfo
+    secrets: Secrets
+    look: Callable[[datetime], RunningProcesses] | None = None
+    systemd: Systemd | None = None
+    fetch: Callable[..., Release | None] = fetch_release
+    clock: Callable[[], RobotClock] = kernel_clock
+
+
+def run_round(folder: Path, settings: AgentSettings, machine: Machine) -> Round:
+    """Run a round of the agent in the security folder ``folder``.
+
+    Raises:
+        KeystoreError: the folder as a whole cannot be used.
+    """
+    return _Round(folder, settings, machine).run()
+
+
+class _Round:
+    """A round that is under way, with its problems so far."""
+
+    def __init__(self, folder: Path, settings: AgentSettings, machine: Machine) -> None:
+        self._folder = folder
+        self._settings = settings
+        self._machine = machine
+        self._problems: list[str] = []
+        self._state = read_state(folder)
+
+    def run(self) -> Round:
+        now, before = self._machine.now, self._state
+        self._attempt(lambda: tidy(self._folder))
+        clock = self._clock()
+        # Documents that were verified prove that this moment has passed, whatever the clock shows.
+        certain = max(now, before.latest) if before.latest else now
+        installation, fetched = self._fetch_and_install(certain)
+        names = self._enclaves()
+        opened = self._open(names, now)
+        self._note_due(installation.changed, names)
+        if clock is not RobotClock.BEHIND:  # nodes would not accept their certificates
+            self._restart(names, opened)
+        seen = look_at_processes(
+            self._folder, names, now=now, zone=self._machine.zone, look=self._machine.look
+        )
+        self._problems += [f"{problem}." for problem in seen.problems]
+        self._state = replace(self._state, due=still_due(self._state.due, seen))
+        requests = self._requests(names, opened)
+        arrived = self._confirm(names, opened, seen, clock, requests)
+        problems = tuple(dict.fromkeys(self._problems))
+        self._state = replace(
+            self._state, fetched=now if fetched else self._state.fetched, problems=problems
+        )
+        self._save()
+        return Round(
+            self._state.release,
+            fetched,
+            installation.changed,
+            installation.removed,
+            self._state.due,
+            len(requests),
+            arrived,
+            tuple(dict.fromkeys(self._problems)),
+        )
+
+    # ── parts of a round ───────────────────────────────────────────────────────────────────
+
+    def _attempt(self, work: Callable[[], None]) -> bool:
+        """Do ``work``; return whether it succeeded, and note the problem if not."""
+        try:
+            work()
+        except SrosError as error:
+            self._problems.append(_sentence(error))
+        except OSError as error:
+            self._problems.append(self._refused(error))
+        else:
+            return True
+        return False
+
+    def _refused(self, error: OSError) -> str:
+        where = f" '{os.fsdecode(error.filename)}'" if error.filename else ""
+        text = f"The operating system refuses{where}: {error.strerror or error}."
+        if error.errno in _FULL:
+            return f"{text} Make room on the disk of '{self._folder}'; the agent then goes on."
+        return text
+
+    def _save(self) -> None:
+        self._attempt(lambda: write_state(self._folder, self._state))
+
+    def _clock(self) -> RobotClock:
+        now, latest = self._machine.now, self._state.latest
+        if latest and now < latest - _TOLERANCE:
+            self._problems.append(
+                f"The clock shows {iso(now)}, but documents that this robot verified were made at "
+                f"{iso(latest)}: it is at least {elapsed(latest - now)} behind. Nothing is "
+                "restarted; set the clock."
+            )
+            return RobotClock.BEHIND
+        return self._machine.clock()
+
+    def _fetch_and_install(self, certain: datetime) -> tuple[Installation, bool]:
+        """Fetch and install a release; return what changed, and whether the source was reached."""
+        settings, state = self._settings, self._state
+        intact = self._is_installed()
+        try:
+            release = self._machine.fetch(
+                agent_folder(self._folder),
+                settings.source,
+                settings.robot,
+                now=certain,
+                installed=state.accepted if intact else 0,
+                client_certificate=self._client_certificate(),
+                tls_ca=Path(settings.tls_ca) if settings.tls_ca else None,
+            )
+        except FetchError as error:
+            self._problems.append(_sentence(error))
+            if error.problem is FetchProblem.EXPIRED:
+                self._problems.append(
+                    f"By the clock of this robot it is {iso(self._machine.now)}; if that is wrong, "
+                    "set the clock."
+                )
+            return Installation(), False
+        except SrosError as error:
+            self._problems.append(_sentence(error))
+            return Installation(), False
+        except OSError as error:
+            self._problems.append(self._refused(error))
+            return Installation(), False
+        if release is None:
+            return Installation(), True
+        return self._install(release, certain), True
+
+    def _is_installed(self) -> bool:
+        """Return whether the folder has every file of the release that was accepted last."""
+        state = self._state
+        if not state.accepted or state.release != state.accepted:
+            return False
+        try:
+            text = smime.parse(read_seal(self._folder)).text
+        except SrosError:
+            return False
+        with Folder(self._folder) as opened:
+            for line in text.splitlines():
+                digest, mark, path = line.decode(errors="replace").partition("  ")
+                if not mark:
+                    continue
+                try:
+                    data = opened.read_inside(path)
+                except (SrosError, OSError):
+                    return False
+                if hashlib.sha256(data).hexdigest() != digest:
+                    return False
+        return True
+
+    def _install(self, release: Release, certain: datetime) -> Installation:
+        settings, state = self._settings, self._state
+        if release.number == state.accepted and self._differs_from_accepted(release):
+            self._problems.append(
+                f"There are two releases with the number {release.number}: the ledger at home was "
+                "reset, or somebody else publishes. Nothing was changed."
+            )
+            return Installation()
+        names = tuple({*release.enclaves(), *search_enclaves(self._folder)[0]})
+        keys = waiting_keys(self._folder, names)
+        try:
+            installation = install_release(
+                self._folder,
+                release,
+                settings.robot,
+                now=certain,
+                installed=state.accepted,
+                pinned=frozenset(settings.authorities),
+                new_keys=keys,
+                before=self._record_due,
+            )
+        except SrosError as error:
+            self._problems.append(_sentence(error))
+            return Installation()
+        except OSError as error:
+            self._problems.append(self._refused(error))
+            return Installation()
+        for name, why in installation.kept.items():
+            self._problems.append(f"{name} keeps its files: {why}.")
+        for name in installation.removed:
+            self._problems.append(
+                f"{name} was removed: release {release.number} does not have it. Stop its "
+                "processes."
+            )
+        self._attempt(lambda: write_seal(self._folder, release.seal))
+        latest = max(filter(None, (state.latest, installation.latest)), default=None)
+        self._state = replace(
+            self._state,
+            release=state.release if installation.kept else release.number,
+            accepted=release.number,
+            latest=latest,
+        )
+        self._save()
+        drop_installed_keys(self._folder, keys)
+        return installation
+
+    def _differs_from_accepted(self, release: Release) -> bool:
+        """Return whether the accepted release with the same number has other files."""
+        with suppress(SrosError):
+            text = smime.parse(read_seal(self._folder)).text
+            return not text.endswith(b"\n" + listed_digests(release.files))
+        return False
+
+    def _record_due(self, names: Sequence[str]) -> None:
+        """Record restarts before the change: who is killed in between looks once too often."""
+        self._state = replace(self._state, due=tuple(sorted({*self._state.due, *names})))
+        self._save()
+
+    def _note_due(self, changed: Iterable[str], names: Iterable[str]) -> None:
+        due = {*self._state.due, *changed} & set(names)
+        self._state = replace(self._state, due=tuple(sorted(due)))
+
+    def _enclaves(self) -> tuple[str, ...]:
+        """Return the enclaves with a certificate, in which processes can run."""
+        return tuple(
+            name
+            for name in search_enclaves(self._folder)[0]
+            if (enclave_path(self._folder, name) / CERTIFICATE_FILE).exists()
+        )
+
+    def _open(self, names: Iterable[str], now: datetime) -> dict[str, _Opened]:
+        opened, files = {}, FilesReadOnce()
+        for name in names:
+            place = enclave_path(self._folder, name)
+            with suppress(SrosError, OSError):
+                state = open_enclave(place, now=now, files=files)
+                evaluation = evaluated(name, place, state, at=now)
+                opened[name] = _Opened(evaluation.state, "; ".join(evaluation.problems_here))
+        for name, enclave in opened.items():
+            if enclave.problem:
+                self._problems.append(f"{name} could not start: {enclave.problem}.")
+        return opened
+
+    def _restart(self, names: Iterable[str], opened: Mapping[str, _Opened]) -> None:
+        settings, machine = self._settings, self._machine
+        if not settings.restart or not self._state.due:
+            return
+        # Only processes that were seen with earlier files, or may have them.
+        seen = look_at_processes(
+            self._folder, names, now=machine.now, zone=machine.zone, look=machine.look
+        )
+        routers = [
+            name for name in names if (enclave_path(self._folder, name) / ROUTER_FILE).exists()
+        ]
+        self._problems += restart_units(
+            settings,
+            still_due(self._state.due, seen),
+            routers=routers,
+            unusable={name: enclave.problem for name, enclave in opened.items() if enclave.problem},
+            systemd=machine.systemd or Systemd(settings.systemctl),
+        )
+
+    def _requests(self, names: Iterable[str], opened: Mapping[str, _Opened]) -> tuple[str, ...]:
+        until = {}
+        for name, enclave in opened.items():
+            if moment := enclave.permissions_until():
+                until[name] = moment
+        requests, problems = renewal_requests(
+            self._folder,
+            names,
+            now=self._machine.now,
+            new_key=self._settings.new_key,
+            secrets=self._machine.secrets,
+            permissions_until=until,
+        )
+        self._problems += problems
+        return requests
+
+    # ── the message ────────────────────────────────────────────────────────────────────────
+
+    def _confirm(
+        self,
+        names: Sequence[str],
+        opened: Mapping[str, _Opened],
+        seen: EnclaveProcesses,
+        clock: RobotClock,
+        requests: tuple[str, ...],
+    ) -> bool:
+        """Send the message; return whether it arrived."""
+        now = self._machine.now.replace(microsecond=0)
+        sequence = self._state.next_sequence(now)
+        self._state = replace(self._state, sequence=sequence)
+        self._save()
+        confirmation = make_confirmation(
+            self._folder, self._settings.robot, now=now, dds=seen.dds, unreadable=self._unreadable
+        )
+        confirmation = replace(
+            confirmation,
+            restart=self._state.due,
+            sequence=sequence,
+            release=self._state.release,
+            expiry={name: _expiry(opened.get(name)) for name in names},
+            running=seen.states,
+            clock=clock,
+            problems=_short(self._problems),
+            requests=requests,
+        )
+        message = self._signed(confirmation, names)
+        if not message:
+            return False
+        settings = self._settings
+
+        def deliver() -> None:
+            send(
+                settings.inbox,
+                settings.robot,
+                message,
+                client_certificate=self._client_certificate(),
+                tls_ca=Path(settings.tls_ca) if settings.tls_ca else None,
+            )
+
+        arrived = self._attempt(deliver)
+        if arrived:
+            self._state = replace(self._state, sent=now)
+        return arrived
+
+    def _unreadable(self, name: str, error: Exception) -> None:
+        text = self._refused(error) if isinstance(error, OSError) else str(error)
+        self._problems.append(f"{name} is not confirmed: {text}")
+
+    def _signed(self, confirmation: Confirmation, names: Sequence[str]) -> bytes:
+        """Return the message, signed by the enclave whose certificate is valid longest.
+
+        Return b"" if no enclave can sign.
+        """
+        certificates = {}
+        for name in names:
+            with suppress(SrosError, OSError):
+                path = enclave_path(self._folder, name) / CERTIFICATE_FILE
+                certificates[name] = read_certificate(path)
+        order = sorted(
+            certificates.items(), key=lambda pair: validity_of(pair[1]).not_after, reverse=True
+        )
+        refused: list[str] = []
+        for name, certificate in order:
+            try:
+                key = enclave_key(self._folder, name, self._machine.secrets)
+                if key.public_key() == certificate.public_key():
+                    return smime.sign(render_confirmation(confirmation), certificate, key)
+            except (SrosError, OSError) as error:
+                refused.append(f"{name}: {error}")
+        why = f" ({refused[0]})" if refused else ""
+        self._problems.append(
+            f"No enclave has a key and a certificate that can sign the message to home{why}."
+        )
+        return b""
+
+    def _client_certificate(self) -> ClientCertificate | None:
+        """Return the files of the enclave whose certificate is valid longest, for TLS."""
+        chosen: tuple[datetime, ClientCertificate] | None = None
+        for name in self._enclaves():
+            place = enclave_path(self._folder, name)
+            with suppress(SrosError, OSError):
+                until = validity_of(read_certificate(place / CERTIFICATE_FILE)).not_after
+                if (place / KEY_FILE).exists() and (chosen is None or until > chosen[0]):
+                    files = ClientCertificate(place / CERTIFICATE_FILE, place / KEY_FILE)
+                    chosen = (until, files)
+        return chosen[1] if chosen else None
+
+
+class _Opened(NamedTuple):
+    """An enclave on the robot, and a clause on why no process could start in it, or ""."""
+
+    state: OpenedEnclave
+    problem: str
+
+    def permissions_until(self) -> datetime | None:
+        with suppress(SrosError):
+            return self.state.grant.validity.not_after if self.state.grant else None
+        return None
+
+
+def _expiry(enclave: _Opened | None) -> EnclaveExpiry:
+    if enclave is None:
+        return EnclaveExpiry(None, None)
+    certificate = enclave.state.certificate
+    with suppress(SrosError):
+        until = validity_of(certificate).not_after if certificate else None
+        return EnclaveExpiry(until, enclave.permissions_until())
+    return EnclaveExpiry(None, enclave.permissions_until())
+
+
+def _short(problems: Iterable[str]) -> tuple[str, ...]:
+    """Return problems as a confirmation can have them."""
+    texts = []
+    for problem in dict.fromkeys(problems):
+        text = "".join(each if each.isprintable() else "?" for each in problem)
+        texts.append(text if len(text) <= LONGEST_PROBLEM else f"{text[: LONGEST_PROBLEM - 3]}...")
+    more = len(texts) - MOST_PROBLEMS
+    if more > 0:
+        texts = [*texts[: MOST_PROBLEMS - 1], f"There are {more + 1} more problems."]
+    return tuple(texts)
+
+
+def _sentence(error: SrosError) -> str:
+    text = str(error)
+    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")

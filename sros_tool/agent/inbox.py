@@ -1,0 +1,82 @@
+"""Sending the robot's message to its inbox at home: a folder, or a server that takes PUT."""
+
+from __future__ import annotations
+
+import http.client
+import ssl
+from pathlib import Path
+from urllib.parse import quote, urlsplit
+
+from sros_tool.agent.fetch import ClientCertificate
+from sros_tool.errors import UnavailableError
+from sros_tool.files import staged_file
+from sros_tool.folders import Folder
+
+MESSAGE_FILE = "confirmation.p7s"
+_SECONDS = 30.0
+_MOST_REPLY = 4096
+
+
+def send(
+    inbox: str,
+    robot: str,
+    message: bytes,
+    *,
+    client_certificate: ClientCertificate | None = None,
+    tls_ca: Path | None = None,
+) -> None:
+    """Put a message into the inbox, in place of the robot's last one.
+
+    Args:
+        inbox: ``https://…``, ``http://…``, or the path of a folder.
+        robot: the name of this robot.
+        message: the signed message.
+        client_certificate: certificate and key for TLS.
+        tls_ca: CA certificates (PEM) of the server; None: those of the system.
+
+    Raises:
+        UnavailableError: the inbox cannot be reached, or does not take the message.
+    """
+    if not inbox.startswith(("https://", "http://")):
+        _write(Path(inbox), robot, message)
+        return
+    url = urlsplit(inbox)
+    where = f"{url.path.rstrip('/')}/{quote(robot)}/{MESSAGE_FILE}"
+    what = f"the inbox {url.scheme}://{url.netloc} does not take the message"
+    try:
+        if url.scheme == "https":
+            context = ssl.create_default_context(cafile=str(tls_ca) if tls_ca else None)
+            if client_certificate:
+                context.load_cert_chain(client_certificate.certificate, client_certificate.key)
+            connection: http.client.HTTPConnection = http.client.HTTPSConnection(
+                url.netloc, timeout=_SECONDS, context=context
+            )
+        else:
+            connection = http.client.HTTPConnection(url.netloc, timeout=_SECONDS)
+        try:
+            connection.request("PUT", where, message, {"Content-Type": "application/pkcs7-mime"})
+            reply = connection.getresponse()
+            reply.read(_MOST_REPLY)
+        finally:
+            connection.close()
+    except (OSError, http.client.HTTPException, ValueError) as error:
+        raise UnavailableError(what, f"{error}.", "It is tried again at the next run.") from error
+    if not 200 <= reply.status < 300:
+        raise UnavailableError(
+            what, f"It answers {reply.status} to PUT {where}.", "See the log of the server."
+        )
+
+
+def _write(inbox: Path, robot: str, message: bytes) -> None:
+    try:
+        with Folder(inbox) as folder:
+            if not folder.is_folder(robot):
+                folder.mkdir(robot, 0o755)
+        with staged_file(inbox / robot / MESSAGE_FILE, message, mode=0o644) as put_in_place:
+            put_in_place()
+    except OSError as error:
+        raise UnavailableError(
+            f"the message cannot be written into '{inbox}'",
+            f"{error.strerror or error}.",
+            "It is tried again at the next run.",
+        ) from error

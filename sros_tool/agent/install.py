@@ -1,0 +1,488 @@
+"""Installing a release in the security folder of a robot, verified first, and whole or not at all.
+
+Two things are verified that the publishing folder could not do: that a permissions CA which the
+folder already trusts sealed the release, and that nothing in it is older than what is here.  Then
+each enclave is tried as DDS would load it, with the key that is here.  An enclave that cannot be
+used keeps its files, and no other enclave waits for it.
+
+Units and containers mount the folders of enclaves, so a folder stays the same folder, and a file
+that does not change is not touched.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+from cryptography import x509
+
+from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.folders import Folder
+from sros_tool.keystore.delivery.release import RELEASE_FILES, Release, seal_problem
+from sros_tool.keystore.delivery.robot import evaluate_delivered
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    CRL_FILE,
+    IDENTITY_CA_FILE,
+    KEY_FILE,
+    KEY_FILES,
+    KEY_URI_FILE,
+    OPTIONAL_FILES,
+    PERMISSIONS_CA_FILE,
+    PRIVATE,
+    PUBLIC,
+    REQUEST,
+    SEAL,
+    ZENOH_FILES,
+    enclave_folder,
+    search_enclaves,
+)
+from sros_tool.keystore.reader import OpenedEnclave, weaknesses
+from sros_tool.keystore.transaction.recovery import tidy
+from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.pki.certificates import (
+    digest,
+    load_certificates,
+    load_request,
+    make_request,
+    validity_of,
+)
+from sros_tool.pki.crl import last_update, list_number, read_lists, signed_by
+from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem, load_key
+
+_OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
+_OF_ENCLAVE = (*sorted(RELEASE_FILES), *KEY_FILES, REQUEST, SEAL)
+"""The files of an enclave that go with it when it is removed."""
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+class Installation(NamedTuple):
+    """What became of the enclaves of a release; an enclave without a change is in none of these."""
+
+    changed: tuple[str, ...] = ()
+    """Enclaves of which a file changed."""
+    removed: tuple[str, ...] = ()
+    """Enclaves that were removed, because the release does not have them."""
+    kept: Mapping[str, str] = {}
+    """Enclaves that kept their files, except perhaps the revocation list, and why, as a clause."""
+    latest: datetime | None = None
+    """When the newest certificate or revocation list in the release was made, as it says."""
+
+
+@dataclass(slots=True)
+class _Change:
+    """What changes in an enclave: new contents by path, and paths of files to remove."""
+
+    write: dict[str, bytes] = field(default_factory=dict)
+    remove: list[str] = field(default_factory=list)
+
+    def __bool__(self) -> bool:
+        return bool(self.write or self.remove)
+
+
+def install_release(
+    folder: Path,
+    release: Release,
+    robot: str,
+    *,
+    now: datetime,
+    installed: int = 0,
+    pinned: frozenset[str] = frozenset(),
+    new_keys: Mapping[str, PrivateKey] | None = None,
+    before: Callable[[Sequence[str]], None] = lambda _names: None,
+) -> Installation:
+    """Install a release in the security folder ``folder``.
+
+    Args:
+        folder: the security folder of this robot.
+        release: the release, of which nothing was verified but that its files fit its seal.
+        robot: the name of this robot.
+        now: the present time, or a later one that is known to have passed.
+        installed: the highest number of a release that was accepted before.
+        pinned: SHA-256 of permissions CAs that count as trusted, too.
+        new_keys: keys that wait for their certificate, by enclave.
+        before: is called before the change with the enclaves whose processes will have earlier
+            files.
+
+    Raises:
+        KeystoreError: the release as a whole is not for this folder, or is older than what is here;
+            nothing was changed.
+        OSError: nothing could be written, for example because the disk is full; the revocation
+            lists were installed if there was room for them.
+    """
+    tidy(folder)
+    _check_folder(folder)
+    present = search_enclaves(folder)[0]
+    _check_release(folder, present, release, robot, installed, pinned)
+    enclaves = release.enclaves()
+    with Folder(folder) as opened:
+        _check_lists(opened, enclaves)
+        changes: dict[str, _Change] = {}
+        kept: dict[str, str] = {}
+        for name, files in sorted(enclaves.items()):
+            try:
+                changes[name] = _change(opened, name, files, (new_keys or {}).get(name), now)
+            except (SrosError, OSError) as error:
+                kept[name] = _clause(error)
+                changes[name] = _list_alone(opened, name, files)
+        removed = []
+        for name in present:
+            if name in enclaves or _waits(opened, name):
+                continue
+            try:
+                changes[name] = _removal(opened, name)
+                removed.append(name)
+            except (SrosError, OSError) as error:
+                kept[name] = _clause(error)
+        changes = {name: change for name, change in changes.items() if change}
+        ran = [name for name in changes if name in enclaves and _had_certificate(opened, name)]
+    if changes:
+        before(ran)
+        failed = _apply(folder, changes)
+        kept |= failed
+        changes = {name: change for name, change in changes.items() if name not in failed}
+    return Installation(
+        tuple(name for name in changes if name in enclaves),
+        tuple(name for name in removed if name in changes),
+        kept,
+        _latest(enclaves.values()),
+    )
+
+
+# ── the release as a whole ─────────────────────────────────────────────────────────────────
+
+
+def _check_folder(folder: Path) -> None:
+    if (folder / PRIVATE).exists() or (folder / PUBLIC).exists():
+        raise KeystoreError(
+            f"'{folder}' is a keystore with CAs",
+            "A release belongs in the security folder of a robot.",
+            "Name that folder.",
+        )
+
+
+def _check_release(
+    folder: Path,
+    present: Sequence[str],
+    release: Release,
+    robot: str,
+    installed: int,
+    pinned: frozenset[str],
+) -> None:
+    """Raise `KeystoreError` unless a trusted CA made the release for this robot, not before now."""
+    if release.robot != robot:
+        raise KeystoreError(
+            f"the release is of robot {release.robot}, not of {robot}",
+            "Nothing was changed.",
+            "See whether this robot has the right name (`sros agent init --robot`).",
+        )
+    trusted = [*_trusted(folder, present), *_pinned(release, pinned)]
+    if not trusted:
+        raise KeystoreError(
+            f"'{folder}' trusts no permissions CA yet",
+            "Nothing here can tell whether the release is of your keystore.",
+            "Bring the first enclave by `sros import` or a play, or name the permissions CA with "
+            "`sros agent init --ca`.",
+        )
+    if problem := seal_problem(release, trusted):
+        raise KeystoreError(
+            f"release {release.number} comes from another keystore",
+            f"No permissions CA that '{folder}' trusts has sealed it: {problem.rstrip('.')}.",
+            "Nothing was changed. Find out who can write to the publishing folder.",
+        )
+    if release.number < installed:
+        raise KeystoreError(
+            f"release {release.number} is older than release {installed}, which this robot had",
+            "The keystore at home may come from a backup. Nothing was changed.",
+            "Publish again at home with the newest ledger (`sros fleet publish` says how).",
+        )
+
+
+def _trusted(folder: Path, present: Iterable[str]) -> Iterator[x509.Certificate]:
+    """Yield the permissions CAs of the enclaves; a file that cannot be read counts as missing."""
+    seen = set()
+    with Folder(folder) as opened:
+        for name in present:
+            with suppress(SrosError, OSError):
+                data = opened.read_inside(f"{enclave_folder(name)}/{PERMISSIONS_CA_FILE}")
+                if data not in seen:
+                    seen.add(data)
+                    yield from load_certificates(data, f"of {name}")
+
+
+def _pinned(release: Release, pinned: frozenset[str]) -> Iterator[x509.Certificate]:
+    """Yield the permissions CAs in a release whose SHA-256 is in ``pinned``."""
+    for files in release.enclaves().values() if pinned else ():
+        with suppress(SrosError):
+            for authority in load_certificates(files[PERMISSIONS_CA_FILE], "of the release"):
+                if digest(authority) in pinned:
+                    yield authority
+
+
+def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) -> None:
+    """Raise `KeystoreError` if a revocation list in the release is older than the one here.
+
+    The owner of the folder can write anything into it, so only a list counts that a CA signed which
+    the release trusts.
+    """
+    for name, files in enclaves.items():
+        authorities = files.get(IDENTITY_CA_FILE, b"")
+        path = f"{enclave_folder(name)}/{CRL_FILE}"
+        try:
+            present = _newest_list(folder.read_inside(path), authorities)
+        except (SrosError, OSError):
+            continue  # nothing that a process could load
+        sent = _newest_list(files.get(CRL_FILE, b""), authorities)
+        if present is None or sent == present:
+            continue
+        number = list_number(present)
+        if sent is None or list_number(sent) <= number:
+            has = f"the number {list_number(sent)}" if sent else "none"
+            raise KeystoreError(
+                f"the revocation list for {name} in the release is older than the one here",
+                f"The present list has the number {number}, the release has {has}: revoked "
+                "enclaves would be trusted again. The keystore at home may come from a backup. "
+                "Nothing was changed.",
+                f"Copy '{folder.path / path}' to public/identity_ca.crl.pem at home, revoke what "
+                "`sros crl` then shows, and publish again.",
+            )
+
+
+@lru_cache(maxsize=8)
+def _newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationList | None:
+    """Return the list with the highest number in a file that one of ``authorities`` signed."""
+    try:
+        signers = load_certificates(authorities, IDENTITY_CA_FILE)
+        lists = read_lists(data, CRL_FILE) if data else ()
+    except SrosError:
+        return None
+    signed = [crl for crl in lists if any(signed_by(crl, signer) for signer in signers)]
+    return max(signed, key=list_number, default=None)
+
+
+def _latest(enclaves: Iterable[Mapping[str, bytes]]) -> datetime | None:
+    """Return when the newest certificate or revocation list began to be valid."""
+    moments = []
+    for files in enclaves:
+        with suppress(SrosError):
+            own = load_certificates(files.get(CERTIFICATE_FILE, b""), CERTIFICATE_FILE)
+            moments += [validity_of(certificate).not_before for certificate in own]
+            lists = read_lists(files[CRL_FILE], CRL_FILE) if CRL_FILE in files else ()
+            moments += [last_update(crl) for crl in lists]
+    return max(moments, default=None)
+
+
+# ── an enclave ─────────────────────────────────────────────────────────────────────────────
+
+
+def _change(
+    folder: Folder,
+    name: str,
+    files: Mapping[str, bytes],
+    new_key: PrivateKey | None,
+    now: datetime,
+) -> _Change:
+    """Return what changes in an enclave, after trying its new files with its key.
+
+    Raises:
+        SrosError: the new files cannot be used, or the present ones cannot be replaced.
+        OSError: the present files cannot be read.
+    """
+    place = enclave_folder(name)
+    _check_place(folder, place)
+    certified = load_certificates(files.get(CERTIFICATE_FILE, b""), CERTIFICATE_FILE)[0]
+    takes_new = new_key is not None and new_key.public_key() == certified.public_key()
+    key = new_key.public_key() if new_key and takes_new else _present_key(folder, name, files)
+    state, problems = evaluate_delivered(name, files, key, now=now)
+    problems += _weak(state)
+    if problems:
+        raise KeystoreError("its new files cannot be used", "; ".join(problems))
+    change = _Change()
+    for file, data in files.items():
+        if _content(folder, f"{place}/{file}") != data:
+            change.write[f"{place}/{file}"] = data
+    if new_key and takes_new:
+        change.write[f"{place}/{KEY_FILE}"] = key_pem(new_key)
+        change.write[f"{place}/{REQUEST}"] = make_request(new_key, name)
+    change.remove = [
+        f"{place}/{file}"
+        for file in _OPTIONAL
+        if file not in files and folder.state(f"{place}/{file}")
+    ]
+    return change
+
+
+def _weak(state: OpenedEnclave) -> list[str]:
+    return [f"{file}: {text}" for file, text in weaknesses(state)]
+
+
+def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> PublicKey:
+    """Return the public key of an enclave: of its key file, or as its request or certificate says.
+
+    A key on a token has no file.  Its request was signed by it; without one, the enclave's present
+    certificate tells the key.
+
+    Raises:
+        SrosError: the key is not on this robot, or cannot be read.
+        OSError: a file cannot be read.
+    """
+    place = enclave_folder(name)
+    if (data := _content(folder, f"{place}/{KEY_FILE}")) is not None:
+        return load_key(data, f"of enclave {name}").public_key()
+    if KEY_URI_FILE in files or folder.state(f"{place}/{KEY_URI_FILE}"):
+        if (data := _content(folder, f"{place}/{REQUEST}")) is not None:
+            return load_request(data, f"of enclave {name}").public_key
+        own = _content(folder, f"{place}/{CERTIFICATE_FILE}") or files.get(CERTIFICATE_FILE, b"")
+        return load_certificates(own, CERTIFICATE_FILE)[0].public_key()  # type: ignore[return-value]
+    raise KeystoreError(
+        f"the key of enclave {name} is not on this robot",
+        "A release has no private keys.",
+        "Bring the key once, with `sros distribute_key` or a play, or make one here with "
+        "`sros create_request`.",
+    )
+
+
+def _check_place(folder: Folder, place: str) -> None:
+    """Raise `KeystoreError` unless the folder of an enclave, if it exists, can be changed."""
+    parts = place.split("/")
+    for length in range(1, len(parts) + 1):
+        path = "/".join(parts[:length])
+        if not folder.is_folder(path):
+            return
+        if not os.access(folder.path / path, os.W_OK | os.X_OK):
+            raise KeystoreError(f"'{folder.path / path}' cannot be changed by this user")
+    for file in _OF_ENCLAVE:
+        mode = folder.mode(f"{place}/{file}")
+        if mode and not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
+            raise KeystoreError(f"'{folder.path / place / file}' is not a file")
+
+
+def _content(folder: Folder, path: str) -> bytes | None:
+    """Return the content of a file; None if it does not exist, or is a link that leads nowhere.
+
+    Raises:
+        KeystoreError: a link leads out of the security folder.
+        OSError: the file cannot be read.
+    """
+    if folder.state(path) is None:
+        return None
+    try:
+        return folder.read_inside(path)
+    except FileNotFoundError:
+        return None
+
+
+def _list_alone(folder: Folder, name: str, files: Mapping[str, bytes]) -> _Change:
+    """Return the change that gives an enclave only its new revocation list, if that fits it.
+
+    The enclave must trust the same identity CAs as before, and have a certificate.
+    """
+    place, change = enclave_folder(name), _Change()
+    with suppress(SrosError, OSError):
+        _check_place(folder, place)
+        same = _content(folder, f"{place}/{IDENTITY_CA_FILE}") == files.get(IDENTITY_CA_FILE)
+        path = f"{place}/{CRL_FILE}"
+        if CRL_FILE in files and same and _had_certificate(folder, name):
+            authorities = files.get(IDENTITY_CA_FILE, b"")
+            if _newest_list(files[CRL_FILE], authorities) and not _same(folder, path, files):
+                change.write[path] = files[CRL_FILE]
+    return change
+
+
+def _same(folder: Folder, path: str, files: Mapping[str, bytes]) -> bool:
+    return _content(folder, path) == files[path.rpartition("/")[2]]
+
+
+def _removal(folder: Folder, name: str) -> _Change:
+    """Return the removal of an enclave's files.
+
+    Raises:
+        SrosError: the files cannot be removed.
+    """
+    place = enclave_folder(name)
+    _check_place(folder, place)
+    paths = (f"{place}/{file}" for file in _OF_ENCLAVE)
+    return _Change(remove=[path for path in paths if folder.state(path)])
+
+
+def _waits(folder: Folder, name: str) -> bool:
+    """Return whether an enclave waits for the first answer to its signing request."""
+    with suppress(SrosError, OSError):
+        place = enclave_folder(name)
+        return bool(folder.state(f"{place}/{REQUEST}")) and not _had_certificate(folder, name)
+    return False
+
+
+def _had_certificate(folder: Folder, name: str) -> bool:
+    """Return whether an enclave has a certificate; without one, no process can run in it."""
+    with suppress(SrosError, OSError):
+        return folder.state(f"{enclave_folder(name)}/{CERTIFICATE_FILE}") is not None
+    return False
+
+
+# ── writing ────────────────────────────────────────────────────────────────────────────────
+
+
+def _apply(folder: Path, changes: Mapping[str, _Change]) -> dict[str, str]:
+    """Make all changes at once; if that fails, those of each enclave, whole or not at all.
+
+    Return the enclaves that could not be changed, and why.
+
+    Raises:
+        OSError: the disk is full; at most revocation lists were written.
+    """
+    try:
+        _commit(folder, changes.values())
+        return {}
+    except (SrosError, OSError) as error:
+        if isinstance(error, OSError) and error.errno in _FULL:
+            _commit_lists(folder, changes.values())
+            raise
+        first = error
+    if len(changes) == 1:
+        return {name: _clause(first) for name in changes}
+    failed = {}
+    for name, change in changes.items():
+        try:
+            _commit(folder, [change])
+        except (SrosError, OSError) as error:
+            failed[name] = _clause(error)
+    return failed
+
+
+def _commit(folder: Path, changes: Iterable[_Change]) -> None:
+    with Transaction(folder, partial=True) as transaction:
+        for change in changes:
+            for path, data in change.write.items():
+                transaction.write(path, data, private=path.endswith(f"/{KEY_FILE}"))
+            for path in change.remove:
+                transaction.remove(path)
+        transaction.commit()
+
+
+def _commit_lists(folder: Path, changes: Iterable[_Change]) -> None:
+    """Write the new revocation lists of enclaves whose identity CAs stay, if there is room."""
+    lists = []
+    for change in changes:
+        found = {path: data for path, data in change.write.items() if path.endswith(f"/{CRL_FILE}")}
+        if found and not any(path.endswith(f"/{IDENTITY_CA_FILE}") for path in change.write):
+            lists.append(_Change(write=found))
+    with suppress(SrosError, OSError):
+        if lists:
+            _commit(folder, lists)
+
+
+def _clause(error: SrosError | OSError) -> str:
+    """Return an error as a clause."""
+    if isinstance(error, SrosError):
+        return f"{error.what}: {error.clause}" if error.why else error.what
+    where = f" ('{os.fsdecode(error.filename)}')" if error.filename else ""
+    return f"{error.strerror or error}{where}"

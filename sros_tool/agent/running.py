@@ -1,0 +1,263 @@
+"""What runs on a robot in the enclaves of its security folder, and the units that restart it."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import subprocess
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from datetime import datetime, tzinfo
+from pathlib import Path
+from typing import NamedTuple
+
+from sros_tool.agent.settings import AgentSettings
+from sros_tool.checks.processes import PROCESS_OUTDATED, newer_files, process_findings
+from sros_tool.errors import UnavailableError
+from sros_tool.keystore.confirmation import (
+    RobotClock,
+    RobotDds,
+    RobotLibrary,
+    RunningFiles,
+    Seen,
+)
+from sros_tool.runtime.processes import (
+    Process,
+    ProcessTable,
+    RunningProcesses,
+    installed_dds,
+    plain,
+)
+from sros_tool.runtime.units import unit_instance
+from sros_tool.runtime.variables import ENABLE, KEYSTORE
+
+_LONGEST_PATH = 200
+_RESTART_SECONDS = 120.0
+_ASK_SECONDS = 30.0
+
+
+# ── processes ──────────────────────────────────────────────────────────────────────────────
+
+
+class EnclaveProcesses(NamedTuple):
+    """What runs in the enclaves of a security folder."""
+
+    states: Mapping[str, RunningFiles]
+    """The files that the processes of each enclave have loaded."""
+    complete: bool
+    """Whether every process of the machine could be looked at."""
+    problems: tuple[str, ...]
+    """What `sros check runtime` finds of these processes, but for due restarts."""
+    dds: RobotDds
+    """The DDS of the robot."""
+
+
+def look_at_processes(
+    folder: Path,
+    names: Iterable[str],
+    *,
+    now: datetime,
+    zone: tzinfo,
+    look: Callable[[datetime], RunningProcesses] | None = None,
+) -> EnclaveProcesses:
+    """Return what runs in the enclaves ``names`` of ``folder``; ``look`` reads the processes."""
+    running = (look or ProcessTable().look)(now)
+    own = [process for process in running.processes if _is_of(process, folder)]
+    by_enclave: dict[str, list[Process]] = {}
+    for process in own:
+        assert process.enclave
+        by_enclave.setdefault(f"/{process.enclave.name.strip('/')}", []).append(process)
+    states = {name: _state(by_enclave.get(name, ())) for name in names}
+    environment = {ENABLE: "true", KEYSTORE: str(folder)}
+    findings = process_findings(
+        environment, replace(running, processes=tuple(own), unseen=()), now=now, zone=zone
+    )
+    problems = tuple(
+        f"{finding.subject}: {finding.kind.title}: {finding.text}"
+        for finding in findings
+        if finding.kind is not PROCESS_OUTDATED and finding.subject != "processes"
+    )
+    complete = not (running.unseen or running.hidden or running.container) and all(
+        process.enclave and not process.enclave.problem for process in own
+    )
+    return EnclaveProcesses(states, complete, problems, robot_dds(running))
+
+
+def _is_of(process: Process, folder: Path) -> bool:
+    enclave = process.enclave
+    if enclave is None:
+        return False
+    with suppress(OSError):
+        if enclave.here is not None:
+            return enclave.here.samefile(folder)
+    return os.path.abspath(enclave.keystore) == os.path.abspath(folder)  # noqa: PTH100
+
+
+def _state(processes: Iterable[Process]) -> RunningFiles:
+    seen = False
+    for process in processes:
+        if process.enclave is None or process.enclave.problem:
+            continue
+        if any(newer_files(process, process.enclave)):
+            return RunningFiles.EARLIER
+        seen = True
+    return RunningFiles.CURRENT if seen else RunningFiles.NOT_SEEN
+
+
+def still_due(due: Iterable[str], seen: EnclaveProcesses) -> tuple[str, ...]:
+    """Return the enclaves whose processes have to be restarted.
+
+    A restart is done when the processes of the enclave were seen with the installed files, or when
+    all processes of the machine were seen and none is in the enclave.
+    """
+    return tuple(
+        sorted(
+            name
+            for name, state in seen.states.items()
+            if state is RunningFiles.EARLIER
+            or (name in set(due) and state is RunningFiles.NOT_SEEN and not seen.complete)
+        )
+    )
+
+
+def robot_dds(running: RunningProcesses) -> RobotDds:
+    """Return the DDS libraries that processes of this machine have loaded, or that it has."""
+    loaded = [library for process in running.processes for library in process.dds]
+    seen = dict.fromkeys(installed_dds(), Seen.INSTALLED)
+    seen |= dict.fromkeys((library._replace(replaced=False) for library in loaded), Seen.PROCESS)
+    libraries = dict.fromkeys(
+        RobotLibrary(library.product, library.version, plain(library.path, _LONGEST_PATH), how)
+        for library, how in sorted(seen.items(), key=lambda pair: (pair[1] != "process", pair[0]))
+    )
+    return RobotDds(tuple(libraries), len(running.unseen) + bool(running.hidden))
+
+
+# ── the clock ──────────────────────────────────────────────────────────────────────────────
+
+_UNSYNCHRONIZED = 5  # TIME_ERROR
+_SIZE_OF_TIMEX = 512  # more than any
+
+
+def kernel_clock() -> RobotClock:
+    """Return whether a time service has set the clock, as adjtimex(2) says."""
+    try:
+        library = ctypes.CDLL(None, use_errno=True)
+        state = library.adjtimex(ctypes.create_string_buffer(_SIZE_OF_TIMEX))  # changes nothing
+    except (OSError, AttributeError):
+        return RobotClock.UNKNOWN
+    if state < 0:
+        return RobotClock.UNKNOWN
+    return RobotClock.UNSYNCHRONIZED if state == _UNSYNCHRONIZED else RobotClock.SYNCHRONIZED
+
+
+# ── units ──────────────────────────────────────────────────────────────────────────────────
+
+
+class Systemd:
+    """The command that restarts units, and lists those that are active."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self._command = command
+
+    def active(self) -> frozenset[str]:
+        """Return the names of the active units that `sros units` writes for nodes.
+
+        Raises:
+            UnavailableError: the command cannot be run, or fails.
+        """
+        listing = self._run(
+            "list-units", "--plain", "--no-legend", "--state=active", "sros@*.service",
+            within=_ASK_SECONDS,
+        )  # fmt: skip
+        return frozenset(line.split()[0] for line in listing.splitlines() if line.split())
+
+    def restart(self, unit: str) -> None:
+        """Restart a unit.
+
+        Raises:
+            UnavailableError: it does not restart; the error says why.
+        """
+        self._run("restart", unit, within=_RESTART_SECONDS)
+
+    def _run(self, *words: str, within: float) -> str:
+        what = f"`{' '.join((*self._command, *words[:1], *words[-1:]))}` failed"
+        try:
+            done = subprocess.run(
+                (*self._command, *words),
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=within,
+                stdin=subprocess.DEVNULL,
+            )
+        except subprocess.TimeoutExpired as error:
+            raise UnavailableError(what, f"It did not end within {within:.0f} s.") from error
+        except OSError as error:
+            raise UnavailableError(what, f"{error.strerror or error}.") from error
+        if done.returncode:
+            said = plain(" ".join((done.stderr or done.stdout).split()), _LONGEST_PATH)
+            raise UnavailableError(what, f"{said or f'Its exit status is {done.returncode}'}.")
+        return done.stdout
+
+
+def due_units(
+    settings: AgentSettings, due: Sequence[str], routers: Iterable[str], active: Iterable[str]
+) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield the units to restart and their enclaves, those of Zenoh routers first.
+
+    The order is otherwise that of the settings; then come the units of `sros units` in ``active``
+    that run in enclaves without a unit in the settings.
+    """
+    units = [(unit.name, unit.enclaves) for unit in settings.units if set(unit.enclaves) & set(due)]
+    named = {name for _, enclaves in units for name in enclaves}
+    known = set(active)
+    for name in due:
+        if name not in named and (unit := f"sros@{unit_instance(name)}.service") in known:
+            units.append((unit, (name,)))
+    first = set(routers)
+    yield from sorted(units, key=lambda unit: not first & set(unit[1]))
+
+
+def restart_units(
+    settings: AgentSettings,
+    due: Sequence[str],
+    *,
+    routers: Iterable[str],
+    unusable: Mapping[str, str],
+    systemd: Systemd,
+) -> Iterator[str]:
+    """Restart the units of enclaves, one after the other; yield sentences on those that do not.
+
+    A unit of an enclave in ``unusable``, which maps names to reasons, is left running: it would not
+    start again.
+    """
+    if not due or not settings.restart:
+        return
+    if settings.restart_if:
+        try:
+            allowed = subprocess.run(
+                settings.restart_if,
+                timeout=_ASK_SECONDS,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+        except (OSError, subprocess.SubprocessError) as error:
+            yield f"Whether units may restart could not be asked: {plain(str(error), 120)}."
+            return
+        if allowed.returncode:
+            return
+    try:
+        active = systemd.active()
+    except UnavailableError as error:
+        active = frozenset()
+        yield str(error)
+    for unit, enclaves in due_units(settings, due, routers, active):
+        if broken := [name for name in enclaves if name in unusable]:
+            yield f"{unit} is not restarted: {broken[0]} could not start: {unusable[broken[0]]}."
+            continue
+        try:
+            systemd.restart(unit)
+        except UnavailableError as error:
+            yield str(error)

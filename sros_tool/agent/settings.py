@@ -1,0 +1,233 @@
+"""The settings of a robot's agent (``agent.toml``), and the folder that the agent keeps to itself.
+
+`sros agent init` writes the settings, and people can edit them.  The folder decides from where
+files come and which programs run, so only its owner may be able to change it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sros_tool.errors import DocumentError, InvalidNameError, KeystoreError
+from sros_tool.files import read_toml, replace_file
+from sros_tool.fleet.robots import name_problem
+from sros_tool.folders import Folder
+from sros_tool.names import check_enclave_name
+from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
+from sros_tool.xml import read_bytes
+
+AGENT = ".agent"
+"""The folder of the agent in the security folder."""
+SETTINGS_FILE = "agent.toml"
+_UNIT = re.compile(r"[A-Za-z0-9:_.\\@-]{1,250}\.(?:service|target)\Z")
+_DIGEST = re.compile(r"[0-9a-f]{64}\Z")
+_SOURCE = re.compile(r"(?:https?://[!-~]+|/.*)\Z")
+
+
+class Unit(NamedTuple):
+    """A unit of systemd, and the enclaves in which its processes run."""
+
+    name: str
+    enclaves: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSettings:
+    """The settings of a robot's agent.
+
+    ``source`` and ``inbox`` are URLs (https, http) or absolute paths of folders.  ``authorities``
+    are the SHA-256 of permissions CAs that are trusted besides those that the folder has.
+    ``tls_ca`` is a file with the CAs of the servers, or "" for those of the system.  With
+    ``new_key``, the agent makes a new key for each renewal.  With ``restart``, it restarts units:
+    ``units``, and those of `sros units` that are active; ``restart_if`` is a command that exits
+    with 0 if a restart is possible now, and ``systemctl`` the command that restarts a unit.
+    """
+
+    robot: str
+    source: str
+    inbox: str
+    authorities: tuple[str, ...] = ()
+    tls_ca: str = ""
+    new_key: bool = False
+    restart: bool = False
+    restart_if: tuple[str, ...] = ()
+    systemctl: tuple[str, ...] = ("systemctl",)
+    units: tuple[Unit, ...] = ()
+
+
+def agent_folder(folder: Path) -> Path:
+    """Return the folder of the agent in the security folder ``folder``."""
+    return folder / AGENT
+
+
+def check_owner(folder: Path) -> None:
+    """Raise `KeystoreError` unless the agent's folder is safe: nobody else can change it.
+
+    An agent that runs as root in a folder of another user would run programs which that user
+    chooses.
+    """
+    user = os.geteuid()
+    state = folder.stat()
+    if state.st_uid != user:
+        raise KeystoreError(
+            f"'{folder}' belongs to {user_name(state.st_uid)}",
+            "The agent runs as the owner of the security folder, which needs no right of root.",
+            "Run it as that user.",
+        )
+    own = agent_folder(folder)
+    trusted = frozenset({0, user})
+    places = [(step, why) for step, why in replaceable_on_the_way(own / "x", trusted) if why]
+    places += [
+        (path, other_writers(path.lstat(), trusted))
+        for path in (own, own / SETTINGS_FILE)
+        if os.path.lexists(path)
+    ]
+    for path, why in places:
+        if why:
+            raise KeystoreError(
+                f"others can change '{path}'",
+                f"{why[:1].upper()}{why[1:]}. They could choose what the agent trusts and runs.",
+                f"Take the right from them: `chmod go-w {path}`.",
+            )
+
+
+def make_agent_folder(folder: Path) -> None:
+    """Make the agent's folder in the security folder ``folder``, if it does not exist."""
+    with Folder(folder) as opened:
+        if not opened.is_folder(AGENT):
+            opened.mkdir(AGENT, 0o700)
+
+
+def write_settings(folder: Path, settings: AgentSettings) -> None:
+    """Write the settings of the agent of ``folder``, which has an agent's folder.
+
+    Raises:
+        OSError: they cannot be written; earlier settings stay.
+    """
+    replace_file(agent_folder(folder) / SETTINGS_FILE, render_settings(settings))
+
+
+def render_settings(settings: AgentSettings) -> bytes:
+    """Return settings as a TOML document, which `read_settings` reads."""
+    lines = [
+        "# The agent of this robot (`sros agent`); docs/fetching.md describes each key.",
+        f"robot = {_text(settings.robot)}",
+        f"from = {_text(settings.source)}",
+        f"inbox = {_text(settings.inbox)}",
+    ]
+    if settings.authorities:
+        lines.append(f"authorities = {_list(settings.authorities)}")
+    if settings.tls_ca:
+        lines.append(f"tls_ca = {_text(settings.tls_ca)}")
+    lines += [
+        f"new_key = {_truth(settings.new_key)}",
+        f"restart = {_truth(settings.restart)}",
+    ]
+    if settings.restart_if:
+        lines.append(f"restart_if = {_list(settings.restart_if)}")
+    lines.append(f"systemctl = {_list(settings.systemctl)}")
+    for unit in settings.units:
+        lines += [
+            "",
+            "[[unit]]",
+            f"name = {_text(unit.name)}",
+            f"enclaves = {_list(unit.enclaves)}",
+        ]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _text(text: str) -> str:
+    return json.dumps(text, ensure_ascii=True).replace("\\/", "/")
+
+
+def _list(texts: Sequence[str]) -> str:
+    return f"[{', '.join(map(_text, texts))}]"
+
+
+def _truth(value: bool) -> str:
+    return "true" if value else "false"
+
+
+def read_settings(folder: Path) -> AgentSettings:
+    """Return the settings of the agent of ``folder``.
+
+    Raises:
+        KeystoreError: there are none, or others can change them.
+        DocumentError: they are malformed.
+    """
+    path = agent_folder(folder) / SETTINGS_FILE
+    if not path.exists():
+        raise KeystoreError(
+            f"'{folder}' has no agent",
+            f"'{path}' does not exist.",
+            "Make it with `sros agent init`.",
+        )
+    check_owner(folder)
+    what = f"'{path}'"
+    return settings_from(read_toml(read_bytes(path, "agent's settings"), what), what)
+
+
+_TEXTS = {"robot": "robot", "from": "source", "inbox": "inbox", "tls_ca": "tls_ca"}
+_TRUTHS = {"new_key", "restart"}
+_LISTS = {"authorities", "restart_if", "systemctl"}
+
+
+def settings_from(value: Mapping[str, Any], what: str) -> AgentSettings:
+    """Return the settings in a TOML document; ``what`` names it in errors.
+
+    Raises:
+        DocumentError: a key is missing, unknown or of another form.
+    """
+    fields: dict[str, Any] = {}
+    for key, entry in value.items():
+        if key in _TEXTS and isinstance(entry, str):
+            fields[_TEXTS[key]] = entry
+        elif key in _TRUTHS and isinstance(entry, bool):
+            fields[key] = entry
+        elif key in _LISTS and _is_texts(entry):
+            fields[key] = tuple(entry)
+        elif key == "unit" and isinstance(entry, list):
+            fields["units"] = tuple(_unit(unit, what) for unit in entry)
+        else:
+            raise _wrong(what, f"{key} is no key of it, or not of the right form")
+    if missing := [key for key in ("robot", "from", "inbox") if _TEXTS[key] not in fields]:
+        raise _wrong(what, f"it lacks {', '.join(missing)}")
+    settings = AgentSettings(**fields)
+    if problem := name_problem(settings.robot):
+        raise _wrong(what, f"{settings.robot!r} is not the name of a robot: {problem}")
+    for place in (settings.source, settings.inbox):
+        if not _SOURCE.match(place):
+            raise _wrong(what, f"{place!r} is neither a URL (https, http) nor an absolute path")
+    if not all(map(_DIGEST.match, settings.authorities)):
+        raise _wrong(what, "authorities are the SHA-256 of CAs, in lower-case hexadecimal")
+    if not settings.systemctl:
+        raise _wrong(what, "systemctl is empty")
+    return settings
+
+
+def _unit(value: Any, what: str) -> Unit:
+    if not isinstance(value, dict) or value.keys() != {"name", "enclaves"}:
+        raise _wrong(what, "a unit has the keys name and enclaves")
+    name, enclaves = value["name"], value["enclaves"]
+    if not isinstance(name, str) or not _UNIT.match(name):
+        raise _wrong(what, f"{name!r} is not the name of a service or target of systemd")
+    if not _is_texts(enclaves):
+        raise _wrong(what, f"the enclaves of {name} are no list of names")
+    try:
+        return Unit(name, tuple(map(check_enclave_name, enclaves)))
+    except InvalidNameError as error:
+        raise _wrong(what, str(error)) from error
+
+
+def _is_texts(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, str) for entry in value)
+
+
+def _wrong(what: str, why: str) -> DocumentError:
+    return DocumentError(f"{what} are not the settings of an agent", f"{why}.", "Correct it.")

@@ -1,0 +1,145 @@
+"""What a robot's agent remembers between its runs: one small file, replaced as a whole.
+
+Losing the file loses nothing that matters: the release that is installed names its number, and the
+sequence of messages goes by the clock.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from sros_tool.agent.settings import agent_folder
+from sros_tool.errors import InvalidNameError, KeystoreError, SrosError
+from sros_tool.files import staged_file
+from sros_tool.folders import Folder
+from sros_tool.keystore.delivery.release import sealed_robot
+from sros_tool.keystore.layout import RELEASE_SEAL
+from sros_tool.names import check_enclave_name
+from sros_tool.validity import parse_iso
+from sros_tool.values import as_plain, parse_json
+from sros_tool.xml import read_bytes
+
+_STATE = "state.json"
+_LOCK = "lock"
+_FORMAT = 1
+
+
+@dataclass(frozen=True, slots=True)
+class AgentState:
+    """What an agent remembers.
+
+    ``release`` is the number of the release that is installed with all its enclaves, and
+    ``accepted`` the highest number that was verified: an older release is refused.  ``sequence`` is
+    that of the last message.  ``latest`` is the latest moment that has certainly passed: verified
+    documents begin to be valid then.  ``due`` are the enclaves whose processes were not yet seen
+    with the installed files.  ``fetched`` and ``sent`` tell when the source and the inbox were last
+    reached.
+    """
+
+    release: int = 0
+    accepted: int = 0
+    sequence: int = 0
+    latest: datetime | None = None
+    due: tuple[str, ...] = ()
+    fetched: datetime | None = None
+    sent: datetime | None = None
+    problems: tuple[str, ...] = ()
+
+    def next_sequence(self, now: datetime) -> int:
+        """Return the sequence of the next message: higher than all before, also by the clock.
+
+        By the clock, so that a robot whose disk is restored goes on where home expects it.
+        """
+        return max(self.sequence, int(now.timestamp())) + 1
+
+
+def read_state(folder: Path) -> AgentState:
+    """Return what the agent of ``folder`` remembers; if the file is damaged, what can be known."""
+    state = AgentState()
+    with suppress(SrosError, OSError, ValueError, TypeError, InvalidNameError):
+        path = agent_folder(folder) / _STATE
+        state = _state_from(parse_json(read_bytes(path, "agent's state")))
+    seal = read_seal(folder)
+    with suppress(SrosError):
+        number = sealed_robot(seal).number if seal else 0
+        if number > state.accepted:
+            return replace(state, accepted=number)
+    return state
+
+
+def _state_from(value: Any) -> AgentState:
+    """Return the state in a JSON value.
+
+    Raises:
+        ValueError, TypeError, InvalidNameError: it is not of that form.
+    """
+    if not isinstance(value, dict) or value.pop("format", None) != _FORMAT:
+        raise ValueError("another format")
+    for number in ("release", "accepted", "sequence"):
+        if type(value.get(number)) is not int or value[number] < 0:
+            raise ValueError(number)
+    for moment in ("latest", "fetched", "sent"):
+        value[moment] = parse_iso(value[moment]) if value[moment] is not None else None
+    value["due"] = tuple(map(check_enclave_name, value["due"]))
+    value["problems"] = tuple(text for text in value["problems"] if isinstance(text, str))
+    return AgentState(**value)
+
+
+def write_state(folder: Path, state: AgentState) -> None:
+    """Write what the agent of ``folder`` remembers.
+
+    Raises:
+        OSError: it cannot be written; the earlier state stays.
+    """
+    text = json.dumps({"format": _FORMAT, **as_plain(state)}, indent=1)
+    with staged_file(agent_folder(folder) / _STATE, text.encode() + b"\n") as put_in_place:
+        put_in_place()
+
+
+def read_seal(folder: Path) -> bytes:
+    """Return the seal of the release that was accepted last; b"" if there is none."""
+    with suppress(SrosError, OSError):
+        return read_bytes(agent_folder(folder) / RELEASE_SEAL, "seal of the release")
+    return b""
+
+
+def write_seal(folder: Path, seal: bytes) -> None:
+    """Keep the seal of the release that is accepted.
+
+    Raises:
+        OSError: it cannot be written; the earlier seal stays.
+    """
+    if read_seal(folder) != seal:
+        with staged_file(agent_folder(folder) / RELEASE_SEAL, seal, mode=0o644) as put_in_place:
+            put_in_place()
+
+
+@contextmanager
+def only_agent(folder: Path) -> Iterator[None]:
+    """Let only one agent at a time work in ``folder``.
+
+    Raises:
+        KeystoreError: another one does.
+    """
+    with Folder(agent_folder(folder)) as opened:
+        handle = opened.open_private(_LOCK)
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise KeystoreError(
+                    f"another agent is at work in '{folder}'",
+                    "",
+                    "Wait for it, or see `systemctl status sros-agent`.",
+                ) from None
+            yield
+        finally:
+            os.close(handle)

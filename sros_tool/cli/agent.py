@@ -1,0 +1,344 @@
+"""The verbs `sros agent ...`, which run on a robot: set up its agent, run it, show its state."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from shlex import split
+from typing import TYPE_CHECKING
+
+import click
+
+from sros_tool.cli.common import (
+    PATH,
+    Verb,
+    dry_run_option,
+    json_option,
+    local_zone,
+    now,
+    print_json,
+    read_named,
+    secrets,
+)
+from sros_tool.cli.program import VerbGroup
+from sros_tool.errors import SrosError, UsageError
+from sros_tool.terminal import echo, visible_line
+from sros_tool.values import file_change
+from sros_tool.wording import counted, first_few
+
+if TYPE_CHECKING:
+    from datetime import datetime
+
+    from sros_tool.agent.agent import Round
+    from sros_tool.agent.settings import AgentSettings, Unit
+    from sros_tool.agent.status import AgentStatus
+
+_INTERVAL = "5m"
+_MOST_ROOT = 512 * 1024
+_MOST_SHOWN = 10
+
+
+class _Agent(Verb, VerbGroup):
+    """A click group whose subcommands are verbs."""
+
+    command_class = Verb
+
+
+@click.group("agent", cls=_Agent)
+def agent() -> None:
+    """On a robot: fetch what home publishes for it, install it, and confirm.
+
+    Example:
+      $ sros agent init /etc/sros/keystore --robot r1 --root root.json \\
+            --from https://fleet.example/pub --inbox https://fleet.example/inbox
+      $ sros agent run /etc/sros/keystore --once
+    """
+
+
+@agent.command("init")
+@click.argument("folder", type=PATH)
+@click.option("--robot", metavar="NAME", required=True, help="The name of this robot.")
+@click.option(
+    "--from", "source", metavar="PLACE", required=True,
+    help="What `sros fleet publish` writes: a URL (https, http) or a folder.",
+)  # fmt: skip
+@click.option(
+    "--inbox", metavar="PLACE", required=True,
+    help="Where the robot's messages go: a URL that takes PUT, or a folder.",
+)  # fmt: skip
+@click.option(
+    "--root", "root_file", metavar="FILE", required=True, type=PATH,
+    help="The root metadata (root.json) that home published first; from it on, all is verified.",
+)  # fmt: skip
+@click.option(
+    "--ca", "authorities", metavar="SHA256|FILE", multiple=True,
+    help="A permissions CA to trust, for a robot without any enclave yet. Can be repeated.",
+)  # fmt: skip
+@click.option(
+    "--tls-ca", metavar="FILE", type=PATH,
+    help="CA certificates of the servers. [default: those of the system]",
+)  # fmt: skip
+@click.option(
+    "--new-key", is_flag=True, help="Make a new key for each renewal, instead of keeping it."
+)
+@click.option(
+    "--restart", is_flag=True,
+    help="Restart units of changed enclaves: those of --unit, and active ones of `sros units`. "
+    "[default: only say what is due]",
+)  # fmt: skip
+@click.option(
+    "--unit", "units", metavar="UNIT=ENCLAVE,...", multiple=True,
+    help="A unit of systemd, and the enclaves in which it runs; in the order of the restarts. Can "
+    "be repeated.",
+)  # fmt: skip
+@click.option(
+    "--restart-if", metavar="COMMAND",
+    help="Restart units only if COMMAND exits with 0, for example because the robot stands still.",
+)  # fmt: skip
+@click.option(
+    "--systemctl", metavar="COMMAND", default="systemctl", show_default=True,
+    help="The command that restarts units, such as 'systemctl --user'.",
+)  # fmt: skip
+@click.option("--force", is_flag=True, help="Replace the settings of an earlier init.")
+@dry_run_option
+@json_option
+def _init(
+    folder: Path,
+    robot: str,
+    source: str,
+    inbox: str,
+    root_file: Path,
+    authorities: tuple[str, ...],
+    tls_ca: Path | None,
+    new_key: bool,
+    restart: bool,
+    units: tuple[str, ...],
+    restart_if: str | None,
+    systemctl: str,
+    force: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
+    """Set up the agent of the security folder FOLDER: FOLDER/.agent/agent.toml.
+
+    FOLDER is where `sros import` or a play installs this robot's enclaves. The agent runs as its
+    owner. Compare the SHA-256 of the root metadata that is printed with the one that `sros fleet
+    publish` printed at home.
+
+    Example:
+      $ sros agent init /etc/sros/keystore --robot r1 --root root.json \\
+            --from https://fleet.example/pub --inbox https://fleet.example/inbox
+      wrote /etc/sros/keystore/.agent/agent.toml
+      root metadata: SHA-256 9f2c...
+      $ sros agent init robot --robot r1 --root /media/usb/pub/metadata/1.root.json \\
+            --from /media/usb/pub --inbox /media/usb/inbox --restart
+    """
+    from sros_tool.agent.fetch import pin_root
+    from sros_tool.agent.settings import (
+        SETTINGS_FILE,
+        AgentSettings,
+        agent_folder,
+        check_owner,
+        make_agent_folder,
+        render_settings,
+        settings_from,
+        write_settings,
+    )
+    from sros_tool.agent.status import InitializedAgent
+    from sros_tool.files import parse_toml
+    from sros_tool.keystore.delivery.robot import read_pin
+
+    if not folder.is_dir():
+        raise UsageError(
+            f"'{folder}' is not a folder",
+            "",
+            "Name the folder that the enclaves of this robot are in, or will be in.",
+        )
+    check_owner(folder)
+    settings = AgentSettings(
+        robot,
+        _place(source),
+        _place(inbox),
+        authorities=tuple(sorted({pin for text in authorities for pin in read_pin(text)})),
+        tls_ca=str(tls_ca.absolute()) if tls_ca else "",
+        new_key=new_key,
+        restart=restart,
+        restart_if=tuple(split(restart_if or "")),
+        systemctl=tuple(split(systemctl)),
+        units=tuple(_unit(text) for text in units),
+    )
+    settings_from(parse_toml(render_settings(settings).decode()), "these options")
+    if tls_ca and not tls_ca.is_file():
+        raise UsageError(f"'{tls_ca}' is not a file")
+    root = read_named(root_file, "root metadata", most=_MOST_ROOT)
+    path = agent_folder(folder) / SETTINGS_FILE
+    existed = path.exists()
+    if existed and not force:
+        raise UsageError(
+            f"'{folder}' already has an agent",
+            f"'{path}' exists.",
+            "Edit it, or add --force to write it again and to trust this root metadata alone.",
+        )
+    digest = ""
+    if not dry_run:
+        make_agent_folder(folder)
+        digest = pin_root(agent_folder(folder), root, now=now())
+        write_settings(folder, settings)
+    if as_json:
+        changes = file_change(path, existed=existed)
+        print_json(InitializedAgent(folder, dry_run, robot, digest or None, changes, ()))
+        return
+    echo(f"{'would write' if dry_run else 'wrote'} {path}")
+    if digest:
+        echo(f"root metadata: SHA-256 {digest}")
+
+
+def _place(text: str) -> str:
+    """Return a URL as it is, and the path of a folder as an absolute path."""
+    return text if "://" in text else str(Path(text).absolute())
+
+
+def _unit(text: str) -> Unit:
+    from sros_tool.agent.settings import Unit
+
+    name, mark, enclaves = text.partition("=")
+    if not mark or not enclaves:
+        raise UsageError(
+            f"--unit {text!r} names no enclave", "", "Write --unit camera.service=/r1/camera."
+        )
+    return Unit(name, tuple(enclaves.split(",")))
+
+
+@agent.command("run")
+@click.argument("folder", type=PATH)
+@click.option("--once", is_flag=True, help="Run one round and end, for a timer.")
+@click.option(
+    "--interval", metavar="DURATION", default=_INTERVAL, show_default=True,
+    help="The time between two rounds.",
+)  # fmt: skip
+@json_option
+def _run(folder: Path, once: bool, interval: str, as_json: bool) -> int:
+    """Keep the enclaves in FOLDER as home publishes them, and confirm what is there and runs.
+
+    A round fetches the robot's release, verifies it, installs it whole or not at all, restarts
+    units or says what is due, looks at the running processes, asks for renewal in the last third
+    of a certificate's life, and sends a signed message. A part that fails does not keep the others
+    from their work, and the next round goes on where this one was.
+
+    Example:
+      $ sros agent run /etc/sros/keystore --once
+      release 12: changed 2 enclaves
+      restart due: /r1/camera, /r1/lidar
+      sent to home
+      $ sros agent run /etc/sros/keystore --interval 10m
+
+    The exit status of --once is 0 if nothing is wrong, and 1 if something is.
+    """
+    from sros_tool.agent.settings import read_settings
+    from sros_tool.agent.state import only_agent
+    from sros_tool.validity import parse_duration
+
+    pause = parse_duration(interval)
+    if once:
+        with only_agent(folder):
+            done = _round(folder, read_settings(folder))
+        _show(done, as_json=as_json)
+        return int(bool(done.problems))
+    while True:
+        try:
+            with only_agent(folder):
+                _show(_round(folder, read_settings(folder)), as_json=as_json)
+        except (SrosError, OSError) as error:
+            if isinstance(error, BrokenPipeError):
+                raise
+            echo(visible_line(f"this round failed: {error}"), err=True)
+        sys.stdout.flush()
+        time.sleep(pause.total_seconds())
+
+
+def _round(folder: Path, settings: AgentSettings) -> Round:
+    import os
+
+    from sros_tool.agent.agent import Machine, run_round
+
+    moment = now()
+    return run_round(folder, settings, Machine(moment, local_zone(os.environ), secrets()))
+
+
+def _show(done: Round, *, as_json: bool) -> None:
+    if as_json:
+        print_json(done)
+        return
+    for line in _round_lines(done):
+        echo(visible_line(line))
+    for problem in done.problems:
+        echo(visible_line(problem), err=True)
+
+
+def _round_lines(done: Round) -> Iterator[str]:
+    release = f"release {done.release}" if done.release else "no release"
+    changes = [f"changed {counted(len(done.changed), 'enclave')}"] if done.changed else []
+    changes += [f"removed {counted(len(done.removed), 'enclave')}"] if done.removed else []
+    nothing = "nothing new" if done.fetched else "nothing could be fetched"
+    yield f"{release}: {', '.join(changes) or nothing}"
+    if done.restart:
+        yield f"restart due: {first_few(done.restart, _MOST_SHOWN)}"
+    if done.requests:
+        yield f"asked for renewal of {counted(done.requests, 'enclave')}"
+    yield "sent to home" if done.sent else "not sent to home"
+
+
+@agent.command("status")
+@click.argument("folder", type=PATH)
+@click.option(
+    "--max-age", metavar="DURATION", default="1d", show_default=True,
+    help="The source and the inbox have to be reached at least this often.",
+)  # fmt: skip
+@json_option
+def _status(folder: Path, max_age: str, as_json: bool) -> int:
+    """Show what the agent of FOLDER last did, and what waits.
+
+    Example:
+      $ sros agent status /etc/sros/keystore
+      robot r1: release 12
+      fetched 4 min ago from https://fleet.example/pub
+      confirmed 4 min ago to https://fleet.example/inbox
+      restart due: /r1/camera
+
+    The exit status is 0 if nothing is wrong or due, and 1 if something is.
+    """
+    from sros_tool.agent.status import agent_status
+    from sros_tool.validity import parse_duration
+
+    oldest = parse_duration(max_age)
+    moment = now()
+    status = agent_status(folder, now=moment, oldest=oldest)
+    if as_json:
+        print_json(status)
+    else:
+        for line in _status_lines(status, moment):
+            echo(visible_line(line))
+    return int(not status.well)
+
+
+def _status_lines(status: AgentStatus, moment: datetime) -> Iterator[str]:
+    release = f"release {status.release}" if status.release else "no release"
+    newer = f", not yet whole: {status.accepted}" if status.accepted > status.release else ""
+    yield f"robot {status.robot}: {release}{newer}"
+    yield f"fetched {_ago(status.fetched, moment)} from {status.source}"
+    yield f"confirmed {_ago(status.sent, moment)} to {status.inbox}"
+    if status.restart:
+        yield f"restart due: {first_few(status.restart, _MOST_SHOWN)}"
+    yield from status.problems
+
+
+def _ago(time: datetime | None, moment: datetime) -> str:
+    from sros_tool.validity import elapsed
+
+    if time is None:
+        return "never"
+    gone = moment - time
+    return f"{elapsed(gone)} ago" if gone >= timedelta() else f"in the future ({elapsed(-gone)})"

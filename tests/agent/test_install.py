@@ -1,0 +1,312 @@
+"""Installing a release on a robot: what is verified, what stays, and that it is whole or not."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+
+from sros_tool.agent.install import Installation, install_release
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore.delivery.release import Release
+from sros_tool.pki.certificates import digest, make_request
+from sros_tool.pki.keys import generate_key
+from tests.agent.releases import NAMES, Home, authority_of, files_of, moment, release_of
+from tests.keystore.test_transaction import DIED, in_child, run_out_of_space
+from tests.keystore.test_transaction import REFUSED as GIVEN_UP
+from tests.support.children import apart, some_steps
+from tests.support.harness import sros
+
+A, B, C = (f"enclaves{name}" for name in NAMES)
+
+
+def install(folder: Path, release: Release, **more: object) -> Installation:
+    return install_release(folder, release, "r1", now=moment(), **more)  # type: ignore[arg-type]
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def has(folder: Path, release: Release, names: tuple[str, ...] = NAMES) -> bool:
+    """Return whether the folder has exactly the files of a release for these enclaves."""
+    wanted = {path: data for path, data in release.files.items() if in_one_of(path, names)}
+    present = content(folder)
+    return wanted == {
+        path: data
+        for path, data in present.items()
+        if in_one_of(path, names) and not path.endswith("key.pem")
+    }
+
+
+def in_one_of(path: str, names: tuple[str, ...]) -> bool:
+    return path.rpartition("/")[0] in {f"enclaves{name}" for name in names}
+
+
+def inodes(folder: Path) -> dict[str, int]:
+    return {str(path.relative_to(folder)): path.stat().st_ino for path in folder.rglob("*")}
+
+
+def test_what_changed_is_installed_and_nothing_else_is_touched(home: Home, robot: Path) -> None:
+    before = inodes(robot)
+    due: list[str] = []
+    done = install(robot, home.renewed, before=due.extend)
+    assert done.changed == ("/r1/a",) == tuple(due)
+    assert not done.removed and not done.kept and done.latest
+    assert has(robot, home.renewed)
+    after = inodes(robot)
+    renewed = {f"{A}/cert.pem", f"{A}/permissions.p7s"}
+    assert {path for path in before if before[path] != after[path]} == renewed
+    assert os.listdir(robot) == ["enclaves"]
+    assert (robot / A / "key.pem").stat().st_mode & 0o777 == 0o600
+    again = install(robot, home.renewed, installed=2)
+    assert again == Installation(latest=done.latest) and inodes(robot) == after
+    sros("verify", robot).ok()
+
+
+def test_a_revocation_list_comes_to_all(home: Home, robot: Path) -> None:
+    assert install(robot, home.revoked).changed == NAMES
+    assert all((robot / place / "crl.pem").is_file() for place in (A, B, C))
+    sros("verify", robot).ok()
+
+
+REFUSED: dict[str, tuple[Callable[[Home], Release], str]] = {
+    "another robot's": (lambda home: home.release(home.renewed.files, robot="r2"), "of robot r2"),
+    "an older number": (lambda home: home.first, "older than release 2"),
+    "another keystore's": (
+        lambda home: Release("r1", 9, home.renewed.files, home.first.seal),
+        "comes from another keystore",
+    ),
+    "changed files": (
+        lambda home: Release(
+            "r1", 3, {**home.revoked.files, f"{A}/crl.pem": b"x"}, home.revoked.seal
+        ),
+        "comes from another keystore",
+    ),
+    "an older list": (lambda home: home.release(home.renewed.files), "is older than the one here"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_release_that_is_not_for_here_changes_nothing(name: str, home: Home, robot: Path) -> None:
+    install(robot, home.revoked)
+    before = content(robot)
+    made, why = REFUSED[name]
+    with pytest.raises(KeystoreError, match=why):
+        install(robot, made(home), installed=2)
+    assert content(robot) == before
+    assert install(robot, home.release(home.revoked.files), installed=2) == Installation(
+        latest=install(robot, home.revoked).latest
+    ), "the right one is taken"
+
+
+def test_another_keystore_with_the_same_names_is_refused(
+    home: Home, robot: Path, tmp_path: Path
+) -> None:
+    sros("generate_artifacts", "-k", tmp_path / "other", "-e", *NAMES).ok()
+    other = authority_of(tmp_path / "other")
+    theirs = release_of(files_of(tmp_path / "other"), 9, other)
+    with pytest.raises(KeystoreError, match="comes from another keystore"):
+        install(robot, theirs)
+    shutil.rmtree(robot / "enclaves")
+    with pytest.raises(KeystoreError, match="trusts no permissions CA yet"):
+        install(robot, theirs)
+    with pytest.raises(KeystoreError, match="trusts no permissions CA yet"):
+        install(robot, theirs, pinned=frozenset({digest(home.authority.certificate)}))
+    done = install(robot, theirs, pinned=frozenset({digest(other.certificate)}))
+    assert set(done.kept) == set(NAMES), "trusted, and without keys"
+    assert "is not on this robot" in done.kept["/r1/a"]
+    assert not (robot / "enclaves").exists()
+
+
+def spoil_key(folder: Path) -> None:
+    (folder / A / "key.pem").unlink()
+
+
+def other_key(folder: Path) -> None:
+    shutil.copy(folder / B / "key.pem", folder / A / "key.pem")
+
+
+def folder_in_the_way(folder: Path) -> None:
+    (folder / A / "cert.pem").unlink()
+    (folder / A / "cert.pem").mkdir()
+
+
+def link_elsewhere(folder: Path) -> None:
+    shutil.move(folder / A, folder.parent / "elsewhere")
+    (folder / A).symlink_to(folder.parent / "elsewhere")
+
+
+def pipe(folder: Path) -> None:
+    (folder / A / "permissions.p7s").unlink()
+    os.mkfifo(folder / A / "permissions.p7s")
+
+
+def unreadable_ca(folder: Path) -> None:
+    (folder / A / "permissions_ca.cert.pem").write_text("mine")
+    (folder / A / "key.pem").write_text("mine")
+
+
+@pytest.mark.parametrize(
+    "spoil", [spoil_key, other_key, folder_in_the_way, link_elsewhere, pipe, unreadable_ca]
+)
+def test_a_bad_enclave_keeps_nothing_from_the_others(
+    spoil: Callable[[Path], None], home: Home, robot: Path
+) -> None:
+    spoil(robot)
+    done = install(robot, home.revoked)
+    assert set(done.kept) == {"/r1/a"}, done
+    assert done.kept["/r1/a"].isprintable()
+    assert has(robot, home.revoked, ("/r1/b", "/r1/c"))
+    assert {"/r1/b", "/r1/c"} <= set(done.changed)
+    if spoil in (spoil_key, other_key):  # its files are there, and can have the list
+        assert (robot / A / "crl.pem").read_bytes() == home.revoked.files[f"{A}/crl.pem"]
+        assert (robot / A / "cert.pem").read_bytes() == home.first.files[f"{A}/cert.pem"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs files of another user")
+def test_files_of_another_user_keep_nothing_from_the_others(home: Home, robot: Path) -> None:
+    """As the owner of the folder, in which root made an enclave's files its own."""
+    for path in (robot.parent, robot, *robot.rglob("*")):
+        os.chown(path, 1000, 1000)
+    (robot / A / "permissions.p7s").chmod(0o600)
+    os.chown(robot / A / "permissions.p7s", 0, 0)
+    os.chown(robot / B, 0, 0)
+    (robot / B).chmod(0o755)
+    for above in robot.parents:
+        if above.stat().st_uid == 0 and not above.stat().st_mode & 0o001:
+            above.chmod(above.stat().st_mode | 0o001)
+
+    def as_owner() -> tuple[list[str], list[str]]:
+        os.setgroups([])
+        os.setresgid(1000, 1000, 0)
+        os.setresuid(1000, 1000, 0)
+        done = install(robot, home.revoked)
+        os.setresuid(0, 0, 0)
+        os.setresgid(0, 0, 0)
+        return sorted(done.kept), list(done.changed)
+
+    kept, changed = apart(as_owner)
+    assert kept == ["/r1/a", "/r1/b"]
+    assert "/r1/c" in changed and has(robot, home.revoked, ("/r1/c",))
+
+
+def test_an_enclave_that_home_could_not_mean_keeps_its_files(home: Home, robot: Path) -> None:
+    """Sealed, but not usable: what would not start is not installed."""
+    files = dict(home.revoked.files)
+    files[f"{B}/permissions.p7s"] = files[f"{C}/permissions.p7s"]
+    del files[f"{C}/governance.p7s"]
+    done = install(robot, home.release(files))
+    assert set(done.kept) == {"/r1/b", "/r1/c"}
+    assert has(robot, home.revoked, ("/r1/a",))
+    later = moment() + timedelta(days=3650)
+    late = install_release(robot, home.release(home.revoked.files), "r1", now=later)
+    assert set(late.kept) == set(NAMES), "nothing of it is valid then"
+    assert not install(robot, home.release(home.revoked.files)).kept
+
+
+def test_an_enclave_that_the_release_does_not_have_goes(home: Home, robot: Path) -> None:
+    sros("create_request", "/r1/new", robot).ok()
+    (robot / C / "notes.txt").write_text("mine")
+    files = {path: data for path, data in home.renewed.files.items() if in_one_of(path, ("/r1/a",))}
+    done = install(robot, home.release(files))
+    assert done.removed == ("/r1/b", "/r1/c")
+    assert not (robot / B).exists() and os.listdir(robot / C) == ["notes.txt"]
+    assert (robot / "enclaves/r1/new/key.pem").exists(), "it waits for its answer"
+
+
+def test_a_new_enclave_with_a_key_of_this_robot_and_its_next_key(
+    home: Home, robot: Path, tmp_path: Path
+) -> None:
+    """A new key is installed together with its certificate only."""
+    root, place = tmp_path / "home", robot / "enclaves/r1/d"
+    shutil.copytree(home.root, root, symlinks=True)
+    names = (*NAMES, "/r1/d")
+
+    def signed(request: Path, number: int, *options: str) -> Release:
+        sros("sign_request", root, request, "-o", tmp_path / f"{number}.tgz", *options).ok()
+        return release_of(files_of(root, names), number, authority_of(root))
+
+    sros("create_request", "/r1/d", robot).ok()
+    born = (place / "key.pem").read_bytes()
+    due: list[str] = []
+    done = install(robot, signed(place / "request.pem", 10), before=due.extend)
+    assert "/r1/d" in done.changed and "/r1/d" not in due, "nothing ran in it"
+    key = generate_key()
+    (tmp_path / "request.pem").write_bytes(make_request(key, "/r1/d"))
+    release = signed(tmp_path / "request.pem", 11, "--renew")
+    assert set(install(robot, release).kept) == {"/r1/d"}, "the key is not known here"
+    assert (place / "key.pem").read_bytes() == born
+    done = install(robot, release, new_keys={"/r1/d": key})
+    assert done.changed == ("/r1/d",) and not done.kept
+    assert (place / "key.pem").read_bytes() != born
+    assert (place / "key.pem").stat().st_mode & 0o777 == 0o600
+    sros("verify", robot).ok()
+
+
+@pytest.fixture
+def no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that dies takes nothing with it that the system was given."""
+    monkeypatch.setattr("sros_tool.folders.flush_file_system", lambda _: None)
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+
+
+def copy(home: Home, folder: Path) -> Path:
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return home.robot(folder)
+
+
+@pytest.mark.usefixtures("no_waiting_for_the_disk")
+def test_an_installation_that_is_killed_is_whole_or_did_not_happen(
+    home: Home, tmp_path: Path
+) -> None:
+    """At every step of it; the next installation ends it."""
+    work = tmp_path / "work"
+    folder = copy(home, work)
+    status, steps = in_child(lambda: install(folder, home.revoked))
+    assert status == 0 and steps[-1] > 40
+    outcomes = set()
+    for step in some_steps(steps):
+        folder = copy(home, work)
+        ended, _ = in_child(lambda folder=folder: install(folder, home.revoked), step)  # type: ignore[misc]
+        assert ended == DIED, step
+        whole = [has(folder, release) for release in (home.first, home.revoked)]
+        assert any(whole), f"neither before nor after at step {step}"
+        outcomes.add(whole.index(True))
+        assert not install(folder, home.revoked).kept
+        assert has(folder, home.revoked) and os.listdir(folder) == ["enclaves"]
+    assert outcomes == {0, 1}
+
+
+@pytest.mark.usefixtures("no_waiting_for_the_disk")
+def test_a_full_disk_leaves_all_or_takes_the_lists_alone(home: Home, tmp_path: Path) -> None:
+    work = tmp_path / "work"
+    folder = copy(home, work)
+    _, steps = in_child(lambda: install(folder, home.revoked))
+    listed = 0
+    for step in some_steps(steps):
+        folder = copy(home, work)
+        ended, _ = in_child(
+            lambda folder=folder: install(folder, home.revoked),  # type: ignore[misc]
+            step,
+            run_out_of_space,
+        )
+        if ended == 0:
+            continue
+        assert ended == GIVEN_UP, step
+        assert (folder / A / "cert.pem").read_bytes() == home.first.files[f"{A}/cert.pem"]
+        lists = [(folder / place / "crl.pem").exists() for place in (A, B, C)]
+        assert len(set(lists)) == 1, "all or none"
+        listed += all(lists)
+        assert os.listdir(folder) == ["enclaves"]
+        assert not install(folder, home.revoked).kept and has(folder, home.revoked)
+    assert listed, "there was room for the lists"
