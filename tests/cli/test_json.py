@@ -232,7 +232,13 @@ WITH_A_GRAPH = {
 }
 
 
-@pytest.mark.parametrize("verb", sorted({*CASES} - {"check", "demo", "doctor", *WITH_A_GRAPH}))
+ON_A_ROBOT = {verb for verb in CASES if verb.startswith("agent ")}
+"""They need a publishing folder: tests/agent/test_agent_verbs.py."""
+
+
+@pytest.mark.parametrize(
+    "verb", sorted({*CASES} - {"check", "demo", "doctor", *WITH_A_GRAPH, *ON_A_ROBOT})
+)
 def test_what_a_verb_prints(verb: str, made_folder: Path, tmp_path: Path) -> None:
     seen = Seen()
     for case in CASES[verb]:
