@@ -34,6 +34,9 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
 
+_MOST_NAMES = 200
+"""Enclaves whose keys are looked up one by one; for more, the files of all enclaves are read."""
+
 
 class KnownKeys:
     """The keys of a keystore, to compare with a key that is about to be certified."""
@@ -55,7 +58,10 @@ class KnownKeys:
             entry.key: f"certificate {entry.serial} of {entry.subject}" for entry in recorded
         }
         serials = {entry.serial for entry in recorded}
+        indexed = self._keystore.ledger_file.is_indexed
         for path in revoked_certificates(self._keystore.root):
+            if indexed and path.parent.name in serials:
+                continue  # the ledger has it
             try:
                 descriptions.update([_described(self._keystore.certificate(path))])
             except SrosError:
@@ -74,9 +80,8 @@ class KnownKeys:
         lists = (entry for crl in self._keystore.revocation_lists for entry in crl.revoked)
         return serials | {entry.serial for entry in lists if entry.reason != SUPERSEDED}
 
-    @cached_property
-    def revoked_enclaves(self) -> Collection[str]:
-        """The names of enclaves whose last certificate was revoked, and not superseded.
+    def revoked_before(self, names: Collection[str]) -> set[str]:
+        """Return those of ``names`` whose last certificate was revoked, and not superseded.
 
         If the ledger was lost, these are the enclaves in the folder ``revoked`` whose certificate a
         revocation list names.
@@ -84,8 +89,8 @@ class KnownKeys:
         files = revoked_certificates(self._keystore.root)
         if not files and all(entry.reason == SUPERSEDED for entry in self._revocations):
             return set()
-        enclaves, recorded = set(), set()
-        for entry in self._keystore.ledger.entries:
+        enclaves, recorded = set(), {entry.serial for entry in self._revocations}
+        for entry in self._keystore.ledger_file.with_values("enclave", names).entries:
             recorded.add(entry.serial)
             if entry.what == "certificate":
                 enclaves.discard(entry.enclave)
@@ -97,12 +102,14 @@ class KnownKeys:
                     certificate = self._keystore.certificate(path)
                     if certificate.serial_number in self._revoked_serials:
                         enclaves.add(common_name_of(certificate.subject))
-        return enclaves
+        return enclaves.intersection(names)
 
     def revoked_before_notes(self, names: Iterable[str]) -> Iterator[Note]:
         """Yield a note for each new enclave in ``names`` that was revoked before."""
+        names = tuple(names)
+        revoked = self.revoked_before(names) if names else ()
         for name in names:
-            if name in self.revoked_enclaves:
+            if name in revoked:
                 yield Note(
                     "keystore.revoked-before",
                     f"{name} was revoked, and now exists again with a new key and certificate; "
@@ -151,13 +158,21 @@ class KnownKeys:
         """Yield a note for each enclave in ``names`` that shares its key with other enclaves."""
         if not names:
             return
-        shared = {
-            name: others
-            for enclaves in self._enclaves.values()
-            if len(enclaves) > 1
-            for name in enclaves
-            if (others := [other for other in enclaves if other != name])
-        }
+        if self._keystore.ledger_file.is_indexed and len(names) <= _MOST_NAMES:
+            shared = {
+                name: others
+                for name in names
+                for digest in _digests(self._keystore, name)
+                if (others := [other for other in self._holders(digest) if other != name])
+            }
+        else:
+            shared = {
+                name: others
+                for enclaves in self._enclaves.values()
+                if len(enclaves) > 1
+                for name in enclaves
+                if (others := [other for other in enclaves if other != name])
+            }
         for name in names:
             if name in shared:
                 yield Note(
@@ -167,7 +182,21 @@ class KnownKeys:
                 )
 
     def _others(self, key: PublicKey, name: str) -> list[str]:
-        return [enclave for enclave in self._enclaves.get(key_digest(key), ()) if enclave != name]
+        return [enclave for enclave in self._holders(key_digest(key)) if enclave != name]
+
+    def _holders(self, digest: str) -> Sequence[str]:
+        """Return the enclaves that have the key with this digest.
+
+        In a keystore with an index these are the enclaves that the ledger records for the key, and
+        that still have it; a key that was put into another enclave by hand is found by `sros
+        check`, which reads the files of all.
+        """
+        if "_enclaves" in self.__dict__ or not self._keystore.ledger_file.is_indexed:
+            return self._enclaves.get(digest, ())
+        # Certificates of earlier versions of sros are recorded without their keys.
+        entries = self._keystore.ledger_file.with_values("key", (digest, "")).entries
+        recorded = {e.enclave for e in entries if e.what == "certificate" and e.key in ("", digest)}
+        return [name for name in sorted(recorded) if digest in _digests(self._keystore, name)]
 
 
 def _described(certificate: x509.Certificate) -> tuple[str, str]:

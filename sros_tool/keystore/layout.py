@@ -27,6 +27,8 @@ LEDGER = "ledger.jsonl"
 """The log of issued certificates and documents; keystores of ros2/sros2 do not have it."""
 LEDGER_HEAD = "ledger.p7s"
 """The number of lines of the ledger and the digest of the last one, signed by a CA."""
+LEDGER_INDEX = ".sros-index"
+"""The index of a long ledger, which is made again where it is missing or does not fit."""
 
 IDENTITY, PERMISSIONS = "identity", "permissions"
 ROLES = (IDENTITY, PERMISSIONS)

@@ -8,6 +8,10 @@ first line with ``previous``, it is the SHA-256 of all lines before, joined by l
 versions of sros wrote no chain).  The signed document ``ledger.p7s`` states the number of lines and
 the SHA-256 of the last line.  So a line that was changed, removed, added or cut off is noticed.  A
 fault that was noticed when a line was added stays visible as an entry ``gap`` before that line.
+
+The head of a long ledger also states the root of its index (`sros_tool.keystore.ledger_index`).  A
+question that the index answers reads only the lines that it names, each verified by its digest, and
+the end of the ledger; other lines that were changed are noticed by whoever reads all of them.
 """
 
 from __future__ import annotations
@@ -29,7 +33,7 @@ from itertools import chain
 from pathlib import Path
 from shlex import quote
 from sys import intern
-from typing import TYPE_CHECKING, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple, TypeAlias
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
@@ -42,6 +46,7 @@ from sros_tool.validity import Window, iso
 from sros_tool.xml import open_at_once, read_bytes
 
 if TYPE_CHECKING:
+    from sros_tool.keystore.ledger_index import IndexUpdate, LedgerIndex
     from sros_tool.keystore.transaction.transaction import Transaction
 
 GAP = "gap"
@@ -130,7 +135,13 @@ _MOST_BITS = 159
 """Largest length of a serial number, in bits (RFC 5280, 4.1.2.2)."""
 _MOST_NUMBER = 10**12
 _MOST_KEPT = 16 * 1024 * 1024
-_HEAD = re.compile(rb"sros ledger 1\nlines ([0-9]{1,12})\nsha256 ([0-9a-f]{64})\n")
+_HEAD = re.compile(
+    rb"sros ledger [12]\nlines ([0-9]{1,12})\nsha256 ([0-9a-f]{64})\n(?:index ([0-9a-f]{64})\n)?"
+)
+_INDEXED_FROM = 2000
+"""Lines from which a ledger has an index: reading a shorter ledger takes less than finding out."""
+_LINES_PER_LOOKUP = 5
+"""Lines that are read in the time that the index takes to look up a value."""
 _VALUES = {
     "serial": r'"(?P<serial>[0-7][0-9a-f]{39}|[0-9a-f]{1,39})"',
     "number": r"([1-9][0-9]{0,11})",
@@ -208,13 +219,15 @@ class _Reading(NamedTuple):
     """The ledger, and the values that are needed to add lines.
 
     ``unrecorded`` are the faults that no entry ``gap`` records yet.  ``previous`` is the digest for
-    the next line; ``ended`` says whether the last line has its line end.
+    the next line; ``ended`` says whether the last line has its line end.  ``sound`` says that
+    every line is chained, and none has a fault.
     """
 
     ledger: Ledger
     unrecorded: Sequence[_Fault] = ()
     previous: str = hashlib.sha256().hexdigest()
     ended: bool = True
+    sound: bool = True
 
 
 _EVERY = b""
@@ -227,12 +240,13 @@ class _Files(NamedTuple):
     """The ledger and its head at the same moment.
 
     ``state`` is None without a ledger; ``lines`` is the content of the file, None if it is too long
-    to keep in memory.
+    to keep in memory.  ``ledger_index`` is None without an index that fits.
     """
 
     head: _Head | None
     state: os.stat_result | None
     lines: bytes | None
+    ledger_index: LedgerIndex | None = None
 
 
 class LedgerFile:
@@ -277,11 +291,62 @@ class LedgerFile:
         """
         if _EVERY in self._readings:
             return self._readings[_EVERY].ledger
-        return self._reading(f'"{name}":{_quoted(value)}'.encode()).ledger
+        return self._reading(f'"{name}":{_quoted(value)}'.encode(), [(name, value)]).ledger
+
+    def with_values(self, name: str, values: Collection[str]) -> Ledger:
+        """Return the ledger with at least the entries whose field ``name`` has one of ``values``.
+
+        Without an index, or for very many values, it is the whole ledger.
+
+        Raises:
+            KeystoreError: the file cannot be read at all.
+        """
+        index = self._opened().ledger_index
+        if index is None or len(values) * _LINES_PER_LOOKUP > index.state.lines:
+            return self.ledger()
+        terms = [(name, value) for value in values]
+        return self._compared(_EVERY, terms).ledger
+
+    def next_number(self) -> int:
+        """Return the number for a new answer, as `Ledger.next_number`."""
+        if index := self._opened().ledger_index:
+            state = index.state
+            return max(state.lines, state.number) + 1
+        return self.ledger().next_number()
+
+    @property
+    def is_indexed(self) -> bool:
+        """Whether an index finds entries, so that few of them take little time."""
+        return self._opened().ledger_index is not None
+
+    def _opened(self) -> _Files:
+        if self._files is None:
+            self._files = self._read()
+        return self._files
 
     def end(self) -> _Reading:
         """Return the values that are needed to add lines; their ``ledger`` may lack entries."""
-        return self._readings.get(_EVERY) or self._reading(_NONE)
+        return self._readings.get(_EVERY) or self._reading(_NONE, ())
+
+    def index_with(self, new: int, reading: _Reading) -> IndexUpdate | None:
+        """Return the index, to add ``new`` lines to it; None for a ledger that gets no index.
+
+        ``reading`` is the present `end`.  A ledger with a fault gets no index: only who reads all
+        of it knows what is certain.
+        """
+        if reading.ledger.lines + new < _INDEXED_FROM or not reading.sound:
+            return None
+        from sros_tool.keystore.ledger_index import IndexUpdate
+
+        if index := self._opened().ledger_index:
+            return IndexUpdate(index)
+        update = IndexUpdate(None)
+        with _open(self.root, self._follow_link) or io.BytesIO() as file:
+            for line in file:
+                text = line.removesuffix(b"\n")
+                if entry := _parse(text):
+                    update.add(entry, text)
+        return update
 
     def content(self) -> Iterator[bytes]:
         """Yield the bytes of all lines, in blocks."""
@@ -291,17 +356,23 @@ class LedgerFile:
         with _open(self.root, self._follow_link) or io.BytesIO() as file:
             yield from iter(lambda: file.read(_BLOCK), b"")
 
-    def _reading(self, having: bytes) -> _Reading:
-        """Return the ledger; chained lines without the text ``having`` are verified, not parsed."""
+    def _reading(self, having: bytes, terms: _Terms | None = None) -> _Reading:
+        """Return the ledger; chained lines without the text ``having`` are verified, not parsed.
+
+        ``terms`` are the same for the index; None for what no index finds.
+        """
         if having not in self._readings:
-            self._readings[having] = self._compared(having)
+            self._readings[having] = self._compared(having, terms)
         return self._readings[having]
 
-    def _compared(self, having: bytes) -> _Reading:
+    def _compared(self, having: bytes, terms: _Terms | None) -> _Reading:
         while True:
             known = self._files
             files = known or self._read()
-            reading = self._compared_with_head(files, having)
+            if found := self._found(files, terms):
+                self._files = files
+                return self._compared_with_head(files, found)
+            reading = self._compared_with_head(files, self._lines(files, having))
             # A transaction of another process may have ended between the reading of the two files.
             kept = known is not None and known.lines is not None
             if kept or not reading.unrecorded or self._is_still(files):
@@ -317,7 +388,49 @@ class LedgerFile:
             return _Files(head, None, b"")
         with file:
             state = os.fstat(file.fileno())
+            if head and (index := self._index(file, head)):
+                return _Files(head, state, None, index)
             return _Files(head, state, file.read() if state.st_size <= _MOST_KEPT else None)
+
+    def _index(self, file: BinaryIO, head: _Head) -> LedgerIndex | None:
+        """Return the index that the head states; None without one for a ledger with this end."""
+        if not head.index_root:
+            return None
+        from sros_tool.keystore.ledger_index import LedgerIndex
+
+        index = LedgerIndex.open(self.root, head.lines, head.last, head.index_root)
+        ends_so = index and _last_line(file, index.state.size) == head.last
+        file.seek(0)
+        return index if ends_so else None
+
+    def _found(self, files: _Files, terms: _Terms | None) -> _Lines | None:
+        """Return the lines that the index finds; None if it is not there or finds none of them."""
+        if files.ledger_index is None or files.head is None or terms is None:
+            return None
+        from sros_tool.keystore.ledger_index import IndexDamagedError, is_indexed, merged
+
+        if not all(is_indexed(*term) for term in terms):
+            return None
+        index, head = files.ledger_index, files.head
+        entries: list[Entry] = []
+        try:
+            terms = dict.fromkeys([*terms, ("what", "ca"), ("what", GAP)])
+            postings = merged(index.postings(*term) for term in terms)
+            with _open(self.root, self._follow_link) or io.BytesIO() as file:
+                for posting in postings:
+                    file.seek(posting.offset)
+                    line = file.read(posting.length)
+                    entry = _parse(line)
+                    if hashlib.sha256(line).digest() != posting.digest or entry is None:
+                        raise IndexDamagedError(f"line {posting.number} was changed")
+                    entries.append(entry)
+        except IndexDamagedError:
+            self._files = None
+            return None
+        numbers = [posting.number for posting in postings]
+        return _Lines(
+            tuple(entries), numbers, (), head.lines, 0, True, head.last, head.last, ended=True
+        )
 
     def _read_head(self, read: Callable[[Path, str], bytes]) -> _Head | None:
         """Return the head of the ledger; None without one."""
@@ -333,7 +446,7 @@ class LedgerFile:
             return _Head(fault=f"{LEDGER_HEAD} does not sign its end: {error.what}")
         if not stated:
             return _Head(fault=f"{LEDGER_HEAD} is not the signed end of a ledger")
-        return _Head(int(stated[1]), stated[2].decode())
+        return _Head(int(stated[1]), stated[2].decode(), index_root=(stated[3] or b"").decode())
 
     def _is_still(self, files: _Files) -> bool:
         """Return whether ledger and head on disk are still as they were read."""
@@ -357,9 +470,7 @@ class LedgerFile:
             raise _too_large(self.root / LEDGER)
         return read
 
-    def _compared_with_head(self, files: _Files, having: bytes) -> _Reading:
-        read = self._lines(files, having)
-
+    def _compared_with_head(self, files: _Files, read: _Lines) -> _Reading:
         if not read.lines:
             return _without_lines(self.root, is_there=files.state is not None)
         entries, numbers, faults = read.entries, read.numbers, [*read.faults]
@@ -379,7 +490,21 @@ class LedgerFile:
             read.lines,
         )
         unrecorded = [fault for fault in faults if fault.line >= last_recorded]
-        return _Reading(ledger, unrecorded, read.previous, read.ended)
+        sound = not (faults or read.unchained)
+        return _Reading(ledger, unrecorded, read.previous, read.ended, sound)
+
+
+_Terms: TypeAlias = Collection[tuple[str, str]]
+"""Fields of entries, each with a value."""
+
+
+def _last_line(file: BinaryIO, size: int) -> str:
+    """Return the digest of the last line of a ledger of ``size`` bytes; "" for another size."""
+    if os.fstat(file.fileno()).st_size != size:
+        return ""
+    file.seek(max(0, size - _LONGEST_LINE))
+    before, ended, nothing = file.read().rpartition(b"\n")
+    return _digest(before.rpartition(b"\n")[2]) if ended and not nothing else ""
 
 
 class _Lines(NamedTuple):
@@ -607,11 +732,15 @@ def _first_of(authorities: Iterable[x509.Certificate], entries: Iterable[tuple[i
 
 
 class _Head(NamedTuple):
-    """The signed head of a ledger: number of lines, digest of the last line, or a fault."""
+    """The signed head of a ledger: number of lines, digest of the last line, or a fault.
+
+    ``index_root`` is the root of the index, "" for a ledger without one.
+    """
 
     lines: int = 0
     last: str = ""
     fault: str = ""
+    index_root: str = ""
 
 
 def _head_fault(head: _Head | None, lines: int, signed: str, *, chained: bool) -> _Fault | None:
@@ -660,8 +789,11 @@ def append(
     does not hide them.
     """
     present = file.end()
-    gaps = (Entry(iso(now), GAP, reason=e.text, number=e.line) for e in present.unrecorded)
-    links = _Links(chain(gaps, entries), present.previous)
+    gaps = [Entry(iso(now), GAP, reason=e.text, number=e.line) for e in present.unrecorded]
+    index = None
+    if not transaction.dry_run:
+        index = file.index_with(len(gaps) + len(entries), present)
+    links = _Links(chain(gaps, entries), present.previous, index)
 
     def content() -> Iterator[bytes]:
         yield from file.content()
@@ -672,26 +804,38 @@ def append(
     for _ in links:  # of a dry run, which writes nothing
         pass
     lines = present.ledger.lines + links.count
-    head = f"sros ledger 1\nlines {lines}\nsha256 {links.previous}\n".encode()
-    transaction.write(LEDGER_HEAD, sign(head, "the head of the ledger"))
+    head = f"lines {lines}\nsha256 {links.previous}\n"
+    root = ""
+    if index:
+        with suppress(SrosError):  # a damaged index is made again by the next change
+            root = index.root()
+            transaction.after_commit(lambda: index.save(transaction.root))
+    head = f"sros ledger 2\n{head}index {root}\n" if root else f"sros ledger 1\n{head}"
+    transaction.write(LEDGER_HEAD, sign(head.encode(), "the head of the ledger"))
 
 
 class _Links:
     """Iterator over the lines of new entries; each line gets the digest of the line before.
 
-    ``previous`` is the digest of the last line so far, ``count`` the number of lines so far.
+    ``previous`` is the digest of the last line so far, ``count`` the number of lines so far.  The
+    lines are added to ``index``.
     """
 
-    def __init__(self, entries: Iterable[Entry], previous: str) -> None:
+    def __init__(
+        self, entries: Iterable[Entry], previous: str, index: IndexUpdate | None = None
+    ) -> None:
         self.previous = previous
         self.count = 0
         self._entries = iter(entries)
+        self._index = index
 
     def __iter__(self) -> Iterator[bytes]:
         for entry in self._entries:
             line = _line(entry, self.previous)
             self.previous = _digest(line)
             self.count += 1
+            if self._index:
+                self._index.add(entry, line)
             yield line + b"\n"
 
 

@@ -11,6 +11,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -540,6 +541,30 @@ class SignedRights(NamedTuple):
     nodes: str = ""
 
 
+_MOST_LOOKUPS = 200
+"""Enclaves that are looked up one by one; for more, all permissions in the ledger are read."""
+
+
+class _OfLedger:
+    """The permissions in a ledger, or in the part of it that is about some enclaves.
+
+    ``last`` maps enclaves to their last permissions; those in ``chained`` have some after the lines
+    without a chain, those in ``certain`` after the last gap.
+    """
+
+    def __init__(self, ledger: Ledger, keystore: Keystore) -> None:
+        self.gaps = ledger.gaps
+        self.unchained = ledger.unchained
+        chained = ledger.entries[ledger.unchained :]
+        self.chained = {entry.enclave for entry in chained if entry.what == "permissions"}
+        # A keystore of ros2/sros2 has enclaves that no ledger records.
+        self.complete = keystore.has(SETTINGS) or not (keystore.is_of_ros2 or ledger.lines)
+        self.last = {
+            entry.enclave: entry for entry in ledger.entries if entry.what == "permissions"
+        }
+        self.certain = {entry.enclave for entry in ledger.certain if entry.what == "permissions"}
+
+
 class RecordedRights:
     """The rights that were last signed for each enclave, by the ledger.
 
@@ -548,18 +573,26 @@ class RecordedRights:
     """
 
     def __init__(self, keystore: Keystore, ledger: Ledger | None = None) -> None:
-        ledger = ledger or keystore.ledger_with("what", "permissions")
+        self._keystore = keystore
         self._root = keystore.root
-        self._gaps = ledger.gaps
-        self._unchained = ledger.unchained
-        chained = ledger.entries[ledger.unchained :]
-        self._chained = {entry.enclave for entry in chained if entry.what == "permissions"}
-        # A keystore of ros2/sros2 has enclaves that no ledger records.
-        self._complete = keystore.has(SETTINGS) or not (keystore.is_of_ros2 or ledger.lines)
-        self._last = {
-            entry.enclave: entry for entry in ledger.entries if entry.what == "permissions"
-        }
-        self._certain = {entry.enclave for entry in ledger.certain if entry.what == "permissions"}
+        self._whole = ledger
+        self._looked_up: dict[str, _OfLedger] = {}
+
+    @cached_property
+    def _of_all(self) -> _OfLedger:
+        return _OfLedger(
+            self._whole or self._keystore.ledger_with("what", "permissions"), self._keystore
+        )
+
+    def _of(self, name: str) -> _OfLedger:
+        """Return what the ledger has of an enclave, and perhaps of others."""
+        is_first = len(self._looked_up) < _MOST_LOOKUPS and "_of_all" not in self.__dict__
+        if self._whole or not is_first or not self._keystore.ledger_file.is_indexed:
+            return self._of_all
+        if name not in self._looked_up:
+            ledger = self._keystore.ledger_with("enclave", name)
+            self._looked_up[name] = _OfLedger(ledger, self._keystore)
+        return self._looked_up[name]
 
     def of(self, name: str, digest: str, grant: Grant) -> SignedRights:
         """Return the rights in the permissions of an enclave, to sign them again.
@@ -570,7 +603,8 @@ class RecordedRights:
 
     def nodes(self, name: str) -> str:
         """Return the nodes of the last permissions of an enclave, as the ledger has them."""
-        return self._last[name].nodes if name in self._last else ""
+        last = self._of(name).last
+        return last[name].nodes if name in last else ""
 
     def latest(self, name: str, digest: str) -> Entry | None:
         """Return the entry of permissions that are certainly the enclave's last, or None.
@@ -579,14 +613,15 @@ class RecordedRights:
         """
         with suppress(KeystoreError):
             self.policy(name, digest)
-            return self._last.get(name)
+            return self._of(name).last.get(name)
         return None
 
     def unproven(self) -> dict[str, Entry]:
         """Map enclaves to their last entries, if these are on lines from before the chain."""
-        if not self._unchained:
+        of_all = self._of_all
+        if not of_all.unchained:
             return {}
-        return {name: entry for name, entry in self._last.items() if name not in self._chained}
+        return {name: entry for name, entry in of_all.last.items() if name not in of_all.chained}
 
     def policy(self, name: str, digest: str) -> str:
         """Return the SHA-256 of the policy of an enclave's permissions; "" if the ledger lacks it.
@@ -598,24 +633,25 @@ class RecordedRights:
         Raises:
             KeystoreError: it is not the last document that the ledger records for the enclave.
         """
-        last, trust = self._last.get(name), ""
+        recorded = self._of(name)
+        last, trust = recorded.last.get(name), ""
         if last and last.sha256 != digest:
             why = (
                 f"The ledger has others, signed at {last.time}. Perhaps older ones were put back, "
                 "with rights that were taken away since."
             )
-        elif self._gaps and name not in self._certain:
-            why = f"The ledger has gaps ({'; '.join(self._gaps)}), so later ones may be missing."
-        elif self._unchained and name not in self._chained:
+        elif recorded.gaps and name not in recorded.certain:
+            why = f"The ledger has gaps ({'; '.join(recorded.gaps)}), so later ones may be missing."
+        elif recorded.unchained and name not in recorded.chained:
             why = (
-                f"Nothing shows whether a line was removed from the first {self._unchained} of the "
-                "ledger, so later ones may be missing."
+                f"Nothing shows whether a line was removed from the first {recorded.unchained} of "
+                "the ledger, so later ones may be missing."
             )
             trust = (
                 " If you know that nobody else could change the ledger since version 0.1 of sros "
                 f"wrote it, run `sros update_keystore {quote(str(self._root))} --trust-records`."
             )
-        elif not last and self._complete:
+        elif not last and recorded.complete:
             why = "The ledger has none for this enclave."
         else:
             return last.policy if last else ""

@@ -50,6 +50,7 @@ from sros_tool.keystore.layout import (
     SEAL,
     ZENOH_FILES,
     enclave_folder,
+    has_enclave,
 )
 from sros_tool.keystore.ledger import document_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
@@ -162,7 +163,7 @@ def sign_request(
         issued = signer.certify(request, renew=renew, named=bool(only) and not refuse_revoked)
         signer.keep_zenoh()
         files = _answer_files(root, issued, change.zenoh)
-        number = change.ledger.next_number()
+        number = change.keystore.ledger_file.next_number()
         sealed = seal(files, number, change.permissions)
         _check_result(RequestAnswer(name, files, sealed), request, now)
         archive = pack({SEAL: sealed, **files})
@@ -382,14 +383,14 @@ class _Signer:
         change, root, name = self._change, self._root, request.name
         known, authority = change.known, change.permissions.certificate
         stated = self._stated[name].enclave
-        _check_name(root, name, renew, name in change.names)
+        _check_name(root, name, renew, has_enclave(root, name))
         if stated is not None:
             refuse_less_protected(root, change.governance, stated_protections([stated]))
         present = change.keystore.certificate_of(name) if renew else None
         _check_key(request, known, present)
         if not (self._replace_keys and self._keep_only_key_of(request)):
             _check_file_of_key(change.keystore, request, present)
-        if not renew and not named and name in known.revoked_enclaves:
+        if not renew and not named and known.revoked_before([name]):
             raise KeystoreError(
                 f"enclave {name} was revoked in keystore '{root}'",
                 "Whoever has the revoked key could have made this request to get access again.",
@@ -452,6 +453,8 @@ class _Signer:
 
     def name_notes(self) -> Iterator[Note]:
         """Yield notes on the names of new enclaves that vendors or users may confuse."""
+        if not self._new:
+            return iter(())
         return name_notes({*self._change.names, *self._new}, self._new)
 
     def result(

@@ -46,6 +46,7 @@ from sros_tool.keystore.layout import (
     ROLES,
     ca_certificate,
     enclave_folder,
+    has_enclave,
 )
 from sros_tool.keystore.participant import JoinContext, VendorParticipant, load_enclave
 from sros_tool.keystore.reader import Keystore
@@ -457,7 +458,7 @@ class _FilesOfChange:
 
 def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
     """Group the complete, changed enclaves by everything that vendors could treat differently."""
-    changed, enclaves = files.changed, files.transaction.enclaves
+    changed, root = files.changed, files.transaction.root
     shared = changed.get(PUBLIC, set()) | changed.get(ENCLAVES, set()) & {GOVERNANCE_FILE}
     documents = not shared <= _ONLY_IDENTITY
     names = {
@@ -466,8 +467,8 @@ def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
         if folder.split("/", 1)[0] == ENCLAVES and not changed_files.isdisjoint(_LOADED)
     }
     if shared:
-        names.update(enclaves)
-    present = frozenset(enclaves)
+        names.update(files.transaction.enclaves)
+    present = {name for name in names if has_enclave(root, name)}
     lists: dict[str, frozenset[int]] = {}
     kinds: dict[_Kind, list[str]] = {}
     for name in sorted(names):

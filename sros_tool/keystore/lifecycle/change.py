@@ -276,9 +276,9 @@ class KeystoreChange:
         before = before or self.fleet
         wanted = with_routers_of_robots(network, before, self.fleet)
         missing = {*wanted.router_names()}.difference(self.names)
-        if self.is_new or missing.isdisjoint(self.known.revoked_enclaves):
+        gone = set() if self.is_new else self.known.revoked_before(missing)
+        if not gone:
             return wanted
-        gone = missing.intersection(self.known.revoked_enclaves)
         return with_routers_of_robots(network, before, self.fleet, gone)
 
     def set_network(self, network: ZenohNetwork) -> None:

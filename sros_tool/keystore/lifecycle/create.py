@@ -299,7 +299,8 @@ def _revoked_before(
     """
     existing, known, root = frozenset(change.names), change.known, change.root
     missing = [name for name in wanted if name not in existing]
-    again = [name for name in missing if name in known.revoked_enclaves]
+    revoked = known.revoked_before(missing) if missing else ()
+    again = [name for name in missing if name in revoked]
     if unasked := [name for name in again if name not in named]:
         raise KeystoreError(
             f"a policy names {', '.join(unasked)}, revoked in keystore '{root}'",

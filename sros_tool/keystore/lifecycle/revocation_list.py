@@ -204,7 +204,7 @@ class RevocationListSigner:
         """
         certificates: dict[str, dict[int, Entry]] = {name: {} for name in names}
         moment = iso(self._now)
-        for entry in self._keystore.ledger.entries:
+        for entry in self._keystore.ledger_file.with_values("enclave", certificates).entries:
             expired = entry.not_after and entry.not_after < moment
             if (
                 entry.what == "certificate"
@@ -213,7 +213,7 @@ class RevocationListSigner:
                 and not expired
             ):
                 certificates[entry.enclave][int(entry.serial, 16)] = entry
-        for certificate in _moved_away(self._keystore):
+        for certificate in _moved_away(self._keystore, self._recorded_as_moved()):
             name = common_name_of(certificate.subject)
             if name in certificates and validity_of(certificate).not_after >= self._now:
                 entry = certificate_entry(self._now, "certificate", certificate, name)
@@ -222,11 +222,21 @@ class RevocationListSigner:
             certificates[name][int(entry.serial, 16)] = entry
         return certificates
 
+    def _recorded_as_moved(self) -> Container[str]:
+        """Return the serial numbers in the folder ``revoked`` that the ledger certainly has."""
+        ledger = self._keystore.ledger_file
+        if not ledger.is_indexed:
+            return ()
+        serials = [path.parent.name for path in revoked_certificates(self._keystore.root)]
+        certain = ledger.with_values("serial", serials).certain
+        return {entry.serial for entry in certain if entry.what == "certificate"}
+
     def _note_lack(self) -> None:
         """Add a remark if the ledger may lack earlier certificates of the revoked enclaves."""
         if not self._last:
             return
-        ledger = self._keystore.ledger
+        serials = {entry.serial for entry in self._last.values()}
+        ledger = self._keystore.ledger_file.with_values("serial", serials)
         why = list(ledger.gaps)
         if ledger.unchained:
             why.append(
@@ -314,13 +324,14 @@ class RevocationListSigner:
         kept += [entry for entry in new_entries if entry.serial not in listed]
         # Without an earlier list that is authentic: above every number that was used, because each
         # list that is signed adds an entry to the ledger, and at most 2 to the number.
-        used = 2 * sum(entry.what == "crl" for entry in self._keystore.ledger.entries)
+        lists = self._keystore.ledger_with("what", "crl").entries
+        used = 2 * sum(entry.what == "crl" for entry in lists)
         number = max(old.number + 1 if old else used + 1, least)
         return sign_list(authority, kept, number=number, template=self._template, now=self._now)
 
     def _lost(self, expiries: Mapping[int, str]) -> list[Revoked]:
         """Return the revocations that the present list lacks, if it is older than the last list."""
-        entries = self._keystore.ledger.entries
+        entries = self._keystore.ledger_file.with_values("what", ("revocation", "crl")).entries
         count = max(
             (i for i, entry in enumerate(entries, 1) if entry.what == "revocation"), default=0
         )
@@ -345,9 +356,13 @@ class RevocationListSigner:
 
         A certificate whose ledger entry is not certain has no expiry, and so stays on the list.
         """
+        revocations = self._keystore.ledger_with("what", "revocation").entries
+        serials = {entry.serial for entry in revocations if entry.what == "revocation"}
+        for crl in self._keystore.revocation_lists:
+            serials.update(f"{entry.serial:x}" for entry in crl.revoked)
         recorded = {
             entry.serial: entry.not_after
-            for entry in self._keystore.ledger.certain
+            for entry in self._keystore.ledger_file.with_values("serial", serials).certain
             if entry.what == "certificate" and entry.serial and entry.not_after
         }
         expiries = {int(serial, 16): not_after for serial, not_after in recorded.items()}

@@ -18,7 +18,8 @@ import logging
 import os
 import secrets
 import stat
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
@@ -72,8 +73,8 @@ class Transaction:
 
     Use it as a context manager; without `commit` nothing changes.  With ``fresh``, the keystore may
     be new; otherwise it must exist.  With ``dry_run`` nothing is written, and ``changes`` lists the
-    changes that would be made.  ``enclaves`` are the sorted names of the enclaves before the
-    change.  With ``partial``, the caller may leave out enclaves: some may be unreadable.
+    changes that would be made.  With ``partial``, the caller may leave out enclaves: some may be
+    unreadable.
     """
 
     def __init__(
@@ -81,7 +82,6 @@ class Transaction:
     ) -> None:
         self.root = root
         self.changes = Changes()
-        self.enclaves: tuple[str, ...] = ()
         self.dry_run = dry_run
         self._fresh = fresh
         self._partial = partial
@@ -96,6 +96,8 @@ class Transaction:
         self._parents: set[str] = set()  # of folders that are staged
         self._moves: list[Move] = []
         self._undo: list[Callable[[], None]] = []
+        self._after: list[Callable[[], None]] = []
+        self._adopts = False
         # New files, None for those beyond the limit, and targets of links, of a dry run.
         self._kept: dict[str, bytes | str | None] = {}
         self._kept_bytes = 0
@@ -116,21 +118,22 @@ class Transaction:
         """Register ``undo``, which is called if the transaction ends without a commit."""
         self._undo.append(undo)
 
+    def after_commit(self, action: Callable[[], None]) -> None:
+        """Register ``action``, which is called once all files are in place."""
+        self._after.append(action)
+
     # ── begin and end ──────────────────────────────────────────────────────────────────────
 
     def __enter__(self) -> Self:
         """Begin the transaction, and lock the keystore.
 
         Raises:
-            KeystoreError: this user cannot read all enclaves, the keystore is busy, or a new
-                keystore would belong to another user.
+            KeystoreError: the keystore is busy, or a new keystore would belong to another user.
         """
         try:
             if self._fresh and not self._new_root:
                 self._refuse_folder_of_stranger()
-            if self.dry_run:
-                self.enclaves = self._readable_enclaves()
-            else:
+            if not self.dry_run:
                 self._begin()
         except BaseException:
             self._end()
@@ -152,12 +155,19 @@ class Transaction:
         self._lock = KeystoreLock(self._in)
         self._lock.acquire()
         recover(self._in)
-        self.enclaves = self._readable_enclaves()
         for path in (STAGE, f"{STAGE}/{ADDED}", f"{STAGE}/{AFTER}"):
             self._in.mkdir(path, 0o700)
         _LOG.info("began a transaction in the keystore '%s'", self.root)
 
-    def _readable_enclaves(self) -> tuple[str, ...]:
+    @cached_property
+    def enclaves(self) -> tuple[str, ...]:
+        """The sorted names of the enclaves before the change, for who changes all of them.
+
+        Raises:
+            KeystoreError: this user cannot read all files of all enclaves.
+        """
+        if self._new_root:
+            return ()
         return search_enclaves(self.root)[0] if self._partial else readable_enclaves(self.root)
 
     def _refuse_folder_of_stranger(self) -> None:
@@ -432,6 +442,7 @@ class Transaction:
 
     def adopt(self) -> None:
         """Add a change that says that the keystore gets its first settings and ledger."""
+        self._adopts = True
         self.changes.add(ADOPT, "")
 
     # ── commit ─────────────────────────────────────────────────────────────────────────────
@@ -439,8 +450,9 @@ class Transaction:
     def commit(self) -> None:
         """Put all staged changes in place atomically, and flush them to disk.
 
-        Private keys and folders of keys that other users could open are closed to them: ros2/sros2
-        leaves their mode to the umask.
+        Private keys and folders of keys that other users could open are closed to them, because
+        ros2/sros2 leaves their mode to the umask: those of the CAs and of the enclaves that change,
+        and of all enclaves when a keystore of ros2/sros2 is taken over or all enclaves are read.
 
         Raises:
             KeystoreError: another process has created the keystore meanwhile.
@@ -455,16 +467,16 @@ class Transaction:
         if self._new_root:
             folder.flush_file_system()
             self._appear()
-            self._report_commit()
+            self._finish()
             return
         write_manifest(folder, self._moves)
         folder.flush_file_system(STAGE)
         _bridge(folder, self._moves)
         point_live(folder, AFTER)
         self._undo.clear()
-        self._report_commit()
         with contextlib.suppress(OSError, SrosError):  # already committed; `_end` tries again
             complete(folder, self._moves)
+        self._finish()
         for path in self._open_keys():
             with contextlib.suppress(OSError):  # `check` finds what stays open
                 folder.close_to_others(path)
@@ -475,9 +487,14 @@ class Transaction:
         """Return the keys that other users can open, except files that this transaction writes."""
         if self._new_root:
             return []
-        return [path for path in _open_keys(self.root) if not self.is_staged(path)]
+        # What costs as much as the keystore has enclaves is left to who looks at all of them.
+        every = self._adopts or "enclaves" in self.__dict__
+        changed = None if every else self.changed_folders()
+        return [path for path in _open_keys(self.root, changed) if not self.is_staged(path)]
 
-    def _report_commit(self) -> None:
+    def _finish(self) -> None:
+        for action in self._after:
+            action()
         _LOG.info("committed %d changes to the keystore '%s'", len(self.changes), self.root)
         if _LOG.isEnabledFor(logging.DEBUG):
             for change in self.changes:
@@ -517,17 +534,24 @@ def _content(path: Path) -> bytes | None:
         return None
 
 
-def _open_keys(root: Path) -> Iterator[str]:
-    """Yield the paths of private keys, and top folders of keys, that other users can open."""
+def _open_keys(root: Path, changed: Collection[str] | None = None) -> Iterator[str]:
+    """Yield the paths of private keys, and top folders of keys, that other users can open.
+
+    Of the folders of enclaves, only those in ``changed`` are looked at; None looks at all.
+    """
     for top in _KEY_FOLDERS:
         if _is_open(f"{root}/{top}", stat.S_IFDIR):
             yield top
         folders = [f"{root}/{top}"]
+        below = changed is None or top not in (ENCLAVES, REVOKED)
+        if changed is not None and not below:
+            folders = [f"{root}/{path}" for path in sorted(changed) if path.split("/")[0] == top]
         for folder in folders:  # which grows; os.walk would follow each link to see what it is
             with contextlib.suppress(OSError), os.scandir(folder) as entries:
                 for entry in sorted(entries, key=lambda entry: entry.name):
                     if entry.is_dir(follow_symlinks=False) and not entry.name.startswith("."):
-                        folders.append(entry.path)
+                        if below:
+                            folders.append(entry.path)
                     elif entry.name.endswith(KEY_FILE) and _is_open(entry.path, stat.S_IFREG):
                         yield os.path.relpath(entry.path, root)
 

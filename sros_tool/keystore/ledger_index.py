@@ -1,0 +1,313 @@
+"""The index of a long ledger: it finds the lines about an enclave, a key or a document.
+
+It is an SQLite file next to the ledger, so that a change of one enclave need not read what was
+recorded about all others.  It is only a cache, and input like any other file: the signed head of
+the ledger states its `root`, the digest of all that it says, and every part that is read is
+compared with it.  An index that is missing, damaged, forged, or of another state of the ledger is
+not used, and is made again from the ledger when the keystore is next changed.
+
+A *term* is the value of a field of an entry, such as the name of an enclave.  A *posting* says
+that a line has a term, where the line is, and what its digest is.  Postings are kept in buckets by
+the first bits of their terms; the root is the digest of the digests of all buckets.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sqlite3
+import stat
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import NamedTuple, Protocol, Self
+from urllib.parse import quote
+
+from sros_tool.errors import SrosError
+from sros_tool.keystore.layout import LEDGER_INDEX
+
+_NEW = f"{LEDGER_INDEX}.new"
+_BUCKETS = 4096
+_POSTING = struct.Struct(">16sIQI32s")
+_DIGEST = 32
+_EMPTY = hashlib.sha256().digest()
+_FIELDS = ("enclave", "serial", "sha256", "key")
+_FREQUENT = ("certificate", "permissions")
+"""Kinds of entries that are half of a ledger each, so that no index helps to find them."""
+_SCHEMA = (
+    "CREATE TABLE buckets (bucket INTEGER PRIMARY KEY, postings BLOB NOT NULL)",
+    "CREATE TABLE state (lines INTEGER NOT NULL, size INTEGER NOT NULL, number INTEGER NOT NULL, "
+    "last TEXT NOT NULL, digests BLOB NOT NULL)",
+)
+_STATE = "SELECT lines, size, number, last, digests FROM state WHERE length(digests) = ?"
+_LARGEST = 128 << 20
+"""Size of the largest bucket, in bytes."""
+_SETTINGS = ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0")
+
+
+class IndexDamagedError(SrosError):
+    """The index is not the one that the ledger's head states."""
+
+
+class Posting(NamedTuple):
+    """Where a line is in the ledger: its number, its first byte, its length without line end.
+
+    ``digest`` is the SHA-256 of the line.
+    """
+
+    number: int
+    offset: int
+    length: int
+    digest: bytes
+
+
+class IndexState(NamedTuple):
+    """The ledger that an index is of.
+
+    ``lines`` and ``size`` are its lines and bytes, ``number`` is the highest number of an entry,
+    ``last`` is the SHA-256 of the last line, in hexadecimal.
+    """
+
+    lines: int
+    size: int
+    number: int
+    last: str
+
+    def root(self, digests: bytes) -> str:
+        """Return the root, in hexadecimal, of an index whose buckets have these digests."""
+        text = f"sros index 1\n{self.lines} {self.size} {self.number} {self.last}\n".encode()
+        return hashlib.sha256(text + digests).hexdigest()
+
+
+class IndexedEntry(Protocol):
+    """The fields of a ledger entry that the index is about."""
+
+    @property
+    def what(self) -> str:
+        """Kind of the entry."""
+
+    @property
+    def number(self) -> int:
+        """Number of an answer, or 0."""
+
+
+def is_indexed(name: str, value: str) -> bool:
+    """Return whether an index finds the lines whose field ``name`` has this value."""
+    return name in _FIELDS or (name == "what" and value not in _FREQUENT)
+
+
+def _term(name: str, value: str) -> bytes:
+    text = f"{name}\0{value}".encode("utf-8", "surrogatepass")
+    return hashlib.sha256(text).digest()[:16]
+
+
+def _bucket_of(term: bytes) -> int:
+    return int.from_bytes(term[:2], "big") % _BUCKETS
+
+
+def _terms(entry: IndexedEntry) -> Iterator[bytes]:
+    for name in _FIELDS:
+        value = getattr(entry, name)
+        # Earlier versions recorded no keys: these certificates are found by the empty key.
+        if value or (name == "key" and entry.what == "certificate"):
+            yield _term(name, value)
+    if entry.what not in _FREQUENT:
+        yield _term("what", entry.what)
+
+
+class LedgerIndex:
+    """An index that has the root which the signed head of the ledger states."""
+
+    def __init__(self, path: Path, state: IndexState, digests: bytes) -> None:
+        self.state = state
+        self._path = path
+        self._digests = digests
+        self._process = 0
+        self._connection: sqlite3.Connection | None = None
+
+    @classmethod
+    def open(cls, root: Path, lines: int, last: str, stated: str) -> Self | None:
+        """Return the index of the keystore ``root``; None if it is not as the head states.
+
+        The head states the number of ``lines``, the digest of the ``last`` one and the root of the
+        index.
+        """
+        path = root / LEDGER_INDEX
+        try:
+            _check_file(path)
+            with closing(_connect(path, "ro")) as connection:
+                row = connection.execute(_STATE, (_BUCKETS * _DIGEST,)).fetchone()
+        except (OSError, sqlite3.Error, ValueError, SrosError):
+            return None
+        if not row or [type(value) for value in row] != [int, int, int, str, bytes]:
+            return None
+        state, digests = IndexState(*row[:-1]), row[-1]
+        if (state.lines, state.last) != (lines, last) or state.root(digests) != stated:
+            return None
+        return cls(path, state, digests)
+
+    @property
+    def digests(self) -> bytes:
+        """The SHA-256 of every bucket, one after the other."""
+        return self._digests
+
+    def postings(self, name: str, value: str) -> Iterator[Posting]:
+        """Yield the postings of the lines whose field ``name`` has this value, oldest first.
+
+        Raises:
+            IndexDamagedError: the bucket with them is not what it was when the head was signed.
+        """
+        term = _term(name, value)
+        postings = self.bucket(_bucket_of(term))
+        at = postings.find(term)
+        while at >= 0:
+            if at % _POSTING.size == 0:
+                _, *where = _POSTING.unpack_from(postings, at)
+                yield Posting(*where)
+            at = postings.find(term, at + 1)
+
+    def bucket(self, bucket: int) -> bytes:
+        """Return the postings in a bucket, verified.
+
+        Raises:
+            IndexDamagedError: it is not what it was when the head was signed.
+        """
+        try:
+            query = "SELECT postings FROM buckets WHERE bucket = ?"
+            row = self._read_only().execute(query, (bucket,)).fetchone()
+        except (OSError, sqlite3.Error, ValueError, SrosError) as error:
+            raise IndexDamagedError(f"'{self._path}' cannot be read") from error
+        postings = row[0] if row else b""
+        digest = self._digests[bucket * _DIGEST : (bucket + 1) * _DIGEST]
+        if type(postings) is not bytes or hashlib.sha256(postings).digest() != digest:
+            raise IndexDamagedError(f"'{self._path}' is not as the ledger's head states")
+        return postings
+
+    def _read_only(self) -> sqlite3.Connection:
+        """Return the connection of this process: SQLite's does not survive a fork."""
+        if self._connection is None or self._process != os.getpid():
+            _check_file(self._path)
+            self._connection = _connect(self._path, "ro")
+            self._process = os.getpid()
+        return self._connection
+
+
+class IndexUpdate:
+    """The index of a ledger to which lines are added; ``base`` is the present one, None without.
+
+    Without a base, all lines of the ledger have to be added.
+    """
+
+    def __init__(self, base: LedgerIndex | None) -> None:
+        self.state = base.state if base else IndexState(0, 0, 0, "")
+        self._base = base
+        self._added: dict[int, bytearray] = {}
+        self._digests = b""
+
+    def add(self, entry: IndexedEntry, line: bytes) -> None:
+        """Add the next line of the ledger, without its line end."""
+        lines, size, number, _ = self.state
+        digest = hashlib.sha256(line)
+        for term in _terms(entry):
+            posting = _POSTING.pack(term, lines + 1, size, len(line), digest.digest())
+            self._added.setdefault(_bucket_of(term), bytearray()).extend(posting)
+        number = max(number, entry.number)
+        self.state = IndexState(lines + 1, size + len(line) + 1, number, digest.hexdigest())
+
+    def root(self) -> str:
+        """Return the root of the index with all lines that were added, in hexadecimal.
+
+        Raises:
+            IndexDamagedError: the present index is not what it was when the head was signed.
+        """
+        digests = bytearray(self._base.digests if self._base else _EMPTY * _BUCKETS)
+        for bucket, added in self._added.items():
+            if self._base:
+                added[:0] = self._base.bucket(bucket)
+            digests[bucket * _DIGEST : (bucket + 1) * _DIGEST] = hashlib.sha256(added).digest()
+        self._digests = bytes(digests)
+        return self.state.root(self._digests)
+
+    def save(self, root: Path) -> None:
+        """Write the index of the keystore ``root``, after `root` and the commit of the ledger.
+
+        Nothing is written by root in a keystore of another user, who could lead it to another file;
+        then, and if the process stops here, the next change makes the index again.
+        """
+        try:
+            if not _is_own(root):
+                return
+            if self._base is None:
+                self._make(root)
+                return
+            _check_file(root / LEDGER_INDEX)
+            with closing(_connect(root / LEDGER_INDEX, "rw")) as connection:
+                self._write(connection)
+        except (OSError, sqlite3.Error, ValueError, SrosError):
+            from sros_tool.folders import Folder
+
+            with suppress(OSError, SrosError), Folder(root) as folder:
+                folder.unlink(LEDGER_INDEX, missing_ok=True)
+
+    def _make(self, root: Path) -> None:
+        from sros_tool.folders import Folder  # a question does not load what writes
+
+        with Folder(root) as folder:
+            folder.unlink(_NEW, missing_ok=True)
+            folder.write(_NEW, b"", 0o600)
+            with closing(_connect(root / _NEW, "rw", is_new=True)) as connection:
+                self._write(connection)
+            folder.replace(_NEW, LEDGER_INDEX)
+
+    def _write(self, connection: sqlite3.Connection) -> None:
+        with connection:
+            buckets = ((bucket, bytes(added)) for bucket, added in self._added.items())
+            connection.executemany("REPLACE INTO buckets VALUES (?, ?)", buckets)
+            connection.execute("DELETE FROM state")
+            row = (*self.state, self._digests)
+            connection.execute("INSERT INTO state VALUES (?, ?, ?, ?, ?)", row)
+
+
+def _is_own(root: Path) -> bool:
+    """Return whether ``root`` belongs to this user, and nobody else can write to it."""
+    state = root.stat()
+    return state.st_uid == os.geteuid() and not state.st_mode & 0o022
+
+
+def _check_file(path: Path) -> None:
+    """Raise `IndexDamagedError` unless the index is a file that only this user can have written."""
+    state = path.lstat()
+    regular = stat.S_ISREG(state.st_mode) and state.st_nlink == 1
+    if not regular or state.st_uid != os.geteuid() or state.st_mode & 0o022:
+        raise IndexDamagedError(f"'{path}' is not a file of this user alone")
+
+
+def _connect(path: Path, mode: str, *, is_new: bool = False) -> sqlite3.Connection:
+    """Return a connection that only reads and writes the tables of `_SCHEMA`.
+
+    A file with other tables, views or triggers is refused, because queries could then run what is
+    in it.  A file that is only read is taken as it is, without locks and journals next to it.
+    """
+    immutable = "&immutable=1" if mode == "ro" else ""
+    place = f"file:{quote(os.path.abspath(path))}?mode={mode}{immutable}"  # noqa: PTH100
+    connection = sqlite3.connect(place, uri=True, timeout=0)
+    try:
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST)
+        for setting in (*_SETTINGS, "journal_mode = MEMORY", "synchronous = OFF"):
+            connection.execute(f"PRAGMA {setting}")
+        if is_new:
+            for table in _SCHEMA:
+                connection.execute(table)
+        found = connection.execute("SELECT sql FROM sqlite_schema ORDER BY name").fetchall()
+        if found != [(table,) for table in _SCHEMA]:
+            raise IndexDamagedError(f"'{path}' is no index of a ledger")
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def merged(postings: Iterable[Iterable[Posting]]) -> Sequence[Posting]:
+    """Return postings of several terms in the order of their lines, each line once."""
+    return sorted({posting.number: posting for some in postings for posting in some}.values())

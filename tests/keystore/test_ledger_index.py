@@ -1,0 +1,205 @@
+"""The index of a long ledger is believed only if it is the one that the ledger's head states."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore import ledger as ledger_module
+from sros_tool.keystore.delivery.signing import sign_request
+from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, LEDGER_INDEX
+from sros_tool.keystore.ledger_index import IndexUpdate
+from sros_tool.keystore.lifecycle.create import create_enclaves
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.reader import Keystore
+from sros_tool.pki.certificates import make_request
+from sros_tool.pki.keys import generate_key, load_key
+from tests.support.harness import certificate
+
+NOW = datetime.now(UTC) + timedelta(hours=1)
+QUESTIONS = [("enclave", "/a"), ("what", "settings"), ("what", "revocation"), ("enclave", "/none")]
+
+
+@pytest.fixture
+def root(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(ledger_module, "_INDEXED_FROM", 1)
+    monkeypatch.setattr(ledger_module, "_LINES_PER_LOOKUP", 0)
+    renew(keystore, ["/a"], now=NOW)
+    return keystore
+
+
+def is_indexed(root: Path) -> bool:
+    return Keystore(root).ledger_file.is_indexed
+
+
+def check_answers(root: Path) -> None:
+    """Compare what the index finds with the whole ledger."""
+    whole = Keystore(root).ledger
+    serials = [entry.serial for entry in whole.entries if entry.serial]
+    for name, value in [*QUESTIONS, *(("serial", serial) for serial in serials)]:
+        some = Keystore(root).ledger_with(name, value)
+        assert [e for e in some.entries if getattr(e, name) == value] == [
+            e for e in whole.entries if getattr(e, name) == value
+        ]
+        assert (some.gaps, some.lines) == (whole.gaps, whole.lines)
+    assert Keystore(root).ledger_file.next_number() == whole.next_number()
+
+
+def test_an_index_answers_as_the_whole_ledger_does(root: Path) -> None:
+    assert is_indexed(root)
+    check_answers(root)
+    create_enclaves(root, ["/new"], now=NOW)
+    revoke(root, ["/b"], now=NOW)
+    renew(root, ["/a"], now=NOW, new_key=True, revoke_old=True)
+    assert is_indexed(root)
+    check_answers(root)
+    with pytest.raises(KeystoreError, match="was revoked"):
+        sign_request(root, make_request(generate_key(), "/b"), now=NOW)
+
+
+def cut(index: Path) -> None:
+    index.write_bytes(index.read_bytes()[:5000])
+
+
+def overwrite(index: Path) -> None:
+    index.write_bytes(b"no database\n" * 100)
+
+
+def execute(*statements: str) -> Callable[[Path], None]:
+    def change(index: Path) -> None:
+        with closing(sqlite3.connect(index)) as connection, connection:
+            for statement in statements:
+                connection.execute(statement)
+
+    return change
+
+
+def lead_elsewhere(index: Path) -> None:
+    index.rename(index.with_name("elsewhere"))
+    index.symlink_to("elsewhere")
+
+
+def open_to_others(index: Path) -> None:
+    index.chmod(0o622)
+
+
+FORGED: dict[str, Callable[[Path], None]] = {
+    "missing": Path.unlink,
+    "cut off": cut,
+    "no database": overwrite,
+    "a link": lead_elsewhere,
+    "open to others": open_to_others,
+    "without postings": execute("UPDATE buckets SET postings = x''"),
+    "without buckets": execute("DELETE FROM buckets"),
+    "other digests": execute("UPDATE state SET digests = zeroblob(length(digests))"),
+    "a view": execute("ALTER TABLE state RENAME TO old", "CREATE VIEW state AS SELECT * FROM old"),
+    "a trigger": execute("CREATE TRIGGER t AFTER INSERT ON state BEGIN DELETE FROM buckets; END"),
+    "other types": execute("UPDATE buckets SET postings = 'text'"),
+}
+
+
+@pytest.mark.parametrize("forgery", FORGED)
+def test_another_index_is_not_believed_and_made_again(forgery: str, root: Path) -> None:
+    FORGED[forgery](root / LEDGER_INDEX)
+    check_answers(root)
+    renew(root, ["/a"], now=NOW)
+    renew(root, ["/a"], now=NOW)
+    assert is_indexed(root)
+    assert not (root / LEDGER_INDEX).is_symlink()
+    check_answers(root)
+
+
+def test_an_index_of_an_earlier_state_is_not_believed(root: Path) -> None:
+    """The revocation was forgotten by the index, and the key is not certified again."""
+    key = load_key((root / "enclaves/b/key.pem").read_bytes(), "of the test")
+    earlier = (root / LEDGER_INDEX).read_bytes()
+    revoke(root, ["/b"], now=NOW)
+    (root / LEDGER_INDEX).write_bytes(earlier)
+    assert not is_indexed(root)
+    shutil.rmtree(root / "revoked")
+    for indexed in (False, True):
+        with pytest.raises(KeystoreError, match="was revoked"):
+            sign_request(root, make_request(key, "/other"), now=NOW)
+        renew(root, ["/a"], now=NOW)
+        assert is_indexed(root), indexed
+    sign_request(root, make_request(generate_key(), "/other"), now=NOW)
+
+
+def test_a_restored_keystore_has_its_own_index(root: Path, tmp_path: Path) -> None:
+    backup = Path(shutil.copytree(root, tmp_path / "backup", symlinks=True))
+    renew(root, ["/a"], now=NOW)
+    shutil.copy(root / LEDGER_INDEX, backup / LEDGER_INDEX)
+    assert not is_indexed(backup)
+    check_answers(backup)
+
+
+@pytest.mark.parametrize("moment", ["before the index", "in the index"])
+def test_a_kill_between_keystore_and_index_is_noticed(
+    moment: str, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class KilledError(BaseException):
+        pass
+
+    def killed(*_: object) -> None:
+        raise KilledError
+
+    before = certificate(root / "enclaves/a/cert.pem").serial_number
+    with monkeypatch.context() as during:
+        if moment == "before the index":
+            during.setattr(IndexUpdate, "save", killed)
+        else:
+            during.setattr(IndexUpdate, "_write", lambda self, connection: killed())
+        with pytest.raises(KilledError):
+            renew(root, ["/a"], now=NOW)
+    assert certificate(root / "enclaves/a/cert.pem").serial_number != before
+    assert not is_indexed(root)
+    check_answers(root)
+    renew(root, ["/b"], now=NOW)
+    assert is_indexed(root)
+    check_answers(root)
+    assert Keystore(root).ledger.gaps == ()
+
+
+@pytest.mark.parametrize("end", [b"{}\n", b""])
+def test_a_ledger_with_another_end_is_read_whole(end: bytes, root: Path) -> None:
+    ledger = root / LEDGER
+    lines = ledger.read_bytes().splitlines(keepends=True)
+    ledger.write_bytes(b"".join(lines[: None if end else -1]) + end)
+    assert not is_indexed(root)
+    assert Keystore(root).ledger_with("enclave", "/a").gaps
+    create_enclaves(root, ["/new"], now=NOW)
+    assert any(entry.what == "gap" for entry in Keystore(root).ledger.entries)
+    assert not is_indexed(root)
+
+
+def test_a_changed_line_is_not_believed(root: Path) -> None:
+    ledger = root / LEDGER
+    data = ledger.read_bytes()
+    first = data.index(b'"enclave":"/a"')
+    ledger.write_bytes(data[:first] + b'"enclave":"/x"' + data[first + 14 :])
+    assert is_indexed(root)
+    assert Keystore(root).ledger_with("enclave", "/a").gaps
+    assert Keystore(root).ledger.gaps
+
+
+def test_a_short_ledger_has_no_index(keystore: Path) -> None:
+    renew(keystore, ["/a"], now=NOW)
+    assert not (keystore / LEDGER_INDEX).exists()
+    assert b"sros ledger 1\r\n" in (keystore / LEDGER_HEAD).read_bytes()
+
+
+def test_a_key_that_was_put_into_another_enclave_is_found_by_check(root: Path) -> None:
+    """The ledger does not know it; the enclave that the ledger names still has to have it."""
+    key = load_key((root / "enclaves/a/key.pem").read_bytes(), "of the test")
+    with pytest.raises(KeystoreError, match="is the key of enclave /a"):
+        sign_request(root, make_request(key, "/other"), now=NOW)
+    renew(root, ["/a"], now=NOW, new_key=True)
+    sign_request(root, make_request(key, "/other"), now=NOW)
