@@ -143,6 +143,7 @@ VERBS: Mapping[str, str | Shapes] = {
     "units": "sros_tool.runtime.units:WrittenUnits",
     "fleet collect": "sros_tool.keystore.delivery.collect:CollectedInbox",
     "fleet confirm": "sros_tool.keystore.confirmation:KeptConfirmation",
+    "fleet publish": "sros_tool.keystore.delivery.publish:PublishedFleet",
     "metrics": "sros_tool.prometheus:KeystoreMetrics",
     "merge_policy": "sros_tool.policy.merge:MergedPolicy",
     "minimize_policy": "sros_tool.keystore.issuing.size:PolicyMinimization",

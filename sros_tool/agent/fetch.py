@@ -13,12 +13,17 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from sros_tool.errors import SrosError, UnavailableError, UsageError
+from sros_tool.errors import SrosError, UsageError
 from sros_tool.files import replace_file
 from sros_tool.fleet.robots import name_problem
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
-from sros_tool.keystore.delivery.release import Release, read_release, release_target
+from sros_tool.keystore.delivery.release import (
+    Release,
+    check_tuf,
+    read_release,
+    release_target,
+)
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
@@ -85,7 +90,7 @@ def pin_root(state: Path, data: bytes, *, now: datetime) -> str:
         FetchError: it is no root metadata that its own keys signed, or it expired.
         UnavailableError: the package ``tuf`` is not installed.
     """
-    _check_tuf()
+    check_tuf()
     from tuf.api.exceptions import RepositoryError
     from tuf.api.metadata import Metadata, Root
 
@@ -93,7 +98,7 @@ def pin_root(state: Path, data: bytes, *, now: datetime) -> str:
         root = Metadata[Root].from_bytes(data)
         if not isinstance(root.signed, Root):
             raise RepositoryError("it is metadata of another kind")
-        root.verify_delegate(Root.type, root)
+        root.signed.verify_delegate(Root.type, root.signed_bytes, root.signatures)
     except (RepositoryError, ValueError) as error:
         raise FetchError(
             FetchProblem.NOT_SIGNED,
@@ -145,7 +150,7 @@ def fetch_release(
         UsageError: ``source`` is not an address, or ``robot`` not a name.
         UnavailableError: the package ``tuf`` is not installed.
     """
-    _check_tuf()
+    check_tuf()
     from tuf.api.exceptions import DownloadError, RepositoryError
 
     if problem := name_problem(robot):
@@ -163,18 +168,6 @@ def fetch_release(
     except (DownloadError, RepositoryError, OSError, ValueError) as error:
         raise _explained(error, source, now) from error
     return _read(path, robot, number)
-
-
-def _check_tuf() -> None:
-    """Raise `UnavailableError` unless ``tuf`` is installed."""
-    try:
-        import tuf.ngclient  # noqa: F401
-    except ImportError as error:
-        raise UnavailableError(
-            "the Python package tuf is not installed",
-            "It verifies what is fetched.",
-            "Install it: `pip install 'sros_tool[fetch]'`.",
-        ) from error
 
 
 def _transport(

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 
 from sros_tool.cli.common import (
+    PATH,
+    Decorated,
     Verb,
     advisories_of,
     advisories_option,
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.keystore.confirmation import RobotDds
     from sros_tool.keystore.delivery.collect import CollectedInbox
+    from sros_tool.keystore.delivery.publish import PublishedFleet
     from sros_tool.keystore.fleet_status import FleetStatus, RobotStatus
 
 
@@ -285,6 +288,131 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
             else:
                 enclave = request.enclave or f"a request of {robot.robot}"
                 yield f"{enclave}: {request.outcome.replace('_', ' ')}: {request.why}"
+
+
+def _durations(function: Decorated) -> Decorated:
+    """Add an option for the validity of the metadata of each role."""
+    for role, what in reversed(_VALIDITIES.items()):
+        function = click.option(f"--{role}-validity", metavar="DURATION", help=what)(function)
+    return function
+
+
+_VALIDITIES = {
+    "timestamp": "How long robots accept what is published without hearing more (1d).",
+    "snapshot": "How long the list of versions is valid (7d).",
+    "targets": "How long the lists of releases are valid (90d).",
+    "root": "How long the names of the keys are valid (365d).",
+}
+"""Roles of the metadata of what is published → help of the options for their validity."""
+
+
+@fleet.command("publish")
+@words_argument("[ROOT] PUB", shell_complete=complete_file)
+@click.option(
+    "--root-key",
+    type=PATH,
+    metavar="FILE",
+    help="The root key, if it is not in the keystore; it is created there the first time.",
+)
+@click.option(
+    "--rotate-key",
+    "rotated",
+    type=click.Choice(tuple(_VALIDITIES)),
+    multiple=True,
+    help="Give this role a new key, which needs the root key; repeatable.",
+)
+@_durations
+@click.option(
+    "--restored",
+    is_flag=True,
+    help="Go on although PUB has later releases than the keystore, which was restored.",
+)
+@dry_run_option
+@json_option
+def _publish(
+    words: tuple[str, ...],
+    root_key: Path | None,
+    rotated: tuple[str, ...],
+    restored: bool,
+    dry_run: bool,
+    as_json: bool,
+    **validities: str | None,
+) -> int:
+    """Publish what each robot of the keystore ROOT is to have, in the folder PUB.
+
+    PUB has plain files for any web server, bucket or USB stick, and no private key: for each robot
+    an archive with the files of its enclaves, sealed by the permissions CA, and metadata of The
+    Update Framework, by which `sros agent` on the robot refuses what is old, mixed or forged. Run
+    it after each change, and before the timestamp expires, such as each hour. Unchanged robots keep
+    their archives. Robots that are revoked or left the fleet lose theirs.
+
+    The keys are in ROOT/private. The root key signs only which keys the others are: move it away
+    from the keystore, and name it with --root-key to replace a key, and to renew it each year.
+
+    Example:
+      $ sros fleet publish keystore pub
+      published new releases of 2 robots in 'pub', unchanged: 48 robots
+      robots accept it until 2027-05-22T09:00:00Z: publish again before that
+      $ mv keystore/private/fleet_root.pem /media/safe/
+      $ sros fleet publish keystore pub --rotate-key timestamp
+            --root-key /media/safe/fleet_root.pem
+
+    The exit status is 1 if a robot's release was refused, because an enclave cannot run.
+    """
+    from sros_tool.keystore.delivery.publish import publish
+    from sros_tool.keystore.delivery.published import MetadataExpiry
+    from sros_tool.validity import parse_duration
+
+    root, folder = root_and_file(words, "fleet publish takes a keystore and one folder")
+    given = {
+        name.removesuffix("_validity"): parse_duration(text)
+        for name, text in validities.items()
+        if text is not None
+    }
+    with progress("publishing"):
+        published = publish(
+            root,
+            folder,
+            now=now(),
+            expiry=MetadataExpiry(**given),
+            root_key=root_key,
+            rotate=rotated,
+            restored=restored,
+            keyring=keyring(),
+            dry_run=dry_run,
+        )
+    if as_json:
+        print_json(published)
+    else:
+        for line in _published_lines(published):
+            echo(line)
+    print_notes(published.notes)
+    return 1 if published.names("refused") else 0
+
+
+def _published_lines(published: PublishedFleet) -> Iterator[str]:
+    """Yield what was published, which robots were not, and what to do next."""
+    from sros_tool.validity import iso
+
+    new, kept = (len(published.names(outcome)) for outcome in ("published", "kept"))
+    rest = f", unchanged: {counted(kept, 'robot')}" if kept else ""
+    would = "would publish" if published.dry_run else "published"
+    what = f"{would} new releases of {counted(new, 'robot')}" if new else f"{would} no new release"
+    yield f"{what} in '{published.folder}'{rest}"
+    if removed := published.names("removed"):
+        took = "would remove" if published.dry_run else "removed"
+        yield f"{took} the releases of {first_few(removed, _MOST_GROUPS)}, without enclaves now"
+    for robot in published.robots:
+        if robot.outcome == "refused":
+            keeps = "keeps its earlier release" if robot.number else "has no release"
+            yield f"refused: {robot.robot} {keeps}: {robot.why}"
+    if published.rotated:
+        yield f"new keys: {', '.join(published.rotated)}; robots follow by {published.root.name}"
+    if published.versions.get("timestamp") == 1:
+        yield f"robots pin {published.root}, SHA-256 {published.root_sha256}"
+    if published.expires:
+        end = iso(published.expires["timestamp"])
+        yield f"robots accept it until {end}: publish again before that"
 
 
 @shows(spread=("status",))

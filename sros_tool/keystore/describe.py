@@ -997,7 +997,7 @@ def history(root: Path, *, now: datetime) -> History:
     def status(entry: Entry) -> HistoryStatus:
         if entry.what == GAP:
             return HistoryStatus.DAMAGED
-        if entry.what == "answer":
+        if entry.what in ("answer", "release"):
             return HistoryStatus.SENT
         if entry.what == "settings":
             return HistoryStatus.CURRENT if entry.sha256 in settings else HistoryStatus.REPLACED

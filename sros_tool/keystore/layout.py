@@ -23,6 +23,10 @@ FLEET = "fleet.toml"
 """The robots whose enclaves the keystore has; the file exists only in a keystore with a fleet."""
 CONFIRMED = "confirmed"
 """The folder with the last confirmation of each robot of the fleet."""
+FLEET_ROOT = "fleet_root.json"
+"""All versions of the root metadata of what is published for the fleet (TUF)."""
+PUBLISHED = "published.json"
+"""What was published last for each robot of the fleet, and the versions of the metadata."""
 LEDGER = "ledger.jsonl"
 """The log of issued certificates and documents; keystores of ros2/sros2 do not have it."""
 LEDGER_HEAD = "ledger.p7s"
@@ -123,6 +127,11 @@ def enclave_path(root: Path, name: str) -> Path:
     return root / enclave_folder(name)
 
 
+def fleet_key(role: str) -> str:
+    """Return the path of the private key of a role of what is published, such as ``snapshot``."""
+    return f"{PRIVATE}/fleet_{role}.pem"
+
+
 def key_path(root: Path, place: str) -> Path:
     """Return the path of a CA key's file; ``place`` is ``file:PATH``, or a path in ``root``."""
     return root / place.removeprefix("file:").removeprefix("//")
@@ -136,7 +145,7 @@ def folder_mode(path: str) -> int:
 _EARLIER_CA = ("ca.cert.pem", "ca.key.pem")
 """The CA at the top of a flat keystore, of ros2/sros2 0.6 to 0.8 (ROS 2 Crystal to Eloquent)."""
 
-_TOP_FILES = frozenset((SETTINGS, FLEET, LEDGER, LEDGER_HEAD, ROTATION))
+_TOP_FILES = frozenset((SETTINGS, FLEET, FLEET_ROOT, PUBLISHED, LEDGER, LEDGER_HEAD, ROTATION))
 _OF_IDENTITY = (CERTIFICATE_FILE, KEY_FILE)
 _OF_ENCLAVE = (CERTIFICATE_FILE, *KEY_FILES)
 _FILE_TYPES = (".pem", ".p7s", ".p11", ".xml", ".json5")

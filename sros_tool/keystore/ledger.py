@@ -65,7 +65,8 @@ class Entry(NamedTuple):
     what: str
     """What was issued or done: ``ca``, ``certificate``, ``permissions``, ``governance``, ``crl``,
     ``revocation``, ``answer`` (the signed list of the files sent to a robot), ``settings`` (of the
-    keystore), ``fleet``, or ``gap``: lines before were missing or changed."""
+    keystore), ``fleet``, ``release`` (the list of the robots' releases that were published at the
+    same time), or ``gap``: lines before were missing or changed."""
     enclave: str = ""
     """Name of the enclave; empty if the entry is for no enclave. All later keys are empty, too, if
     they do not apply."""
@@ -86,7 +87,8 @@ class Entry(NamedTuple):
     key: str = ""
     """SHA-256 of the public key (DER) of the certificate, or of the revoked certificate."""
     number: int = 0
-    """Number of an answer (later answers have higher numbers), or last line of a gap; else 0."""
+    """Number of an answer or of releases (later ones have higher numbers), or last line of a gap;
+    else 0."""
     settings: str = ""
     """The settings of the keystore, as TOML."""
     nodes: str = ""

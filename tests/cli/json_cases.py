@@ -151,6 +151,8 @@ def make_inboxes(folder: Path) -> None:
     (folder / "from_fresh/b" / MESSAGE_FILE).write_bytes(b"no message")
     (folder / "from_fresh/stranger").mkdir()
     shutil.copytree(folder / "crew", folder / "unable", symlinks=True)
+    shutil.copytree(folder / "fresh", folder / "edited", symlinks=True)
+    (folder / "edited/enclaves/b/permissions.p7s").write_bytes(b"no message")
     for key in folder.glob("unable/private/*.key.pem"):
         key.unlink()
 
@@ -424,6 +426,13 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("fresh from_fresh", 1, before=("renew fresh /a",)),
         Case("unable from_crew", 2),
     ),
+    "fleet publish": (
+        Case("fresh pub"),
+        Case("fresh pub --dry-run"),
+        Case("fresh pub", before=("fleet publish fresh pub", "revoke fresh /b")),
+        Case("edited pub", 1),
+        Case("fresh pub --rotate-key snapshot", before=("fleet publish fresh pub",)),
+    ),
     "fleet status": (
         Case("fleet", 1),
         Case("fleet --robot a", before=("fleet confirm fleet a.json --robot a",)),
@@ -483,6 +492,7 @@ ERRORS = {
     "agent run": "none --once",
     "agent status": "none",
     "fleet confirm": "fleet b.json --robot a",
+    "fleet publish": "ks pub",
     "fleet collect": "ks good",
     "fleet status": "ks",
     "units": "none /a new",

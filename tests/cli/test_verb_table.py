@@ -171,7 +171,7 @@ STATUS: dict[str, tuple[str, str, str]] = {
 ELSEWHERE = {
     "generate_policy": "tests/graph", "minimize_policy": "tests/policy",
     "audit": "tests/cli/test_audit.py", "doctor": "tests/checks", "run": "tests/runtime",
-    "demo": "tests/demo", "review": "tests/test_pull_requests.py",
+    "demo": "tests/demo", "fleet publish": "tests/agent", "review": "tests/test_pull_requests.py",
 }  # fmt: skip
 """Verbs that need a robot, a repository or another program, and where their status is tested."""
 

@@ -11,6 +11,7 @@ from shlex import quote
 from typing import Annotated, NamedTuple
 
 from sros_tool.errors import KeystoreError, Note
+from sros_tool.faults import Fault
 from sros_tool.files import staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack
@@ -35,7 +36,7 @@ from sros_tool.keystore.outcomes import (
     EnclaveResult,
     enclave_result,
 )
-from sros_tool.keystore.participant import evaluated
+from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
 from sros_tool.keystore.reader import Keystore, OpenedEnclave, open_enclave
 from sros_tool.keystore.selection import no_such_enclave, select_enclaves
 from sros_tool.keystore.transaction.stage import Change
@@ -207,32 +208,85 @@ def exported_files(
                 "It was made on its robot and stays there, so an export could not run.",
                 _ANSWER_AGAIN,
             )
-        folder = enclave_path(root, name)
-        evaluation = evaluated(name, folder, open_enclave(folder, now=now), at=now)
-        state = evaluation.state
+        evaluation = _evaluated(root, name, now)
         if evaluation.problems:
-            raise KeystoreError(
-                f"enclave {name} would not run on a robot",
-                "; ".join(evaluation.problems) + ".",
-                f"See `sros inspect {quote(str(folder))}`.",
-            )
-        _check_zenoh(root, folder, name, state)
-        authorities = (state.identity_ca, state.permissions_ca)
-        if any(
-            authority
-            and state.certificate
-            and authority.public_key() == state.certificate.public_key()
-            for authority in authorities
-        ):
-            raise _holds_ca_key(folder / KEY_FILE)
-        with Folder(root) as opened:
-            for file in (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES):
-                path = f"{enclave_folder(name)}/{file}"
-                if (folder / file).exists():
-                    files[path] = opened.read_inside(path)
-                    if file != KEY_FILE and holds_private_key(files[path]):
-                        raise _holds_ca_key(folder / file)
+            raise _not_running(root, name, evaluation.problems)
+        files |= _files_of(root, name, evaluation)
     return dict(sorted(files.items()))
+
+
+def released_files(root: Path, name: str, now: datetime) -> tuple[dict[str, bytes], str]:
+    """Return the files of an enclave without its key, and what of them is not valid at ``now``.
+
+    An enclave that cannot run only because of the time is still released: its robot may have
+    another that can, and has to get the revocation list.  What is not valid is a clause, or "".
+
+    Raises:
+        KeystoreError: the enclave cannot run for another reason.
+    """
+    evaluation = _evaluated(root, name, now)
+    problems = evaluation.state.problems_at_home
+    lasting = [str(problem) for problem in problems if problem.fault not in _OF_TIME]
+    if lasting or (evaluation.problems and not problems):
+        raise _not_running(root, name, lasting or evaluation.problems)
+    files = _files_of(root, name, evaluation)
+    for file in KEY_FILES:
+        files.pop(f"{enclave_folder(name)}/{file}", None)
+    return files, "; ".join(map(str, problems))
+
+
+_OF_TIME = frozenset(
+    {
+        Fault.CERTIFICATE_EXPIRED,
+        Fault.CERTIFICATE_NOT_YET_VALID,
+        Fault.CA_EXPIRED,
+        Fault.CA_NOT_YET_VALID,
+        Fault.CRL_EXPIRED,
+        Fault.CRL_NOT_YET_VALID,
+        Fault.PERMISSIONS_EXPIRED,
+        Fault.PERMISSIONS_NOT_YET_VALID,
+    }
+)
+"""Faults that files have at one time, and not at another."""
+
+
+def _evaluated(root: Path, name: str, now: datetime) -> EvaluatedEnclave:
+    folder = enclave_path(root, name)
+    return evaluated(name, folder, open_enclave(folder, now=now), at=now)
+
+
+def _not_running(root: Path, name: str, problems: Sequence[str]) -> KeystoreError:
+    return KeystoreError(
+        f"enclave {name} would not run on a robot",
+        "; ".join(problems) + ".",
+        f"See `sros inspect {quote(str(enclave_path(root, name)))}`.",
+    )
+
+
+def _files_of(root: Path, name: str, evaluation: EvaluatedEnclave) -> dict[str, bytes]:
+    """Map the paths of all files of an enclave to their content.
+
+    Raises:
+        KeystoreError: a file has a private key of something else, or a Zenoh configuration cannot
+            be used.
+    """
+    folder, state = enclave_path(root, name), evaluation.state
+    files: dict[str, bytes] = {}
+    _check_zenoh(root, folder, name, state)
+    authorities = (state.identity_ca, state.permissions_ca)
+    if any(
+        authority and state.certificate and authority.public_key() == state.certificate.public_key()
+        for authority in authorities
+    ):
+        raise _holds_ca_key(folder / KEY_FILE)
+    with Folder(root) as opened:
+        for file in (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES):
+            path = f"{enclave_folder(name)}/{file}"
+            if (folder / file).exists():
+                files[path] = opened.read_inside(path)
+                if file != KEY_FILE and holds_private_key(files[path]):
+                    raise _holds_ca_key(folder / file)
+    return files
 
 
 def _check_zenoh(root: Path, folder: Path, name: str, state: OpenedEnclave) -> None:

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 from cryptography import x509
 
-from sros_tool.errors import DocumentError, SrosError
+from sros_tool.errors import DocumentError, SrosError, UnavailableError
 from sros_tool.fleet.robots import name_problem
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, listed_digests, pack, unpack
 from sros_tool.keystore.issuing.authority import Authority
@@ -64,6 +64,18 @@ class Release:
             name, file = _enclave_and_file(path)
             found.setdefault(name, {})[file] = data
         return found
+
+
+def check_tuf() -> None:
+    """Raise `UnavailableError` unless the package ``tuf`` is installed."""
+    try:
+        import tuf.ngclient  # noqa: F401
+    except ImportError as error:
+        raise UnavailableError(
+            "the Python package tuf is not installed",
+            "It signs and verifies what robots fetch.",
+            "Install it: `pip install 'sros_tool[fetch]'`.",
+        ) from error
 
 
 def release_target(robot: str) -> str:

@@ -45,8 +45,10 @@ class KeystoreLock:
     anybody who may read the folder could lock the folder itself.
     """
 
-    def __init__(self, folder: Folder) -> None:
+    def __init__(self, folder: Folder, what: str = "keystore") -> None:
+        """Prepare to lock ``folder``, which is ``what`` in errors."""
         self._folder = folder
+        self._what = what
         self._handle = -1
 
     @property
@@ -69,7 +71,7 @@ class KeystoreLock:
             time.sleep(_PAUSE)
         if not self.held:
             raise KeystoreError(
-                f"keystore '{self._folder.path}' is busy",
+                f"{self._what} '{self._folder.path}' is busy",
                 f"Another process has been writing to it for {wait:.0f} seconds.",
                 "Try again when that process has finished.",
             )
@@ -106,7 +108,7 @@ class KeystoreLock:
         return KeystoreError(
             f"'{self._folder.path / LOCK}' is in the way",
             "It is not a file that sros made.",
-            "Find out who can write to the keystore, and remove it.",
+            "Find out who can write to the folder, and remove it.",
         )
 
     def _is_there(self, handle: int) -> bool:

@@ -1,0 +1,617 @@
+"""Publishing the releases of a fleet's robots in a folder that any web server or stick carries.
+
+What robots see is whole at every moment, by the order of writing: new archives, which nothing
+names yet; the keystore's transaction with ledger, keys and the list of what is published; the
+metadata, whose timestamp comes last.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+from sros_tool.errors import KeystoreError, Note, SrosError
+from sros_tool.files import staged_file, write_new_file
+from sros_tool.folders import Folder, make_folders
+from sros_tool.keystore.delivery.archive import listed_digests
+from sros_tool.keystore.delivery.export import released_files
+from sros_tool.keystore.delivery.published import (
+    MetadataExpiry,
+    PublishedRelease,
+    PublishedRobot,
+    read_published,
+)
+from sros_tool.keystore.delivery.release import (
+    RELEASE_FILES,
+    Release,
+    check_tuf,
+    pack_release,
+    seal_releases,
+)
+from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    FLEET_ROOT,
+    PUBLISHED,
+    enclave_path,
+    fleet_key,
+)
+from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.lifecycle.change import KeystoreChange
+from sros_tool.keystore.outcomes import changes_below
+from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.transaction.recovery import KeystoreLock
+from sros_tool.parallel import map_slices, tick
+from sros_tool.validity import iso
+from sros_tool.values import (
+    DryRun,
+    FileChange,
+    FileChanges,
+    NamedKeystore,
+    Notes,
+    Words,
+    file_change,
+    parse_json,
+)
+from sros_tool.wording import first_few
+from sros_tool.xml import read_bytes
+
+if TYPE_CHECKING:
+    from securesystemslib.signer import CryptoSigner
+
+    from sros_tool.keystore.delivery.repository import Composed, Roots
+    from sros_tool.keystore.issuing.authority import Authority
+
+_ROLES = ("root", "targets", "snapshot", "timestamp")
+_ONLINE = _ROLES[1:]
+"""The roles whose keys have to be in the keystore."""
+_METADATA, _ARCHIVES = "metadata", "targets/robots"
+_KEPT = timedelta(days=2)
+"""How long files stay that nothing names any more: robots may be in the middle of an update."""
+_OURS = re.compile(
+    r"metadata/[0-9]+\.(?:targets|snapshot|robots-[0-9a-f]+)\.json"
+    r"|targets/robots/[0-9a-f]{64}\.[A-Za-z0-9_]+\.tar\.gz"
+)
+"""Paths in a publishing folder that are removed once nothing names them."""
+_BEFORE = "before"
+
+
+class RobotRelease(NamedTuple):
+    """What was done with the release of a robot."""
+
+    robot: str
+    """Name of the robot."""
+    outcome: Annotated[str, Words(("published", "kept", "removed", "refused"))]
+    """``published``: a new release; ``kept``: nothing has changed; ``removed``: it has no enclaves
+    any more, or left the fleet; ``refused``: its earlier release stays, if there is one."""
+    number: int | None
+    """Number of the release that is published; null if none is."""
+    why: str
+    """Why it was refused; else empty."""
+
+
+class PublishedFleet(NamedTuple):
+    """The releases and the metadata that were published."""
+
+    keystore: NamedKeystore
+    dry_run: DryRun
+    folder: Path
+    """The publishing folder, as it was named."""
+    robots: Sequence[RobotRelease]
+    """The robots of the fleet, and those whose releases were removed, sorted by name."""
+    rotated: Sequence[str]
+    """Roles that got a new key."""
+    versions: Mapping[str, int]
+    """Versions of the metadata by name; the bins are ``robots-0`` and so on."""
+    expires: Mapping[str, datetime]
+    """MetadataExpiry of the metadata that was written, by name, in UTC."""
+    root: Path
+    """The root metadata that robots are to pin, in the publishing folder."""
+    root_sha256: str
+    """SHA-256 of the root metadata, in hexadecimal."""
+    changes: FileChanges
+    notes: Notes
+
+    def names(self, outcome: str) -> list[str]:
+        """Return the robots with this outcome."""
+        return [robot.robot for robot in self.robots if robot.outcome == outcome]
+
+
+def publish(
+    root: Path,
+    folder: Path,
+    *,
+    now: datetime,
+    expiry: MetadataExpiry | None = None,
+    root_key: Path | None = None,
+    rotate: Collection[str] = (),
+    restored: bool = False,
+    keyring: Keyring = IN_KEYSTORE,
+    dry_run: bool = False,
+) -> PublishedFleet:
+    """Publish the release of each robot of the fleet in ``folder``, and renew the metadata.
+
+    Args:
+        root: the keystore.
+        folder: the publishing folder, which is made if it is missing.
+        now: the present time.
+        expiry: how long new metadata is valid.
+        root_key: the file of the root key; None: in the keystore.  It is made if there is none yet.
+        rotate: the roles that get new keys.
+        restored: go on although the folder has later releases than the keystore knows.
+        keyring: opens the keys of the CAs.
+        dry_run: write nothing.
+
+    Raises:
+        KeystoreError: the keystore has no fleet, ``folder`` is not its own or is in the way, or
+            it has later releases (without ``restored``), or a key is missing.
+        UnavailableError: the package ``tuf`` is not installed.
+    """
+    check_tuf()
+    keystore = Keystore(root)
+    keystore.check()
+    checked_fleet(keystore)
+    _check_apart(root, folder)
+    with ExitStack() as stack:
+        if not dry_run:
+            for part in (_METADATA, _ARCHIVES):
+                make_folders(folder / part)
+            lock = KeystoreLock(stack.enter_context(Folder(folder)), "publishing folder")
+            stack.callback(lock.release)
+            lock.acquire()
+        run = _Run(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
+        run.check_numbers(restored)
+        keys = _Keys(run.roots, root, root_key)
+        keys.open(rotate, now, run.expiry)
+        if run.changed() or keys.new or keys.has_new_root:
+            with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
+                run.keystore = change.keystore
+                run.release(change)
+                run.compose(keys)
+                run.stage(change, keys)
+                change.record()
+                change.transaction.commit()
+                run.keep_changes(change)
+        else:
+            run.compose(keys)
+            run.keep_list()
+        if not dry_run:
+            run.write(keys)
+        return run.result(keys)
+
+
+def _check_apart(root: Path, folder: Path) -> None:
+    """Raise `KeystoreError` if keystore and publishing folder are in one another."""
+    inner, outer = (Path(os.path.realpath(path)) for path in (folder, root))
+    if inner.is_relative_to(outer) or outer.is_relative_to(inner):
+        raise KeystoreError(
+            f"'{folder}' and the keystore '{root}' are in one another",
+            "What is published is for everybody, and the keystore has private keys.",
+            "Choose another folder.",
+        )
+
+
+class _Keys:
+    """The keys of the roles, and the versions of the root metadata that name them."""
+
+    def __init__(self, roots: Roots, root: Path, root_key: Path | None) -> None:
+        """Prepare the keys of the keystore ``root``, whose root key may be at ``root_key``."""
+        self.roots = roots
+        self.signers: dict[str, list[CryptoSigner]] = {}
+        self.new: dict[str, bytes] = {}
+        self.has_new_root = False
+        self.rotated: tuple[str, ...] = ()
+        self.notes: list[Note] = []
+        self._root = root
+        self._elsewhere = root_key
+        self._new_elsewhere = b""
+
+    def open(self, rotate: Collection[str], now: datetime, expiry: MetadataExpiry) -> None:
+        """Open or make the key of each role, and add a version of the root if they change.
+
+        Raises:
+            KeystoreError: a key is missing, or is not the one that the root metadata names.
+        """
+        first = not self.roots.versions
+        if first and (there := [role for role in _ROLES if self._path(role).exists()]):
+            raise KeystoreError(
+                f"'{self._root}' has the {there[0]} key of what it publishes, but no {FLEET_ROOT}",
+                "It says which keys robots trust.",
+                f"Restore {FLEET_ROOT} from a backup.",
+            )
+        self.rotated = () if first else tuple(role for role in _ROLES if role in rotate)
+        for role in _ONLINE:
+            self.signers[role] = self._online(role, new=first or role in rotate)
+        left = expiry.root if first else self.roots.last.expires - now
+        if first or rotate or left < expiry.root / 3:
+            self._sign_root(now + expiry.root, new=first or "root" in rotate, must=bool(rotate))
+        if left < expiry.root / 3 and not self.has_new_root:
+            text = (
+                f"the root metadata expires at {iso(self.roots.last.expires)}, and robots then "
+                "refuse everything: publish with --root-key FILE before"
+            )
+            self.notes.append(Note("fleet.root-expires", text))
+
+    def _path(self, role: str) -> Path:
+        return self._root / fleet_key(role)
+
+    def _online(self, role: str, *, new: bool) -> list[CryptoSigner]:
+        """Return the signer of a role, and the one before while robots may still ask for it."""
+        from sros_tool.keystore.delivery.repository import load_signer, new_key, replaced_key
+
+        path, before = self._path(role), self._path(f"{role}.{_BEFORE}")
+        if new:
+            self.new[fleet_key(role)] = made = new_key()
+            signers = [load_signer(made, "the new key")]
+            if path.exists():
+                old = read_bytes(path, "key")
+                self.new[fleet_key(f"{role}.{_BEFORE}")] = old
+                signers.append(load_signer(old, f"'{path}'"))
+            return signers
+        if not path.exists():
+            raise KeystoreError(f"'{path}' is missing", "", replaced_key(role))
+        signers = [load_signer(read_bytes(path, "key"), f"'{path}'")]
+        self.roots.check_signer(role, signers[0], path)
+        if before.exists():
+            signers.append(load_signer(read_bytes(before, "key"), f"'{before}'"))
+        return signers
+
+    def _sign_root(self, expires: datetime, *, new: bool, must: bool) -> None:
+        """Add a version of the root, if its key is here; ``new`` makes another root key."""
+        from sros_tool.keystore.delivery.repository import load_signer, new_key
+
+        path = self._elsewhere or self._path("root")
+        keys = []
+        if path.exists():
+            keys.append(load_signer(read_bytes(path, "root key"), f"'{path}'"))
+            if self.roots.versions:
+                self.roots.check_signer("root", keys[0], path)
+        elif self.roots.versions:
+            if must or self._elsewhere:
+                raise KeystoreError(
+                    f"the root key '{path}' does not exist",
+                    "It has to sign which keys robots trust.",
+                    "Name its file with --root-key.",
+                )
+            return
+        if new and (self.roots.versions or not keys):
+            made = new_key()
+            if self._elsewhere:
+                self._new_elsewhere = made
+            else:
+                self.new[fleet_key("root")] = made
+            keys.append(load_signer(made, "the new key"))
+        named = {role: signers[0] for role, signers in self.signers.items()}
+        self.roots.add({"root": keys[-1], **named}, keys, expires.replace(microsecond=0))
+        self.has_new_root = True
+
+    def stage_elsewhere(self) -> None:
+        """Write a new root key that is not in the keystore, next to the one before."""
+        if self._new_elsewhere and self._elsewhere:
+            write_new_file(self._beside(self._elsewhere), self._new_elsewhere)
+
+    def finish(self) -> None:
+        """Put a new root key that is elsewhere in its place, and remove the keys of before."""
+        if self._new_elsewhere and self._elsewhere and self._elsewhere.exists():
+            with staged_file(self._elsewhere, self._new_elsewhere) as put_in_place:
+                put_in_place()
+            with Folder(self._elsewhere.parent) as folder:
+                folder.unlink(self._beside(self._elsewhere).name)
+        with Folder(self._root) as folder:
+            for role in _ONLINE:
+                folder.unlink(fleet_key(f"{role}.{_BEFORE}"), missing_ok=True)
+
+    def _beside(self, path: Path) -> Path:
+        """Return where a new root key is until it is in use; the first is there at once."""
+        return path.with_name(f"{path.name}.new") if path.exists() else path
+
+
+class _Changed(NamedTuple):
+    """A robot whose files may have changed: its enclaves, and a digest of its files' state."""
+
+    robot: str
+    enclaves: Sequence[str]
+    state: str
+
+
+class _Made(NamedTuple):
+    """What came of a robot's release; ``published`` is None if it was refused."""
+
+    robot: str
+    published: PublishedRobot | None
+    is_new: bool = False
+    why: str = ""
+    not_valid: str = ""
+
+
+class _Run:
+    """One run of `publish`: what is there, what is to be, and the writing."""
+
+    def __init__(
+        self, keystore: Keystore, folder: Path, now: datetime, expiry: MetadataExpiry, dry_run: bool
+    ) -> None:
+        """Read what was published, and what is in the folder."""
+        from sros_tool.keystore.delivery.repository import Roots, read_present
+
+        self.keystore = keystore
+        self.expiry = expiry
+        self.list = read_published(keystore)
+        documents = ()
+        if keystore.has(FLEET_ROOT):
+            documents = parse_json(keystore.read(FLEET_ROOT, "root metadata"))["roots"]
+        self.roots = Roots(documents)
+        self._folder = folder
+        self._now = now
+        self._dry_run = dry_run
+        self._present = read_present(folder, self.roots)
+        self._there = self._present.releases()
+        self._composed: Composed | None = None
+        self._made: list[_Made] = []
+        self._removed: list[str] = []
+        self._number = 0
+        self._changes: Sequence[FileChange] = ()
+        self._notes: list[Note] = []
+
+    def check_numbers(self, restored: bool) -> None:
+        """Refuse a folder with later releases than the keystore knows, unless it is ``restored``.
+
+        Raises:
+            KeystoreError: the keystore was restored from a backup.
+        """
+        latest = max((release.number for release in self._there.values()), default=0)
+        if latest <= self.list.number or latest < self.keystore.ledger.next_number():
+            return
+        if not restored:
+            robots = [robot for robot, there in self._there.items() if there.number == latest]
+            raise KeystoreError(
+                f"'{self._folder}' has later releases than the keystore '{self.keystore.root}' "
+                f"knows: {first_few(robots, 3)} with the number {latest}",
+                "The keystore was restored from a backup, or is a copy. What was changed since, "
+                "such as a revocation, would be undone.",
+                "Restore a later backup. If there is none, repeat what was changed, above all "
+                "revocations, and then add --restored.",
+            )
+        self.list.robots.clear()
+        self._number = latest
+
+    # ── which robots ───────────────────────────────────────────────────────────────────────
+
+    def changed(self) -> list[_Changed]:
+        """Return the robots that may need a new release; forget those that have no enclaves."""
+        root, fleet = self.keystore.root, recorded_fleet(self.keystore)
+        found, wanted = [], set()
+        for robot in fleet.robots.values():
+            names = [
+                name
+                for name in enclaves_of_robot(root, fleet, robot)
+                if (enclave_path(root, name) / CERTIFICATE_FILE).exists()
+            ]
+            if not names:
+                continue
+            wanted.add(robot.name)
+            state = _state(root, names)
+            before = self.list.robots.get(robot.name)
+            if not before or before.files != state or not self._has(robot.name, before.release):
+                found.append(_Changed(robot.name, names, state))
+        for name in self.list.robots.keys() - wanted:
+            del self.list.robots[name]
+        self._removed = sorted(self._there.keys() - wanted)
+        return found
+
+    def _has(self, robot: str, release: PublishedRelease) -> bool:
+        """Return whether the folder has the archive of a release."""
+        try:
+            return (self._folder / release.path(robot)).stat().st_size == release.length
+        except OSError:
+            return False
+
+    # ── their releases ─────────────────────────────────────────────────────────────────────
+
+    def release(self, change: KeystoreChange) -> None:
+        """Make and write the archives of new releases, which nothing names yet."""
+        changed = self.changed()
+        number = max(change.ledger.next_number(), self._number + 1)
+        authority = None if self._dry_run or not changed else change.permissions
+
+        def work(part: Sequence[_Changed]) -> list[_Made]:
+            return list(self._release_all(part, number, authority))
+
+        alone = authority is not None and authority.on_token
+        made = [(changed, work(changed))] if alone else map_slices(changed, work)
+        self._made = [robot for _, part in made for robot in part]
+        lines = []
+        for robot, published, is_new, _, not_valid in self._made:
+            if published:
+                self.list.robots[robot] = published
+            if published and is_new:
+                lines.append(f"{published.release.sha256}  {robot}\n")
+            if not_valid:
+                text = f"{robot}: published although it is not valid now: {not_valid}"
+                self._notes.append(Note("fleet.release-not-valid", text))
+        if lines:
+            digest = hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
+            change.entries.append(Entry(iso(self._now), "release", sha256=digest, number=number))
+
+    def _release_all(
+        self, robots: Sequence[_Changed], number: int, authority: Authority | None
+    ) -> Iterator[_Made]:
+        """Yield what came of each robot; without ``authority`` nothing is sealed and written."""
+        new: list[tuple[_Changed, dict[str, bytes], str, str]] = []
+        for robot in robots:
+            files: dict[str, bytes] = {}
+            problems = []
+            try:
+                for name in robot.enclaves:
+                    of_enclave, problem = released_files(self.keystore.root, name, self._now)
+                    files |= of_enclave
+                    problems += [f"{name}: {problem}"] if problem else []
+            except SrosError as error:
+                yield _Made(robot.robot, None, why=str(error))
+                continue
+            files = dict(sorted(files.items()))
+            content = hashlib.sha256(listed_digests(files)).hexdigest()
+            before = self.list.robots.get(robot.robot)
+            if before and before.content == content and self._has(robot.robot, before.release):
+                yield _Made(robot.robot, before._replace(files=robot.state))
+            else:
+                new.append((robot, files, content, "; ".join(problems)))
+            tick()
+        if authority is None:
+            for robot, _, content, not_valid in new:
+                planned = PublishedRobot(
+                    PublishedRelease(number, "0" * 64, 0), content, robot.state
+                )
+                yield _Made(robot.robot, planned, is_new=True, not_valid=not_valid)
+            return
+        seals = seal_releases(
+            [(robot.robot, number, files) for robot, files, _, _ in new], authority
+        )
+        with Folder(self._folder) as folder:
+            for (robot, files, content, not_valid), seal in zip(new, seals, strict=True):
+                data = pack_release(Release(robot.robot, number, files, seal))
+                digest = hashlib.sha256(data).hexdigest()
+                release = PublishedRelease(number, digest, len(data))
+                _put(folder, release.path(robot.robot), data)
+                published = PublishedRobot(release, content, robot.state)
+                yield _Made(robot.robot, published, is_new=True, not_valid=not_valid)
+
+    # ── metadata ───────────────────────────────────────────────────────────────────────────
+
+    def compose(self, keys: _Keys) -> None:
+        """Make the metadata, and note which files it no longer names."""
+        from sros_tool.keystore.delivery.repository import Composer
+
+        composer = Composer(
+            self._present,
+            keys.signers,
+            known=self.list.versions,
+            expiry=self.expiry,
+            now=self._now,
+        )
+        releases = {name: robot.release for name, robot in self.list.robots.items()}
+        self._composed = composer.compose(releases)
+        self.list.versions = dict(self._composed.versions)
+        needed = {release.path(robot) for robot, release in releases.items()}
+        needed |= {f"{_METADATA}/{version}.{n}.json" for n, version in self.list.versions.items()}
+        self.list.superseded = {
+            path: self.list.superseded.get(path, self._now)
+            for path in self._paths()
+            if path not in needed
+        }
+
+    def _paths(self) -> Iterator[str]:
+        """Yield the paths in the folder of files that may be removed one day."""
+        if not (self._folder / _ARCHIVES).exists():
+            return  # a dry run before anything was published
+        with Folder(self._folder) as folder:
+            for part in (_METADATA, _ARCHIVES):
+                paths = (f"{part}/{name}" for name in folder.names(part))
+                yield from (path for path in paths if _OURS.fullmatch(path))
+
+    def stage(self, change: KeystoreChange, keys: _Keys) -> None:
+        """Stage the keys, the versions of the root, and the list of what is published."""
+        if not self._dry_run:
+            keys.stage_elsewhere()
+        for path, data in keys.new.items():
+            change.transaction.write(path, data, private=True)
+        if keys.has_new_root:
+            document = json.dumps({"roots": self.roots.as_json()}, indent=1).encode()
+            change.transaction.write(FLEET_ROOT, document)
+        change.transaction.write(PUBLISHED, self.list.document(self._now))
+
+    def keep_list(self) -> None:
+        """Write the list of what is published, where nothing else of the keystore changes."""
+        path = self.keystore.root / PUBLISHED
+        self._changes = file_change(path, existed=True)
+        if not self._dry_run:
+            with staged_file(path, self.list.document(self._now)) as put_in_place:
+                put_in_place()
+
+    def keep_changes(self, change: KeystoreChange) -> None:
+        """Note the changes of the keystore, once they are committed."""
+        self._changes = changes_below(self.keystore.root, change.transaction.changes)
+
+    def write(self, keys: _Keys) -> None:
+        """Write the metadata, the timestamp last; then remove what nothing has named for long.
+
+        A new root comes first if what is there follows it already, else after the metadata, which
+        the keys of both roots have signed: so robots find whole metadata at every moment.
+        """
+        assert self._composed
+        with Folder(self._folder) as folder:
+            roots = [file for file in self.roots.files() if not folder.state(file[0])]
+            late = [] if self._present.follows(self.roots.last) else roots
+            *files, timestamp = self._composed.files
+            for path, data in (*([] if late else roots), *files):
+                _put(folder, path, data)
+            folder.flush_file_system()
+            _put(folder, *timestamp)
+            for path, data in late:
+                _put(folder, path, data)
+            folder.flush_file_system()
+            for path, since in self.list.superseded.items():
+                if self._now - since >= _KEPT:
+                    folder.unlink(path, missing_ok=True)
+        keys.finish()
+
+    # ── the result ─────────────────────────────────────────────────────────────────────────
+
+    def result(self, keys: _Keys) -> PublishedFleet:
+        """Return what was done."""
+        outcomes = {robot: RobotRelease(robot, "removed", None, "") for robot in self._removed}
+        for robot, kept in self.list.robots.items():
+            outcomes[robot] = RobotRelease(robot, "kept", kept.release.number, "")
+        for robot, published, is_new, why, _ in self._made:
+            before = self._there.get(robot)
+            if published is None:
+                number = before.number if before else None
+                outcomes[robot] = RobotRelease(robot, "refused", number, why)
+            elif is_new:
+                number = published.release.number
+                outcomes[robot] = RobotRelease(robot, "published", number, "")
+        path, data = list(self.roots.files())[-1]
+        return PublishedFleet(
+            self.keystore.root,
+            self._dry_run,
+            self._folder,
+            [outcomes[robot] for robot in sorted(outcomes)],
+            keys.rotated,
+            dict(sorted(self.list.versions.items())),
+            dict(self._composed.expires) if self._composed else {},
+            self._folder / path,
+            hashlib.sha256(data).hexdigest(),
+            self._changes,
+            (*self._notes, *keys.notes),
+        )
+
+
+def _state(root: Path, names: Sequence[str]) -> str:
+    """Return a digest of inode, size and times of all files in the releases of enclaves."""
+    digest = hashlib.sha256()
+    for name in names:
+        folder = os.fspath(enclave_path(root, name))
+        for file in sorted(RELEASE_FILES):
+            try:
+                there = os.stat(f"{folder}/{file}")  # noqa: PTH116 - faster, of very many files
+            except OSError:
+                continue
+            times = there.st_mtime_ns, there.st_ctime_ns
+            digest.update(f"{name}\0{file}\0{there.st_ino} {there.st_size} {times}\n".encode())
+    return digest.hexdigest()
+
+
+def _put(folder: Folder, path: str, data: bytes) -> None:
+    """Write a file of the publishing folder, whole or not at all."""
+    parent, _, name = path.rpartition("/")
+    spare = f"{parent}/.{name}.new"
+    folder.unlink(spare, missing_ok=True)
+    folder.write(spare, data, 0o644)
+    folder.replace(spare, path)

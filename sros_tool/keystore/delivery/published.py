@@ -1,0 +1,127 @@
+"""What was published last for a fleet, as the keystore records it in ``published.json``.
+
+The file saves work and keeps versions rising; what robots trust never rests on it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from typing import Any, NamedTuple
+
+from sros_tool.errors import DocumentError
+from sros_tool.keystore.delivery.release import release_target
+from sros_tool.keystore.layout import PUBLISHED
+from sros_tool.keystore.reader import Keystore
+from sros_tool.validity import iso, parse_iso
+from sros_tool.values import parse_json
+from sros_tool.xml import read_bytes
+
+_FORMAT = 1
+_MOST_BYTES = 128 * 1024 * 1024
+
+
+class PublishedRelease(NamedTuple):
+    """The archive of a robot's release as the metadata describes it."""
+
+    number: int
+    """Number of the release."""
+    sha256: str
+    """SHA-256 of the archive, in hexadecimal."""
+    length: int
+    """Size of the archive in bytes."""
+
+    def path(self, robot: str) -> str:
+        """Return the path of the archive in the publishing folder."""
+        folder, _, name = release_target(robot).rpartition("/")
+        return f"targets/{folder}/{self.sha256}.{name}"
+
+
+class PublishedRobot(NamedTuple):
+    """What was published last for a robot, and what it was made from.
+
+    ``content`` is the SHA-256 of the list of its files, ``files`` a digest of the state of these
+    files in the keystore (inode, size and times), by which an unchanged robot is known.
+    """
+
+    release: PublishedRelease
+    content: str
+    files: str
+
+
+@dataclass
+class Published:
+    """What was published last: by robot, and the versions of the metadata by name.
+
+    ``superseded`` maps paths in the publishing folder that nothing names any more to the time when
+    that was first seen.
+    """
+
+    robots: dict[str, PublishedRobot] = field(default_factory=dict)
+    versions: dict[str, int] = field(default_factory=dict)
+    superseded: dict[str, datetime] = field(default_factory=dict)
+
+    @property
+    def number(self) -> int:
+        """The highest number of a release; 0 without one."""
+        return max((robot.release.number for robot in self.robots.values()), default=0)
+
+    def document(self, now: datetime) -> bytes:
+        """Return the content of the file."""
+        robots = {
+            name: {**robot.release._asdict(), "content": robot.content, "files": robot.files}
+            for name, robot in sorted(self.robots.items())
+        }
+        superseded = {path: iso(time) for path, time in sorted(self.superseded.items())}
+        value = {
+            "format": _FORMAT,
+            "time": iso(now),
+            "versions": dict(sorted(self.versions.items())),
+        }
+        return json.dumps({**value, "superseded": superseded, "robots": robots}).encode()
+
+
+def read_published(keystore: Keystore) -> Published:
+    """Return what was published last; empty if nothing was.
+
+    Raises:
+        DocumentError: the file is damaged.
+    """
+    if not keystore.has(PUBLISHED):
+        return Published()
+    try:
+        path, what = keystore.root / PUBLISHED, "list of what is published"
+        value = parse_json(read_bytes(path, what, most=_MOST_BYTES))
+        return Published(
+            {name: _robot(each) for name, each in value["robots"].items()},
+            {name: int(version) for name, version in value["versions"].items()},
+            {path: parse_iso(time) for path, time in value["superseded"].items()},
+        )
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DocumentError(
+            f"'{keystore.root / PUBLISHED}' is damaged",
+            "",
+            "Restore it from a backup. If there is none, remove it: all robots then get their "
+            "releases again, with new numbers.",
+        ) from error
+
+
+def _robot(value: Mapping[str, Any]) -> PublishedRobot:
+    release = PublishedRelease(int(value["number"]), str(value["sha256"]), int(value["length"]))
+    return PublishedRobot(release, str(value["content"]), str(value["files"]))
+
+
+class MetadataExpiry(NamedTuple):
+    """How long published metadata of each role is valid."""
+
+    root: timedelta = timedelta(days=365)
+    targets: timedelta = timedelta(days=90)
+    snapshot: timedelta = timedelta(days=7)
+    timestamp: timedelta = timedelta(days=1)
+
+    def of(self, name: str) -> timedelta:
+        """Return how long the metadata ``name`` is valid; bins are like targets."""
+        of_roles: dict[str, timedelta] = self._asdict()
+        return of_roles.get(name, self.targets)

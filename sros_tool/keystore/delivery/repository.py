@@ -1,0 +1,391 @@
+"""The metadata of The Update Framework (TUF) in a publishing folder: reading and writing it.
+
+Top-level targets delegates to bins, each with the releases of about 32 robots, so that a robot
+transfers little.  All files but the timestamp have their version in the name and are never changed;
+robots read the timestamp first, so it is written last: whoever stops the writing leaves what was
+there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from math import ceil, log2
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from securesystemslib.signer import CryptoSigner
+from tuf.api.exceptions import RepositoryError
+from tuf.api.metadata import (
+    Delegations,
+    Metadata,
+    MetaFile,
+    Root,
+    Snapshot,
+    SuccinctRoles,
+    TargetFile,
+    Targets,
+    Timestamp,
+)
+from tuf.api.serialization.json import JSONSerializer
+
+from sros_tool.errors import DocumentError, KeystoreError, PkiError
+from sros_tool.folders import Folder
+from sros_tool.keystore.delivery.published import MetadataExpiry, PublishedRelease
+from sros_tool.keystore.delivery.release import release_target
+
+_ROOT, _TARGETS, _SNAPSHOT, _TIMESTAMP = Root.type, Targets.type, Snapshot.type, Timestamp.type
+_METADATA = "metadata"
+"""The folder of the metadata in a publishing folder."""
+_BINS = "robots"
+_ROBOTS_OF_A_BIN = 32
+_MOST_BYTES = 8 * 1024 * 1024
+
+_Content = TypeVar("_Content", Root, Targets, Snapshot, Timestamp)
+
+
+# ── keys ───────────────────────────────────────────────────────────────────────────────────
+
+
+def new_key() -> bytes:
+    """Return a new Ed25519 key (PEM, PKCS #8)."""
+    return Ed25519PrivateKey.generate().private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+
+
+def load_signer(data: bytes, what: str) -> CryptoSigner:
+    """Return the signer with an Ed25519 key (PEM); ``what`` names its file in errors."""
+    try:
+        key = serialization.load_pem_private_key(data, None)
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        raise PkiError(f"{what} is not a private key without passphrase") from error
+    if not isinstance(key, Ed25519PrivateKey):
+        raise PkiError(f"{what} is not an Ed25519 key", "", "Name the key that sros made.")
+    return CryptoSigner(key)
+
+
+def replaced_key(role: str) -> str:
+    """Return the remedy for the key of a role that is lost, as a sentence."""
+    return f"Restore it from a backup, or make another with --rotate-key {role}."
+
+
+# ── root ───────────────────────────────────────────────────────────────────────────────────
+
+
+class Roots:
+    """The versions of the root metadata, oldest first, each signed by the keys of the one before.
+
+    A robot that knows any of them gets to the last one.
+    """
+
+    def __init__(self, documents: Sequence[Mapping[str, object]] = ()) -> None:
+        """Read the versions from their JSON values.
+
+        Raises:
+            DocumentError: they are not a chain of root metadata.
+        """
+        self.versions: list[Metadata[Root]] = []
+        try:
+            for number, document in enumerate(documents, 1):
+                version = Metadata[Root].from_dict(dict(document))
+                if not isinstance(version.signed, Root) or version.signed.version != number:
+                    raise RepositoryError("a version is missing")
+                for signer in (*self.versions[-1:], version):
+                    _verify(signer.signed, _ROOT, version)
+                self.versions.append(version)
+        except (RepositoryError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise DocumentError("it is not a chain of root metadata", f"{error}.") from error
+
+    @property
+    def last(self) -> Root:
+        """The present root metadata."""
+        return self.versions[-1].signed
+
+    def as_json(self) -> list[dict[str, object]]:
+        """Return the JSON values of all versions."""
+        return [version.to_dict() for version in self.versions]
+
+    def files(self) -> Iterator[tuple[str, bytes]]:
+        """Yield path in the publishing folder and content of each version."""
+        for version in self.versions:
+            yield f"{_METADATA}/{version.signed.version}.{_ROOT}.json", _bytes(version)
+
+    def add(
+        self, signers: Mapping[str, CryptoSigner], keys: Sequence[CryptoSigner], expires: datetime
+    ) -> None:
+        """Add a version that names the keys of ``signers`` by role, signed by ``keys``."""
+        number = self.last.version + 1 if self.versions else 1
+        root = Root(version=number, expires=expires, consistent_snapshot=True)
+        for role, signer in signers.items():
+            root.add_key(signer.public_key, role)
+        version = Metadata(root)
+        for key in keys:
+            version.sign(key, append=True)
+        self.versions.append(version)
+
+    def check_signer(self, role: str, signer: CryptoSigner, path: Path) -> None:
+        """Raise `KeystoreError` unless the key of ``signer``, at ``path``, is that of ``role``."""
+        if signer.public_key.keyid not in self.last.roles[role].keyids:
+            raise KeystoreError(
+                f"'{path}' is not the {role} key of what this keystore publishes",
+                "Robots would refuse what it signs.",
+                "Name the right file with --root-key." if role == _ROOT else replaced_key(role),
+            )
+
+    def verify(
+        self, role: str, metadata: Metadata[Timestamp] | Metadata[Snapshot] | Metadata[Targets]
+    ) -> None:
+        """Raise `RepositoryError` unless the keys of any version signed ``metadata``."""
+        for version in reversed(self.versions):
+            if _is_signed(version.signed, role, metadata):
+                return
+        raise RepositoryError(f"no root metadata names the keys that signed {role}")
+
+
+def _verify(
+    delegator: Root | Targets,
+    role: str,
+    metadata: Metadata[Root] | Metadata[Timestamp] | Metadata[Snapshot] | Metadata[Targets],
+) -> None:
+    delegator.verify_delegate(role, metadata.signed_bytes, metadata.signatures)
+
+
+def _is_signed(
+    delegator: Root | Targets,
+    role: str,
+    metadata: Metadata[Timestamp] | Metadata[Snapshot] | Metadata[Targets],
+) -> bool:
+    try:
+        _verify(delegator, role, metadata)
+    except (RepositoryError, ValueError):
+        return False
+    return True
+
+
+# ── what is there ──────────────────────────────────────────────────────────────────────────
+
+
+@dataclass
+class Present:
+    """The metadata in a publishing folder, as its timestamp leads to it; empty without one."""
+
+    timestamp: Metadata[Timestamp] | None = None
+    snapshot: Metadata[Snapshot] | None = None
+    snapshot_file: bytes = b""
+    targets: Metadata[Targets] | None = None
+    bins: dict[str, Metadata[Targets]] = field(default_factory=dict)
+
+    def versions(self) -> dict[str, int]:
+        """Map the names of all metadata to their versions."""
+        if not (self.timestamp and self.snapshot):
+            return {}
+        parts = {_TIMESTAMP: self.timestamp.signed.version, _SNAPSHOT: self.snapshot.signed.version}
+        meta = self.snapshot.signed.meta.items()
+        return parts | {name.removesuffix(".json"): file.version for name, file in meta}
+
+    def releases(self) -> dict[str, PublishedRelease]:
+        """Map robots to their releases."""
+        begin, end = release_target("*").split("*")
+        return {
+            path.removeprefix(begin).removesuffix(end): PublishedRelease(
+                target.custom["number"], target.hashes["sha256"], target.length
+            )
+            for each in self.bins.values()
+            for path, target in each.signed.targets.items()
+        }
+
+    def follows(self, root: Root) -> bool:
+        """Return whether a robot that knows ``root`` accepts the metadata."""
+        parts = ((_TIMESTAMP, self.timestamp), (_SNAPSHOT, self.snapshot), (_TARGETS, self.targets))
+        return all(part is not None and _is_signed(root, role, part) for role, part in parts)
+
+
+def read_present(folder: Path, roots: Roots) -> Present:
+    """Return the metadata in a publishing folder, after verifying it by any version of the root.
+
+    Raises:
+        KeystoreError: the folder has metadata that the keys of this keystore did not sign, or that
+            is damaged.
+    """
+    try:
+        with Folder(folder) as opened:
+            if not opened.is_folder(_METADATA) or not opened.state(
+                f"{_METADATA}/{_TIMESTAMP}.json"
+            ):
+                return Present()
+            return _read_present(opened, roots)
+    except FileNotFoundError as error:
+        if not folder.exists():
+            return Present()
+        raise _not_ours(folder, f"'{error.filename}' is missing") from error
+    except OSError as error:
+        raise _not_ours(folder, f"'{error.filename}': {error.strerror}") from error
+    except (RepositoryError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise _not_ours(folder, str(error)) from error
+
+
+def _not_ours(folder: Path, why: str) -> KeystoreError:
+    return KeystoreError(
+        f"'{folder}' has metadata that this keystore did not write",
+        f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
+        "Name another folder; or, if it is the folder of this keystore and was damaged, remove its "
+        f"folder {_METADATA}, and publish again.",
+    )
+
+
+def _read_present(folder: Folder, roots: Roots) -> Present:
+    timestamp = _read(folder, Timestamp, _TIMESTAMP)
+    roots.verify(_TIMESTAMP, timestamp)
+    described = timestamp.signed.snapshot_meta
+    snapshot = _read(folder, Snapshot, _SNAPSHOT, described.version)
+    file = folder.read(f"{_METADATA}/{described.version}.{_SNAPSHOT}.json", most=_MOST_BYTES)
+    described.verify_length_and_hashes(file)
+    roots.verify(_SNAPSHOT, snapshot)
+    meta = snapshot.signed.meta
+    targets = _read(folder, Targets, _TARGETS, meta[f"{_TARGETS}.json"].version)
+    roots.verify(_TARGETS, targets)
+    bins = {}
+    roles = targets.signed.delegations and targets.signed.delegations.succinct_roles
+    for name in roles.get_roles() if roles else ():
+        bins[name] = _read(folder, Targets, name, meta[f"{name}.json"].version)
+        _verify(targets.signed, name, bins[name])
+    return Present(timestamp, snapshot, file, targets, bins)
+
+
+def _read(
+    folder: Folder, kind: type[_Content], role: str, version: int | None = None
+) -> Metadata[_Content]:
+    name = f"{role}.json" if version is None else f"{version}.{role}.json"
+    data = folder.read(f"{_METADATA}/{name}", most=_MOST_BYTES)
+    metadata = Metadata[_Content].from_bytes(data)
+    if not isinstance(metadata.signed, kind):
+        raise RepositoryError(f"{name} is metadata of another kind")
+    return metadata
+
+
+# ── what is to be ──────────────────────────────────────────────────────────────────────────
+
+
+class Composed(NamedTuple):
+    """New metadata: the files in the order in which they have to be written, and all versions."""
+
+    files: Sequence[tuple[str, bytes]]
+    versions: Mapping[str, int]
+    expires: Mapping[str, datetime]
+
+
+class Composer:
+    """Makes the metadata for releases, and keeps what is there and still fits.
+
+    ``signers`` has the signers of each role: the present one, and during its rotation also the one
+    before, whose signature robots ask for that do not know the new root yet.
+    """
+
+    def __init__(
+        self,
+        present: Present,
+        signers: Mapping[str, Sequence[CryptoSigner]],
+        *,
+        known: Mapping[str, int],
+        expiry: MetadataExpiry,
+        now: datetime,
+    ) -> None:
+        """Prepare to compose.
+
+        Args:
+            present: what is in the publishing folder.
+            signers: by role, the present one first.
+            known: the versions that were published before, as far as the keystore knows.
+            expiry: how long new metadata is valid.
+            now: the present time.
+        """
+        self._present = present
+        self._signers = signers
+        self._now = now.replace(microsecond=0)
+        self._expiry = expiry
+        there = present.versions()
+        names = {*there, *known}
+        self.versions = {name: max(there.get(name, 0), known.get(name, 0)) for name in names}
+        self._files: list[tuple[str, bytes]] = []
+        self._expires: dict[str, datetime] = {}
+
+    def compose(self, releases: Mapping[str, PublishedRelease]) -> Composed:
+        """Return the metadata for ``releases``, by robot."""
+        roles = self._roles(len(releases))
+        targets: dict[str, dict[str, TargetFile]] = {name: {} for name in roles.get_roles()}
+        for robot, release in sorted(releases.items()):
+            path = release_target(robot)
+            more = {"custom": {"number": release.number}}
+            hashes = {"sha256": release.sha256}
+            targets[roles.get_role_for_target(path)][path] = TargetFile(
+                release.length, hashes, path, more
+            )
+        before = self._present.targets
+        key = self._signers[_TARGETS][0].public_key
+        for name, content in targets.items():
+            old = self._present.bins.get(name)
+            same_key = old is not None and key.keyid in old.signatures
+            if not (same_key and old and old.signed.targets == content and self._lasts(old)):
+                self._add(name, Targets(targets=content), self._signers[_TARGETS][:1])
+        delegations = Delegations({key.keyid: key}, succinct_roles=roles)
+        if not (before and before.signed.delegations == delegations and self._kept(before)):
+            self._add(_TARGETS, Targets(delegations=delegations), self._signers[_TARGETS])
+        self._add_snapshot()
+        return Composed(self._files, self.versions, self._expires)
+
+    def _roles(self, robots: int) -> SuccinctRoles:
+        """Return the bins; their number grows with the fleet, to at most twice what is wanted."""
+        bits = max(1, ceil(log2(max(1, robots / _ROBOTS_OF_A_BIN))))
+        before = self._present.targets and self._present.targets.signed.delegations
+        if before and before.succinct_roles:
+            kept = before.succinct_roles.bit_length
+            bits = bits if bits > kept + 1 else kept
+        return SuccinctRoles([self._signers[_TARGETS][0].public_key.keyid], 1, bits, _BINS)
+
+    def _lasts(self, metadata: Metadata[_Content]) -> bool:
+        """Return whether more than half of the validity is left."""
+        signed = metadata.signed
+        return signed.expires - self._now > self._expiry.of(signed.type) / 2
+
+    def _kept(self, metadata: Metadata[_Content]) -> bool:
+        """Return whether top-level metadata can stay: it lasts, and each signer has signed it."""
+        signers = self._signers[metadata.signed.type]
+        signed = all(signer.public_key.keyid in metadata.signatures for signer in signers)
+        return signed and self._lasts(metadata)
+
+    def _add(self, name: str, content: _Content, signers: Sequence[CryptoSigner]) -> None:
+        """Add a file with a new version of the metadata ``name``."""
+        content.version = self.versions[name] = self.versions.get(name, 0) + 1
+        content.expires = self._now + self._expiry.of(name)
+        metadata = Metadata(content)
+        for signer in signers:
+            metadata.sign(signer, append=True)
+        file = f"{name}.json" if name == _TIMESTAMP else f"{content.version}.{name}.json"
+        self._files.append((f"{_METADATA}/{file}", _bytes(metadata)))
+        self._expires[name] = content.expires
+
+    def _add_snapshot(self) -> None:
+        """Add snapshot and timestamp, which is always new."""
+        parts = sorted(self.versions.keys() - {_TIMESTAMP, _SNAPSHOT})
+        # Names of bins that are no longer used stay: robots refuse a snapshot that lacks any.
+        meta = {f"{name}.json": MetaFile(self.versions[name]) for name in parts}
+        before = self._present.snapshot
+        if before and before.signed.meta == meta and self._kept(before):
+            self._expires[_SNAPSHOT] = before.signed.expires
+            data = self._present.snapshot_file
+        else:
+            self._add(_SNAPSHOT, Snapshot(meta=meta), self._signers[_SNAPSHOT])
+            data = self._files[-1][1]
+        described = MetaFile.from_data(self.versions[_SNAPSHOT], data, ["sha256"])
+        self._add(_TIMESTAMP, Timestamp(snapshot_meta=described), self._signers[_TIMESTAMP])
+
+
+def _bytes(metadata: Metadata[_Content]) -> bytes:
+    return metadata.to_bytes(JSONSerializer(compact=True))
