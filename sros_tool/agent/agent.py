@@ -18,11 +18,12 @@ from typing import NamedTuple
 
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
 from sros_tool.agent.inbox import send
-from sros_tool.agent.install import Installation, install_release
+from sros_tool.agent.install import Installation, install_release, made_at
 from sros_tool.agent.renewal import (
+    Renewals,
     drop_installed_keys,
     enclave_key,
-    renewal_requests,
+    renewals,
     waiting_keys,
 )
 from sros_tool.agent.running import (
@@ -138,8 +139,8 @@ class _Round:
         )
         self._problems += [f"{problem}." for problem in seen.problems]
         self._state = replace(self._state, due=still_due(self._state.due, seen))
-        requests = self._requests(names, opened)
-        arrived = self._confirm(names, opened, seen, clock, requests)
+        asked = self._renewals(names)
+        arrived = self._confirm(names, opened, seen, clock, asked)
         problems = tuple(dict.fromkeys(self._problems))
         self._state = replace(
             self._state, fetched=now if fetched else self._state.fetched, problems=problems
@@ -151,7 +152,7 @@ class _Round:
             installation.changed,
             installation.removed,
             self._state.due,
-            len(requests),
+            len(asked.requests),
             arrived,
             tuple(dict.fromkeys(self._problems)),
         )
@@ -260,7 +261,7 @@ class _Round:
                 self._folder,
                 release,
                 settings.robot,
-                now=certain,
+                now=self._certain_with(release, certain),
                 installed=state.accepted,
                 pinned=frozenset(settings.authorities),
                 new_keys=keys,
@@ -290,6 +291,15 @@ class _Round:
         self._save()
         drop_installed_keys(self._folder, keys)
         return installation
+
+    def _certain_with(self, release: Release, certain: datetime) -> datetime:
+        """Return the time at which a release has to be valid.
+
+        If documents have proven that the clock is behind, the keystore's clock counts, by which the
+        release was made; a clock that may be right is never overruled.
+        """
+        made = made_at(release) if self._machine.now < certain - _TOLERANCE else None
+        return max(certain, made) if made else certain
 
     def _differs_from_accepted(self, release: Release) -> bool:
         """Return whether the accepted release with the same number has other files."""
@@ -347,21 +357,16 @@ class _Round:
             systemd=machine.systemd or Systemd(settings.systemctl),
         )
 
-    def _requests(self, names: Iterable[str], opened: Mapping[str, _Opened]) -> tuple[str, ...]:
-        until = {}
-        for name, enclave in opened.items():
-            if moment := enclave.permissions_until():
-                until[name] = moment
-        requests, problems = renewal_requests(
+    def _renewals(self, names: Iterable[str]) -> Renewals:
+        asked = renewals(
             self._folder,
             names,
             now=self._machine.now,
             new_key=self._settings.new_key,
             secrets=self._machine.secrets,
-            permissions_until=until,
         )
-        self._problems += problems
-        return requests
+        self._problems += asked.problems
+        return asked
 
     # ── the message ────────────────────────────────────────────────────────────────────────
 
@@ -371,7 +376,7 @@ class _Round:
         opened: Mapping[str, _Opened],
         seen: EnclaveProcesses,
         clock: RobotClock,
-        requests: tuple[str, ...],
+        asked: Renewals,
     ) -> bool:
         """Send the message; return whether it arrived."""
         now = self._machine.now.replace(microsecond=0)
@@ -390,9 +395,9 @@ class _Round:
             running=seen.states,
             clock=clock,
             problems=_short(self._problems),
-            requests=requests,
+            requests=asked.requests,
         )
-        message = self._signed(confirmation, names)
+        message = self._signed(confirmation, (asked.signer,) if asked.signer else names)
         if not message:
             return False
         settings = self._settings

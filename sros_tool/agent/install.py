@@ -55,7 +55,7 @@ from sros_tool.pki.certificates import (
     make_request,
     validity_of,
 )
-from sros_tool.pki.crl import last_update, list_number, read_lists, signed_by
+from sros_tool.pki.crl import last_update, list_number, next_update, read_lists, signed_by
 from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem, load_key
 
 _OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
@@ -132,7 +132,7 @@ def install_release(
                 changes[name] = _change(opened, name, files, (new_keys or {}).get(name), now)
             except (SrosError, OSError) as error:
                 kept[name] = _clause(error)
-                changes[name] = _list_alone(opened, name, files)
+                changes[name] = _list_alone(opened, name, files, now)
         removed = []
         for name in present:
             if name in enclaves or _waits(opened, name):
@@ -153,7 +153,7 @@ def install_release(
         tuple(name for name in changes if name in enclaves),
         tuple(name for name in removed if name in changes),
         kept,
-        _latest(enclaves.values()),
+        made_at(release),
     )
 
 
@@ -268,10 +268,10 @@ def _newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationL
     return max(signed, key=list_number, default=None)
 
 
-def _latest(enclaves: Iterable[Mapping[str, bytes]]) -> datetime | None:
-    """Return when the newest certificate or revocation list began to be valid."""
+def made_at(release: Release) -> datetime | None:
+    """Return when the newest certificate or revocation list in a release began to be valid."""
     moments = []
-    for files in enclaves:
+    for files in release.enclaves().values():
         with suppress(SrosError):
             own = load_certificates(files.get(CERTIFICATE_FILE, b""), CERTIFICATE_FILE)
             moments += [validity_of(certificate).not_before for certificate in own]
@@ -380,25 +380,25 @@ def _content(folder: Folder, path: str) -> bytes | None:
         return None
 
 
-def _list_alone(folder: Folder, name: str, files: Mapping[str, bytes]) -> _Change:
+def _list_alone(folder: Folder, name: str, files: Mapping[str, bytes], now: datetime) -> _Change:
     """Return the change that gives an enclave only its new revocation list, if that fits it.
 
-    The enclave must trust the same identity CAs as before, and have a certificate.
+    The enclave must trust the same identity CAs as before, and have a certificate; the list must be
+    signed by one of them and valid.
     """
     place, change = enclave_folder(name), _Change()
     with suppress(SrosError, OSError):
         _check_place(folder, place)
-        same = _content(folder, f"{place}/{IDENTITY_CA_FILE}") == files.get(IDENTITY_CA_FILE)
-        path = f"{place}/{CRL_FILE}"
-        if CRL_FILE in files and same and _had_certificate(folder, name):
-            authorities = files.get(IDENTITY_CA_FILE, b"")
-            if _newest_list(files[CRL_FILE], authorities) and not _same(folder, path, files):
-                change.write[path] = files[CRL_FILE]
+        authorities = files.get(IDENTITY_CA_FILE, b"")
+        same = _content(folder, f"{place}/{IDENTITY_CA_FILE}") == authorities
+        path, sent = f"{place}/{CRL_FILE}", files.get(CRL_FILE, b"")
+        newest = _newest_list(sent, authorities)
+        expiry = next_update(newest) if newest else None
+        fits = same and _had_certificate(folder, name) and _content(folder, path) != sent
+        valid = newest and last_update(newest) <= now and (expiry is None or now < expiry)
+        if fits and valid:
+            change.write[path] = sent
     return change
-
-
-def _same(folder: Folder, path: str, files: Mapping[str, bytes]) -> bool:
-    return _content(folder, path) == files[path.rpartition("/")[2]]
 
 
 def _removal(folder: Folder, name: str) -> _Change:

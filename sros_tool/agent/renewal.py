@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
+from typing import NamedTuple
 
 from sros_tool.agent.settings import agent_folder
 from sros_tool.errors import SrosError
@@ -20,14 +21,15 @@ from sros_tool.keystore.reader import read_certificate
 from sros_tool.pki.certificates import make_request, validity_of
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.token import Secrets, open_enclave_key
+from sros_tool.validity import Window
 from sros_tool.xml import read_bytes
 
 _NEW_KEYS = "new-keys"
 
 
-def is_due(certificate_from: datetime, until: datetime, now: datetime) -> bool:
-    """Return whether less than a third of a certificate's life is left."""
-    return now >= until - (until - certificate_from) / 3
+def is_due(validity: Window, now: datetime) -> bool:
+    """Return whether at most a third of the validity of a certificate is left."""
+    return now >= validity.not_after - (validity.not_after - validity.not_before) / 3
 
 
 def enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
@@ -42,45 +44,51 @@ def enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
     return open_enclave_key(place_in(place / KEY_URI_FILE), secrets)
 
 
-def renewal_requests(
-    folder: Path,
-    names: Iterable[str],
-    *,
-    now: datetime,
-    new_key: bool,
-    secrets: Secrets,
-    permissions_until: Mapping[str, datetime],
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return signing requests (PEM) for enclaves that expire, and sentences on those without.
+class Renewals(NamedTuple):
+    """The signing requests (PEM) for a message, and who has to sign it.
 
-    Args:
-        folder: the security folder of the robot.
-        names: its enclaves.
-        now: the present time.
-        new_key: whether to ask with a new key, which waits next to the present one until its
-            certificate is installed; a key on a token stays.
-        secrets: is asked for the PIN of a token.
-        permissions_until: when the permissions of enclaves expire.
+    Only the enclave itself can vouch for its new key, with its present one.  So of the enclaves
+    that ask with a new key, a message has the request of one, ``signer``; every hour it is another.
+    """
+
+    requests: tuple[str, ...]
+    signer: str | None
+    problems: tuple[str, ...]
+    """Sentences on enclaves without a request."""
+
+
+def renewals(
+    folder: Path, names: Iterable[str], *, now: datetime, new_key: bool, secrets: Secrets
+) -> Renewals:
+    """Return requests for the enclaves ``names`` whose certificates expire.
+
+    With ``new_key``, they are for new keys, which wait next to the present ones until their
+    certificates are installed; a key on a token stays.  ``secrets`` is asked for the PIN of a
+    token.
     """
     requests: list[str] = []
     problems: list[str] = []
+    with_new_keys: list[str] = []
     for name in names:
         place = enclave_path(folder, name)
         try:
             validity = validity_of(read_certificate(place / CERTIFICATE_FILE))
-            until = min(validity.not_after, permissions_until.get(name, validity.not_after))
-            if not is_due(validity.not_before, until, now) or len(requests) == MOST_REQUESTS:
+            if not is_due(validity, now) or len(requests) == MOST_REQUESTS - 1:
                 continue
-            in_file = (place / KEY_FILE).exists()
-            key = (
-                _waiting_key(folder, name)
-                if new_key and in_file
-                else enclave_key(folder, name, secrets)
-            )
-            requests.append(make_request(key, name).decode())
+            if new_key and (place / KEY_FILE).exists():
+                with_new_keys.append(name)
+                continue
+            requests.append(make_request(enclave_key(folder, name, secrets), name).decode())
         except (SrosError, OSError) as error:
             problems.append(f"{name} cannot be renewed: {error}")
-    return tuple(requests), tuple(problems)
+    signer = None
+    if with_new_keys:
+        signer = with_new_keys[int(now.timestamp()) // 3600 % len(with_new_keys)]
+        try:
+            requests.append(make_request(_waiting_key(folder, signer), signer).decode())
+        except (SrosError, OSError) as error:
+            problems.append(f"{signer} cannot be renewed: {error}")
+    return Renewals(tuple(requests), signer, tuple(problems))
 
 
 def _key_file(name: str) -> str:

@@ -1,0 +1,517 @@
+"""Rounds of the agent: what it installs, restarts, remembers, asks for and sends."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+
+from sros_tool.agent.agent import Machine, Round, run_round
+from sros_tool.agent.fetch import FetchError, FetchProblem
+from sros_tool.agent.running import Systemd
+from sros_tool.agent.settings import (
+    AgentSettings,
+    Unit,
+    make_agent_folder,
+    read_settings,
+    write_settings,
+)
+from sros_tool.agent.state import only_agent, read_state
+from sros_tool.errors import DocumentError, KeystoreError, UnavailableError
+from sros_tool.keystore.confirmation import (
+    Confirmation,
+    RobotClock,
+    RunningFiles,
+    parse_confirmation,
+)
+from sros_tool.keystore.delivery.release import Release
+from sros_tool.keystore.issuing.keyring import no_secrets
+from sros_tool.keystore.layout import CRL_FILE, REQUIRED_FILES
+from sros_tool.keystore.reader import read_certificate
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import load_certificates, load_request, validity_of
+from sros_tool.runtime.processes import (
+    LoadedFile,
+    Process,
+    ProcessEnclave,
+    RunningProcesses,
+    UnseenProcess,
+)
+from tests.agent.releases import NAMES, Home, moment
+from tests.agent.test_install import content, has
+from tests.keystore.test_transaction import DIED, in_child, run_out_of_space
+from tests.support.children import some_steps
+from tests.support.harness import sros
+
+
+@dataclass
+class Robot:
+    """A robot with its agent, whose source, processes and units are data."""
+
+    folder: Path
+    inbox: Path
+    release: Release | FetchError | None = None
+    started: dict[str, datetime] = field(default_factory=dict)
+    """When the process of an enclave started; it has none if it is not here."""
+    unseen: bool = False
+    clock: RobotClock = RobotClock.SYNCHRONIZED
+    settings: AgentSettings = field(init=False)
+    asked: list[int] = field(default_factory=list)
+    """The number of the installed release in each question to the source."""
+    systemctl: list[str] = field(default_factory=list)
+    """The units that were restarted."""
+    signers: list[x509.Certificate] = field(default_factory=list)
+    """Further certificates that may have signed a message."""
+
+    def __post_init__(self) -> None:
+        self.inbox.mkdir()
+        self.settings = AgentSettings("r1", "/nowhere", str(self.inbox))
+        make_agent_folder(self.folder)
+        write_settings(self.folder, self.settings)
+
+    def round(self, now: datetime | None = None) -> Round:
+        """Run a round."""
+        machine = Machine(
+            now or moment(),
+            UTC,
+            no_secrets,
+            look=lambda _now: self.running(),
+            systemd=FakeSystemd(self),
+            fetch=self.fetch,
+            clock=lambda: self.clock,
+        )
+        return run_round(self.folder, self.settings, machine)
+
+    def fetch(self, _state: Path, _source: str, robot: str, **more: object) -> Release | None:
+        assert robot == "r1"
+        self.asked.append(int(str(more["installed"])))
+        if isinstance(self.release, FetchError):
+            raise self.release
+        fresh = self.release and self.release.number != more["installed"]
+        return self.release if fresh else None
+
+    def running(self) -> RunningProcesses:
+        unseen = (UnseenProcess(9, ("x",), "it is closed", speaks=False),) if self.unseen else ()
+        return RunningProcesses(tuple(map(self.process, self.started)), unseen)
+
+    def process(self, name: str) -> Process:
+        place = self.folder / f"enclaves{name}"
+        files = tuple(
+            LoadedFile(file, datetime.fromtimestamp((place / file).stat().st_ctime, UTC))
+            for file in (*REQUIRED_FILES, CRL_FILE)
+            if (place / file).exists()
+        )
+        environment = {
+            "ROS_SECURITY_ENABLE": "true",
+            "ROS_SECURITY_KEYSTORE": str(self.folder),
+            "ROS_SECURITY_STRATEGY": "Enforce",
+        }
+        enclave = ProcessEnclave(str(self.folder), name, files, is_there=True, here=self.folder)
+        return Process(1, ("node",), environment, self.started[name], enclave=enclave)
+
+    def message(self) -> Confirmation:
+        """Return the last message, whose signature is verified."""
+        signed = smime.parse((self.inbox / "r1/confirmation.p7s").read_bytes())
+        own = map(read_certificate, sorted(self.folder.rglob("enclaves/**/cert.pem")))
+        for signer in (*own, *self.signers):
+            try:
+                signed.verify(signer)
+            except Exception:
+                continue
+            return parse_confirmation(signed.text, "the message")
+        raise AssertionError("no enclave of the robot signed it")
+
+
+class FakeSystemd(Systemd):
+    """Units that restart at once, or not."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+
+    def active(self) -> frozenset[str]:
+        return frozenset({"sros@r1-b.service"})
+
+    def restart(self, unit: str) -> None:
+        if unit == "bad.service":
+            raise UnavailableError("`systemctl restart bad.service` failed", "It is bad.")
+        self._robot.systemctl.append(unit)
+        name = {"sros@r1-b.service": "/r1/b", "a.service": "/r1/a"}.get(unit)
+        if name:
+            self._robot.started[name] = moment() + timedelta(seconds=1)
+
+
+@pytest.fixture
+def r1(home: Home, tmp_path: Path) -> Robot:
+    """The robot r1 with its agent, which has not run yet; home published what was delivered."""
+    return Robot(home.robot(tmp_path), tmp_path / "inbox", release=home.first)
+
+
+# ── the round ──────────────────────────────────────────────────────────────────────────────
+
+
+def test_rounds_follow_what_home_publishes(home: Home, r1: Robot) -> None:
+    done = r1.round()
+    assert (done.release, done.fetched, done.sent) == (1, True, True)
+    assert not (done.changed or done.removed or done.restart or done.problems), done
+    first = r1.message()
+    assert first.release == 1 and first.clock is RobotClock.SYNCHRONIZED and first.requests == ()
+    assert first.running == dict.fromkeys(NAMES, RunningFiles.NOT_SEEN)
+    assert first.problems == () and first.restart == () and first.dds
+    own = validity_of(read_certificate(r1.folder / "enclaves/r1/a/cert.pem"))
+    assert first.expiry and first.expiry["/r1/a"].certificate == own.not_after
+    assert first.expiry["/r1/a"].permissions
+    r1.release = home.revoked
+    done = r1.round()
+    assert done.changed == NAMES and done.release == 3 and has(r1.folder, home.revoked)
+    second = r1.message()
+    assert second.release == 3 and first.sequence and second.sequence
+    assert second.sequence > first.sequence
+    assert second.files["enclaves/r1/a/crl.pem"]
+    r1.round()
+    assert r1.asked == [0, 1, 3]
+    sros("agent", "status", r1.folder).ok()
+
+
+def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None:
+    r1.round()
+    (r1.folder / "enclaves/r1/a/permissions.p7s").unlink()
+    shutil.rmtree(r1.folder / "enclaves/r1/b")
+    done = r1.round()
+    assert done.changed == ("/r1/a",), "the key of /r1/b is gone, and only here"
+    assert any("/r1/b keeps its files" in problem for problem in done.problems)
+    assert r1.message().release == 1
+    assert has(r1.folder, home.first, ("/r1/a", "/r1/c"))
+    assert sros("agent", "status", r1.folder).status == 1
+
+
+REFUSED = {
+    FetchProblem.UNREACHABLE: "cannot be reached",
+    FetchProblem.EXPIRED: "expired",
+    FetchProblem.ROLLED_BACK: "older",
+}
+
+
+@pytest.mark.parametrize("problem", REFUSED)
+def test_a_source_that_fails_keeps_no_confirmation_back(
+    problem: FetchProblem, home: Home, r1: Robot
+) -> None:
+    r1.round()
+    before = content(r1.folder / "enclaves")
+    r1.release = FetchError(problem, f"it {REFUSED[problem]}")
+    done = r1.round(moment() + timedelta(days=30))
+    assert not done.fetched and done.sent and content(r1.folder / "enclaves") == before
+    problems = r1.message().problems
+    assert problems and REFUSED[problem] in problems[0]
+    r1.release = home.revoked
+    done = r1.round(moment() + timedelta(days=30))
+    assert done.changed == NAMES and not done.problems, "it goes on where it was"
+
+
+def test_an_inbox_that_fails_keeps_no_installation_back(home: Home, r1: Robot) -> None:
+    r1.round()
+    r1.inbox.rename(r1.inbox.with_name("away"))
+    r1.release = home.revoked
+    done = r1.round()
+    assert not done.sent and done.changed == NAMES
+    assert any("cannot be written into" in problem for problem in done.problems)
+    r1.inbox.with_name("away").rename(r1.inbox)
+    assert r1.round().sent and r1.message().release == 3
+
+
+def test_two_releases_with_one_number_are_refused(home: Home, r1: Robot) -> None:
+    r1.release = home.renewed
+    r1.round()
+    (r1.folder / "enclaves/r1/a/cert.pem").unlink()  # so that it asks again
+    before = content(r1.folder / "enclaves")
+    r1.release = home.release(home.revoked.files, 2)
+    done = r1.round()
+    assert any("two releases with the number 2" in problem for problem in done.problems)
+    assert content(r1.folder / "enclaves") == before
+    r1.release = home.renewed
+    assert r1.round().changed == ("/r1/a",)
+
+
+def test_an_older_release_is_refused_also_without_a_state(home: Home, r1: Robot) -> None:
+    r1.release = home.renewed
+    r1.round()
+    (r1.folder / ".agent/state.json").write_text("damaged")
+    assert read_state(r1.folder).accepted == 2
+    r1.release = home.first
+    done = r1.round()
+    assert any("older than release 2" in problem for problem in done.problems)
+    assert has(r1.folder, home.renewed)
+
+
+def test_a_disk_of_yesterday_goes_on(home: Home, r1: Robot, tmp_path: Path) -> None:
+    r1.round()
+    yesterday = tmp_path / "yesterday"
+    shutil.copytree(r1.folder, yesterday, symlinks=True)
+    r1.release = home.revoked
+    r1.round()
+    last = r1.message().sequence
+    shutil.rmtree(r1.folder)
+    shutil.copytree(yesterday, r1.folder, symlinks=True)
+    done = r1.round(moment() + timedelta(minutes=5))
+    assert done.changed == NAMES and has(r1.folder, home.revoked)
+    now = r1.message().sequence
+    assert last and now and now > last, "home takes it"
+
+
+# ── the clock ──────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_clock_that_is_behind_is_said_and_nothing_restarts(home: Home, r1: Robot) -> None:
+    r1.settings = replace(r1.settings, restart=True)
+    r1.round()
+    r1.started = {"/r1/b": moment() - timedelta(hours=1)}
+    r1.release = home.revoked
+    done = r1.round(datetime(2020, 1, 1, tzinfo=UTC))
+    assert any("is at least" in problem and "behind" in problem for problem in done.problems)
+    assert done.changed == NAMES, "verified by the latest moment that has certainly passed"
+    assert "/r1/b" in done.restart and not r1.systemctl
+    message = r1.message()
+    assert message.clock is RobotClock.BEHIND and message.time.year == 2020
+    assert message.sequence and message.sequence > moment().timestamp() - 1000
+    done = r1.round()
+    assert r1.systemctl == ["sros@r1-b.service"] and done.restart == ()
+
+
+def test_on_a_wrong_clock_nothing_is_installed_that_is_not_valid_then(
+    home: Home, r1: Robot
+) -> None:
+    """A clock that was never right: no document tells what has passed."""
+    before = content(r1.folder / "enclaves")
+    r1.release = home.revoked
+    done = r1.round(datetime(2020, 1, 1, tzinfo=UTC))
+    assert not done.changed and content(r1.folder / "enclaves") == before
+    assert any("not valid" in problem or "not yet valid" in problem for problem in done.problems)
+    assert r1.round().changed == NAMES
+
+
+# ── restarts ───────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_restart_is_due_until_the_processes_were_seen_with_the_new_files(
+    home: Home, r1: Robot
+) -> None:
+    r1.round()
+    r1.started = {"/r1/a": moment() - timedelta(hours=1), "/r1/b": moment() - timedelta(hours=1)}
+    r1.unseen = True
+    r1.release = home.revoked
+    done = r1.round()
+    assert done.restart == NAMES, "of /r1/c nothing is known"
+    message = r1.message()
+    assert message.restart == NAMES and message.running == {
+        "/r1/a": RunningFiles.EARLIER,
+        "/r1/b": RunningFiles.EARLIER,
+        "/r1/c": RunningFiles.NOT_SEEN,
+    }
+    later = moment() + timedelta(seconds=1)
+    r1.started |= {"/r1/a": later}
+    assert r1.round().restart == ("/r1/b", "/r1/c")
+    assert r1.message().running == {
+        "/r1/a": RunningFiles.CURRENT,
+        "/r1/b": RunningFiles.EARLIER,
+        "/r1/c": RunningFiles.NOT_SEEN,
+    }
+    r1.unseen = False
+    assert r1.round().restart == ("/r1/b",), "all are seen, and nothing runs in /r1/c"
+    (r1.folder / ".agent/state.json").unlink()
+    assert r1.round().restart == ("/r1/b",), "what is seen is known without the state"
+    r1.started["/r1/b"] = later
+    assert r1.round().restart == ()
+
+
+def test_units_restart_in_their_order(home: Home, r1: Robot) -> None:
+    units = (Unit("bad.service", ("/r1/c",)), Unit("a.service", ("/r1/a",)))
+    r1.settings = replace(r1.settings, restart=True, units=units)
+    r1.round()
+    r1.started = {name: moment() - timedelta(hours=1) for name in NAMES}
+    r1.release = home.revoked
+    done = r1.round()
+    assert r1.systemctl == ["a.service", "sros@r1-b.service"] and done.restart == ("/r1/c",)
+    assert any("bad.service" in problem for problem in done.problems)
+    r1.round()
+    assert r1.systemctl == ["a.service", "sros@r1-b.service"], "what is done is not done again"
+
+
+def test_no_unit_restarts_that_could_not_start_or_must_not(home: Home, r1: Robot) -> None:
+    units = (Unit("a.service", ("/r1/a",)), Unit("c.service", ("/r1/c",)))
+    r1.settings = replace(r1.settings, restart=True, units=units, restart_if=("false",))
+    r1.round()
+    r1.started = dict.fromkeys(NAMES, moment() - timedelta(hours=1))
+    r1.release = home.revoked
+    assert r1.round().restart == NAMES and not r1.systemctl
+    (r1.folder / "enclaves/r1/a/key.pem").unlink()
+    r1.settings = replace(r1.settings, restart_if=("true",))
+    done = r1.round()
+    assert r1.systemctl == ["c.service", "sros@r1-b.service"]
+    assert any("a.service is not restarted" in problem for problem in done.problems)
+
+
+def test_what_is_wrong_with_processes_is_confirmed(r1: Robot) -> None:
+    r1.started = {"/r1/a": moment() + timedelta(seconds=1)}
+    process = r1.process("/r1/a")
+    permissive = {**process.environment, "ROS_SECURITY_STRATEGY": "Permissive"}
+    outside = replace(process, enclave=replace(process.enclave, keystore="/x", here=None))  # type: ignore[type-var]
+    r1.running = lambda: RunningProcesses((replace(process, environment=permissive), outside))  # type: ignore[method-assign]
+    (problem,) = r1.round().problems
+    assert problem.startswith("process 1 (node):") and r1.message().problems == (problem,)
+
+
+# ── renewal ────────────────────────────────────────────────────────────────────────────────
+
+
+def late_in_life(r1: Robot) -> datetime:
+    validity = validity_of(read_certificate(r1.folder / "enclaves/r1/a/cert.pem"))
+    return validity.not_after - (validity.not_after - validity.not_before) / 4
+
+
+def test_renewal_is_asked_for_in_the_last_third_of_a_certificate(home: Home, r1: Robot) -> None:
+    assert r1.round().requests == 0
+    done = r1.round(late_in_life(r1))
+    assert done.requests == 3
+    requests = [load_request(text.encode(), "it") for text in r1.message().requests or ()]
+    assert [request.name for request in requests] == list(NAMES)
+    own = read_certificate(r1.folder / "enclaves/r1/a/cert.pem")
+    assert requests[0].public_key == own.public_key()
+
+
+def test_a_new_key_waits_beside_the_present_one(r1: Robot) -> None:
+    """A message asks for one enclave, which signs it; every hour it is another."""
+    r1.settings = replace(r1.settings, new_key=True)
+    now = late_in_life(r1)
+    keys = {name: (r1.folder / f"enclaves{name}/key.pem").read_bytes() for name in NAMES}
+    asked = {}
+    for hour in (0, 1, 2, 3):
+        r1.round(now + timedelta(hours=hour))
+        (text,) = r1.message().requests or ()
+        request = load_request(text.encode(), "it")
+        own = read_certificate(r1.folder / f"enclaves{request.name}/cert.pem")
+        smime.parse((r1.inbox / "r1/confirmation.p7s").read_bytes()).verify(own)
+        assert request.public_key != own.public_key()
+        assert asked.setdefault(request.name, request.public_key) == request.public_key
+    assert set(asked) == set(NAMES)
+    assert keys == {name: (r1.folder / f"enclaves{name}/key.pem").read_bytes() for name in NAMES}
+    waiting = list((r1.folder / ".agent/new-keys").iterdir())
+    assert len(waiting) == 3 and all(path.stat().st_mode & 0o777 == 0o600 for path in waiting)
+
+
+# ── death and full disks ───────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that dies takes nothing with it that the system was given."""
+    monkeypatch.setattr("sros_tool.folders.flush_file_system", lambda _: None)
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+
+
+def certificate_of(release: Release) -> x509.Certificate:
+    """Return the certificate of /r1/a in a release."""
+    (certificate,) = load_certificates(release.files["enclaves/r1/a/cert.pem"], "it")
+    return certificate
+
+
+@pytest.mark.usefixtures("no_waiting_for_the_disk")
+@pytest.mark.parametrize("instead", [None, run_out_of_space], ids=["killed", "full disk"])
+def test_a_round_that_ends_anywhere_is_ended_by_the_next(
+    instead: Callable[..., object] | None, home: Home, r1: Robot, tmp_path: Path
+) -> None:
+    r1.round()
+    r1.started = {"/r1/a": moment() - timedelta(hours=1)}
+    before, inbox = tmp_path / "before", tmp_path / "inbox-before"
+    shutil.copytree(r1.folder, before, symlinks=True)
+    shutil.copytree(r1.inbox, inbox)
+    r1.release = home.revoked
+
+    def fresh() -> None:
+        for place, kept in ((r1.folder, before), (r1.inbox, inbox)):
+            shutil.rmtree(place)
+            shutil.copytree(kept, place, symlinks=True)
+
+    fresh()
+    r1.signers += map(certificate_of, (home.first, home.renewed))
+    status, steps = in_child(r1.round)
+    assert status == 0 and steps[-1] > 40
+    earlier = 0
+    for step in some_steps(steps):
+        fresh()
+        if instead is None:
+            assert in_child(r1.round, step)[0] == DIED, step
+        else:
+            assert in_child(r1.round, step, instead)[0] == 0, step
+        assert any(has(r1.folder, each) for each in (home.first, home.revoked)) or instead
+        earlier += not has(r1.folder, home.revoked)
+        last = r1.message().sequence
+        done = r1.round(moment() + timedelta(minutes=5))
+        assert has(r1.folder, home.revoked) and not done.problems, (step, done)
+        assert done.restart == ("/r1/a",), f"the restart is not forgotten, at {step}"
+        now = r1.message().sequence
+        assert last and now and now > last
+        assert sorted(os.listdir(r1.folder)) == [".agent", "enclaves"]
+    assert earlier
+
+
+# ── settings ───────────────────────────────────────────────────────────────────────────────
+
+
+def test_settings_are_read_as_written(r1: Robot) -> None:
+    assert read_settings(r1.folder) == r1.settings
+    odd = AgentSettings(
+        "r1",
+        "https://fleet.example/pub?x='\"",
+        "/in box\\",
+        authorities=("0" * 64,),
+        tls_ca="/etc/ca.pem",
+        new_key=True,
+        restart=True,
+        restart_if=("/bin/true", "a b"),
+        systemctl=("systemctl", "--user"),
+        units=(Unit("a.service", ("/r1/a", "/r1/b")), Unit("b.service", ("/r1/b",))),
+    )
+    write_settings(r1.folder, odd)
+    assert read_settings(r1.folder) == odd
+
+
+WRONG = (
+    "", "robot = 1", 'robot = "r1"', "robot = [", "x = 1",
+    'robot = "../r1"\nfrom = "/a"\ninbox = "/b"', 'robot = "r1"\nfrom = "a"\ninbox = "/b"',
+    'robot = "r1"\nfrom = "ftp://a"\ninbox = "/b"',
+    'robot = "r1"\nfrom = "/a"\ninbox = "/b"\nauthorities = ["x"]',
+    'robot = "r1"\nfrom = "/a"\ninbox = "/b"\nsystemctl = []',
+    'robot = "r1"\nfrom = "/a"\ninbox = "/b"\n[[unit]]\nname = "-x.service"\nenclaves = []\nx = 1',
+    'robot = "r1"\nfrom = "/a"\ninbox = "/b"\n[[unit]]\nname = "x"\nenclaves = ["/a"]',
+    'robot = "r1"\nfrom = "/a"\ninbox = "/b"\n[[unit]]\nname = "x.service"\nenclaves = ["a"]',
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_wrong_settings_are_refused(text: str, r1: Robot) -> None:
+    (r1.folder / ".agent/agent.toml").write_text(text)
+    with pytest.raises(DocumentError, match=r"agent\.toml"):
+        read_settings(r1.folder)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs files of another user")
+@pytest.mark.parametrize("of_others", ["", ".agent", ".agent/agent.toml"])
+def test_settings_that_others_can_change_are_not_used(of_others: str, r1: Robot) -> None:
+    os.chown(r1.folder / of_others, 1000, 1000)
+    with pytest.raises(KeystoreError, match=r"belongs to|can change"):
+        read_settings(r1.folder)
+
+
+def test_one_agent_at_a_time(r1: Robot) -> None:
+    with (
+        only_agent(r1.folder),
+        pytest.raises(KeystoreError, match="another agent"),
+        only_agent(r1.folder),
+    ):
+        pass
+    assert sros("agent", "run", r1.folder, "--once").status in (1, 2)
