@@ -43,7 +43,7 @@ from sros_tool.enclave_environment import (
     node_units,
     target_path,
 )
-from sros_tool.errors import Note, UnavailableError, UsageError
+from sros_tool.errors import KeystoreError, Note, UnavailableError, UsageError
 from sros_tool.runtime.environment import COMPOSE, CONTAINER_FORMS, KUBERNETES, SECRET
 from sros_tool.runtime.units import Job
 from sros_tool.terminal import echo, echo_document, echo_lines
@@ -423,7 +423,8 @@ class _WithCommandAfterDashes(_WithCommand):
     help="renew: renew enclaves that expire within 30 days. check: check the keystore "
     "daily. metrics: write the keystore's metrics every 15 minutes. fleet: write "
     "them and the metrics of `sros fleet status`. guard: watch all ROS processes of the machine "
-    "(runs as root, without a timer).  Can be repeated.",
+    "(runs as root, without a timer). agent: run `sros agent` for the security folder ROOT of a "
+    "robot every 5 minutes.  Can be repeated.",
 )
 @click.option(
     "--target",
@@ -490,6 +491,7 @@ def units(
       $ sudo systemctl enable --now sros@talker
       $ sros units keystore --match '/arm/*' units  # /etc/sros/nodes/arm/...
       $ sros units keystore --job renew --job check --job metrics units
+      $ sros units /etc/sros/keystore --job agent units  # on a robot, see `sros agent`
     """
     from sros_tool.runtime.units import (
         WrittenUnits,
@@ -551,6 +553,7 @@ def units(
             sros=program or _this_program(),
             passphrase=passphrase or "",
             domain=domain_of(domain) or 0,
+            writable=_inbox(root) if job == Job.AGENT else (),
         )
     changes = unit_changes(folder, files, force=force)
     if not dry_run:
@@ -565,6 +568,17 @@ def units(
     if not changes:
         echo(f"the units in '{folder}' are already up to date", err=True)
     print_notes(list(dict.fromkeys(notes)))
+
+
+def _inbox(root: Path) -> tuple[str, ...]:
+    """Return the inbox of the agent of a security folder, if it is a folder of this machine."""
+    from sros_tool.agent.settings import read_settings
+
+    try:
+        inbox = read_settings(root).inbox
+    except KeystoreError:  # units for another machine, or before `sros agent init`
+        return ()
+    return () if "://" in inbox else (inbox,)
 
 
 def _owner(root: Path) -> str:

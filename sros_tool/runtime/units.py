@@ -78,6 +78,7 @@ class Job(StrEnum):
     METRICS = "metrics"
     FLEET = "fleet"
     GUARD = "guard"
+    AGENT = "agent"
 
 
 _OFTEN = "*:0/15"
@@ -206,7 +207,14 @@ def node_settings(
 
 
 def job_units(
-    job: Job, keystore: str, *, user: str, sros: str, passphrase: str = "", domain: int = 0
+    job: Job,
+    keystore: str,
+    *,
+    user: str,
+    sros: str,
+    passphrase: str = "",
+    domain: int = 0,
+    writable: Sequence[str] = (),
 ) -> dict[str, str]:
     """Return the service and the timer of a job by their names; the guard has no timer.
 
@@ -217,12 +225,15 @@ def job_units(
         sros: the path of the program sros.
         passphrase: the path of the file with the passphrase of the CA keys, or "".
         domain: the ROS domain in which the guard takes open nodes for mistakes.
+        writable: folders besides the keystore in which the agent writes.
 
     Raises:
         UsageError: a path cannot be written in a unit.
     """
     if job is Job.GUARD:
         return {f"sros-{job}.service": _guard(keystore, sros, domain)}
+    if job is Job.AGENT:
+        return _agent(keystore, user=user, sros=sros, writable=writable)
     name = f"sros-{job}"
     root, program = _check_path(keystore, "the keystore"), _check_path(sros, "the program")
     what, words, own = {
@@ -317,6 +328,51 @@ RestrictAddressFamilies=AF_UNIX
 [Install]
 WantedBy=multi-user.target
 """
+
+
+def _agent(folder: str, *, user: str, sros: str, writable: Sequence[str] = ()) -> dict[str, str]:
+    """Return the service and the timer of a robot's agent (`sros agent`)."""
+    root, program = _check_path(folder, "the security folder"), _check_path(sros, "the program")
+    places = " ".join((root, *(f"-{_check_path(place, 'the inbox')}" for place in writable)))
+    what = f"Keep the enclaves in {root} as home publishes them"
+    # It asks the kernel whether the clock is set; without capabilities it cannot set it anyway.
+    closed = _CLOSED.replace("ProtectClock=yes\n", "")
+    service = f"""\
+{_MADE}
+[Unit]
+Description={what}
+Wants=network-online.target time-sync.target
+After=network-online.target time-sync.target
+
+[Service]
+Type=oneshot
+User={_check_user(user)}
+Nice=10
+TimeoutStartSec=30min
+ExecStart={program} agent run {root} --once
+# What is wrong is in the message to home, and in `sros agent status`.
+SuccessExitStatus=1
+ReadWritePaths={places}
+UMask=0077
+{closed}
+PrivateDevices=yes
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6
+"""
+    timer = f"""\
+{_MADE}
+[Unit]
+Description={what}
+
+[Timer]
+# Not by the calendar: the clock of a robot may be wrong, or jump.
+OnBootSec=1min
+OnUnitInactiveSec=5min
+RandomizedDelaySec=1min
+
+[Install]
+WantedBy=timers.target
+"""
+    return {"sros-agent.service": service, "sros-agent.timer": timer}
 
 
 def _lines(lines: Iterable[str]) -> str:

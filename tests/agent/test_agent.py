@@ -388,7 +388,7 @@ def test_a_new_key_waits_beside_the_present_one(r1: Robot) -> None:
     r1.settings = replace(r1.settings, new_key=True)
     now = late_in_life(r1)
     keys = {name: (r1.folder / f"enclaves{name}/key.pem").read_bytes() for name in NAMES}
-    asked = {}
+    asked: dict[str, object] = {}
     for hour in (0, 1, 2, 3):
         r1.round(now + timedelta(hours=hour))
         (text,) = r1.message().requests or ()

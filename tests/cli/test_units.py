@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.agent.settings import AgentSettings, make_agent_folder, write_settings
 from sros_tool.runtime.units import FLEET_FILE
 from tests.support.harness import policy_text, publish, snapshot, sros
 
@@ -99,6 +100,26 @@ def test_the_guard_watches_with_the_keystore_and_its_domain(made: Path, tmp_path
     assert 'Environment="ROS_SECURITY_KEYSTORE=/srv/k"' in lines
     assert 'Environment="ROS_DOMAIN_ID=3"' in lines
     assert "CapabilityBoundingSet=CAP_SYS_PTRACE CAP_DAC_READ_SEARCH" in lines
+
+
+def test_the_agent_is_of_the_owner_and_may_write_into_its_inbox(made: Path, tmp_path: Path) -> None:
+    robot = tmp_path / "robot"
+    sros("distribute_key", made, "/leg", robot).ok()
+    words = ("--job", "agent", "--sros", "/usr/bin/sros")
+    sros("units", robot, *words, tmp_path / "before").ok()
+    assert {unit.name for unit in (tmp_path / "before").iterdir()} == {
+        "sros-agent.service",
+        "sros-agent.timer",
+    }
+    make_agent_folder(robot)
+    write_settings(robot, AgentSettings("r1", "/media/pub", "/media/inbox"))
+    sros("units", robot, *words, tmp_path / "units").ok()
+    lines = (tmp_path / "units/sros-agent.service").read_text().splitlines()
+    assert f"ExecStart=/usr/bin/sros agent run {robot} --once" in lines
+    assert f"User={robot.owner()}" in lines
+    assert f"ReadWritePaths={robot} -/media/inbox" in lines
+    before = (tmp_path / "before/sros-agent.service").read_text()
+    assert f"ReadWritePaths={robot}\n" in before
 
 
 @pytest.mark.parametrize(

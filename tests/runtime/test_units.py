@@ -98,6 +98,7 @@ def test_systemd_finds_nothing_wrong_in_the_jobs(passphrase: str, tmp_path: Path
     said = verified(tmp_path, files, *files)
     lines = set(re.findall(r"Command Line: (/bin/true .*)", said))
     assert lines == {
+        "/bin/true agent run /srv/ks --once",
         "/bin/true renew /srv/ks --all-expiring 30d",
         "/bin/true check keystore /srv/ks",
         "/bin/true check runtime --watch",
@@ -107,7 +108,11 @@ def test_systemd_finds_nothing_wrong_in_the_jobs(passphrase: str, tmp_path: Path
     renew = files["sros-renew.service"]
     assert ("LoadCredential=ca-passphrase:/etc/sros/passphrase\n" in renew) == bool(passphrase)
     assert "ReadWritePaths=/srv/ks\n" in renew
-    assert not any("ReadWritePaths" in files[name] for name in files if "renew" not in name)
+    writing = {name for name in files if "ReadWritePaths" in files[name]}
+    assert writing == {"sros-renew.service", "sros-agent.service"}
+    env = {**os.environ, "SYSTEMD_UNIT_PATH": f"{tmp_path}:"}
+    command = ["systemd-analyze", "security", "--offline=true", "--no-pager", "--threshold=30"]
+    run([*command, "sros-agent.service"], env=env)
 
 
 # ── hostile names and words ────────────────────────────────────────────────────────────────
