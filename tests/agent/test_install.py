@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
+import subprocess
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
+from subprocess import PIPE
 
 import pytest
 
@@ -18,7 +21,7 @@ from sros_tool.pki.keys import generate_key
 from tests.agent.releases import NAMES, Home, authority_of, files_of, moment, release_of
 from tests.keystore.test_transaction import DIED, in_child, run_out_of_space
 from tests.keystore.test_transaction import REFUSED as GIVEN_UP
-from tests.support.children import apart, some_steps
+from tests.support.children import LONG, apart, some_steps
 from tests.support.harness import sros
 
 A, B, C = (f"enclaves{name}" for name in NAMES)
@@ -76,6 +79,54 @@ def test_a_revocation_list_comes_to_all(home: Home, robot: Path) -> None:
     assert install(robot, home.revoked).changed == NAMES
     assert all((robot / place / "crl.pem").is_file() for place in (A, B, C))
     sros("verify", robot).ok()
+
+
+VIEW = """
+set -e
+mkdir -p {spare}/own {spare}/box
+mount --bind {robot}/enclaves/r1/b {spare}/own
+mount --bind {robot}/enclaves/r1/c {spare}/box
+mount -t tmpfs none {robot}/enclaves
+mkdir -p {robot}/enclaves/r1/b
+mount --bind {spare}/own {robot}/enclaves/r1/b
+echo ready
+while read line; do
+    (cd / && ls {robot}/enclaves/r1 && sha256sum < {robot}/enclaves/r1/b/key.pem
+    ls {robot}/enclaves/r1/b | wc -l && ls {spare}/box | wc -l) | tr '\\n' ' '
+    echo
+done
+"""
+
+
+@pytest.mark.skipif(not shutil.which("unshare"), reason="unshare is needed")
+def test_units_and_containers_keep_their_view_through_many_installations(
+    home: Home, robot: Path, tmp_path: Path
+) -> None:
+    """A unit of `sros units` sees one enclave alone, a container the folder of another one."""
+    key = (robot / B / "key.pem").read_bytes()
+    script = VIEW.format(robot=robot, spare=tmp_path / "spare")
+    user = [] if os.geteuid() == 0 else ["--map-root-user"]
+    command = ["unshare", *user, "--mount", "sh", "-c", script]
+    with subprocess.Popen(command, stdin=PIPE, stdout=PIPE, text=True) as unit:
+        assert unit.stdin and unit.stdout
+        if unit.stdout.readline() != "ready\n":
+            pytest.skip("mount namespaces are not allowed here")
+
+        def seen() -> str:
+            assert unit.stdin and unit.stdout
+            unit.stdin.write("\n")
+            unit.stdin.flush()
+            return unit.stdout.readline()
+
+        full = seen()
+        assert full == f"b {hashlib.sha256(key).hexdigest()}  - 6 6 \n"
+        for number in range(10, 60 if LONG else 20):
+            files = home.renewed.files if number % 2 else home.first.files
+            assert install(robot, home.release(files, number)).changed == ("/r1/a",) or number == 10
+        assert seen() == full
+        assert install(robot, home.revoked).changed == NAMES
+        assert seen() == full.replace("6 6", "7 7"), "the revocation list comes into both"
+        unit.stdin.close()
 
 
 REFUSED: dict[str, tuple[Callable[[Home], Release], str]] = {
