@@ -491,7 +491,7 @@ def units(
       $ sudo systemctl enable --now sros@talker
       $ sros units keystore --match '/arm/*' units  # /etc/sros/nodes/arm/...
       $ sros units keystore --job renew --job check --job metrics units
-      $ sros units /etc/sros/keystore --job agent units  # on a robot, see `sros agent`
+      $ sros units /etc/sros/keystore --job agent units  # on a robot
     """
     from sros_tool.runtime.units import (
         WrittenUnits,
