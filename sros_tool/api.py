@@ -261,7 +261,8 @@ def fleet_status(
     Args:
         keystore: A keystore with a fleet, or its path.
         robots: The names of some robots; all by default.
-        max_age: Robots whose last confirmation is older count as ``overdue``.
+        max_age: Robots whose last confirmation is older are ``overdue`` and ``offline``; without
+            it, robots that fetch and were not heard of for more than a day.
         now: The time from which ages count; the current time by default.
 
     Returns:
@@ -282,7 +283,7 @@ def fleet_status(
     from sros_tool.keystore.reader import Keystore as OpenedKeystore
 
     fleet = status.fleet_status(OpenedKeystore(Path(keystore)), tuple(_several("robots", robots)))
-    return fleet.with_overdue(max_age, _moment(now)) if max_age else fleet
+    return fleet.with_overdue(_moment(now), max_age)
 
 
 def export_enclaves(

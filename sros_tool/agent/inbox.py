@@ -11,8 +11,8 @@ from sros_tool.agent.fetch import ClientCertificate
 from sros_tool.errors import UnavailableError
 from sros_tool.files import staged_file
 from sros_tool.folders import Folder
+from sros_tool.keystore.confirmation import MESSAGE_FILE
 
-MESSAGE_FILE = "confirmation.p7s"
 _SECONDS = 30.0
 _MOST_REPLY = 4096
 

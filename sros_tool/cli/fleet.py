@@ -435,7 +435,8 @@ class ComparedFleet(NamedTuple):
 @click.option(
     "--max-age",
     metavar="DURATION",
-    help="Treat confirmations older than this, such as 7d, as missing.",
+    help="Robots not heard of for longer than this are offline. [default: 1d for robots that "
+    "fetch]",
 )
 @click.option("--prometheus", is_flag=True, help="Print metrics for node_exporter's textfile.")
 @click.option("--html", is_flag=True, help="Print the status as an HTML page.")
@@ -459,8 +460,9 @@ def _status(
     A robot should have what an export from the keystore ROOT would give it now. A file is current;
     earlier (issued for this enclave before); another's (issued for another enclave); revoked;
     missing; or unknown (never issued by this keystore). Processes use new files only after a
-    restart: those that are due are in what the Ansible collection confirms, and not in what `sros
-    fleet report` does. Then the known vulnerabilities of the DDS that the
+    restart: those that are due are in what the Ansible collection and `sros agent` confirm, and not
+    in what `sros fleet report` does. A robot that was not heard of for too long is offline. Then
+    the known vulnerabilities of the DDS that the
     robots reported are named, by the advisories of sros and of --advisories.
 
     Example:
@@ -495,8 +497,7 @@ def _status(
     known = advisories_of(advisories)
     with progress("comparing"):
         status = fleet_status(Keystore(root), robots)
-    if oldest:
-        status = status.with_overdue(oldest, moment)
+    status = status.with_overdue(moment, oldest)
     reported = {robot.robot: robot.dds for robot in status.robots if robot.received}
     outdated = [
         robot
@@ -555,8 +556,6 @@ def _lines(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[str]:
     if status.stage != "complete":
         behind = sum(robot.stage != status.stage for robot in status.robots if robot.enclaves)
         yield f"CA rotation: {status.stage}; {counted(behind, 'robot')} not there yet"
-    if status.overdue:
-        yield f"{counted(len(status.overdue), 'robot')} confirmed too long ago"
     if status.unassigned:
         whom = "it" if status.unassigned == 1 else "them"
         yield f"{counted(status.unassigned, 'enclave')} of no robot: nothing is known of {whom}"
@@ -569,10 +568,7 @@ def _lines(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[str]:
             "; ".join(_summary(robot, status.stage)),
         )
         for robot in status.robots
-        if robots
-        or robot.state not in ("current", "none")
-        or robot.notes
-        or robot.robot in status.overdue
+        if robots or robot.state not in ("current", "none") or robot.notes or robot.problems
     ]
     widths = [max(len(row[column]) for row in rows) for column in range(3)]
     for row in rows if len(rows) > 1 else ():
@@ -611,7 +607,10 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
         yield f"processes of {first_few(robot.restart, _MOST_GROUPS)} run with earlier files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"CA files of the stage {robot.stage}"
+    if robot.crl_in_force is False and robot.received:
+        yield "the revocation list is not in force"
     yield from robot.notes
+    yield from (robot.problems or ())[:_MOST_GROUPS]
 
 
 def _several(number: int, kind: str) -> str:

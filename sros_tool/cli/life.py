@@ -526,7 +526,7 @@ def _unconfirmed(root: Path) -> tuple[str, ...] | str:
     if rotation.stage is RotationStage.NONE:
         return ()
     try:
-        return robots_cut_off(keystore, rotation, rotation.next_stage())
+        return robots_cut_off(keystore, rotation, rotation.next_stage(), now())
     except SrosError as error:
         return error.what
 

@@ -48,6 +48,8 @@ from sros_tool.xml import read_bytes
 _FORMAT = 1
 MAX_BYTES = 4 * 1024 * 1024
 """Largest size of a confirmation in bytes; enough for a robot with 4,000 enclaves."""
+MESSAGE_FILE = "confirmation.p7s"
+"""Name of a robot's signed message, in the folder of the robot in an inbox."""
 CONFIRMED_FILES = (
     *(file for file in REQUIRED_FILES if file != KEY_FILE),
     *OPTIONAL_FILES,

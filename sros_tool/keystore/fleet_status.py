@@ -24,7 +24,11 @@ from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     CONFIRMED_FILES,
+    Confirmation,
+    Received,
+    RobotClock,
     RobotDds,
+    RunningFiles,
     certificate_digests,
     enclave_of,
     last_confirmation,
@@ -32,6 +36,7 @@ from sros_tool.keystore.confirmation import (
 from sros_tool.keystore.fleet import enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
+    CRL,
     CRL_FILE,
     GOVERNANCE_FILE,
     IDENTITY_CA_FILE,
@@ -49,6 +54,7 @@ from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import digest
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.prometheus import Metric, Sample
+from sros_tool.validity import parse_iso
 from sros_tool.values import NamedKeystore, Words, shows
 
 
@@ -68,6 +74,8 @@ class State(StrEnum):
     DIFFERENT = "different"
     """A Zenoh file that is not the present one; the ledger does not record earlier Zenoh files."""
     MISSING = "missing"
+    OFFLINE = "offline"
+    """Nothing was heard of the robot for too long, whatever it had then."""
     BROKEN = "broken"
     """The file in the keystore is missing or cannot be read, so no export can be made."""
     NEVER = "never"
@@ -92,6 +100,10 @@ _KINDS = {
 _ZENOH = "zenoh"
 FileKind = Annotated[str, Words((*_KINDS.values(), _ZENOH))]
 _AUTHORITIES = ("identity_ca", "permissions_ca")
+_EXPIRING = ("certificate", "permissions", "crl")
+"""Kinds of files whose expiry on a robot the ledger tells."""
+_LONGEST_SILENCE = timedelta(days=1)
+"""From when a robot that fetches is offline, if nothing else is asked for."""
 
 
 def _kind_of(path: str) -> str:
@@ -136,7 +148,8 @@ class ConfirmedFile:
 
 @shows(
     *("robot", "state", "enclaves", "revoked", "unrecorded", "sharing_name", "received", "clock"),
-    *("stage", "files", "pending", "restart", "dds", "notes"),
+    *("fetches", "release", "stage", "files", "pending", "restart", "running", "crl_in_force"),
+    *("expiry", "dds", "problems", "notes"),
     null_if_empty=("stage",),
 )
 @dataclass(frozen=True, slots=True)
@@ -150,8 +163,8 @@ class RobotStatus:
     """Name of the robot."""
     state: State
     """The worst state of the robot's files; ``restart``: they are current, but processes still run
-    with earlier ones; ``never``: it sent no confirmation; ``none``: it has no enclave in the
-    keystore."""
+    with earlier ones; ``offline``: its last confirmation is too old (`overdue`); ``never``: it sent
+    no confirmation; ``none``: it has no enclave in the keystore."""
     enclaves: int
     """Number of the robot's enclaves in the keystore."""
     revoked: tuple[str, ...]
@@ -162,6 +175,11 @@ class RobotStatus:
     null."""
     clock: datetime | None
     """The time of the robot's clock in the last confirmation, in UTC, or null."""
+    fetches: bool
+    """Whether the robot fetches its files: its agent has sent a message, which was verified."""
+    release: int | None
+    """Number of the release that the robot's agent installed last, 0 for none; null if it does not
+    say it."""
     stage: Annotated[str, Words(("unknown", "before", "distribute", "reissue", "complete"))]
     """The stage of a CA rotation that the robot's CA files have reached; null if it confirmed no CA
     file. ``before``: it does not trust the new CA yet; ``complete``: it trusts only the new CA."""
@@ -172,8 +190,20 @@ class RobotStatus:
     restart: tuple[str, ...] | None
     """The robot's enclaves whose processes still run with earlier files, by its last confirmation;
     null if it does not say it."""
+    running: Mapping[str, RunningFiles] | None
+    """The files that the processes of each enclave of the robot have loaded, by its last
+    confirmation; null if it does not say it."""
+    crl_in_force: bool | None
+    """Whether the robot has the present revocation list, and no process that runs with earlier
+    files, as far as it says it, and is not ``offline``; null if the keystore has no list, or the
+    robot has no enclave."""
+    expiry: Mapping[Annotated[str, Words(_EXPIRING)], datetime]
+    """The first expiry of the robot's files, by kind, in UTC, as the ledger has it for the files
+    that the robot confirmed."""
     dds: RobotDds | None
     """The DDS of the robot by its last confirmation; null if it does not say it."""
+    problems: tuple[str, ...] | None
+    """What the robot's agent could not do, in its own words; null if it does not say it."""
     notes: tuple[str, ...]
     """Remarks, as clauses, such as on the robot's clock."""
 
@@ -191,6 +221,12 @@ class RobotStatus:
         """
         return self.others.naming
 
+    def offline(self) -> RobotStatus:
+        """Return the status after nothing was heard of the robot for too long."""
+        state = max(self.state, State.OFFLINE, key=_BADNESS.__getitem__)
+        in_force = None if self.crl_in_force is None else False
+        return replace(self, state=state, crl_in_force=in_force)
+
 
 @shows("keystore", "complete", "stage", "counts", "unassigned", "overdue", "robots")
 @dataclass(frozen=True, slots=True)
@@ -206,7 +242,8 @@ class FleetStatus:
     """Number of enclaves that belong to no robot, so that no confirmation covers them; 0 with
     --robot."""
     overdue: frozenset[str] = frozenset()
-    """The robots whose last confirmation is older than --max-age, sorted by name."""
+    """The robots whose last confirmation is older than --max-age, sorted by name; without that
+    option, the robots that fetch and were not heard of for more than a day."""
 
     @property
     def counts(self) -> Mapping[State, int]:
@@ -223,14 +260,22 @@ class FleetStatus:
             robot.state in (State.CURRENT, State.NONE) for robot in self.robots
         )
 
-    def with_overdue(self, max_age: timedelta, now: datetime) -> FleetStatus:
-        """Return a copy that names the robots whose last confirmation is older than ``max_age``."""
-        late = (
+    def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
+        """Return a copy in which the robots that were not heard of for too long are offline.
+
+        These are the robots whose last confirmation is older than ``max_age``; without it, the
+        robots that fetch and were not heard of for more than a day.
+        """
+        late = frozenset(
             robot.robot
             for robot in self.robots
-            if robot.enclaves and robot.received and now - robot.received > max_age
+            if robot.enclaves
+            and robot.received
+            and (max_age or robot.fetches)
+            and now - robot.received > (max_age or _LONGEST_SILENCE)
         )
-        return replace(self, overdue=frozenset(late))
+        robots = (robot.offline() if robot.robot in late else robot for robot in self.robots)
+        return replace(self, robots=tuple(robots), overdue=late)
 
 
 def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
@@ -277,19 +322,39 @@ class _ComparedRobot(NamedTuple):
     """A robot's confirmation, compared with the files of its enclaves in the keystore.
 
     ``current`` counts the files that are as in the keystore, by kind.  ``authorities`` maps the
-    kind of a CA file to the certificates in the confirmed CA files of all enclaves.
+    kind of a CA file to the certificates in the confirmed CA files of all enclaves.  ``expiring``
+    maps kinds of files that expire to the SHA-256 by which the ledger has them.
     """
 
     robot: Robot
     enclaves: tuple[str, ...]
-    received: datetime | None
-    clock: datetime | None
+    received: Received | None
     current: Mapping[str, int]
     different: tuple[_Difference, ...]
     authorities: Mapping[str, frozenset[tuple[str, ...]]]
-    restart: tuple[str, ...] | None
-    dds: RobotDds | None
+    expiring: Mapping[str, frozenset[str]]
     notes: tuple[str, ...]
+
+    @property
+    def confirmed(self) -> Confirmation | None:
+        """The confirmation; None if the robot sent none."""
+        return self.received.confirmation if self.received else None
+
+    def running(self) -> Mapping[str, RunningFiles] | None:
+        """Return what the processes of the robot's enclaves have loaded; None if it is not said."""
+        if self.confirmed is None or self.confirmed.running is None:
+            return None
+        running = self.confirmed.running
+        return {name: running[name] for name in self.enclaves if name in running}
+
+    def restart(self) -> tuple[str, ...] | None:
+        """Return the enclaves whose processes have earlier files; None if it is not said."""
+        running = self.running()
+        due = self.confirmed.restart if self.confirmed else None
+        if due is None and running is None:
+            return None
+        earlier = {name for name, files in (running or {}).items() if files == RunningFiles.EARLIER}
+        return tuple(sorted(earlier | ({*(due or ())} & {*self.enclaves})))
 
 
 def _compare_robots(root: Path, fleet: Fleet, robots: Sequence[Robot]) -> list[_ComparedRobot]:
@@ -312,13 +377,13 @@ def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _Compare
     except SrosError as error:
         notes.append(f"its last confirmation cannot be used: {error}")
     if received is None:
-        return _ComparedRobot(robot, enclaves, None, None, {}, (), {}, None, None, tuple(notes))
-    if note := received.clock_note():
-        notes.append(note)
+        return _ComparedRobot(robot, enclaves, None, {}, (), {}, {}, tuple(notes))
+    notes += _notes_on_clock(received)
     confirmed = received.confirmation
     current: Counter[str] = Counter()
     different: list[_Difference] = []
     authorities: dict[str, set[tuple[str, ...]]] = {kind: set() for kind in _AUTHORITIES}
+    expiring: dict[str, set[str]] = {kind: set() for kind in _EXPIRING}
     left = set(confirmed.files)
     for name in enclaves:
         for path, file in at_home.files_of(name).items():
@@ -333,6 +398,10 @@ def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _Compare
                 different.append(_Difference(path, sha256, certificates, at_keystore, own=True))
             if kind in authorities:
                 authorities[kind].add(certificates)
+            elif kind in expiring:
+                expiring[kind].update(
+                    certificates[:1] if kind == "certificate" else {sha256} - {""}
+                )
     folders = {enclave_folder(name) for name in enclaves}
     for path in sorted(left):
         certificates = confirmed.certificates.get(path, ())
@@ -341,15 +410,20 @@ def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _Compare
     return _ComparedRobot(
         robot,
         enclaves,
-        received.time,
-        confirmed.time,
+        received,
         current,
         tuple(different),
         {kind: frozenset(certificates) for kind, certificates in authorities.items()},
-        None if confirmed.restart is None else tuple({*confirmed.restart} & {*enclaves}),
-        confirmed.dds,
+        {kind: frozenset(digests) for kind, digests in expiring.items()},
         tuple(notes),
     )
+
+
+def _notes_on_clock(received: Received) -> Iterator[str]:
+    if note := received.clock_note():
+        yield note
+    if received.confirmation.clock == RobotClock.BEHIND:
+        yield "its clock is earlier than documents that it has verified"
 
 
 class _FileAtHome(NamedTuple):
@@ -406,8 +480,8 @@ class _Home:
             data = read(path)
         except (SrosError, OSError):
             return None
-        is_bundle = _kind_of(path) in _AUTHORITIES
-        certificates = certificate_digests(data) if is_bundle else ()
+        has_certificates = _kind_of(path) in (*_AUTHORITIES, "certificate")
+        certificates = certificate_digests(data) if has_certificates else ()
         return _FileAtHome(hashlib.sha256(data).hexdigest(), certificates)
 
 
@@ -421,6 +495,8 @@ class _Known:
         self, keystore: Keystore, fleet: Fleet, compared: Sequence[_ComparedRobot]
     ) -> None:
         self._root = keystore.root
+        self.has_list = keystore.has(CRL)
+        """Whether the keystore has a revocation list."""
         self._fleet = fleet
         self._issued: dict[str, Entry] = {}
         self._revoked_serials: set[str] = set()
@@ -428,6 +504,9 @@ class _Known:
         different = [file for robot in compared for file in robot.different if file.confirmed]
         wanted = {file.confirmed for file in different}
         wanted.update(certificate for file in different for certificate in file.certificates)
+        for robot in compared:
+            wanted.update(*robot.expiring.values())
+        wanted.discard("")  # of a file that the robot does not have
         ledger = keystore.ledger if wanted else keystore.ledger_with("what", "revocation")
         for entry in ledger.entries:
             if entry.sha256 in wanted:
@@ -448,6 +527,16 @@ class _Known:
         names = {name for name in enclaves_of(self._fleet, robot) if name in self._revoked}
         names.update(self._unrecorded[robot.name].below)
         return tuple(sorted(name for name in names if not has_enclave(self._root, name)))
+
+    def expiry(self, compared: _ComparedRobot) -> dict[str, datetime]:
+        """Return the first expiry of a robot's files, by kind, as far as the ledger has them."""
+        first: dict[str, datetime] = {}
+        for kind, digests in compared.expiring.items():
+            entries = (self._issued.get(digest) for digest in digests)
+            ends = [entry.not_after for entry in entries if entry and entry.what == kind]
+            if end := min(filter(None, ends), default=""):
+                first[kind] = parse_iso(end)
+        return first
 
     def file(self, robot: Robot, difference: _Difference) -> ConfirmedFile:
         """Return the state and the origin of a robot's file that differs from the keystore."""
@@ -507,27 +596,38 @@ def _status(
         counts.setdefault(kind, Counter())[State.CURRENT] = number
     for file in different:
         counts.setdefault(file.kind, Counter())[file.state] += 1
+    restart = compared.restart()
     if different:
         state = max((file.state for file in different), key=_BADNESS.__getitem__)
     elif not compared.enclaves:
         state = State.NONE
-    elif compared.restart:
+    elif restart:
         state = State.RESTART
     else:
         state = State.NEVER if compared.received is None else State.CURRENT
+    received, confirmed = compared.received, compared.confirmed
+    in_force = (
+        received is not None and not restart and set(counts.get("crl", ())) <= {State.CURRENT}
+    )
     return RobotStatus(
         compared.robot.name,
         state,
         len(compared.enclaves),
         known.revoked(compared.robot),
         unrecorded,
-        compared.received,
-        compared.clock,
+        received.time if received else None,
+        confirmed.time if confirmed else None,
+        bool(received and received.message),
+        confirmed.release if confirmed else None,
         stages.of(compared),
         {kind: counts[kind] for kind in (*_KINDS.values(), _ZENOH) if kind in counts},
         different,
-        compared.restart and tuple(sorted(compared.restart)),
-        compared.dds,
+        restart,
+        compared.running(),
+        in_force if known.has_list and compared.enclaves else None,
+        known.expiry(compared),
+        confirmed.dds if confirmed else None,
+        confirmed.problems if confirmed else None,
         compared.notes,
     )
 
@@ -613,6 +713,44 @@ def fleet_metrics(
                 Sample(int(robot.received.timestamp()), labels)
                 for labels, robot in robots
                 if robot.received
+            ),
+        ),
+        Metric(
+            "sros_fleet_expiry_timestamp_seconds",
+            "The first expiry of the files on a robot by kind, in seconds since 1970, as the "
+            "ledger has it for the files that the robot confirmed.",
+            tuple(
+                Sample(int(end.timestamp()), {**labels, "kind": kind})
+                for labels, robot in robots
+                for kind, end in robot.expiry.items()
+            ),
+        ),
+        Metric(
+            "sros_fleet_restarts_due",
+            "Number of enclaves whose processes still run with earlier files, for robots that "
+            "say it.",
+            tuple(
+                Sample(len(robot.restart), labels)
+                for labels, robot in robots
+                if robot.restart is not None
+            ),
+        ),
+        Metric(
+            "sros_fleet_revocation_list_in_force",
+            "Whether the present revocation list is in force on a robot (1) or not (0).",
+            tuple(
+                Sample(int(robot.crl_in_force), labels)
+                for labels, robot in robots
+                if robot.crl_in_force is not None
+            ),
+        ),
+        Metric(
+            "sros_fleet_release",
+            "Number of the release that a robot installed last, for robots that fetch.",
+            tuple(
+                Sample(robot.release, labels)
+                for labels, robot in robots
+                if robot.release is not None
             ),
         ),
         Metric(

@@ -346,7 +346,7 @@ def _demo_row(row: Json) -> Iterator[str]:
 # ── a fleet ──────────────────────────────────────────────────────────────────────────────────────
 
 _GOOD = ("current", "none")
-_OUT_OF_DATE = ("restart", "earlier", "different", "missing", "never")
+_OUT_OF_DATE = ("restart", "earlier", "different", "missing", "offline", "never")
 
 
 def render_fleet_page(status: Json) -> str:
@@ -378,7 +378,10 @@ def _fleet_head(status: Json) -> str:
 
 def _fleet_table(status: Json) -> str:
     rows = sorted(status["robots"], key=lambda robot: (robot["state"] in _GOOD, robot["robot"]))
-    heads = ("robot", "state", "confirmed", "enclaves", "CA stage", "what differs")
+    heads = (
+        *("robot", "state", "confirmed", "release", "enclaves", "first expiry", "CA stage"),
+        "what differs",
+    )
     return (
         f"<table><thead><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead>"
         f"<tbody>{''.join(map(_fleet_row, rows))}</tbody></table>"
@@ -395,13 +398,18 @@ def _fleet_row(robot: Json) -> str:
         for (kind, state, whose, since), number in differences.items()
     ]
     due = [f"processes of {name} run with earlier files" for name in robot["restart"] or ()]
+    if robot["crl_in_force"] is False and robot["received"]:
+        due.append("the revocation list is not in force")
+    release = "" if robot["release"] is None else str(robot["release"])
     cells = (
         f"<code>{escape(robot['robot'])}</code>",
         f'<span class="{_fleet_class(robot["state"])}">{escape(robot["state"])}</span>',
         escape(robot["received"] or ""),
+        release,
         str(robot["enclaves"]),
+        escape(min(robot["expiry"].values(), default="")),
         escape(robot["stage"] or ""),
-        "<br>".join(map(escape, (*what, *due, *robot["notes"]))),
+        "<br>".join(map(escape, (*what, *due, *robot["notes"], *(robot["problems"] or ())))),
     )
     return f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
 

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from sros_tool.files import templates_dir
-from sros_tool.keystore.delivery.collect import MESSAGE_FILE
+from sros_tool.keystore.confirmation import MESSAGE_FILE
 from sros_tool.pki.certificates import make_request
 from tests.keystore.test_confirmation import DDS
 from tests.support.harness import policy_text, publish, sros
@@ -423,6 +423,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("crew from_crew", 1),
         Case("crew from_crew --dry-run", 1),
         Case("fresh good", before=("fleet collect fresh good",)),
+        Case("fresh from_fresh", 1),
         Case("fresh from_fresh", 1, before=("renew fresh /a",)),
         Case("unable from_crew", 2),
     ),

@@ -7,31 +7,44 @@ import json
 import re
 import shutil
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from sros_tool.keystore.confirmation import parse_confirmation
+from sros_tool.keystore.confirmation import (
+    MESSAGE_FILE,
+    RobotDds,
+    RobotLibrary,
+    RunningFiles,
+    Seen,
+    parse_confirmation,
+)
 from sros_tool.keystore.layout import ENCLAVES
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import Keystore, read_certificate
+from sros_tool.pki.certificates import digest
 from sros_tool.validity import iso, parse_iso
 from tests.keystore.test_confirmation import DDS, LIBRARY, hostile
 from tests.support.harness import Ended, policy_text, publish, sros
+from tests.support.messages import said_by, signed_message
 
 ROBOTS = ("r1", "r2", "r3")
 NO_NODE = ("--exclude", "enclave.node-cannot-start")
 POLICY = policy_text({"/{robot}/base": publish("/{robot}/x"), "/dispatcher": publish("/y")})
+SOUND_DDS = RobotDds(
+    (RobotLibrary(LIBRARY["product"], LIBRARY["version"], LIBRARY["path"], Seen.PROCESS),), 0
+)
 SHARED = ("governance", "identity_ca", "permissions_ca")
 
 
-@dataclass(frozen=True)
+@dataclass
 class Field:
     """A keystore with a fleet, and a folder for each robot."""
 
     folder: Path
+    sequence: int = 0
 
     @property
     def root(self) -> Path:
@@ -54,6 +67,24 @@ class Field:
         said = json.loads(self.run("fleet", "report", robot, "--robot", robot).out)
         (self.folder / "said.json").write_text(json.dumps(said | {"dds": DDS} | changed))
         return self.run("fleet", "confirm", "ks", "said.json", "--robot", robot)
+
+    def send(self, robot: str, **changed: object) -> Ended:
+        """Let the agent of a robot say what it has, with ``changed`` values, and take it in."""
+        self.sequence += 1
+        folder, now = self.folder / robot, datetime.now(UTC)
+        values = {"sequence": self.sequence, "dds": SOUND_DDS, **changed}
+        message = signed_message(folder, f"/{robot}/base", said_by(folder, robot, now, **values))
+        place = self.folder / "inbox" / robot
+        place.mkdir(parents=True, exist_ok=True)
+        (place / MESSAGE_FILE).write_bytes(message)
+        return sros("fleet", "collect", "ks", "inbox", cwd=self.folder)
+
+    def age(self, robot: str, by: timedelta) -> None:
+        """Let the last confirmation of a robot be older."""
+        kept = self.root / "confirmed" / f"{robot}.json"
+        value = json.loads(kept.read_text())
+        value["received"] = iso(parse_iso(value["received"]) - by)
+        kept.write_text(json.dumps(value))
 
     def status(self) -> dict[str, Any]:
         """Return what is where; the exit status says whether all of it is as it should be."""
@@ -110,7 +141,7 @@ def test_a_fleet_that_has_all_it_should_have(field: Field) -> None:
         json.dumps({**json.loads(kept.read_text()), "received": "2020-01-01T00:00:00Z"})
     )
     lines = field.run("fleet", "status", "ks", "--max-age", "1h", status=1).out.splitlines()
-    assert lines[:2] == ["3 robots: 3 current", "1 robot confirmed too long ago"]
+    assert lines[0] == "3 robots: 2 current, 1 offline"
     assert lines[-1].startswith("r1 ")
     late = json.loads(field.run("fleet", "status", "ks", "--max-age", "1h", "--json", status=1).out)
     assert (late["overdue"], late["complete"]) == (["r1"], False)
@@ -283,6 +314,106 @@ def test_a_restart_that_is_due(field: Field) -> None:
     assert "processes of /r1/base run with earlier files" in told
     page = field.run("fleet", "status", "ks", "--html", status=1).out
     assert "processes of /r1/base run with earlier files" in page
+
+
+def test_a_robot_that_fetches_is_offline_after_a_day(field: Field) -> None:
+    """A robot that confirms by plays is not, unless somebody asks for it."""
+    hours = timedelta(hours=1)
+    field.send("r1", release=3, problems=("the disk is full",))
+    assert field.states() == dict.fromkeys(ROBOTS, "current")
+    for robot in ("r1", "r2"):
+        field.age(robot, 23 * hours)
+    assert field.states() == dict.fromkeys(ROBOTS, "current")
+    for robot in ("r1", "r2"):
+        field.age(robot, 2 * hours)
+    found = field.status()
+    assert field.states() == {"r1": "offline", "r2": "current", "r3": "current"}
+    assert (found["overdue"], found["complete"]) == (["r1"], False)
+    assert [found["robots"][robot]["fetches"] for robot in ROBOTS] == [True, False, False]
+    assert found["robots"]["r1"]["release"] == 3
+    lines = field.run("fleet", "status", "ks", status=1).out.splitlines()
+    assert lines[0] == "3 robots: 2 current, 1 offline"
+    (line,) = (line for line in lines if line.startswith("r1 "))
+    assert line.split(maxsplit=2)[1] == "offline" and line.endswith("the disk is full")
+    field.run("fleet", "status", "ks", "--max-age", "7d")
+    field.run("fleet", "status", "ks", "--max-age", "24h", status=1)
+    page = field.run("fleet", "status", "ks", "--html", status=1).out
+    assert "the disk is full" in page and "offline" in page
+    # What is worse stays, and what is pending is still known.
+    field.run("revoke", "ks", "--robot", "r1")
+    field.run("renew", "ks", "--robot", "r2")
+    assert field.states()["r1"] == "revoked"
+    field.send("r2")
+    field.age("r2", 25 * hours)
+    assert field.states()["r2"] == "offline" and field.pending("r2")["certificate"][0] == "earlier"
+
+
+def test_a_rotation_waits_for_robots_that_are_offline(field: Field) -> None:
+    field.run("rotate_ca", "ks", "--next")
+    field.deliver(*ROBOTS)
+    field.send("r1")
+    field.age("r1", timedelta(hours=25))
+    refused = field.run("rotate_ca", "ks", "--next", status=2).err
+    assert "not every robot has confirmed the stage distribute: r1. " in refused
+    field.send("r1", running={"/r1/base": RunningFiles.EARLIER})
+    assert ": r1. " in field.run("rotate_ca", "ks", "--next", status=2).err
+    field.send("r1", running={"/r1/base": RunningFiles.CURRENT})
+    field.run("rotate_ca", "ks", "--next")
+
+
+def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
+    def in_force() -> list[bool | None]:
+        return [field.status()["robots"][robot]["crl_in_force"] for robot in ROBOTS]
+
+    assert in_force() == [None, None, None], "nothing was revoked yet"
+    field.run("revoke", "ks", "/dispatcher")
+    assert in_force() == [False, False, False]
+    assert "the revocation list is not in force" in field.run("fleet", "status", "ks", status=1).out
+    field.deliver("r1", "r2")
+    field.send("r2", running={"/r2/base": RunningFiles.EARLIER, "/r9/base": RunningFiles.EARLIER})
+    assert in_force() == [True, False, False]
+    found = field.status()["robots"]["r2"]
+    assert (found["state"], found["restart"]) == ("restart", ["/r2/base"])
+    assert found["running"] == {"/r2/base": "earlier"}
+    field.send("r2", running={"/r2/base": RunningFiles.NOT_SEEN})
+    assert in_force() == [True, True, False]
+    field.age("r2", timedelta(days=2))
+    assert in_force() == [True, False, False]
+    text = field.run("fleet", "status", "ks", "--prometheus", status=1).out
+    assert [value for _, value in samples(text, "sros_fleet_revocation_list_in_force")] == [1, 0, 0]
+
+
+def test_expiry_on_robots_is_that_of_the_files_that_they_have(field: Field) -> None:
+    """Home renewed; the robot that was not reached still has what expires earlier."""
+
+    def expiry() -> dict[str, dict[str, str]]:
+        return {name: robot["expiry"] for name, robot in field.status()["robots"].items()}
+
+    before = expiry()
+    ledger = {entry.sha256: entry.not_after for entry in Keystore(field.root).ledger.entries}
+    first = digest(read_certificate(field.folder / "r1/enclaves/r1/base/cert.pem"))
+    assert before["r1"] == before["r2"] and before["r1"]["certificate"] == ledger[first]
+    field.run("update_keystore", "ks", "--set", "certificates.validity=30d")
+    field.run("renew", "ks", "--robot", "r1", "--robot", "r2")
+    field.deliver("r2")
+    after = expiry()
+    assert after["r1"] == before["r1"] and after["r3"] == before["r3"]
+    assert after["r2"]["certificate"] < before["r2"]["certificate"]
+    assert after["r2"]["permissions"] <= after["r2"]["certificate"]
+    text = field.run("fleet", "status", "ks", "--prometheus", status=1).out
+    seconds = dict(samples(text, "sros_fleet_expiry_timestamp_seconds", "robot", "kind"))
+    assert seconds["r2", "certificate"] == parse_iso(after["r2"]["certificate"]).timestamp()
+    assert len(seconds) == 6
+
+
+def samples(text: str, metric: str, *labels: str) -> list[tuple[tuple[str, ...], float]]:
+    """Return the values of a metric, with some of their labels."""
+    return [
+        (tuple(sample.labels[label] for label in labels), sample.value)
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+        if sample.name == metric
+    ]
 
 
 @pytest.mark.parametrize(

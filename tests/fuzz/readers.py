@@ -258,7 +258,7 @@ def _confirmation(data: bytes, place: Place) -> None:
     keep(place.keystore, received)
     kept = last_confirmation(place.keystore, "r7")
     assert kept and kept.confirmation == received.confirmation
-    found = fleet_status(Keystore(place.keystore)).with_overdue(timedelta(days=1), NOW)
+    found = fleet_status(Keystore(place.keystore)).with_overdue(NOW, timedelta(days=1))
     assert [each.robot for each in found.robots] == ["r7"]
     assert "r7" in render_metrics(fleet_metrics(found, now=NOW))
 

@@ -28,6 +28,7 @@ from sros_tool.fleet.robots import RENEWAL_ALLOWED, Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     MAX_BYTES,
+    MESSAGE_FILE,
     Confirmation,
     LastMessage,
     Received,
@@ -63,8 +64,6 @@ from sros_tool.validity import Window, elapsed, iso, parse_duration
 from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words
 from sros_tool.wording import counted, first_few
 
-MESSAGE_FILE = "confirmation.p7s"
-"""Name of a robot's message in its folder of the inbox."""
 _MOST_NAMES = 100_000
 """Names in an inbox that are looked at, to name those of no robot of the fleet."""
 _SHOWN = 5
@@ -73,6 +72,9 @@ _FEW = 4
 
 
 # ── what is done with messages and requests ────────────────────────────────────────────────
+
+_OUTCOMES = ("renewed", "answered", "not_due", "not_allowed", "refused", "not_signed")
+_GOOD = _OUTCOMES[:3]
 
 
 class CollectedRequest(NamedTuple):
@@ -83,10 +85,10 @@ class CollectedRequest(NamedTuple):
     key_sha256: str
     """SHA-256 of the public key (DER) in the request, in hexadecimal; empty if it cannot be read.
     """
-    outcome: Annotated[str, Words(("renewed", "answered", "not_allowed", "refused", "not_signed"))]
+    outcome: Annotated[str, Words(_OUTCOMES)]
     """``renewed``: the enclave has a new certificate; ``answered``: it had one already, which comes
-    with the next release; ``not_allowed``: the fleet file does not allow it; ``refused``: it must
-    not be signed; ``not_signed``: the CAs cannot sign now."""
+    with the next release; ``not_due``: too early; ``not_allowed``: the fleet file does not allow
+    it; ``refused``: it must not be signed; ``not_signed``: the CAs cannot sign now."""
     why: str
     """The reason as a clause; empty for ``renewed``."""
 
@@ -130,7 +132,7 @@ class CollectedInbox(NamedTuple):
         """Whether no message and no request was refused, and all that are allowed were signed."""
         requests = (request for robot in self.robots for request in robot.requests)
         return all(robot.outcome != "refused" for robot in self.robots) and all(
-            request.outcome in ("renewed", "answered") for request in requests
+            request.outcome in _GOOD for request in requests
         )
 
 
@@ -512,7 +514,7 @@ class _Renewals:
         if self._now < (due := _due(read_credentials(keystore, name).lifetime())):
             if same_key and not is_there:
                 return "answered", "its new certificate comes with the next release"
-            raise _RefusedError(f"it is not due for renewal before {iso(due)}")
+            return "not_due", f"it can be renewed from {iso(due)}"
         if robot.renewal != RENEWAL_ALLOWED:
             return (
                 "not_allowed",

@@ -151,7 +151,7 @@ def rotate_ca(
         if finish or stage not in (rotation.stage, RotationStage.NONE):
             if rotation.stage is not RotationStage.REISSUE:  # the last stage signs nothing
                 _refuse_edited(change.keystore)
-            cut_off = robots_cut_off(change.keystore, rotation, stage)
+            cut_off = robots_cut_off(change.keystore, rotation, stage, now)
             if cut_off and not allow_unconfirmed:
                 raise _would_cut_off(root, rotation, cut_off)
             stage = rotator.go_to(stage, roles, new_keys, validity, progress)
@@ -176,13 +176,15 @@ def _step(change: KeystoreChange, **more: Any) -> RotationStep:
     return change.result(RotationStep, outcomes=outcomes, restart=(), **more)
 
 
-def robots_cut_off(keystore: Keystore, rotation: Rotation, to: RotationStage) -> tuple[str, ...]:
+def robots_cut_off(
+    keystore: Keystore, rotation: Rotation, to: RotationStage, now: datetime
+) -> tuple[str, ...]:
     """Return the sorted names of the robots that the stage ``to`` would cut off from the others.
 
     These are the robots with enclaves that have not confirmed the stage before: first that they
-    trust the new CA, then that they have the files it issued; and those where processes still run
-    with earlier files.  Without a fleet, or by the first
-    stage, no robot is cut off.
+    trust the new CA, then that they have the files it issued; those where processes still run with
+    earlier files; and those that fetch and are offline.  Without a fleet, or by the first stage, no
+    robot is cut off.
 
     Raises:
         KeystoreError: the fleet file is not the file that sros wrote last.
@@ -190,7 +192,8 @@ def robots_cut_off(keystore: Keystore, rotation: Rotation, to: RotationStage) ->
     if to is RotationStage.DISTRIBUTE or checked_fleet(keystore) is None:
         return ()
     stages = list(RotationStage)
-    robots = [robot for robot in fleet_status(keystore).robots if robot.enclaves]
+    status = fleet_status(keystore).with_overdue(now)
+    robots = [robot for robot in status.robots if robot.enclaves]
     if stages.index(to) - stages.index(rotation.stage) > 1:
         return tuple(robot.robot for robot in robots)  # stages that no robot was ever at
     roles = {
@@ -206,6 +209,7 @@ def robots_cut_off(keystore: Keystore, rotation: Rotation, to: RotationStage) ->
         for robot in robots
         if robot.received is None
         or robot.restart
+        or robot.robot in status.overdue
         or any(file.kind in needed and not file.surplus for file in robot.pending)
     )
 
