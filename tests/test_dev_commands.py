@@ -264,6 +264,75 @@ def test_counts_come_from_the_reports_of_pytest(tmp_path: Path) -> None:
     assert checks.count(tmp_path / "none.xml") == {}
 
 
+FORKED_TESTS = {
+    "test_one.py": """
+import os
+import pytest
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("shared")
+    yield folder
+    (folder.parents[2] / f"ended-{os.getpid()}").touch()
+
+def test_passes(shared, tmp_path):
+    assert not list(tmp_path.iterdir())
+
+def test_fails(shared):
+    print("what it printed")
+    assert "this" == "that"
+
+@pytest.mark.skip(reason="why not")
+def test_skipped():
+    pass
+""",
+    "test_two.py": """
+import os
+
+def test_passes():
+    pass
+
+def test_ends_its_process():
+    os.abort()
+
+def test_never_runs():
+    pass
+""",
+}
+
+
+def test_forked_processes_report_what_a_single_one_would(tmp_path: Path) -> None:
+    """A test that ends its process has failed, and so has what would have come after it."""
+    for name, text in FORKED_TESTS.items():
+        (tmp_path / name).write_text(text)
+    words = ("-p", "no:cacheprovider", "-c", "/dev/null", "--rootdir", ".", "-ra")
+    forked = ("-p", "tools.forked_tests", "--processes", "2", f"--basetemp={tmp_path / 'made'}")
+
+    def run(*more: str) -> str:
+        ended = subprocess.run(
+            [sys.executable, "-m", "pytest", *words, *forked, f"--junit-xml={report}", *more],
+            cwd=tmp_path,
+            env={"PYTHONPATH": str(CHECKOUT), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"},
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+        )
+        return f"{ended.stdout}{ended.returncode}"
+
+    report = tmp_path / "report.xml"
+    text = run("-k", "not ends and not never")
+    assert text.endswith("1")
+    assert "assert 'this' == 'that'" in text
+    assert "what it printed" in text
+    assert "SKIPPED [1] test_one.py:18: why not" in text
+    assert checks.count(report) == {"passed": 2, "failed": 1, "skipped": 1}
+    assert len(list(tmp_path.glob("ended-*"))) == 1
+    text = run("test_two.py", "test_one.py")
+    assert "test_ends_its_process - its process ended: SIGABRT" in text
+    assert "2 tests have not ended, such as test_two.py::test_ends_its_process" in text
+    assert not text.endswith("\n0")
+
+
 @pytest.mark.parametrize(
     ("arguments", "started"),
     [

@@ -13,6 +13,7 @@ from sros_tool.cli.program import FAMILIES
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.demo.scenarios.on_zenoh import ATTACKS as ZENOH_ATTACKS
 from tests.support.checkout import known_files
+from tests.support.tables import for_every
 
 PROJECT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
@@ -36,7 +37,7 @@ def anchors(document: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=str)
+@for_every(DOCUMENTS)
 def test_links_lead_somewhere(document: Path) -> None:
     links = re.findall(r"\]\(([^)]+)\)", FENCE.sub("", read(document)))
     for link in links:

@@ -18,6 +18,7 @@ from sros_tool.explain.log import explain_log
 from tests.explain.broken import make_keystore
 from tests.explain.test_log import LOGS
 from tests.support.harness import sros
+from tests.support.tables import for_every
 
 PACKAGE = Path(sros_tool.__file__).parent
 FILLED_IN = re.compile(r"\{[\w.]*\}")
@@ -118,7 +119,7 @@ def test_a_denied_topic_names_a_question_that_can_be_asked(line: str, keystore: 
         assert asked.status in (0, 1), (command, asked)
 
 
-@pytest.mark.parametrize("log", sorted(LOGS.glob("*.log")), ids=lambda log: log.name)
+@for_every(sorted(LOGS.glob("*.log")), lambda log: log.name)
 def test_every_remedy_for_a_log_is_a_command(log: Path, keystore: Path) -> None:
     for found in explain_log(log.read_text(), lambda _: None, lambda _: pytest.fail("")):
         for command in re.findall("`(sros .+?)`", found.remedy):

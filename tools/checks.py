@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from xml.etree import ElementTree
@@ -20,7 +20,7 @@ from tools.steps import CHECKOUT, VENV, SetupError, log_tail, say, succeeds
 _NOTHING_COLLECTED = 5
 """pytest's exit status when a selection matches no test."""
 
-_PLUGINS = "xdist.plugin,_hypothesis_pytestplugin"
+_PLUGINS = "_hypothesis_pytestplugin"
 
 LONG = "--long"
 """The argument for more random and exhaustive cases; like the variable SROS_LONG."""
@@ -34,8 +34,8 @@ OLDEST_PACKAGES = ("click==8.1.6", "cryptography==41.0.7", "lxml==5.2.1")
 WITH_DDS = ("tests/integration", "tests/explain")
 """The folders with tests that start DDS processes; see `modules_with_dds`."""
 
-COLLECT = ["-m", "pytest", "--collect-only", "-qq", "-p", "tools.import_tests"]
-"""pytest compiles the tests for its messages; once, before five processes would do it each."""
+FORKED = ("-p", "tools.forked_tests", "--processes")
+"""pytest's arguments before a number of processes."""
 
 LINT = {
     "ruff check": ["-m", "ruff", "check", "--quiet"],
@@ -73,12 +73,8 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
         return _conclude(_run_together(steps, "pytest", env), Counter(), started)
     cores = len(os.sched_getaffinity(0))
     parts = {
-        "tests": ["-m", "not dds", "-n", str(cores), "--dist", "worksteal"],
-        # One file runs in one process; `tests/conftest.py` puts the slowest files first.
-        "tests on a real DDS": [
-            *("-m", "dds", "-n", str(cores + 1), "--dist", "loadfile", "--no-loadscope-reorder"),
-            *modules_with_dds(),
-        ],
+        "tests": ["-m", "not dds", *FORKED, str(cores)],
+        "tests on a real DDS": ["-m", "dds", *FORKED, str(cores + 1), *modules_with_dds()],
     }
     reports = {name: VENV / f"{name.replace(' ', '-')}.xml" for name in parts}
     for report in reports.values():
@@ -87,7 +83,7 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
         name: ["-m", "pytest", *words, f"--junit-xml={reports[name]}"]
         for name, words in parts.items()
     }
-    results = _run_together(steps, "tests", env, first=COLLECT)
+    results = _run_together(steps, "tests", env)
     for name in parts:
         if results[name] == _NOTHING_COLLECTED:
             results[name] = 0
@@ -113,24 +109,14 @@ def _with_oldest_packages(env: Mapping[str, str]) -> dict[str, str]:
 
 
 def _run_together(
-    steps: Mapping[str, list[str]],
-    shown: str,
-    env: Mapping[str, str],
-    *,
-    first: Sequence[str] = (),
+    steps: Mapping[str, list[str]], shown: str, env: Mapping[str, str]
 ) -> dict[str, int]:
-    """Run steps at the same time; show the output of one as it comes, and of the others later.
-
-    What is to be done ``first`` is done before the tests begin, beside the other steps.
-    """
+    """Run steps at the same time; show the output of one as it comes, and of the others later."""
     with ExitStack() as running:
         # The step with direct output is started last, and usually ends first.
         order = sorted(steps, key=lambda name: (name not in LINT, name == shown))
         begun = {}
         for name in order:
-            if first and name not in LINT:
-                _quietly(first, env)
-                first = ()
             step = _Step(name, steps[name], env, aside=name != shown)
             begun[name] = running.enter_context(step)
         ended = {name: begun[name].end() for name in reversed(order)}
@@ -145,12 +131,6 @@ def modules_with_dds() -> list[str]:
         for path in sorted(paths)
         if "pytest.mark.dds" in path.read_text(encoding="utf-8")
     ]
-
-
-def _quietly(words: Sequence[str], env: Mapping[str, str]) -> None:
-    """Run Python without output; what fails is shown by the steps that follow."""
-    nowhere = subprocess.DEVNULL
-    subprocess.run([PYTHON, *words], cwd=CHECKOUT, env=env, stdout=nowhere, stderr=nowhere)
 
 
 def _conclude(results: Mapping[str, int], counts: Counter[str], started: float) -> int:

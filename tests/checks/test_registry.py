@@ -27,6 +27,7 @@ from tests.cli import test_requirements
 from tests.fleet import test_status
 from tests.proof import test_crossing, test_upgrade
 from tests.support.harness import sros
+from tests.support.tables import for_every
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
@@ -48,7 +49,7 @@ def test_every_finding_has_a_test_that_brings_it_about() -> None:
     assert len(all_kinds()) >= 50
 
 
-@pytest.mark.parametrize("kind", all_kinds().values(), ids=lambda kind: kind.id)
+@for_every(all_kinds().values(), lambda kind: kind.id)
 def test_kinds_are_complete(kind: Any) -> None:
     assert re.fullmatch(
         r"(policy|requirement|keystore|enclave|permissions|governance|portable|zenoh|runtime"

@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from sros_tool.cli.program import FAMILIES, program
+from tests.support.tables import for_every
 
 VERBS = {name: verb for family in FAMILIES.values() for name, verb in family.items()}
 
@@ -20,13 +21,13 @@ def help_of(*words: str, width: int = 80) -> str:
 
 
 @pytest.mark.parametrize("width", [80, 200])
-@pytest.mark.parametrize("verb", ["", *VERBS])
+@for_every(["", *VERBS])
 def test_no_line_of_a_help_is_longer_than_80_columns(verb: str, width: int) -> None:
     lines = help_of(*filter(None, [verb]), width=width).splitlines()
     assert [line for line in lines if len(line) > 80] == [], f"in `sros {verb} --help`"
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@for_every(VERBS)
 def test_no_word_of_an_option_is_broken(verb: str) -> None:
     """A line that ends with a hyphen would cut an option such as --revoke-old in two."""
     lines = help_of(verb).splitlines()
@@ -41,7 +42,7 @@ def test_every_verb_of_a_module_is_in_one_family() -> None:
     assert {name: families for name, families in homes.items() if len(families) > 1} == {}
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@for_every(VERBS)
 def test_the_summary_of_a_verb_is_one_sentence_that_fits_its_line(verb: str) -> None:
     assert VERBS[verb].help.endswith(".")
     module = import_module(f"sros_tool.cli.{VERBS[verb].module}")

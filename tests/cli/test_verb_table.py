@@ -19,6 +19,7 @@ import pytest
 from tests.conftest import POLICY
 from tests.keystore.test_confirmation import DDS
 from tests.support.harness import policy_text, publish, sros
+from tests.support.tables import for_every
 from tests.support.verbs import COMMANDS, module_of
 
 # What a verb does not have, and why.
@@ -47,7 +48,7 @@ def options(verb: str) -> set[str]:
     return {word for parameter in command.params for word in parameter.opts}
 
 
-@pytest.mark.parametrize("verb", COMMANDS)
+@for_every(COMMANDS)
 def test_every_verb_has_an_example_with_its_name(verb: str) -> None:
     command = COMMANDS[verb]
     assert command.epilog
@@ -55,17 +56,17 @@ def test_every_verb_has_an_example_with_its_name(verb: str) -> None:
     assert f"sros {verb}" in command.epilog
 
 
-@pytest.mark.parametrize("verb", COMMANDS)
+@for_every(COMMANDS)
 def test_every_verb_has_json(verb: str) -> None:
     assert ("--json" in options(verb)) != (verb in NO_JSON)
 
 
-@pytest.mark.parametrize("verb", COMMANDS)
+@for_every(COMMANDS)
 def test_every_verb_that_writes_has_a_dry_run(verb: str) -> None:
     assert ("--dry-run" in options(verb)) != (verb in READS | RUNS)
 
 
-@pytest.mark.parametrize("verb", COMMANDS)
+@for_every(COMMANDS)
 def test_every_argument_completes(verb: str) -> None:
     command = COMMANDS[verb]
     for parameter in command.params:

@@ -27,6 +27,7 @@ from tests.dds.decision_documents import (
     subscribe,
     topic_rule,
 )
+from tests.support.tables import for_every
 
 WORDS = {
     "yes": Outcome.ALLOWED,
@@ -427,8 +428,8 @@ ROWS = [
 ASKED = (Vendor.STANDARD, Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE)
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
 @pytest.mark.parametrize("vendor", ASKED)
+@for_every(ROWS, lambda row: row.name)
 def test_row(row: Row, vendor: Vendor) -> None:
     found = access_of(
         vendor,

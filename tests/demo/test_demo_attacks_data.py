@@ -27,6 +27,7 @@ from sros_tool.demo.scenarios.model import (
 from sros_tool.demo.scenarios.on_zenoh import ATTACKS as ZENOH_ATTACKS
 from sros_tool.errors import KeystoreError
 from tests.support.checkout import CHECKOUT
+from tests.support.tables import for_every
 
 ROWS = (
     *ATTACKS.rows,
@@ -42,7 +43,7 @@ CLOSED = {
     RowStatus.NOT_ERASED,
     RowStatus.NOT_READABLE,
 }
-BY_NAME = pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+BY_NAME = for_every(ROWS, lambda row: row.name)
 
 
 @BY_NAME

@@ -17,11 +17,11 @@ from sros_tool.demo.scenarios.model import (
 )
 from sros_tool.demo.scenarios.on_zenoh import ZENOH_SCENARIOS
 from sros_tool.errors import UsageError
+from tests.support.tables import for_every
 
-EVERY_ROW = pytest.mark.parametrize(
-    "row",
-    [row for scenario in (*SCENARIOS, *ZENOH_SCENARIOS) for row in scenario.rows],
-    ids=lambda row: row.name,
+EVERY_ROW = for_every(
+    (row for scenario in (*SCENARIOS, *ZENOH_SCENARIOS) for row in scenario.rows),
+    lambda row: row.name,
 )
 
 
@@ -44,7 +44,7 @@ def test_what_is_expected_of_a_row_is_what_its_claims_say(row: Row) -> None:
         assert row.expected not in STATUS_OF.values()
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+@for_every(ROWS, lambda row: row.name)
 def test_every_negative_claim_has_a_positive_one_beside_it(row: Row) -> None:
     everything = (*row.claims, *row.controls)
     for claim in everything:

@@ -30,7 +30,7 @@ from tests.integration.vendor_oracle import (
 )
 from tests.support.harness import policy_text, publish, sros
 
-pytestmark = [pytest.mark.dds, pytest.mark.xdist_group("broken_keystores")]
+pytestmark = pytest.mark.dds
 
 CONTROL = Breakage("nothing", lambda bench: None, MATCHED, MATCHED, "")
 ALL = (CONTROL, *HARMLESS, *ROWS, *MORE)

@@ -46,14 +46,13 @@ def demo(backend: Backend, *arguments: str, folder: Path) -> Running:
     return start("demo", *chosen, *arguments, folder=folder)
 
 
-ALWAYS = (SIGNED_BY_ITSELF, "old permissions put back", "replay of captured packets")
-"""The attacks of which more is asserted than that they end as expected."""
+PUT_BACK, REPLAY = "old permissions put back", "replay of captured packets"
 
 
 def some_attacks() -> list[str]:
     """Return some of the attacks, drawn anew in every run; in the long form all."""
-    kinds = list(dict.fromkeys(row.attack for row in ATTACKS.rows if row.attack not in ALWAYS))
-    return [*ALWAYS, *some(kinds, 1)]
+    kinds = dict.fromkeys(row.attack for row in ATTACKS.rows if row.attack != SIGNED_BY_ITSELF)
+    return [SIGNED_BY_ITSELF, *some(list(kinds), 2)]
 
 
 def is_played(row: Row) -> bool:
@@ -89,13 +88,14 @@ def test_every_attack_ends_as_expected(
     if ISOLATION.isolated and os.geteuid() == 0:
         assert not skipped
     observed = {row["name"]: row["observed"] for row in result["rows"]}
-    assert observed["packets of an unsecured talker sent again"] in ("heard again", "skipped")
-    assert observed["packets of a secured talker sent again"] in ("not heard again", "skipped")
-    assert observed["permissions signed by the enclave itself"] == "not let in"
+    if REPLAY in some_attacks():
+        assert observed["packets of an unsecured talker sent again"] in ("heard again", "skipped")
+        assert observed["packets of a secured talker sent again"] in ("not heard again", "skipped")
+    assert observed[SIGNED_BY_ITSELF] == "not let in"
     twins = [row.name for row in rows if row.attack == SIGNED_BY_ITSELF and row.removed]
     assert [observed[name] for name in twins] == ["heard"]
     open_doors = {row["name"] for row in result["rows"] if row["open_because"]}
-    assert "old permissions put back" in open_doors
+    assert (PUT_BACK in open_doors) is (PUT_BACK in some_attacks())
     assert all(row["remedy"] for row in result["rows"] if row["open_because"])
 
 

@@ -50,12 +50,19 @@ def start(*arguments: str, folder: Path, **more: str) -> Running:
     return Running(*arguments, env={**os.environ, **more}, first=first)
 
 
+HEARD = "secured talker to secured listener"
+DENIED = "secured talker without permission"
+PLAYED = [HEARD, DENIED, *some([r.name for r in ROWS if r.name not in (HEARD, DENIED)], 2)]
+"""The rows that are played: what is heard, what is denied, and two that are drawn."""
+
+
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], int, Path]:
     folder = tmp_path_factory.mktemp("demo")
     keep = folder / "kept"
     arguments = ["--backend", "cyclone", "--json", "--domain", "140", "--keep", str(keep)]
-    ended = start("demo", *arguments, folder=folder).end()
+    only = [word for name in PLAYED for word in ("--only", name)]
+    ended = start("demo", *arguments, *only, folder=folder).end()
     assert not ended.err
     return json.loads(ended.out), ended.status, keep
 
@@ -68,19 +75,18 @@ def test_every_row_is_as_expected(shown: tuple[dict[str, Any], int, Path]) -> No
     assert result["backend"] == "cyclone"
     assert result["dds"].startswith("Cyclone DDS 0.10")
     observed = {row["name"]: row["observed"] for row in result["rows"]}
-    assert len(observed) == len(ROWS)
-    assert observed["secured talker to secured listener"] == "heard"
-    assert observed["secured talker to unsecured listener"] == "not heard"
-    assert observed["secured listener without permission"] == "refused"
+    assert observed.keys() >= set(PLAYED)
+    assert observed[HEARD] == "heard"
+    assert observed[DENIED] == "refused"
     details = {row["name"]: row["detail"] for row in result["rows"]}
-    assert "rt/chatter denied by default rule" in details["secured talker without permission"]
+    assert "rt/chatter denied by default rule" in details[DENIED]
 
 
 def test_what_is_kept(shown: tuple[dict[str, Any], int, Path]) -> None:
     result, _, keep = shown
     assert json.loads((keep / "result.json").read_text()) == result
     assert (keep / "keystore/enclaves/governance.p7s").is_file()
-    assert len(list((keep / "rows").glob("row_*/*.jsonl"))) >= 2 * len(ROWS)
+    assert len(list((keep / "rows").glob("row_*/*.jsonl"))) >= 2 * len(PLAYED)
     for key in keep.glob("**/*.key.pem"):
         assert key.stat().st_mode & 0o777 == 0o600
 

@@ -28,10 +28,12 @@ ROWS = [row for scenario in ZENOH_SCENARIOS for row in scenario.rows]
 
 
 def some_words() -> list[str]:
-    """Return names of rows that nobody but their scenario has, and of an attack."""
+    """Return names of rows, of each scenario some, and of an attack; in the long form all."""
     attacks = list(dict.fromkeys(row.attack for row in ATTACKS.rows))
-    others = [row.name for row in ROWS if not row.attack]
-    return [*others, *some(attacks, 1)]
+    others = [
+        some([row.name for row in each.rows if not row.attack], 3) for each in ZENOH_SCENARIOS
+    ]
+    return [*(name for names in others for name in names), *some(attacks, 1)]
 
 
 def is_played(row: Row) -> bool:

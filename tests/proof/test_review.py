@@ -144,7 +144,7 @@ def test_what_a_partial_clone_lacks_is_not_passed_over(change: Change) -> None:
                 b'<profile>\n<topics publish="ALLOW"><topic>/x</topic></topics></profile>',
             ),
         ],
-        4,
+        2,
     ),
 )
 def test_a_policy_that_is_not_named_is_said(change: Change, name: str, content: bytes) -> None:
@@ -198,12 +198,20 @@ def test_a_keystore_fits_on_a_disk(change: Change) -> None:
 
 @pytest.mark.parametrize(
     ("before", "after", "pointer", "status"),
-    [
-        ("<x>{}</x>", "<x>{}{more}</x>", "/x/topics[@subscribe]", 1),
-        ("<x>{}</x>", "<x>{}{include}</x>", "/x/topics[@subscribe]", 1),
-        ("<x>{}</x>", "<x>{}<!-- -->{}</x>", "/x/*", 0),
-        ("<profile>{}</profile>", "<profile ns='/other' node='n'>{}</profile>", "/profile/*", 1),
-    ],
+    some(
+        [
+            ("<x>{}</x>", "<x>{}{more}</x>", "/x/topics[@subscribe]", 1),
+            ("<x>{}</x>", "<x>{}{include}</x>", "/x/topics[@subscribe]", 1),
+            ("<x>{}</x>", "<x>{}<!-- -->{}</x>", "/x/*", 0),
+            (
+                "<profile>{}</profile>",
+                "<profile ns='/other' node='n'>{}</profile>",
+                "/profile/*",
+                1,
+            ),
+        ],
+        2,
+    ),
 )
 def test_a_part_that_is_included_in_part_is_said(
     change: Change, before: str, after: str, pointer: str, status: int
@@ -276,7 +284,7 @@ def test_a_policy_that_is_included_in_part_is_said(change: Change) -> None:
             ("robots/sub", "", 2),
             ("vendor", "", 1),
         ],
-        4,
+        2,
     ),
 )
 def test_links_and_submodules_hide_no_policy(
@@ -425,33 +433,36 @@ _HOSTS = """{"_meta": {"hostvars": {"r1": {"ansible_host": "10.0.0.1"}}},
 
 @pytest.mark.parametrize(
     ("path", "before", "after", "said"),
-    [
-        (
-            "fleet.toml",
-            _TWO,
-            _TWO.replace("/n1", "/n").replace("/n2", "/n1").replace('"/n"', '"/n2"'),
-            "'r1' gets the keys of /n2/a, which r2 had, and 1 more",
-        ),
-        (
-            "fleet.toml",
-            _TWO,
-            f'{_TWO}[robots.hq]\naddress = "10.6.6.6"\nnamespace = "/hq"\n',
-            "'hq' gets the keys of /hq/a, which no robot had",
-        ),
-        ("hosts.json", _HOSTS, _HOSTS.replace("red", "blue"), ""),
-        (
-            "hosts.json",
-            _HOSTS,
-            _HOSTS.replace('"red"', '"red", "ansible_ssh_common_args": "-o ProxyCommand=evil"'),
-            "'all.vars.ansible_ssh_common_args' is -o ProxyCommand=evil, which can change how",
-        ),
-        (
-            "hosts.json",
-            _HOSTS,
-            _HOSTS.replace('10.0.0.1"', '10.0.0.1", "sros_patterns": ["/*"]'),
-            "'_meta.hostvars.r1.sros_patterns' is ['/*'], which can change how",
-        ),
-    ],
+    some(
+        [
+            (
+                "fleet.toml",
+                _TWO,
+                _TWO.replace("/n1", "/n").replace("/n2", "/n1").replace('"/n"', '"/n2"'),
+                "'r1' gets the keys of /n2/a, which r2 had, and 1 more",
+            ),
+            (
+                "fleet.toml",
+                _TWO,
+                f'{_TWO}[robots.hq]\naddress = "10.6.6.6"\nnamespace = "/hq"\n',
+                "'hq' gets the keys of /hq/a, which no robot had",
+            ),
+            ("hosts.json", _HOSTS, _HOSTS.replace("red", "blue"), ""),
+            (
+                "hosts.json",
+                _HOSTS,
+                _HOSTS.replace('"red"', '"red", "ansible_ssh_common_args": "-o ProxyCommand=evil"'),
+                "'all.vars.ansible_ssh_common_args' is -o ProxyCommand=evil, which can change how",
+            ),
+            (
+                "hosts.json",
+                _HOSTS,
+                _HOSTS.replace('10.0.0.1"', '10.0.0.1", "sros_patterns": ["/*"]'),
+                "'_meta.hostvars.r1.sros_patterns' is ['/*'], which can change how",
+            ),
+        ],
+        3,
+    ),
 )
 def test_keys_go_to_no_other_robot_unseen(
     change: Change, path: str, before: str, after: str, said: str
@@ -467,7 +478,7 @@ def test_keys_go_to_no_other_robot_unseen(
     assert ended.status == bool(said), ended
 
 
-@pytest.mark.parametrize("case", ["rights", "ca", "governance", "default"])
+@pytest.mark.parametrize("case", some(["rights", "ca", "governance", "default"], 2))
 def test_the_access_of_a_keystore_is_compared(
     change: Change, made_keystores: Path, case: str
 ) -> None:
@@ -582,13 +593,16 @@ def named(change: Change) -> Change:
 
 @pytest.mark.parametrize(
     ("reference", "name", "said"),
-    [
-        ("refs/tags/origin/main", "origin/main", "'refs/remotes/origin/main'"),
-        ("refs/heads/origin/main", "origin/main", "'refs/heads/origin/main'"),
-        ("refs/tags/main", "main", "'refs/tags/main' and 'refs/heads/main'"),
-        ("refs/tags/{short}", "{short}", "ambiguous"),
-        ("refs/main", "main", "'refs/main' and"),
-    ],
+    some(
+        [
+            ("refs/tags/origin/main", "origin/main", "'refs/remotes/origin/main'"),
+            ("refs/heads/origin/main", "origin/main", "'refs/heads/origin/main'"),
+            ("refs/tags/main", "main", "'refs/tags/main' and 'refs/heads/main'"),
+            ("refs/tags/{short}", "{short}", "ambiguous"),
+            ("refs/main", "main", "'refs/main' and"),
+        ],
+        2,
+    ),
 )
 def test_an_ambiguous_name_is_refused(named: Change, reference: str, name: str, said: str) -> None:
     """A tag that has the name of the base would be taken in its place."""
@@ -624,7 +638,7 @@ def test_a_full_reference_is_taken_exactly(named: Change, place: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["main", "main~1", "HEAD", "@", "HEAD^", "v1", "v1^{}", "HEAD@{0}"]
+    "name", some(["main", "main~1", "HEAD", "@", "HEAD^", "v1", "v1^{}", "HEAD@{0}"], 3)
 )
 def test_names_that_are_clear_are_taken(named: Change, name: str) -> None:
     named.git("tag", "-a", "-m", "x", "v1")

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 pytest_plugins = ["tests.report.browsing"]
-pytestmark = pytest.mark.xdist_group("browser")
 
 ASSETS = WEB.parent / "sros_tool" / "report" / "assets"
 

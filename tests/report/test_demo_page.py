@@ -123,7 +123,6 @@ def test_no_place_of_the_machine_is_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.browser
-@pytest.mark.xdist_group("browser")
 def test_it_opens_from_disk_and_runs_nothing(browser: Browser, built: Path, tmp_path: Path) -> None:
     rows = [row(text, mechanism=text, attack=text, detail=text) for text in HOSTILE]
     path = tmp_path / "demo.html"

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 pytest_plugins = ["tests.report.browsing"]
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 PRODUCTION = templates_dir() / "production.toml"
 ASKED_FOR_FLOW = ("/cmd_vel", "/scan", "/navigate_to_pose", "/lifecycle_manager/is_active")
 SIZES = {"desk": (1440, 900), "phone": (390, 844)}
