@@ -1,12 +1,12 @@
-"""Exact sets of names, from names and expressions: union, difference, first match.
+"""Exact sets of names, and the operations on them: union, difference, first match.
 
 A set holds exact names, and finite automata for expressions with wildcards.  The modules that
 create the automata define what wildcards mean: `sros_tool.policy.patterns`,
-`sros_tool.dds.decision` and `sros_tool.zenoh`. `NameSet.example` finds the shortest name of a set,
-or proves that there is none.  Nothing is sampled or approximated: a set that takes too many steps
-raises an error.
+`sros_tool.dds.decision` and `sros_tool.zenoh`.  `NameSet.example` finds the shortest name of a set,
+or proves that there is none.  Nothing is sampled or approximated: an operation that takes too many
+steps raises an error.
 
-Names are texts of any characters but NUL, which no DDS and no file can have in a name.
+Names are texts of any characters but NUL, which no name in DDS and no file can have.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _PREFERRED = ascii_lowercase + ascii_uppercase + digits + "_/" + punctuation + "
 
 @dataclass(frozen=True, slots=True)
 class Letters:
-    """A set of characters, as ranges of code points that neither touch nor overlap, in order."""
+    """A set of characters: sorted ranges of code points that neither touch nor overlap."""
 
     ranges: tuple[tuple[int, int], ...]
 
@@ -45,7 +45,7 @@ class Letters:
 
     @classmethod
     def between(cls, ends: Iterable[tuple[str, str]]) -> Letters:
-        """Return the characters of inclusive ranges; one that ends before it starts is empty."""
+        """Return the characters of inclusive ranges; one whose end is before its start is empty."""
         return cls._joined((ord(low), ord(high)) for low, high in ends)
 
     @classmethod
@@ -70,7 +70,7 @@ class Letters:
         return ~(~self | ~other)
 
     def __invert__(self) -> Letters:
-        """Return all other characters."""
+        """Return all characters that are not in this set."""
         ends = [-1, *(end for part in self.ranges for end in part), _LAST + 1]
         between = zip(ends[::2], ends[1::2], strict=True)
         return Letters(tuple((a + 1, b - 1) for a, b in between if a + 1 < b))
@@ -82,7 +82,7 @@ class Letters:
         return any(low <= ord(letter) <= high for low, high in self.ranges)
 
     def single(self) -> str:
-        """Return the character if it is the only one, else ""."""
+        """Return the character if the set has only one, else ""."""
         if len(self.ranges) == 1 and self.ranges[0][0] == self.ranges[0][1]:
             return chr(self.ranges[0][0])
         return ""
@@ -95,19 +95,19 @@ _USABLE = ~Letters(_NO_LETTERS)
 # ── automata ───────────────────────────────────────────────────────────────────────────────
 
 _Moves = Mapping[int, int]
-"""Distance → bit mask of the positions that a letter advances by this distance (0: stays)."""
+"""Maps a distance to the positions (a bit mask) that a letter moves by it; 0: they stay."""
 
 
 _MOST_KNOWN = 20_000
-"""Size of an automaton's cache of answers: callers ask about the same names repeatedly."""
+"""Maximum number of cached answers of an automaton; callers ask about the same names again."""
 
 
 @dataclass(frozen=True)
 class Automaton:
     """A finite automaton: numbered positions, edges labelled with letters, accepting positions.
 
-    There may be several edges from a position with the same letter.  Equal expressions should have
-    equal automata: then nothing is searched where both are compared.
+    Several edges from a position may have the same letter.  Equal expressions should have equal
+    automata, because a comparison of equal automata needs no search.
     """
 
     edges: tuple[tuple[int, Letters, int], ...]
@@ -199,12 +199,12 @@ class Automaton:
 
     @cached_property
     def end_bits(self) -> int:
-        """The accepting positions, as a bit mask."""
+        """The accepting positions: bit n of the integer stands for position n."""
         return sum(1 << end for end in self.ends)
 
     @cached_property
     def endless_bits(self) -> int:
-        """The positions from which every text is accepted, as a bit mask."""
+        """The positions from which every further text is accepted: bit n stands for position n."""
         loops = {at for at, letters, to in self.edges if at == to and letters == ANY_LETTER}
         return sum(1 << state for state in self.ends & loops)
 
@@ -215,7 +215,10 @@ class Automaton:
 
     @cached_property
     def levels(self) -> tuple[tuple[int, int], ...]:
-        """Lower bounds on the letters to an accepting position, each with its positions as bits."""
+        """Pairs of a number of letters and positions (as bits), sorted by the number.
+
+        From these positions, at least so many letters lead to an accepting position.
+        """
         before: dict[int, list[int]] = {}
         for at, letters, to in self.edges:
             if letters:
@@ -248,7 +251,7 @@ class Automaton:
 
     @cached_property
     def order(self) -> tuple[str, str, str]:
-        """A sort key that does not depend on when automata were made."""
+        """A sort key that is the same in every run of the program."""
         return self.prefix, self.suffix, repr(self.edges)
 
     def may_meet(self, other: Automaton) -> bool:
@@ -259,7 +262,7 @@ class Automaton:
 def _only_way(
     edges: Mapping[int, Sequence[tuple[Letters, int]]], at: int, stops: frozenset[int]
 ) -> str:
-    """Return the text that must follow position ``at``, up to a fork or one of the ``stops``."""
+    """Return the text that must follow position ``at``, up to a fork or a position in ``stops``."""
     found = ""
     while at not in stops:
         ways = edges.get(at, ())
@@ -356,6 +359,8 @@ class _Some:
 
 @dataclass(frozen=True)
 class _Not:
+    """The names that are not in the set ``of``."""
+
     of: _Node
 
     def parts(self) -> tuple[_Node, ...]:
@@ -387,7 +392,11 @@ class _Every:
 
 @dataclass(frozen=True)
 class _First:
-    """The names decided by the first set of ``of`` that contains them, else by ``last``."""
+    """The names that a list of rules accepts: the first rule whose set has the name decides.
+
+    ``of`` has pairs of a set and whether its names are accepted; ``last`` is the answer for names
+    that are in none of these sets.
+    """
 
     of: tuple[tuple[_Node, bool], ...]
     last: bool
@@ -443,10 +452,10 @@ class SearchLimit:
         self._left = most
 
     def spend(self, steps: int) -> None:
-        """Count steps.
+        """Subtract ``steps`` from the steps that are left.
 
         Raises:
-            DocumentError: there were too many.
+            DocumentError: no steps are left.
         """
         self._left -= steps
         if self._left < 0:
@@ -463,7 +472,7 @@ def _too_many() -> DocumentError:
 
 
 class NameSet:
-    """An immutable set of names, perhaps endless.
+    """An immutable set of names, which may be infinite.
 
     ``|``, ``&``, ``-`` and ``~`` return new sets.
     """
@@ -482,7 +491,11 @@ class NameSet:
 
     @classmethod
     def first(cls, rules: Iterable[tuple[NameSet, bool]], otherwise: bool = False) -> NameSet:
-        """Return the names that the first matching rule accepts; ``otherwise`` decides the rest."""
+        """Return the names that a list of rules accepts: the first rule with the name decides.
+
+        A rule is a set and whether its names are accepted; ``otherwise`` decides on all other
+        names.
+        """
         joined = tuple(
             (cls.union(names for names, _ in same)._node, kept)
             for kept, same in groupby(rules, key=lambda pair: pair[1])
@@ -516,7 +529,7 @@ class NameSet:
         return NameSet._of(_between(self._node, begin, end))
 
     def around(self) -> Surroundings | None:
-        """Return exact names and automata that cover this set, and possibly more names.
+        """Return exact names and automata that include all names of this set, and perhaps more.
 
         Returns None if that would be all names.
         """
@@ -540,7 +553,10 @@ class NameSet:
         return NameSet._of(_Not(self._node))
 
     def __eq__(self, other: object) -> bool:
-        """Return whether both were built in the same way; sets of the same names may be unequal."""
+        """Return whether both sets were built in the same way.
+
+        Sets with the same names may be unequal, if they were built in different ways.
+        """
         return isinstance(other, NameSet) and self._node == other._node
 
     def __hash__(self) -> int:
@@ -550,17 +566,17 @@ class NameSet:
         return bool(self._node.truth(lambda some: some.has(name)))
 
     def stated(self) -> Iterator[str]:
-        """Yield the exact names of this set (not those of wildcards), the shortest first."""
+        """Yield the exact names in this set, the shortest first; not the names of wildcards."""
         exact = {name for leaf in _leaves(self._node) for name in leaf.exact}
         return (name for name in sorted(exact, key=_length) if name in self)
 
     def example(
         self, limit: SearchLimit | None = None, *, longest: int | None = None
     ) -> str | None:
-        """Return a name of this set, always the same one, or None if there is none.
+        """Return the first name of this set, or None if the set is empty.
 
-        Exact names come first, then short ones.  Names longer than ``longest``, in bytes of UTF-8,
-        do not count.
+        Exact names come first, then short names, so the result is always the same.  Names longer
+        than ``longest``, in bytes of UTF-8, are ignored.
 
         Raises:
             DocumentError: the search takes more steps than ``limit`` allows.
@@ -577,7 +593,11 @@ class NameSet:
         return best
 
     def is_empty(self, limit: SearchLimit | None = None) -> bool:
-        """Return whether no name is in this set; raises what `example` raises."""
+        """Return whether this set has no name.
+
+        Raises:
+            DocumentError: the search takes more steps than ``limit`` allows.
+        """
         if next(self.stated(), None) is not None:
             return False
         limit = limit or SearchLimit()
@@ -609,14 +629,14 @@ def _between(node: _Node, begin: str, end: str) -> _Node:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """A superset of a set of names: exact names, and automata."""
+    """A simple set that includes a complicated one: exact names, and automata."""
 
     exact: frozenset[str]
     automata: frozenset[Automaton]
 
 
 def _around(node: _Node, best: Callable[[Surroundings], tuple[int, int]]) -> Surroundings | None:
-    """Return the superset of a set for which ``best`` returns the smallest value."""
+    """Return a simple set that includes ``node``, or None; of several, the smallest by ``best``."""
     match node:
         case _Some():
             return Surroundings(node.exact, node.automata)
@@ -642,7 +662,7 @@ def _around(node: _Node, best: Callable[[Surroundings], tuple[int, int]]) -> Sur
 
 
 def _roughness(around: Surroundings) -> tuple[int, int]:
-    """Return the sort key of a superset: long prefixes and suffixes come first."""
+    """Return a sort key for sets by which long prefixes and suffixes come first."""
     told = min((len(a.prefix) + len(a.suffix) for a in around.automata), default=_LAST)
     return -told, -len(around.exact)
 
@@ -664,10 +684,11 @@ def _leaves(node: _Node) -> Iterator[_Some]:
 def _reduced(
     node: _Node, sure: frozenset[Automaton], possible: frozenset[Automaton] | None
 ) -> _Node | bool:
-    """Return a set without the parts that do not matter to names other than its exact names.
+    """Return a set in which automata are replaced by what is known about them.
 
-    The automata ``sure`` accept these names.  Of the other automata, only ``possible`` may accept
-    them; None stands for all.
+    Every considered name is accepted by the automata ``sure``; of all others, only automata in
+    ``possible`` may accept it (None: any).  The exact names of the set are left out.  Returns True
+    or False if the set then has all names or none.
     """
     if isinstance(node, _Some):
         if not sure.isdisjoint(node.automata):
@@ -744,7 +765,7 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
 
 
 def _width(around: Surroundings) -> tuple[int, int]:
-    """Return the sort key of a superset: few automata that share no name come first."""
+    """Return a sort key for sets by which few automata come first, if their names differ."""
     if len(around.automata) > _FEW:
         return len(around.automata), 0
     rough, _ = _roughness(around)
@@ -752,7 +773,7 @@ def _width(around: Surroundings) -> tuple[int, int]:
 
 
 def _needed(node: _Node) -> frozenset[Automaton]:
-    """Return automata that every name of the set matches; the set has no exact names."""
+    """Return automata that accept every name of a set, which has no exact names."""
     match node:
         case _Some():
             return node.automata if len(node.automata) == 1 else frozenset()
@@ -770,7 +791,7 @@ def _needed(node: _Node) -> frozenset[Automaton]:
 
 
 def _excepted(node: _Node) -> frozenset[Automaton]:
-    """Return automata that every name outside of the set matches; the set has no exact names."""
+    """Return automata that accept every name outside of a set, which has no exact names."""
     match node:
         case _Not():
             return _needed(node.of)
@@ -782,11 +803,13 @@ def _excepted(node: _Node) -> frozenset[Automaton]:
 
 
 def _in_all(sets: Iterable[frozenset[Automaton]]) -> frozenset[Automaton]:
+    """Return the automata that are in all of the sets; none if there are no sets."""
     first, *others = [*sets] or [frozenset[Automaton]()]
     return first.intersection(*others)
 
 
 def _within(own: Automaton, left: _Node | bool) -> _Node:
+    """Return the names of the set ``left`` that ``own`` accepts; True stands for all names."""
     node = _Some(automata=frozenset((own,)))
     return node if isinstance(left, bool) else _Every((node, left))
 
@@ -796,10 +819,10 @@ def _order(automaton: Automaton) -> tuple[str, str, str]:
 
 
 class _Search:
-    """The search for the shortest name of a set without exact names, except ``taken`` names.
+    """The search for the shortest name of a set, other than the names in ``taken``.
 
-    It is an A* search.  A state is the set of positions that all automata reach together.  States
-    come first from which the automata that must accept need the fewest letters.
+    The set has no exact names.  The search is A*: a state is the set of positions that all automata
+    have reached, and a state comes early if few letters are left to a name of the set.
     """
 
     def __init__(self, node: _Node, taken: frozenset[str]) -> None:
@@ -842,7 +865,7 @@ class _Search:
         return None
 
     def _left(self, reached: int) -> int | None:
-        """Return the fewest letters that complete a name, or None if no name begins like this."""
+        """Return the fewest letters that complete a name, or None if no name begins in this way."""
         left = 0
         for need in self._needed:
             some = self._machine.left(need, reached)
@@ -859,6 +882,7 @@ def _asked_of(name: str) -> _Ask:
 def _spelt(
     state: tuple[int, int], before: Mapping[tuple[int, int], tuple[tuple[int, int], str]]
 ) -> str:
+    """Return the letters on the way to a state, which ``before`` leads back to the start."""
     letters = []
     while state in before:
         state, letter = before[state]
@@ -880,7 +904,10 @@ class _Class(NamedTuple):
 
 
 class _Machine:
-    """Several automata run in parallel; all their positions are the bits of one integer."""
+    """Several automata that run in parallel.
+
+    The positions of all automata are the bits of one integer, ``reached`` in its methods.
+    """
 
     def __init__(self, automata: tuple[Automaton, ...]) -> None:
         sizes = [automaton.size for automaton in automata]
@@ -902,11 +929,11 @@ class _Machine:
         )
 
     def ended(self, reached: int) -> _Ask:
-        """Return a test for the automata that accept a name that ends at ``reached``."""
+        """Return a test whether an automaton of a set accepts the text read so far."""
         return lambda some: any(reached & self._ends[automaton] for automaton in some.automata)
 
     def going_on(self, reached: int) -> _Ask:
-        """Return a test for the automata that can accept a longer name after ``reached``."""
+        """Return a test whether an automaton of a set may accept a longer text."""
 
         def ask(some: _Some) -> _Truth:
             if any(reached & self._endless[automaton] for automaton in some.automata):
@@ -920,7 +947,7 @@ class _Machine:
         return ask
 
     def left(self, automaton: Automaton, reached: int) -> int | None:
-        """Return the fewest letters after which an automaton accepts; None if it never does."""
+        """Return the fewest letters after which an automaton accepts; None if there is no way."""
         for distance, places in self._levels[automaton]:
             if reached & places:
                 return distance
@@ -928,7 +955,7 @@ class _Machine:
 
 
 def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
-    """Group letters that all edges treat in the same way into classes, best letters first."""
+    """Return classes of letters that all edges treat alike, sorted by their best letter."""
     by_letters: dict[Letters, list[tuple[int, int]]] = {}
     for at, letters, to in edges:
         by_letters.setdefault(letters, []).append((at, to))
@@ -966,7 +993,10 @@ def _rank(letter: str) -> tuple[int, str]:
 
 
 class _Taken:
-    """Excluded names, as a tree of their letters; place -1 means outside of the tree."""
+    """Names that a search leaves out, as a tree of their letters.
+
+    A place is the number of a node of the tree; -1 is every place outside of it.
+    """
 
     def __init__(self, names: Iterable[str]) -> None:
         self._tree: list[dict[str, int]] = [{}]
@@ -981,7 +1011,7 @@ class _Taken:
         self._ways: dict[int, list[tuple[str, _Moves, int]]] = {}
 
     def ways(self, place: int, classes: Sequence[_Class]) -> list[tuple[str, _Moves, int]]:
-        """Return the possible next letters at a place, with their moves and next places."""
+        """Return the next letters to try at a place, each with its moves and the next place."""
         if place not in self._ways:
             children = self._tree[place] if place >= 0 else {}
             found = []

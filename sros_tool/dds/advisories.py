@@ -1,13 +1,15 @@
-"""Known vulnerabilities of DDS products by release, as advisories in the OSV format.
+"""Known vulnerabilities of DDS products, as advisories in the OSV format.
 
-The advisories that ship with sros are ``advisories.json`` next to this module: for Fast DDS, what
-the history of eProsima/Fast-DDS says of each release line (as of 2026-08-20).  An event ``fixed``
-names the first release with the mend; a line whose mend is in no release has none, so that its
-later releases count as affected until newer advisories say otherwise.  ``database_specific`` has
-what an attack needs (``security``: DDS Security is on, ``identity``: a certificate of the
-keystore's CA, ``document``: a document that the permissions CA signed; none: only the network),
-what it gives (``denial``, ``memory``, ``access``, or ``unclear``), and ``unclear_lines``: release
-lines of which the history says nothing, which is not the same as not affected.
+The advisories that ship with sros are in ``advisories.json`` next to this module: what the history
+of eProsima/Fast-DDS says of each release line of Fast DDS (as of 2026-08-20).  An event ``fixed``
+names the first release with the fix.  A release line without a fixed release has no such event, so
+its later releases count as affected until newer advisories say otherwise.
+
+``database_specific`` has three members.  ``needs`` is what an attack needs: ``security`` (DDS
+Security is on), ``identity`` (a certificate of the keystore's CA), ``document`` (a document that
+the permissions CA signed) or nothing but the network.  ``gives`` is its effect: ``denial``,
+``memory``, ``access`` or ``unclear``.  ``unclear_lines`` are release lines of which the history
+says nothing, which does not mean that they are not affected.
 
 Source: https://ossf.github.io/osv-schema.
 """
@@ -42,14 +44,14 @@ Version = tuple[int, int, int]
 
 
 class _Range(NamedTuple):
-    """Releases from ``introduced`` up to ``end``: None is without end."""
+    """The releases from ``introduced`` up to ``end`` (None: no end)."""
 
     introduced: Version
     end: Version | None
     inclusive: bool
 
     def has(self, version: Version) -> bool:
-        """Return whether a release is within."""
+        """Return whether a release is in the range."""
         if version < self.introduced:
             return False
         return self.end is None or version < self.end or (self.inclusive and version == self.end)
@@ -58,9 +60,9 @@ class _Range(NamedTuple):
 class Advisory(NamedTuple):
     """A known vulnerability of one product.
 
-    ``needs`` and ``gives`` are words of ``database_specific``.  ``unclear_lines`` are release lines
-    such as 2.14 of which it is not known whether they are affected.  ``unread`` are listed versions
-    that are not three numbers, such as those of release candidates; they count for nothing.
+    ``needs`` and ``gives`` are words of ``database_specific``.  ``unclear_lines`` are release
+    lines, such as 2.14, that may be affected.  ``unread`` are listed versions that are not three
+    numbers, such as release candidates; they are ignored.
     """
 
     id: str
@@ -78,7 +80,7 @@ class Advisory(NamedTuple):
         return version in self.versions or any(part.has(version) for part in self.ranges)
 
     def mended_in(self, version: Version) -> str:
-        """Return the first release of the same major version with the mend; "" if none has it."""
+        """Return the first release with the fix, of the same major version; "" if there is none."""
         ends = {None if part.inclusive else part.end for part in self.ranges if part.has(version)}
         last = max((end for end in ends if end), default=None)
         if last is None or None in ends or last[0] != version[0] or self.affects(last):
@@ -86,7 +88,7 @@ class Advisory(NamedTuple):
         return ".".join(map(str, last))
 
     def with_releases_of(self, other: Advisory) -> Advisory:
-        """Return the advisory with what another one of the same number adds."""
+        """Return the advisory with the releases of another one that has the same id."""
         return self._replace(
             ranges=self.ranges + other.ranges,
             versions=self.versions | other.versions,
@@ -96,9 +98,9 @@ class Advisory(NamedTuple):
 
 
 class KnownVulnerabilities(NamedTuple):
-    """The advisories for one release of a product.
+    """The advisories about one release of a product.
 
-    ``known`` affect it; of ``unclear`` it is not known whether they do.
+    ``known`` advisories affect the release; ``unclear`` ones perhaps.
     """
 
     known: tuple[Advisory, ...]
@@ -108,10 +110,10 @@ class KnownVulnerabilities(NamedTuple):
 def known_vulnerabilities(
     product: str, version: str, advisories: Iterable[Advisory] | None = None
 ) -> KnownVulnerabilities | None:
-    """Return what is known of a release, such as "Fast DDS" and "2.14.5".
+    """Return the advisories about a release, such as "2.14.5" of "Fast DDS".
 
-    Without ``advisories``, those that ship with sros count.  None if the version cannot be read,
-    or if no advisory is about the product: then nothing can be said.
+    ``advisories`` None stands for those that ship with sros.  Returns None if the version cannot be
+    read, or if no advisory is about the product.
     """
     numbers = version_numbers(version)
     own = [
@@ -131,7 +133,7 @@ def known_vulnerabilities(
 
 
 def version_numbers(version: str) -> Version | None:
-    """Return the three numbers of a release such as "2.14.5"; None if they are not all there."""
+    """Return the three numbers of a release such as "2.14.5"; None if it has another form."""
     numbers = _VERSION.fullmatch(version)
     if not numbers or numbers[3] is None:
         return None
@@ -145,9 +147,9 @@ def shipped_advisories() -> tuple[Advisory, ...]:
 
 
 def read_advisories(path: Path) -> tuple[Advisory, ...]:
-    """Return the advisories of sros with those of a file.
+    """Return the advisories that ship with sros, and those in a file.
 
-    An advisory replaces the one of sros with the same id, for the products that it names.
+    An advisory in the file replaces the one with the same id, for the products that it names.
 
     Raises:
         DocumentError: The file cannot be read, is not of the OSV format, or is about no product
@@ -167,13 +169,13 @@ def read_advisories(path: Path) -> tuple[Advisory, ...]:
 
 
 def parse_advisories(data: bytes, what: str) -> tuple[Advisory, ...]:
-    """Return the advisories of an OSV record or a list of them; ``what`` names it in errors.
+    """Return the advisories in an OSV record or a list of records; errors call it ``what``.
 
-    Records of one number become one advisory, which has the releases of all of them.  A record that
-    was withdrawn affects no release.  Products that sros does not know are left out.
+    Records with the same id become one advisory, which has the releases of all of them.  A
+    withdrawn record affects no release.  Products that sros does not know are left out.
 
     Raises:
-        DocumentError: It is not of the OSV format, or states no releases of a known product.
+        DocumentError: the data is not in the OSV format, or states no releases of a known product.
     """
     try:
         value = parse_json(data)
@@ -239,7 +241,7 @@ _CVE = re.compile(r"CVE-\d{4}-\d{4,9}", re.ASCII)
 
 
 def _product(affected: Mapping[str, Any]) -> str:
-    """Return the product by the package's name or the repository of a range; "" if unknown."""
+    """Return the product, by the name of the package or its repository; "" if unknown."""
     names = [_object(affected.get("package", {})).get("name", "")]
     names += [_object(part).get("repo", "") for part in _list(affected.get("ranges", []), "ranges")]
     for name in names:
@@ -297,7 +299,7 @@ def _text(value: object) -> str:
 
 
 def _line(product: str, version: Version) -> str:
-    """Return the line of the advisories that a release belongs to."""
+    """Return the release line of a release, as the advisories name it."""
     if product != "Fast DDS":
         return f"{version[0]}.{version[1]}"
     for first, line in ((3, 3), "3.6"), ((3, 0), "3.2"), ((2, 7), "2.14"):

@@ -18,8 +18,8 @@ _ONE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?\Z", re.ASCII)
 class DomainRange:
     """The domains from ``first`` to ``last``, both included.
 
-    In documents not made by sros one end may be open (None); vendors read that differently, and
-    sros itself never writes it.
+    In documents that others wrote, one of them may be missing (None); vendors read that
+    differently, and sros never writes it.
     """
 
     first: int | None
@@ -46,10 +46,12 @@ class DomainSet:
 
     @classmethod
     def parse(cls, text: str, source: str = "") -> DomainSet:
-        """Read ``0``, ``0,7`` or ``3-5,9``; sorted, and joined where ranges touch.
+        """Return the domains in a text such as ``0``, ``0,7`` or ``3-5,9``, as sorted ranges.
 
-        ``source`` names the origin of the text in errors.  Raises `UsageError` unless it
-        lists whole numbers from 0 to 230.
+        ``source`` says in errors where the text comes from.
+
+        Raises:
+            UsageError: the text is not a list of whole numbers from 0 to 230.
         """
         pairs = []
         for part in text.split(","):
@@ -68,7 +70,7 @@ class DomainSet:
 
     @classmethod
     def of(cls, *pairs: tuple[int, int]) -> DomainSet:
-        """Return the set of the ranges ``pairs``, sorted, with adjacent ranges joined."""
+        """Return the set of these ranges, which are sorted and joined where they touch."""
         joined: list[tuple[int, int]] = []
         for first, last in sorted(pairs):
             if joined and first <= joined[-1][1] + 1:
@@ -94,10 +96,10 @@ class DomainSet:
         return ",".join(map(str, self.ranges))
 
     def closed(self) -> DomainSet:
-        """Return the set with both ends of every range given, sorted and joined.
+        """Return the set without open ranges, sorted and joined.
 
-        An open range is read as by Fast DDS and Cyclone DDS: "from N" is N alone, "up to N" begins
-        at 0.
+        A range without its end has only its first domain, and one without its beginning begins at
+        0, as Fast DDS and Cyclone DDS read them.
         """
         pairs = []
         for part in self.ranges:
@@ -109,10 +111,10 @@ class DomainSet:
     def one_of_each_kind(
         cls, listed: Collection[DomainSet], others: Iterable[DomainSet]
     ) -> tuple[int, ...]:
-        """Return one domain for every combination of sets that a domain can be in, sorted.
+        """Return one domain for each combination of sets that domains can be in, sorted.
 
-        Only domains in a ``listed`` set are returned, unless a range has an open end, which vendors
-        read differently.
+        Only domains in a ``listed`` set are returned, unless a range lacks one of its ends, which
+        vendors read differently.
         """
         sets = dict.fromkeys((*listed, *others))
         borders = {0}
@@ -137,6 +139,6 @@ class DomainSet:
         return 0 if 0 in self else next(iter(self))
 
     def only(self) -> int | None:
-        """Return the domain, if the set has just one, else None."""
+        """Return the domain if the set has only one, else None."""
         domains = list(self)
         return domains[0] if len(domains) == 1 else None

@@ -38,16 +38,16 @@ Value = bool | ProtectionKind
 
 
 class Attribute(NamedTuple):
-    """One attribute of domain rules or topic rules, from the metadata of its field below.
+    """An attribute of domain rules or topic rules, declared by the metadata of the rule's field.
 
     All code that reads, writes, describes or compares rules iterates over `attributes`, in the
     order of the schema and of the fields.  So a new attribute needs only a new field.
 
     ``name`` is the name of the element and of the field; ``term`` is the field of
     `sros_tool.policy.model` that it is translated from.  ``values`` are the allowed values.
-    ``open`` is the value that protects nothing; ``portable`` protects, and all vendors enforce it
-    alike.  ``default`` is the value if a document lacks the element; None if the schema requires
-    the element.
+    ``open`` is the value that protects nothing; ``portable`` is a value that protects and that all
+    vendors enforce alike.  ``default`` is the value if a document lacks the element; None if the
+    schema requires the element.
     """
 
     name: str
@@ -147,7 +147,7 @@ def attributes(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
 
 
 def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, Any]:
-    """Map a rule's attributes to protecting values; without ``protect``, to open values."""
+    """Map the attributes of a rule to values that protect, or with ``protect`` False do not."""
     return {
         attribute.name: attribute.portable if protect else attribute.open
         for attribute in attributes(rule)

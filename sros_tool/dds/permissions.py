@@ -74,7 +74,8 @@ class Grant(NamedTuple):
     def validity(self) -> Window:
         """The validity of the grant by the standard: a date without a zone is in UTC.
 
-        Raises `DocumentError` if a date is of a form that only some vendors read.
+        Raises:
+            DocumentError: a date has a form that only some vendors read.
         """
         try:
             return Window(parse_iso(self.not_before), parse_iso(self.not_after))
@@ -83,7 +84,7 @@ class Grant(NamedTuple):
             raise DocumentError(text) from error
 
     def domains(self) -> DomainSet:
-        """Return the domains in which some rule allows something."""
+        """Return the domains in which at least one rule allows something."""
         allowed = (rule.domains.closed() for rule in self.rules if rule.allow)
         return DomainSet.of(
             *(
@@ -105,7 +106,7 @@ class Permissions(NamedTuple):
 
 
 def grant(name: str, subject: str, validity: Window, rules: tuple[Rule, ...]) -> Grant:
-    """Return a grant of the portable profile: dates in UTC, default DENY."""
+    """Return a grant as all vendors read it alike: dates in UTC, default DENY."""
     return Grant(name, subject, iso(validity.not_before), iso(validity.not_after), rules)
 
 
@@ -348,7 +349,7 @@ _CONSEQUENCES = {
 
 
 Meets = Callable[[str], bool]
-"""A function that tells whether an expression shares a name with other expressions."""
+"""Function that tells whether an expression shares a name with some other expressions."""
 
 
 def _meets_text(names: Sequence[str]) -> Meets:
@@ -361,10 +362,10 @@ def outside(
     signed_bytes: int,
     meets_some_of: Callable[[Sequence[str]], Meets] = _meets_text,
 ) -> Iterator[tuple[str, str]]:
-    """Yield (id, clause) of a note for every part of a document outside of the portable profile.
+    """Yield (id, clause) for each part of a document that vendors do not all read alike.
 
-    ``meets_some_of`` returns the function that says whether an expression and one of its arguments
-    match a common name.
+    ``meets_some_of`` returns, for some expressions, the function that tells whether another
+    expression matches a name that one of them matches.
     """
     if signed_bytes >= MAX_SIGNED_BYTES:
         yield "portable.document-size", f"the signed permissions have {signed_bytes} bytes"
@@ -426,9 +427,9 @@ def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
 
 
 def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
-    """Return the sorted pairs of enclaves of which Cyclone DDS mistakes the first for the second.
+    """Return pairs of enclaves of which Cyclone DDS takes the first for the second, sorted.
 
-    It checks only that every part of the first subject occurs in the second one: the permissions
+    Cyclone DDS checks only that the second subject has every part of the first: so the permissions
     of ``/robot/admin`` fit the identity ``/robot``.
     """
     parts_of = {name: frozenset(name.strip("/").split("/")) for name in names}
@@ -447,7 +448,7 @@ def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def some_pairs(pairs: Sequence[tuple[str, str]]) -> str:
-    """Return the first pairs in words: "/robot for /robot/admin and 2 more"."""
+    """Return the first pairs in words, such as "/robot for /robot/admin and 2 more"."""
     return first_few([f"{inner} for {outer}" for inner, outer in pairs], _SHOWN)
 
 

@@ -1,4 +1,4 @@
-"""Decide as Zenoh does, by the configurations in a keystore as they are, link by link.
+"""Decide as Zenoh does, by the configurations in a keystore, for each link between processes.
 
 Zenoh reports no denial as an error: a process that denies a message drops it.  In client mode, the
 router and the session itself decide on a right; in peer mode, the sessions of all other enclaves
@@ -66,17 +66,17 @@ from sros_tool.zenoh.document import ZenohEndpoint, parse_configuration
 from sros_tool.zenoh.key_expressions import includes
 
 _OF_TLS = (CERTIFICATE_FILE, KEY_FILE, IDENTITY_CA_FILE)
-"""The files of an enclave that a process on Zenoh needs, without the files for DDS."""
+"""Names of the files of an enclave that a process on Zenoh needs."""
 
 
 class _Outcome(StrEnum):
-    """What happens to an enclave's messages."""
+    """What happens to the messages of an enclave."""
 
     ALLOWED = "allowed"
     DROPPED = "dropped"
-    """The messages vanish on a link, and no process gets an error."""
+    """A process on a link drops the messages, and no process gets an error."""
     REFUSED = "refused"
-    """The process opens no session, or gets no link."""
+    """The process of the enclave opens no session, or gets no link."""
 
     @property
     def ok(self) -> bool:
@@ -85,10 +85,11 @@ class _Outcome(StrEnum):
 
 
 class ZenohFile(NamedTuple):
-    """The configuration of an enclave's process as it is in the keystore.
+    """The configuration of an enclave's process, as read from the keystore.
 
-    ``process`` is None if it opens no session, and ``problem`` says why.  ``until`` is when the
-    certificate expires.  ``endpoints`` are where a session connects, or where the router listens.
+    ``process`` is None if the process opens no session, and ``problem`` says why.  ``until`` is the
+    time at which the certificate expires.  ``endpoints`` are the addresses to which a session
+    connects, or at which a router listens.
     """
 
     enclave: str
@@ -101,7 +102,7 @@ class ZenohFile(NamedTuple):
 
 @shows("enclave", "problem", null_if_empty=("problem",))
 class Reached(NamedTuple):
-    """An enclave at the other end of a right."""
+    """An enclave that has the right at the other end, such as to subscribe to what is published."""
 
     enclave: str
     """The enclave."""
@@ -120,7 +121,7 @@ class DecidingWildcard(NamedTuple):
 
 
 class CheckedLink(NamedTuple):
-    """A link on which a right is decided."""
+    """A link between two processes on which a right is decided."""
 
     enclaves: tuple[str, str]
     """The enclaves at both ends."""
@@ -142,9 +143,10 @@ _OutcomeWord = Annotated[
 )
 @dataclass(frozen=True, slots=True)
 class ZenohAnswer:
-    """The answer of Zenoh to a question about an enclave.
+    """The decision of Zenoh on a question about an enclave.
 
-    ``text`` says why, as a clause.  ``checks`` are the decisions on the right itself.
+    ``text`` is the reason, as a clause.  ``checks`` are the decisions on the messages of the right
+    itself.
     """
 
     enclave: str
@@ -175,12 +177,12 @@ class ZenohAnswer:
 
     @property
     def wildcard(self) -> str:
-        """The first key expression with a wildcard that decides, or ""."""
+        """The first key expression with a wildcard by which a check decides, or ""."""
         return self.wildcards[0].expression if self.wildcards else ""
 
     @property
     def stopped(self) -> str:
-        """Why its process opens no session, or ""."""
+        """Why the enclave's process opens no session, or ""."""
         return self.text if self.outcome is _Outcome.REFUSED else ""
 
     @property
@@ -190,7 +192,7 @@ class ZenohAnswer:
 
     @property
     def dropped(self) -> Check | None:
-        """The check that drops a message, or None; of several checks, the one that drops data."""
+        """The check that drops a message, or None; a check on data comes before all others."""
         return _first((check for check in self.checks if not check.allowed), self.enclave)
 
     @property
@@ -224,7 +226,7 @@ class ZenohEnclaveOutcome(NamedTuple):
     in_brief: ZenohInBrief
     outcome: _OutcomeWord
     wildcard: str
-    """The key expression that allows it, if it is a wildcard, or null."""
+    """The key expression that allows the right, if it is a wildcard, or null."""
 
 
 class WhoOnZenoh(NamedTuple):
@@ -262,7 +264,13 @@ class ZenohEvaluator:
         self.routers = self._routers()
 
     def _routers(self) -> dict[str, ZenohFile]:
-        """Map the enclaves of routers to their files: one router, or several connected routers."""
+        """Map the enclaves of routers to their files.
+
+        There is one router, or several that are connected to each other.
+
+        Raises:
+            KeystoreError: there is no router, or its rules do not tell what passes.
+        """
         routers = {
             name: self._file(name, ROUTER_FILE)
             for name in self.names
@@ -289,7 +297,7 @@ class ZenohEvaluator:
         )
 
     def _router_of(self, enclave: str) -> ZenohFile:
-        """Return the router that has rules for an enclave, or the first one."""
+        """Return the file of the router whose rules name an enclave; else the first one's."""
         for file in self.routers.values():
             if file.process and file.process.access.rules_for(enclave):
                 return file
@@ -298,11 +306,15 @@ class ZenohEvaluator:
     def answer(
         self, enclave: str, question: Question, *, reach: bool = True, brief: bool = False
     ) -> ZenohAnswer:
-        """Return the answer for one enclave; with ``reach``, also the enclaves that it reaches.
+        """Return the answer for one enclave.
 
-        A ``brief`` answer does not list unsigned files.  It reads the router's file in place of the
-        peers' files, which have the same rights.  If the router drops the message, it reads only
-        the beginning of the enclave's file.
+        Args:
+            enclave: the enclave.
+            question: the right that is asked for.
+            reach: also list the enclaves at the other end of the right.
+            brief: do not list unsigned files, and read as little as possible: the router's file in
+                place of the files of peers, which have the same rights; if the router drops the
+                message, only the beginning of the enclave's file.
         """
         if enclave not in self.names:
             raise no_such_enclave(self.keystore, enclave, self.names)
@@ -370,15 +382,15 @@ class ZenohEvaluator:
         return ZenohAnswer(enclave, question, begun.mode, outcome, text, checks)
 
     def _why(self, check: Check | None) -> str:
-        """Return a clause with the deciding check, its reason, and the file with its rule."""
+        """Return a clause that names the deciding check, its reason, and the file with its rule."""
         assert check
         file = self._file_of(check.enforcer)
         return f"{check}: {check.decision.why}, in {file} of {check.enforcer}"
 
     def out_of_date(self, answer: ZenohAnswer) -> tuple[str, ...] | None:
-        """Return the files that decide an answer and do not match the permissions.
+        """Return the names of files that decide an answer and do not match the permissions.
 
-        Only the rules that concern the question are compared.  Return None if the files cannot be
+        Only the rules that concern the question are compared.  None if the files cannot be
         compared, as in an export.
         """
         try:
@@ -416,9 +428,9 @@ class ZenohEvaluator:
         )
 
     def _other_ends(self, answer: ZenohAnswer) -> set[str]:
-        """Return the enclaves with which an enclave may communicate for the question, by its file.
+        """Return the enclaves with which an enclave may exchange the messages of the question.
 
-        For a client, the file of its router decides.
+        The enclave's file decides; for a client, the file of its router.
         """
         own = self._file(answer.enclave, self._file_of(answer.enclave)).process
         wanted = self._rights(answer.enclave, answer.question)
@@ -438,10 +450,10 @@ class ZenohEvaluator:
         }
 
     def _concerned(self, answer: ZenohAnswer, ends: set[str]) -> set[str]:
-        """Return the enclaves whose rights an answer depends on, by the files or the permissions.
+        """Return the enclaves on whose rights an answer depends.
 
-        A denial depends on the enclave's own rights alone: what it shares with peers is part of
-        them.
+        A denial depends on the enclave's own rights alone.  ``ends`` are the enclaves at the other
+        end.
         """
         if not answer.allowed and not answer.of_router:
             return set()
@@ -507,8 +519,8 @@ class ZenohEvaluator:
     def _of_router(self, answer: ZenohAnswer, own: ZenohProcess, *, brief: bool) -> ZenohAnswer:
         """Return the answer for a router's enclave, which may do what passes through the router.
 
-        Every session that may receive the message accepts it from the router, and from a second
-        process with the router's key.
+        Every session that may receive a message accepts it from the router, and also from a second
+        process that has the router's key.
         """
         wanted = self._rights(answer.enclave, answer.question)
         believing: list[Reached] = []
@@ -551,10 +563,10 @@ class ZenohEvaluator:
     def _deciding(
         self, own: ZenohProcess, router: ZenohProcess, wanted: Sequence[Right], *, brief: bool
     ) -> tuple[Check, ...]:
-        """Return the checks that decide on an enclave's rights on the link with the router.
+        """Return the checks that decide on the rights of an enclave.
 
-        The files of peers state the rights that both ends have.  So if the router denies a right,
-        the peers are searched for one whose file allows it.
+        These are the checks on its link with the router.  If the router denies a right in peer
+        mode, they are the checks on its link with the first peer that allows the right.
         """
         checks = tuple(self._decided(own, router, wanted))
         if own.mode is not Mode.PEER or brief or all(each.allowed for each in checks):
@@ -573,7 +585,7 @@ class ZenohEvaluator:
         return checks
 
     def _rights(self, enclave: str, question: Question) -> tuple[Right, ...]:
-        """Return the rights to topics and services that the question asks for; none for joining."""
+        """Return the rights that a question asks for; () for the question whether it may join."""
         return parts(Right(enclave, ALLOW, question.right, question.name)) if question.right else ()
 
     def _decided(
@@ -585,7 +597,10 @@ class ZenohEvaluator:
             yield from (*delivery.checks, *delivery.replies)
 
     def _delivery(self, way: Route, right: Right, key: str = "") -> Delivery:
-        """Return the delivery for a right of a route's first process, on its own key or ``key``."""
+        """Return the delivery of a message, by a right of the first process on the route ``way``.
+
+        ``key`` is the key of the message; "" stands for the key of the right.
+        """
         key = key or f"{self.domain}{right.name}/{ANY_TYPE}"
         match right.right:
             case "publish":
@@ -598,7 +613,7 @@ class ZenohEvaluator:
                 return call(way[::-1], key)
 
     def _graph(self, own: ZenohProcess, other: ZenohProcess) -> tuple[Delivery, Delivery]:
-        """Return the deliveries by which a node is announced in the graph, and sees all others."""
+        """Return the deliveries that announce a node of ``own``, and that show it other nodes."""
         everything = f"@ros2_lv/{self.domain}/**"
         router = self._router_of(own.name).process
         assert router
@@ -644,7 +659,8 @@ class ZenohEvaluator:
     ) -> Iterator[DecidingWildcard]:
         """Yield the deciding wildcards, with the enclaves that a message on the wildcard reaches.
 
-        Only a put or a query can have such a key; it arrives where every rule includes all of it.
+        Only a put or a query can have a wildcard as its key.  It passes only where a rule includes
+        the whole wildcard.
         """
         asked = [each for each in wanted if each.right in ("publish", "request")]
         for wide in dict.fromkeys(filter(None, map(self._wildcard, checks))):
@@ -657,7 +673,7 @@ class ZenohEvaluator:
             yield DecidingWildcard(wide, tuple(enclaves))
 
     def _wildcard(self, check: Check) -> str:
-        """Return the key expression that allows data, if its name has a wildcard, or ""."""
+        """Return the key expression that allows the data, if its name has a wildcard; else ""."""
         if check.message not in (Message.PUT, Message.QUERY) or not check.decision.rules:
             return ""
         file = self._file(check.enforcer, self._file_of(check.enforcer))
@@ -673,18 +689,21 @@ def _unrestricted(name: str, mode: Mode) -> ZenohProcess:
 
 
 _DATA = (Message.PUT, Message.QUERY, Message.LIVELINESS_TOKEN)
-"""The messages that use a right; all other messages prepare for them."""
+"""The messages that transport data or announce a node; other messages only prepare for them."""
 
 
 def _first(checks: Iterable[Check], enclave: str) -> Check | None:
-    """Return the check to report: on data first, then by another enclave than ``enclave``."""
+    """Return the check to report: on data before others, of other enclaves before ``enclave``."""
     return min(
         checks, key=lambda each: (each.message not in _DATA, each.enforcer == enclave), default=None
     )
 
 
 def _meet(connect: Sequence[ZenohEndpoint], listen: Sequence[ZenohEndpoint]) -> bool:
-    """Return whether a process may connect to where another listens: hosts have several names."""
+    """Return whether a process may connect to an address at which another process listens.
+
+    Only ports and protocols are compared: a host can have several names.
+    """
     ports = {(endpoint.protocol, endpoint.address.rpartition(":")[2]) for endpoint in listen}
     return any(
         (endpoint.protocol, endpoint.address.rpartition(":")[2]) in ports for endpoint in connect
@@ -712,7 +731,7 @@ _ROUTERS_KEY = Note(
 
 
 class ZenohOfKeystore:
-    """Zenoh as decider for enclaves of a keystore: for ``names``, or for all and the router."""
+    """The decisions of Zenoh for enclaves of a keystore: ``names``, or all with the router."""
 
     def __init__(
         self,
@@ -733,7 +752,7 @@ class ZenohOfKeystore:
         return f"Zenoh ({self._why})"
 
     def outcomes(self, question: Question) -> tuple[ZenohAnswer, ...]:
-        """Return the answer for each enclave, without the enclaves it reaches; brief for peers."""
+        """Return the answer for each enclave, without the enclaves at the other end."""
         from sros_tool.explain.who import of_each  # a question about one enclave needs none
 
         def answer(name: str) -> ZenohAnswer:
@@ -742,7 +761,7 @@ class ZenohOfKeystore:
         return of_each(self._names, answer)
 
     def printed(self, question: Question, outcomes: Sequence[ZenohAnswer]) -> WhoOnZenoh:
-        """Return what ``--json`` prints of its outcomes."""
+        """Return what ``--json`` prints for these answers."""
         shown = [
             ZenohEnclaveOutcome(
                 outcome.enclave, outcome.in_brief, outcome.outcome, outcome.wildcard
@@ -774,9 +793,9 @@ class ZenohOfKeystore:
     spread=("asked", "answer"),
 )
 class ZenohExplanation(NamedTuple):
-    """What Zenoh does with the files of the keystore as they are.
+    """The decision of Zenoh by the files in the keystore.
 
-    ``stated`` is the answer by the signed permissions, from which the files are made.
+    ``stated`` is the decision by the signed permissions, from which these files are made.
     """
 
     asked: Asked
@@ -811,7 +830,7 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def permitted(self) -> bool:
-        """Whether the signed permissions allow it."""
+        """Whether the signed permissions allow the right."""
         return self.stated.allowed
 
     @property
@@ -858,7 +877,11 @@ def explain_on_zenoh(
 ) -> ZenohExplanation:
     """Return Zenoh's decision by the files, and the decision by the signed permissions.
 
-    ``why`` is the reason to ask Zenoh; ``kind`` is the type of the name if the user gave it.
+    ``why`` is the reason why Zenoh is asked; ``kind`` is the kind of the name (topic, service or
+    action) if the user gave it.
+
+    Raises:
+        UsageError: the user named no keystore with the enclave.
     """
     enclave, keystore = asked.enclave, asked.enclave.keystore
     if keystore is None or enclave.state is None or not is_keystore(keystore.root):

@@ -1,7 +1,7 @@
-"""Certificate revocation lists (CRLs) of an identity CA (RFC 5280, section 5), and their verdict.
+"""Certificate revocation lists (CRLs, RFC 5280, section 5), and what OpenSSL decides by them.
 
-The DDS vendors ask for a list of the CA that issued the certificate, not for lists of the CAs above
-it (``X509_V_FLAG_CRL_CHECK`` without ``X509_V_FLAG_CRL_CHECK_ALL``).
+DDS vendors need a list only from the CA that issued the certificate, not from the CAs above it
+(``X509_V_FLAG_CRL_CHECK`` without ``X509_V_FLAG_CRL_CHECK_ALL``).
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ class Revoked(NamedTuple):
 
 
 class RevocationList(NamedTuple):
-    """A parsed revocation list; its signature is not verified yet.
+    """A revocation list that was read, with a signature that is not verified yet.
 
-    ``revoked`` lacks entries with the reason removeFromCRL: they revoke nothing.
+    ``revoked`` has no entries with the reason removeFromCRL: they revoke nothing.
     """
 
     number: int
@@ -88,7 +88,15 @@ def sign_crl(
     this_update: datetime,
     next_update: datetime,
 ) -> bytes:
-    """Return a revocation list as PEM, signed with ``key``, the key of the CA ``issuer``.
+    """Return a signed revocation list, as PEM.
+
+    Args:
+        issuer: the certificate of the CA.
+        key: the private key of the CA.
+        revoked: the entries.
+        number: the number of the list, larger than that of the list before.
+        this_update: the time from which the list is valid.
+        next_update: the time at which it expires.
 
     Raises:
         PkiError: a serial number is negative, or has more than 159 bits.
@@ -120,10 +128,10 @@ def sign_crl(
 
 
 def load_crl(data: bytes, name: str) -> RevocationList:
-    """Return the first revocation list of a PEM file; ``name`` names the file in errors.
+    """Return the first revocation list of a PEM file, which has to state its expiry.
 
     Raises:
-        PkiError: the list cannot be read, or does not say when it expires.
+        PkiError: the list cannot be read, or states no expiry; ``name`` names the file.
     """
     crl = read_list(data, name)
     expiry = next_update(crl)
@@ -134,17 +142,17 @@ def load_crl(data: bytes, name: str) -> RevocationList:
 
 
 def last_update(crl: x509.CertificateRevocationList) -> datetime:
-    """Return when a revocation list begins to be valid, in UTC."""
+    """Return the time from which a revocation list is valid, in UTC."""
     return cast(datetime, tolerant.date(crl, "last_update"))
 
 
 def next_update(crl: x509.CertificateRevocationList) -> datetime | None:
-    """Return when a revocation list expires, in UTC; None if it does not say so."""
+    """Return the time at which a revocation list expires, in UTC; None if it states none."""
     return cast("datetime | None", tolerant.date(crl, "next_update"))
 
 
 def read_list(data: bytes, name: str) -> x509.CertificateRevocationList:
-    """Return the first revocation list of a PEM file, with or without the time of its expiry.
+    """Return the first revocation list of a PEM file, even if it states no expiry.
 
     Raises:
         PkiError: the list cannot be read; ``name`` names the file.
@@ -158,7 +166,7 @@ def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, 
     """Return all revocation lists of a PEM file, which may have certificates, too.
 
     Raises:
-        PkiError: a list, or what stands before it, cannot be read; ``name`` names the file.
+        PkiError: a list, or a block before it, cannot be read; ``name`` names the file.
     """
     with _reading(name, data):
         blocks = pem.blocks(data)
@@ -201,15 +209,18 @@ def _read_in_full(crl: x509.CertificateRevocationList) -> x509.CertificateRevoca
 
 
 def embedded_lists(data: bytes) -> list[bytes]:
-    """Split the revocation lists out of a CA file; return a PEM document for each list.
+    """Return the revocation lists in a CA file, each as a PEM document.
 
-    OpenSSL reads all of them, and nothing that does not begin a line (pem_lib.c).
+    OpenSSL reads all lists in the file; a list has to begin at the beginning of a line (pem_lib.c).
     """
     return [CRL_MARK + text for text in (b"\n" + data).split(b"\n" + CRL_MARK)[1:]]
 
 
 def names_issuers(crl: x509.CertificateRevocationList) -> bool:
-    """Return whether an entry names the CA of its certificate (certificateIssuer: indirect CRL)."""
+    """Return whether an entry of the list names a CA that issued the revoked certificate.
+
+    Such a list is indirect: it can revoke certificates of several CAs (certificateIssuer).
+    """
     return any(
         extension.oid == CRLEntryExtensionOID.CERTIFICATE_ISSUER
         for entry in crl
@@ -220,7 +231,7 @@ def names_issuers(crl: x509.CertificateRevocationList) -> bool:
 def lists_as_revoked(crl: x509.CertificateRevocationList, serial: int) -> bool:
     """Return whether a list revokes the certificate with the serial number ``serial``.
 
-    An entry with the reason removeFromCRL does not (OpenSSL 3, x509_vfy.c, cert_crl).
+    An entry with the reason removeFromCRL revokes nothing (OpenSSL 3, x509_vfy.c, cert_crl).
     """
     if serial < 0:  # RFC 5280 forbids it, OpenSSL accepts it, and the search below raises
         entry = next(
@@ -255,9 +266,10 @@ _OF_USERS = x509.IssuingDistributionPoint(
 
 
 def refusal_of(crl: x509.CertificateRevocationList) -> str:
-    """Return why OpenSSL verifies no certificate with a list, as a clause; "" if it does.
+    """Return why OpenSSL cannot use a list, as a clause; "" if it can.
 
-    Source: OpenSSL 3, x_crl.c (crl_set_issuers, crl_cb) and x509_vfy.c (get_crl_score).
+    With such a list, no certificate is verified.  Source: OpenSSL 3, x_crl.c (crl_set_issuers,
+    crl_cb) and x509_vfy.c (get_crl_score).
     """
     for each in crl.extensions:
         if each.critical and each.oid not in _READ_IF_CRITICAL:
@@ -279,7 +291,7 @@ def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) 
 
 
 def may_sign_lists(authority: x509.Certificate) -> bool:
-    """Return whether a CA's keyUsage permits signing CRLs; true without that extension."""
+    """Return whether a CA's keyUsage permits signing CRLs; True if it has no keyUsage."""
     usage = extension(authority, x509.KeyUsage)
     return usage is None or usage.crl_sign
 
@@ -312,7 +324,7 @@ _REASONS = frozenset(x509.ReasonFlags) - {
 
 
 class Obstacle(Enum):
-    """Reasons why a certificate is refused because of revocation lists."""
+    """The reason why OpenSSL refuses a certificate because of revocation lists."""
 
     MISSING = "no list of its CA"
     USAGE = "the CA may not sign lists"
@@ -325,7 +337,10 @@ class Obstacle(Enum):
 
 
 class ListRefusal(NamedTuple):
-    """A refusal because of revocation lists: reason, the list (None if missing), and a clause."""
+    """The refusal of a certificate because of revocation lists.
+
+    It has the reason, the list (None if a list is missing), and a clause for messages.
+    """
 
     obstacle: Obstacle
     list: x509.CertificateRevocationList | None
@@ -333,7 +348,10 @@ class ListRefusal(NamedTuple):
 
 
 class _Score(NamedTuple):
-    """How well a list fits a certificate, in OpenSSL's order of weight (get_crl_score)."""
+    """How well a list fits a certificate; OpenSSL compares the fields in this order.
+
+    Source: OpenSSL 3, x509_vfy.c (get_crl_score).
+    """
 
     only_known: bool
     in_scope: bool
@@ -381,7 +399,7 @@ def list_refusal(
 
 
 def _revokes(crl: x509.CertificateRevocationList, certificate: x509.Certificate) -> bool:
-    """Return whether the list revokes the certificate; a removeFromCRL entry does not."""
+    """Return whether a list revokes a certificate; an entry removeFromCRL revokes nothing."""
     if not _entries(_Content(crl)).name_issuers:
         return lists_as_revoked(crl, certificate.serial_number)
     issuers: list[x509.Name] | None = None
@@ -403,7 +421,10 @@ def _revokes(crl: x509.CertificateRevocationList, certificate: x509.Certificate)
 def _best(
     chain: Sequence[x509.Certificate], lists: Lists, at: datetime
 ) -> tuple[x509.CertificateRevocationList, x509.Certificate, _Score] | None:
-    """Return the list that OpenSSL uses: the best fit, of equal fits the newest (get_crl_sk)."""
+    """Return the list that OpenSSL uses for ``chain[0]``, with its issuer and score, or None.
+
+    It is the list that fits best, and of several the newest (get_crl_sk).
+    """
     best: tuple[x509.CertificateRevocationList, x509.Certificate, _Score] | None = None
     for crl in lists:
         issuer = _issuer(chain, crl)
@@ -428,7 +449,7 @@ def _issuer(
 ) -> x509.Certificate | None:
     """Return the CA in the chain that issued the list, or None (crl_akid_check).
 
-    Only lists with the name of the certificate's issuer are looked at.
+    The list has the name of the certificate's issuer.
     """
     if not same_name(crl.issuer, chain[0].issuer):
         return None
@@ -457,7 +478,7 @@ def _identifies(identifier: x509.AuthorityKeyIdentifier, authority: x509.Certifi
 
 
 class _Content:
-    """A hashable revocation list, for caches: all enclaves of a keystore share their lists."""
+    """A revocation list with a hash, as a key of caches: the enclaves of a keystore share lists."""
 
     def __init__(self, crl: x509.CertificateRevocationList) -> None:
         self.crl = crl
@@ -472,8 +493,8 @@ class _Content:
 class _Entries(NamedTuple):
     """Facts about the extensions of a list and of its entries.
 
-    ``has_unknown`` says whether the list or an entry has a critical extension that OpenSSL does not
-    know, ``name_issuers`` whether entries name the CAs whose certificates they revoke.
+    ``has_unknown``: the list or an entry has a critical extension that OpenSSL does not know.
+    ``name_issuers``: entries name the CAs whose certificates they revoke.
     """
 
     has_unknown: bool
@@ -502,7 +523,10 @@ def _is_in_scope(
     crl: x509.CertificateRevocationList,
     point: x509.IssuingDistributionPoint | None,
 ) -> bool:
-    """Return whether the list is for the certificate (crl_crldp_check)."""
+    """Return whether a list is for the certificate, by its distribution point.
+
+    Source: OpenSSL 3, x509_vfy.c (crl_crldp_check).
+    """
     if point is None:
         return True
     constraints = extension(certificate, x509.BasicConstraints)
@@ -538,7 +562,7 @@ def _general_name(name: x509.GeneralName) -> object:
 
 
 def _all_reasons(certificate: x509.Certificate, crl: x509.CertificateRevocationList) -> bool:
-    """Return whether the certificate's distribution points cover every revocation reason."""
+    """Return whether the distribution points of a certificate cover all reasons to revoke it."""
     for place in extension(certificate, x509.CRLDistributionPoints) or ():
         if _is_of(place, crl):
             return place.reasons is None or place.reasons >= _REASONS

@@ -77,7 +77,7 @@ _MAX_LENGTH = 1000  # characters of a href or an xpointer
 
 
 class IncludedFile(NamedTuple):
-    """A document, and the chain of includes that leads to it, as pairs of file and xpointer.
+    """A policy file, and the includes that lead to it, as pairs of file and xpointer.
 
     ``linked`` says that the last include names the file by a symbolic link.
     """
@@ -92,24 +92,25 @@ class MissingFileError(DocumentError):
 
 
 PolicyFiles = Callable[[Path], bytes]
-"""Function that returns the content of a policy file.
+"""Function that returns the content of a policy file, given its path.
 
-It raises `MissingFileError` if there is none, and `DocumentError` if that is not certain.
+It raises `MissingFileError` if there is no such file, and `DocumentError` if it cannot tell.
 """
 
 
 @dataclass(slots=True)
 class Includer:
-    """A reader of the policy files in ``root`` and below; it reads every file once.
+    """A reader of policy files in the folder ``root`` and below.
 
-    An included file counts each time, because a few small files could expand to gigabytes.
+    It reads each file once, but counts an included file each time, because a few small files could
+    expand to gigabytes.
     """
 
     root: Path
     read: PolicyFiles | None = None
     """Function that returns a file's content; None reads from the file system."""
     fallbacks: list[tuple[Source, str]] = field(default_factory=list)
-    """The includes whose fallback was used, with the missing file."""
+    """The includes whose fallback was used, each with the path of the missing file."""
     _documents: dict[Path, etree._Element] = field(default_factory=dict)
     _sizes: dict[Path, int] = field(default_factory=dict)
     _includes: int = 0
@@ -118,11 +119,11 @@ class Includer:
     _digests: list[bytes] = field(default_factory=list)
 
     def digest(self) -> str:
-        """Return the SHA-256 (hexadecimal) of all documents read so far, in any order."""
+        """Return the SHA-256 (hexadecimal) of all files read so far, whatever their order."""
         return hashlib.sha256(b"".join(sorted(self._digests))).hexdigest()
 
     def load(self, file: Path) -> etree._Element:
-        """Return the root element of the document at ``file``, which is a real path."""
+        """Return the root element of a policy file, given by its real path."""
         if file not in self._documents:
             read = self.read or (lambda file: read_bytes(file, "policy file"))
             self.use_content(file, read(file))
@@ -132,7 +133,7 @@ class Includer:
         return self._documents[file]
 
     def use_content(self, file: Path, content: bytes) -> None:
-        """Use ``content`` in place of the file with this real path, wherever it is included."""
+        """Use ``content`` in place of the file with this real path, even where it is included."""
         root = parse(content, f"the policy file '{file}'", instructions=True)
         _check_instructions(root, file)
         self._documents[file] = root
@@ -142,7 +143,7 @@ class Includer:
     def children(
         self, parent: etree._Element, place: IncludedFile
     ) -> Iterator[tuple[etree._Element, IncludedFile]]:
-        """Return the child elements of ``parent`` with includes replaced by their elements."""
+        """Yield the child elements of ``parent``, and in place of an include its elements."""
         return self._expanded(parent, place)
 
     def target(self, element: etree._Element, place: IncludedFile) -> Path:
@@ -286,12 +287,12 @@ COMMON = "common"
 
 
 def _is_there(file: Path) -> bool:
-    """Return whether a file exists; it does not if its name is too long for the system."""
+    """Return whether a file exists; False if its name is too long for the file system."""
     return os.path.exists(file)  # noqa: PTH110 - Path.exists raises for such a name
 
 
 def _missing_remedy(file: Path) -> str:
-    """Return how to get a missing include that ships with sros, or "" for any other file."""
+    """Return how to get a missing included file that ships with sros; "" for other files."""
     from sros_tool.files import policies_dir  # what writes files is not needed to read policies
 
     tail = file.parts[file.parts.index(COMMON) :] if COMMON in file.parts else ()
@@ -364,10 +365,12 @@ def read_policy(
 ) -> Policy:
     """Read a policy file with its includes, which must be in its folder or below.
 
-    ``content`` replaces the content of the file, which then need not exist.  With
-    ``placeholders``, names may have those of `sros_tool.policy.placeholders`, and are not filled
-    in: only `sros_tool.fleet.expansion` can use such a policy.  ``read`` returns the content of
-    files that are not in the file system.
+    Args:
+        path: the path of the file.
+        content: the content of the file, which then need not exist.
+        placeholders: accept the placeholders of `sros_tool.policy.placeholders` in names; they are
+            not filled in, so only `sros_tool.fleet.expansion` can use the policy.
+        read: returns the content of included files that are not in the file system.
 
     Raises:
         PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
@@ -377,7 +380,7 @@ def read_policy(
 
 
 def refuse_fallbacks(policy: Policy) -> None:
-    """Raise `PolicyError` if a policy used the fallback of an include because a file is missing."""
+    """Raise `PolicyError` if a policy uses a fallback because an included file is missing."""
     for source, file in policy.fallbacks:
         raise PolicyError(
             f"{source}: the fallback of the include is used, because '{file}' is absent",
@@ -584,7 +587,7 @@ class _Reader:
             yield Group(kind, tuple(rights), names, level, source, lines if whole else ())
 
     def _protect(self, element: etree._Element, place: IncludedFile) -> Level | None:
-        """Return the protection level that a name requires, or None."""
+        """Return the protection level that the policy states for a name, or None."""
         if not len(element):
             return None
         where = self._where(element, place)
@@ -629,15 +632,15 @@ class _Reader:
         return name
 
     def _written(self, element: etree._Element) -> str:
-        """Return the text of a name element, unchanged."""
+        """Return the text of an element with a name, as it is written."""
         return element.text or ""
 
     def _sample(
         self, text: str, element: etree._Element, place: IncludedFile, *, several: bool
     ) -> str:
-        """Return an example name with the placeholders filled in, to check the name's grammar.
+        """Return a name with example values for its placeholders, to check its grammar.
 
-        ``several`` says whether names for each robot can stand in its place.
+        With ``several``, a placeholder may stand for the names of several robots.
         """
         parts = self._parts(text, element, place, several=several)
         return sample(parts) if parts else text
@@ -650,9 +653,10 @@ class _Reader:
         *,
         several: bool | None = None,
     ) -> Parts | None:
-        """Return the text and placeholders of a name, or None if it has no placeholder.
+        """Return the texts and placeholders that a name consists of; None if it has no placeholder.
 
-        Without ``several``, it is the path of an enclave.
+        ``several`` tells whether a placeholder may stand for the names of several robots; None if
+        the text is the path of an enclave.
         """
         if not has_placeholder(text):
             return None
@@ -738,10 +742,10 @@ class _Reader:
 
 
 def _absolute(profile: Profile) -> tuple[Profile, ...]:
-    """Return equivalent profiles whose namespaces begin with "/".
+    """Return profiles with the same meaning, whose namespaces begin with "/".
 
     Every ROS name begins with "/", so the first ``*`` of a namespace stands for nothing before a
-    "/", or for a text that begins with one.
+    "/", or for a text that begins with "/".
     """
     below = profile.ns.lstrip("*")
     if below == profile.ns:
@@ -755,10 +759,10 @@ def _absolute(profile: Profile) -> tuple[Profile, ...]:
 
 
 class ConvertedPolicy(NamedTuple):
-    """A policy converted from an earlier format to `Policy`, with the same rights.
+    """A policy converted from an earlier format, with the same rights.
 
-    ``left_out`` are the profiles that no enclave can stand for, with the reason; without them the
-    policy gives less than before, never more.
+    ``left_out`` are profiles for which no enclave is possible, each with the reason; without them,
+    the converted policy permits less than before.
     """
 
     policy: Policy
@@ -869,9 +873,9 @@ _ONE_NODE = f"""<policy version="{VERSION}" xmlns:xi="http://www.w3.org/2001/XIn
 
 
 def with_node_rights(policy: Policy, folder: Path) -> Policy:
-    """Return the policy with the rights that every node needs added to profiles that lack them.
+    """Return the policy in which every profile has the rights that every node needs.
 
-    ``folder`` has ``common/node.xml``, which says what every node of ROS 2 needs.
+    These rights are in ``common/node.xml`` of ``folder``.
     """
     needed = read_policy(folder / "node.xml", _ONE_NODE.encode()).enclaves[0].all_profiles()[0]
 
@@ -1025,16 +1029,16 @@ def write_policy(policy: Policy) -> bytes:
 def checked_text(
     policy: Policy, output: Path | None, what: str, *, placeholders: bool = False
 ) -> bytes:
-    """Return the policy as XML after a check that it reads back as an equal policy.
+    """Return the policy as XML, after a check that it reads back as an equal policy.
 
     Args:
         policy: the policy.
-        output: where it is going to be written; None if it is not.
-        what: how the policy came about, such as "narrowed".
+        output: the file that will be written, or None.
+        what: how the policy was made, such as "narrowed", for errors.
         placeholders: whether names may have placeholders of a fleet.
 
     Raises:
-        PolicyError: it would be read as another one.
+        PolicyError: the XML would be read as a different policy.
     """
     document = write_policy(policy)
     if output and read_policy(output, document, placeholders=placeholders) != policy:
@@ -1049,7 +1053,7 @@ def checked_text(
 def _write_profile(
     parent: etree._Element, profile: Profile
 ) -> Iterator[tuple[etree._Element, Level]]:
-    """Append a profile to the XML; yield the name elements that need a protection."""
+    """Append a profile to the XML; yield the elements of names with a protection level."""
     element = etree.SubElement(parent, "profile", ns=profile.ns, node=profile.node)
     for group in profile.groups:
         child = etree.SubElement(element, group.kind)
@@ -1071,11 +1075,13 @@ _LOOKED_AT = 256 * 1024
 
 
 def policy_files(folder: Path) -> Iterator[Path]:
-    """Yield the policies in a folder and below it, sorted, without fragments for includes.
+    """Yield the paths of the policies in a folder and below it, sorted.
+
+    Fragments that are only included are left out.
 
     Raises:
-        DocumentError: a file is perhaps a policy, but cannot be read, is no XML, or has another
-            ending than ``.xml``; a link leads to a folder, or there are too many files.
+        DocumentError: a file that may be a policy cannot be read, is no XML, or has a name that
+            does not end with ``.xml``; a link leads to a folder; or there are too many files.
     """
     for count, path in enumerate(_files_below(folder)):
         if count >= _MOST_FILES:
@@ -1087,10 +1093,12 @@ def policy_files(folder: Path) -> Iterator[Path]:
 
 
 def is_policy(name: str, content: bytes, shown: str) -> bool:
-    """Return whether a file is a policy; errors call the file ``shown``.
+    """Return whether a file with this name and content is a policy.
+
+    ``shown`` is the file's name in errors.
 
     Raises:
-        DocumentError: that is not certain, or only its name says that it is none.
+        DocumentError: that is unclear, or the file is a policy and only its name denies it.
     """
     if name.lower().endswith(".xml"):
         return parse(content, shown, instructions=True).tag == "policy"
@@ -1105,7 +1113,11 @@ def is_policy(name: str, content: bytes, shown: str) -> bool:
 
 
 def _files_below(folder: Path) -> Iterator[Path]:
-    """Yield the regular files in a folder and below, sorted; refuse links to folders."""
+    """Yield the regular files in a folder and below it, sorted.
+
+    Raises:
+        DocumentError: a folder cannot be read, or a link leads to a folder.
+    """
 
     def fail(error: OSError) -> None:
         raise DocumentError(f"'{error.filename}' cannot be read", str(error.strerror)) from error

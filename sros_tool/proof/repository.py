@@ -1,9 +1,10 @@
-"""Read objects and references of a git repository without trusting the repository.
+"""Read objects and references of a git repository that nobody has to trust.
 
-Git only reads objects here, and each one is verified by its hash: what is returned for a commit is
-what the commit says, whatever replacements, grafts, alternates, attributes or settings the
-repository has.  No program that it configures is run (hooks, filters, textconv, fsmonitor,
-transports), nothing is fetched but by `Repository.fetch`, and no file of the work tree is read.
+Git only reads objects here, and the hash of each object is verified.  So what is returned for a
+commit is the commit's content, whatever replacements, grafts, alternates, attributes or settings
+the repository has.  No program that the repository configures is run (hooks, filters, textconv,
+fsmonitor, transports), only `Repository.fetch_missing` fetches anything, and no file of the work
+tree is read.
 """
 
 from __future__ import annotations
@@ -52,9 +53,9 @@ _ELSEWHERE = (
     *("GIT_GRAFT_FILE", "GIT_INDEX_FILE", "GIT_NAMESPACE", "GIT_OBJECT_DIRECTORY", "GIT_PREFIX"),
     *("GIT_REPLACE_REF_BASE", "GIT_SHALLOW_FILE", "GIT_WORK_TREE"),
 )
-"""Environment variables that make git read another repository than the folder's."""
+"""Environment variables that make git read another repository than that of the folder."""
 _OF_SETTINGS = ("HOME", "XDG_CONFIG_HOME", "GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM")
-"""Environment variables that say where git reads settings outside of the repository."""
+"""Environment variables that tell git where it finds settings outside of the repository."""
 _NO_BASE = "none"
 _FIRST_PARENT = "^1"
 _HASH = re.compile(r"[0-9a-f]{40}(?:[0-9a-f]{24})?\Z")
@@ -86,10 +87,10 @@ class Repository:
     # ── references ─────────────────────────────────────────────────────────────────────────
 
     def exact_commit(self, name: str) -> str:
-        """Return the full commit id for a full id or a full reference.
+        """Return the full id of the commit with this full id or full reference (refs/…).
 
-        Nothing else is taken: git looks up a shorter name in several places, and who may push a tag
-        can put one there that is found first.
+        Shorter names are refused: git looks them up in several places, and whoever may push a tag
+        can create one that git finds first.
 
         Raises:
             UsageError: the name has another form.
@@ -116,7 +117,7 @@ class Repository:
         """Return the full commit id for a name such as ``main`` or ``HEAD~2``.
 
         Raises:
-            DocumentError: git finds none, or the name could stand for several things.
+            DocumentError: git finds no such commit, or the name is ambiguous.
         """
         expression = _EXPRESSION.match(name)
         if not expression or name.startswith("-"):
@@ -144,11 +145,10 @@ class Repository:
         return self._peeled(found, name)
 
     def _candidates(self, name: str) -> dict[str, str]:
-        """Return all references that a short name can stand for, with their ids.
+        """Return the ids of all references that a short name can stand for, by reference.
 
         Raises:
-            DocumentError: the name is that of a remote's branch, but stands for a local tag or
-                branch.
+            DocumentError: the name looks like a branch of a remote, but is a local tag or branch.
         """
         if name.startswith("refs/"):
             found = self._target(name)
@@ -199,7 +199,13 @@ class Repository:
         return {each: targets[each] for each in wanted if each in targets}
 
     def _peeled(self, digits: str, name: str) -> str:
-        """Return the commit that an id names, directly or by annotated tags."""
+        """Return the id of the commit that an object id names, directly or by annotated tags.
+
+        ``name`` is the name that the user gave, for errors.
+
+        Raises:
+            DocumentError: the object is missing, or is no commit.
+        """
         for _ in range(_MOST_TAGS):
             kind, content = self._objects([digits]).get(digits, ("", b""))
             if kind == "commit":
@@ -230,8 +236,9 @@ class Repository:
     def base_commit(self, name: str, remote: str | None) -> str:
         """Return the full id of the base commit to compare with, or "" for the name ``none``.
 
-        The name is that of `exact_commit`, or of a merge commit and ``^1``.  With a ``remote``, a
-        commit that is not there is fetched.
+        The name has a form of `exact_commit`; it can also be such a name of a merge commit with
+        ``^1`` behind it, for its first parent.  With a ``remote``, a missing commit is fetched from
+        there.
         """
         if name == _NO_BASE:
             return ""
@@ -266,10 +273,10 @@ class Repository:
         return parents[0]
 
     def folders(self, ids: Iterable[str]) -> dict[str, dict[str, TreeEntry]]:
-        """Return the entries of git trees, by tree id and name.
+        """Return the entries of git trees, as a map from tree id to entries by name.
 
         Raises:
-            DocumentError: one is missing or malformed, or has a name that no file system has.
+            DocumentError: a tree is missing or malformed, or has a name that no file system allows.
         """
         wanted = list(dict.fromkeys(ids))
         trees = self._all("tree", wanted)
@@ -279,7 +286,7 @@ class Repository:
         """Return the contents of files, by id.
 
         Raises:
-            DocumentError: one is missing, damaged, or larger than `_MOST_BYTES`.
+            DocumentError: a file is missing, damaged, or larger than `_MOST_BYTES`.
         """
         return self._all("blob", list(dict.fromkeys(ids)))
 
@@ -288,17 +295,17 @@ class Repository:
         return {each: size for each, (_, size) in self._described(ids).items()}
 
     def _described(self, ids: Iterable[str]) -> dict[str, tuple[str, int]]:
-        """Return type and size of objects by id, as git reports them."""
+        """Return the type and the size in bytes of objects, by id, as git reports them."""
         asked = "".join(f"{object_id}\n" for object_id in ids).encode()
         lines = self._git(["cat-file", "--batch-check"], stdin=asked).decode().splitlines()
         fields = (line.split() for line in lines)
         return {words[0]: (words[1], int(words[2])) for words in fields if len(words) == 3}
 
     def find(self, commit: str, path: str) -> TreeEntry | None:
-        """Return the tree entry at a path of a commit ("": the root), or None.
+        """Return the entry at a path of a commit ("" is the root), or None if there is none.
 
         Raises:
-            DocumentError: the path leads through something that is no folder, such as a link.
+            DocumentError: a part of the path before its end is no folder, such as a link.
         """
         entry = _top(self, commit)
         gone: list[str] = []
@@ -316,12 +323,13 @@ class Repository:
         """Yield the contents of files by id, in batches that fit into memory.
 
         Raises:
-            DocumentError: as of `contents`, or all of them have more than ``most`` bytes.
+            DocumentError: a file is missing, damaged or too large, or all files together have more
+                than ``most`` bytes.
         """
         known = self.sizes(wanted := dict.fromkeys(ids))
         sizes = {each: known.get(each, 0) for each in wanted}  # what is missing is an error below
         if sum(sizes.values()) > most:
-            raise DocumentError(f"the commit has more than {most} bytes there")
+            raise DocumentError(f"the files of the commit have more than {most} bytes")
         part: list[str] = []
         room = _AT_ONCE
         for each, size in sizes.items():
@@ -333,7 +341,11 @@ class Repository:
         yield self.contents(part)
 
     def content(self, digits: str) -> bytes:
-        """Return the content of a file, as `contents` does, from a cache."""
+        """Return the content of one file, by its id; repeated calls use a cache.
+
+        Raises:
+            DocumentError: the file is missing, damaged, or larger than `_MOST_BYTES`.
+        """
         return _content(self, digits)
 
     def _all(self, kind: str, ids: Sequence[str]) -> dict[str, bytes]:
@@ -352,10 +364,12 @@ class Repository:
         return {object_id: objects[object_id][1] for object_id in ids}
 
     def _objects(self, ids: Sequence[str]) -> dict[str, tuple[str, bytes]]:
-        """Return type and content of objects by id, verified by hash; missing ones are left out.
+        """Return type and content of objects, by id; missing objects are left out.
+
+        The content is verified by its hash.
 
         Raises:
-            DocumentError: one is damaged, or larger than `_MOST_BYTES`.
+            DocumentError: an object is damaged, or larger than `_MOST_BYTES`.
         """
         for each, size in self.sizes(ids).items():
             if size > _MOST_BYTES:
@@ -392,9 +406,9 @@ class Repository:
         credentials.
 
         Raises:
-            UsageError: ``digits`` is no full id, ``remote`` no remote of the repository, or git
+            UsageError: ``digits`` is no full id, ``remote`` is no remote of the repository, or git
                 would read settings in the work tree.
-            DocumentError: it cannot be fetched.
+            DocumentError: the commit cannot be fetched.
         """
         if not _HASH.match(digits):
             raise UsageError(f"'{digits}' is not the full id of a commit")
@@ -411,10 +425,12 @@ class Repository:
         self._git(["fetch", *options], environment=_FETCHING, wait=_WAIT_FOR_SERVER)
 
     def _refuse_settings_inside(self) -> None:
-        """Raise if git would read settings from the work tree, which anybody may have written.
+        """Refuse to go on if git would read settings from the work tree.
+
+        Anybody may have written the files there, and a fetch runs programs that settings name.
 
         Raises:
-            UsageError: a variable names such a place; a fetch would run programs named there.
+            UsageError: an environment variable names such a file or folder.
         """
         top = self.top()
         if top is None:
@@ -457,8 +473,15 @@ class Repository:
     ) -> bytes:
         """Run git and return its output.
 
+        Args:
+            words: the arguments of git.
+            stdin: the input of git.
+            quiet: do not raise if git fails without a message.
+            environment: the environment variables; None for the usual ones.
+            wait: the time after which git is ended, in seconds.
+
         Raises:
-            DocumentError: git fails; if ``quiet``, only if it says why.
+            DocumentError: git fails, warns, or does not end in time.
             UnavailableError: git is not installed.
         """
         own = {name: text for name, text in os.environ.items() if name not in _ELSEWHERE}
@@ -503,19 +526,19 @@ def walk(
 ) -> Iterator[tuple[str, TreeEntry]]:
     """Yield path and entry of all files, links and submodules below a folder, level by level.
 
-    With ``other``, entries are left out that this folder has at the same path with the same
-    content.
+    With ``other``, the id of another folder, entries are left out that this folder has at the same
+    path with the same content.
 
     Raises:
         DocumentError: there are more than ``most`` entries (a few objects can stand for millions),
-            or folders are nested too deeply (each level takes a question to git).
+            or too many levels of folders (git has to be asked again for each level).
     """
     level = [("", tree, other)]
     count = depth = 0
     while level:
         depth += 1
         if depth > _MOST_DEPTH:
-            raise DocumentError(f"the commit has more than {_MOST_DEPTH} folders in each other")
+            raise DocumentError(f"the commit has more than {_MOST_DEPTH} levels of folders")
         ids = [each for _, *pair in level for each in pair if each]
         folders = repository.folders(ids)
         below = []
@@ -538,7 +561,7 @@ def walk(
 
 @lru_cache(maxsize=8)
 def _program(path: str) -> str:
-    """Return the path of the program git; skip relative folders in ``path``.
+    """Return the path of the program git, looked up in ``path`` without its relative folders.
 
     Raises:
         UnavailableError: git is not installed.
@@ -575,7 +598,11 @@ def _digest(kind: str, content: bytes, digits: int) -> str:
 
 
 def _header(content: bytes, key: bytes) -> str:
-    """Return the id in the first line of a commit or tag object."""
+    """Return the object id that stands behind ``key`` in the first line of a commit or tag.
+
+    Raises:
+        DocumentError: the object is malformed.
+    """
     first, _, digits = content.partition(b"\n")[0].partition(b" ")
     found = digits.decode(errors="replace")
     if first != key or not _HASH.match(found):
@@ -584,10 +611,10 @@ def _header(content: bytes, key: bytes) -> str:
 
 
 def _entries(data: bytes, length: int) -> dict[str, TreeEntry]:
-    """Parse a git tree; return its entries by name. Ids have ``length`` bytes.
+    """Return the entries of a git tree, by name; ids have ``length`` bytes.
 
     Raises:
-        DocumentError: the object is malformed, or has a name twice, or one that leads elsewhere.
+        DocumentError: the tree is malformed, has a name twice, or a name that no file can have.
     """
     entries: dict[str, TreeEntry] = {}
     while data:
@@ -608,9 +635,10 @@ _TYPE_BITS, _EXECUTABLE = 0o170000, 0o100
 
 
 def _checked_out(mode: bytes) -> str:
-    """Return the file mode that git uses when it checks an entry out.
+    """Return the file mode that git uses when it checks out an entry of a tree.
 
-    Source: git 2.39, cache.h (canon_mode); what is no file, link or folder is a submodule.
+    ``mode`` is octal.  An entry that is no file, link or folder counts as a submodule. Source: git
+    2.39, cache.h (canon_mode).
 
     Raises:
         DocumentError: the mode is not an octal number.

@@ -1,4 +1,7 @@
-"""The worlds of a policy or keystore: the access of its enclaves on each vendor and on Zenoh."""
+"""The access of all enclaves of a policy or keystore, on each DDS vendor and on Zenoh.
+
+The access on one vendor, or on Zenoh, is called a world.
+"""
 
 from __future__ import annotations
 
@@ -80,15 +83,16 @@ WORLDS = (*(vendor.value for vendor in MEASURED), _ZENOH)
 _PLANNED = timedelta(days=365)
 """The assumed validity of permissions that are not signed yet."""
 _OF_EVERY_NODE = ((True, ROS_DISCOVERY_TOPIC), (False, ROS_DISCOVERY_TOPIC))
-"""Without these topics no node of ROS 2 starts on DDS."""
+"""Access to topics without which no node of ROS 2 starts on DDS: (whether it writes, topic)."""
 
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """The worlds of a policy or a keystore, which is ``file``.
+    """The worlds of a policy or keystore.
 
-    ``rights`` are the allowed rights as they are stated, ``places`` say where.  ``left_out`` says
-    why Zenoh was left out, if it cannot enforce the policy.
+    ``file`` is its path, ``rights`` are the allowed rights as it states them, and ``places`` tells
+    where it states them.  ``left_out`` is the reason why there is no world of Zenoh, if Zenoh
+    cannot enforce the policy.
     """
 
     file: str
@@ -109,16 +113,23 @@ def load_system(
     template: Template | None = None,
     opened: Keystore | None = None,
 ) -> System:
-    """Return the worlds of a policy file, or of a keystore as it is signed.
+    """Return the worlds of a policy file, or of a keystore with its signed documents.
 
-    ``template`` is the template of the keystore that a policy is for.  ``only`` are the wanted
-    worlds of `WORLDS`; () stands for all.  A keystore without configurations of Zenoh has no world
-    of Zenoh.  ``opened`` is the keystore at the path, if it was opened before.
+    Args:
+        path: the policy file or the keystore.
+        at: the time for which rights are decided.
+        zone: the time zone of robots, in which some vendors read dates.
+        domain: the ROS domain; for a keystore, None stands for all domains.
+        fleet: the robots that fill in placeholders of a policy.
+        only: the names of the wanted worlds, from `WORLDS`; () stands for all. A keystore without
+            configurations of Zenoh has no world of Zenoh.
+        template: the template of the keystore for which a policy is meant.
+        opened: the keystore at ``path``, if it is open already.
 
     Raises:
-        DocumentError: the file cannot be read, or only Zenoh is wanted and cannot carry it out.
-        KeystoreError: the keystore cannot be read, or has no configurations of Zenoh that decide.
-        UsageError: a keystore has a template of its own.
+        DocumentError: the file cannot be read, or only Zenoh is wanted and cannot enforce it.
+        KeystoreError: the keystore cannot be read, or what Zenoh enforces in it is not known.
+        UsageError: a template was given for a keystore.
     """
     if is_keystore(path):
         if template:
@@ -145,13 +156,13 @@ def policy_system(
 ) -> System:
     """Return the worlds of a policy as it would be signed at ``at``.
 
-    The governance is that of the template, raised as the policy says.  Without a template, a name
-    has exactly the protection that the policy states for it; for all other names, the protection of
-    the default template is assumed.
+    The governance is the template's, with the protection that the policy states added.  Without a
+    template, a name has exactly the protection that the policy states for it, and all other names
+    have the protection of the default template.
 
     Raises:
-        PolicyError: a fallback of an include is used, or only Zenoh is wanted, and it cannot carry
-            out the policy.
+        PolicyError: the policy uses the fallback of an include, or only Zenoh is wanted and cannot
+            enforce the policy.
     """
     refuse_fallbacks(policy)
     domains = DomainSet.of((domain, domain))
@@ -198,9 +209,9 @@ def policy_system(
 def _planned_zenoh(
     policy: Policy, control: AccessControl, domain: int, stated: Mapping[str, TopicAccess]
 ) -> World:
-    """Return the world of Zenoh with the rules for a policy, which state exactly its rights.
+    """Return the world of Zenoh with the rules that sros would write for a policy.
 
-    Only ROS names are considered, because the rules match the policy only for them.
+    Only ROS names are decided, because only for them the rules have the same meaning as the policy.
     """
     rules = {remote.common_name: AccessControl((remote,)) for remote in control.remotes}
 
@@ -223,10 +234,16 @@ def _dds_world(
     demanded: Mapping[Level, NameSet] | None = None,
     lenders: Mapping[str, Sequence[str]] | None = None,
 ) -> World:
-    """Return the world of a vendor; an enclave may do what one of its accesses gives.
+    """Return the world of a vendor.
 
-    ``demanded`` maps levels to the topics for which a policy, not yet a keystore, states this
-    level.
+    Args:
+        vendor: the vendor.
+        access: for each enclave, its possible documents; it may do what any of them permits.
+        stated: the topics that rights name without wildcards, by enclave.
+        title: the title of the world; "" for the vendor's.
+        idle: the enclaves without valid permissions.
+        demanded: for each level, the topics for which a policy states it; None for a keystore.
+        lenders: for each enclave, the enclaves whose permissions it can present.
     """
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
@@ -261,7 +278,7 @@ _RANK = {Level.NONE: 0, Level.SIGN: 1, Level.ENCRYPT: 2}
 
 
 def _weak(access: Iterable[Access]) -> dict[Level, NameSet]:
-    """Map levels to the topics that the governance of some enclave protects less."""
+    """Map levels to the topics that the governance of at least one enclave protects less."""
     different = dict.fromkeys(each.protection() for each in access)
     return {
         level: NameSet.union(
@@ -273,7 +290,7 @@ def _weak(access: Iterable[Access]) -> dict[Level, NameSet]:
 
 
 def _demanded(protections: Iterable[StatedProtection]) -> dict[Level, NameSet]:
-    """Map levels to the topics for which a policy states them."""
+    """Map each protection level to the topics for which a policy states this level."""
     topics: dict[Level, list[str]] = {level: [] for level in PROTECT.values()}
     for protection in protections:
         topics[protection.level] += protected_topics(protection.kind, protection.name)
@@ -281,7 +298,7 @@ def _demanded(protections: Iterable[StatedProtection]) -> dict[Level, NameSet]:
 
 
 def _rank(domain: DomainRule, rule: TopicRule) -> int:
-    """Return the strongest protection of messages: as a whole, of submessages, or of the data."""
+    """Return the strongest protection of data, of its submessage, or of the whole message."""
     kinds = (
         domain.rtps_protection_kind,
         rule.metadata_protection_kind,
@@ -291,7 +308,10 @@ def _rank(domain: DomainRule, rule: TopicRule) -> int:
 
 
 def _stated(enclaves: Iterable[str], rights: Iterable[Right]) -> dict[str, TopicAccess]:
-    """Map enclaves to the topics that their rights name without wildcards."""
+    """Map enclaves to the topics that their rights name without wildcards.
+
+    The topics that every node needs are included.
+    """
     topics_of_enclave: dict[str, tuple[set[str], set[str]]] = {
         enclave: (set(), set()) for enclave in enclaves
     }
@@ -316,11 +336,15 @@ _MOST_GOVERNANCES = 4
 def _keystore_system(
     keystore: Keystore, at: datetime, zone: tzinfo, domain: int | None, only: Collection[str]
 ) -> System:
-    """Return the worlds of a keystore: one of each vendor for each kind of domain.
+    """Return the worlds of a keystore.
 
-    The documents of an enclave decide, even if its key is not here or its files could not be loaded
-    now: the robot may have other files.  Permissions that become valid later count, too, and the
-    governance of each enclave counts for all.  Enclaves in hidden folders are included.
+    Each vendor has one world for each group of domains with the same rules.  The signed documents
+    of an enclave decide, even if its key is missing or its files could not be loaded: the robot may
+    have other files.  Permissions that become valid later count as valid.  The governance of each
+    enclave counts for all enclaves.  Enclaves in hidden folders are included.
+
+    Raises:
+        KeystoreError: documents cannot be read, or differ too much to decide.
     """
     root = keystore.root
     names = enclave_names(root, hidden=True)
@@ -412,7 +436,7 @@ def _keystore_system(
 
 
 def _possible(enclave: LoadedEnclave, grants: Sequence[Grant], governance: bytes) -> LoadedEnclave:
-    """Return an enclave whose files have no fault, so that only permissions decide."""
+    """Return an enclave whose files have no fault, so that only its permissions decide."""
     subject = enclave.subject or next((grant.subject for grant in grants), "")
     return enclave._replace(subject=subject, governance=governance, state=None)
 
@@ -445,10 +469,13 @@ def _later(name: str, grants: Iterable[Grant], at: datetime) -> tuple[datetime, 
 def _zenoh_worlds(
     keystore: Keystore, domain: int | None, stated: Mapping[str, TopicAccess]
 ) -> Iterator[World]:
-    """Yield the worlds of Zenoh; only rules that other processes enforce on a session count.
+    """Yield the worlds of Zenoh, one for each domain.
+
+    Only rules that other processes enforce on a session count, because a session can ignore its
+    own.
 
     Raises:
-        KeystoreError: there are no configurations of Zenoh, or it is not certain what they enforce.
+        KeystoreError: there are no configurations of Zenoh, or it is unclear what they enforce.
     """
     root, source = keystore.root, load_zenoh_rights(keystore, hidden=True)
     for note in source.notes:
@@ -479,7 +506,7 @@ def _enforced(
     stated: Mapping[str, TopicAccess],
     crossing: Crossing | None,
 ) -> World:
-    """Return the Zenoh world of a domain, with all enclaves and other names in the rules."""
+    """Return the Zenoh world of a domain, with all enclaves and with other names in the rules."""
     names = {*enclaves, *(name for enforcer in enforcers for name in enforcer.names())}
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
@@ -500,14 +527,14 @@ def _enforced(
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A right and the place that states it; without a line, the permissions of an enclave."""
+    """A right, with the line that states it; line 0 stands for the permissions of an enclave."""
 
     right: Right
     source: Source
 
 
 class Places:
-    """The places of rights, to find the right that lets an enclave use a topic."""
+    """An index of stated rights, which finds the right that lets an enclave use a topic."""
 
     def __init__(self, stated: Mapping[str, Iterable[Place]]) -> None:
         """Create an index of rights by enclave."""
@@ -516,11 +543,11 @@ class Places:
 
     @classmethod
     def of_policy(cls, policy: Policy) -> Places:
-        """Return the places in a policy, with their lines."""
+        """Return the index of the rights in a policy, with their lines."""
         return cls({enclave.path: _Lazy(enclave) for enclave in policy.enclaves})
 
     def find(self, use: Use) -> Place | None:
-        """Return the right that allows a use, preferably without wildcards, or None."""
+        """Return a right that permits a use, if possible one without wildcards, or None."""
         topics = self._by_enclave.get(use.enclave)
         if topics is None:
             places = self._stated.get(use.enclave, ())
@@ -539,7 +566,7 @@ class Places:
 
 
 class _Lazy:
-    """The allowed rights of a policy's enclave, computed again on each iteration."""
+    """The allowed rights of an enclave in a policy, computed again each time they are iterated."""
 
     def __init__(self, enclave: Enclave) -> None:
         self._enclave = enclave

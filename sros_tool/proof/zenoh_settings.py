@@ -1,7 +1,8 @@
-"""Find settings of Zenoh processes, apart from their rules, that open more on one side.
+"""Compare two sets of Zenoh configurations: which settings of the new ones permit more.
 
-A setting with an unknown effect is never ignored: it counts as not compared, so that the result
-cannot be "nothing new".  Source of the settings: DEFAULT_CONFIG.json5 of zenoh 1.9.
+Access-control rules are compared elsewhere.  A setting with an unknown effect is never ignored: it
+is reported as not compared, so that the result cannot be "nothing new".  Source of the settings:
+DEFAULT_CONFIG.json5 of zenoh 1.9.
 
 This module reads no files.
 """
@@ -21,7 +22,7 @@ from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration
 
 @dataclass(frozen=True, slots=True)
 class SignedConfiguration:
-    """A configuration of Zenoh, and whether its signature "holds", is "missing" or "broken"."""
+    """A configuration of Zenoh; ``signature`` is "holds", "missing" or "broken"."""
 
     document: ConfigurationDocument
     signature: str
@@ -30,7 +31,7 @@ class SignedConfiguration:
 SIGNED = "holds"
 
 _Files = Mapping[str, SignedConfiguration]
-"""Files by their enclave and name, such as "/web session.json5", or a single one by `LONE`."""
+"""Configurations by enclave and file name, such as "/web session.json5"; or one by `LONE`."""
 LONE = "the file"
 
 _OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...] = (
@@ -64,7 +65,7 @@ _OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...
         True,
         "it looks for others, and answers them, unencrypted",
     ),
-    ("scouting/gossip/enabled", lambda each: each.gossip, True, "it tells of others to others"),
+    ("scouting/gossip/enabled", lambda each: each.gossip, True, "it tells processes of each other"),
     (
         "adminspace/permissions/read",
         lambda each: each.adminspace and each.adminspace_readable,
@@ -90,7 +91,7 @@ _OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...
         "it lets pass what no rule denies",
     ),
 )
-"""Settings that are on or off, with their open value, and what that means as a clause."""
+"""Settings with two values: path, function that reads it, value that permits more, and a clause."""
 
 _COMPARED = re.compile(
     r"mode|namespace|(?:listen|connect)/endpoints(?:/\w+)?|transport/link/protocols"
@@ -98,14 +99,14 @@ _COMPARED = re.compile(
     r"|transport/link/tls/(?:enable_mtls|verify_name_on_connect|close_link_on_expiration)"
     r"|transport/shared_memory/enabled|scouting/(?:multicast|gossip)/enabled"
 )
-"""Settings that are compared by `_OPEN`, as endpoints, or as rules."""
+"""Paths of settings that `_OPEN`, the endpoints or the access-control rules compare."""
 _HARMLESS = re.compile(
     r"metadata(?:/.*)?|timestamping/.*|queries_default_timeout|open/.*|stats/.*"
     r"|transport/unicast/.*|transport/link/[tr]x/.*|transport/link/tls/so_(?:snd|rcv)buf"
     r"|(?:listen|connect)/(?:timeout_ms|exit_on_failure|retry)(?:/.*)?|scouting/(?:timeout|delay)"
     r"|scouting/gossip/autoconnect_strategy/.*|routing/router/peers_failover_brokering"
 )
-"""Settings that give nobody access: times, sizes, words, and which of two peers connects first."""
+"""Paths of settings that give nobody access: times, sizes, names, order of connecting."""
 _GIVING = (
     (re.compile(r"plugins(?:/.*)?"), "a plugin answers others by its own rules"),
     (re.compile(r"plugins_loading(?:/.*)?"), "it loads plugins, which answer others"),
@@ -118,14 +119,14 @@ _GIVING = (
         "whoever has a certificate of that CA is let in",
     ),
 )
-"""Settings whose change may give access, with their meaning as a clause."""
+"""Expressions for paths of settings whose change may give access, each with a clause."""
 
 
 def looser_settings(old: _Files, new: _Files) -> Iterator[SettingChange]:
-    """Yield what the settings in ``new`` open that those in ``old`` do not.
+    """Yield the changes of settings by which ``new`` permits more than ``old``.
 
-    A file that ``old`` does not have is compared with a file as sros writes it; its endpoints are
-    compared with the endpoints of all files of ``old``.
+    A file that ``old`` lacks is compared with a file as sros writes it, and its endpoints with the
+    endpoints of all files of ``old``.
     """
     files: dict[tuple[str, str, str, str], list[str]] = defaultdict(list)
     for place, file in sorted(new.items()):
@@ -137,7 +138,7 @@ def looser_settings(old: _Files, new: _Files) -> Iterator[SettingChange]:
 
 
 def unknown_settings(old: _Files, new: _Files) -> Iterator[str]:
-    """Yield clauses on the settings that differ and whose effect is not known."""
+    """Yield a clause for each setting that differs and whose effect sros does not know."""
     files: dict[str, list[str]] = defaultdict(list)
     for place, file in sorted(new.items()):
         before = old[place].document if place in old else _usual(file.document.mode)
@@ -155,7 +156,10 @@ def unknown_settings(old: _Files, new: _Files) -> Iterator[str]:
 def _changes(
     old: _Files, place: str, file: SignedConfiguration
 ) -> Iterator[tuple[str, str, str, str]]:
-    """Yield key, both values and the meaning of what a file opens."""
+    """Yield path, old value, new value and meaning of each setting by which a file permits more.
+
+    ``place`` is the key of ``file``, by which the old file is looked up in ``old``.
+    """
     known = old.get(place)
     before, after = known.document if known else _usual(file.document.mode), file.document
     if file.signature != SIGNED and (known is None or known.signature == SIGNED):
@@ -190,7 +194,7 @@ def _changes(
 
 
 def _more_protocols(before: tuple[str, ...] | None, after: tuple[str, ...] | None) -> str:
-    """Return the protocols that are allowed after, and not before; "" for none."""
+    """Return the protocols that only ``after`` allows, as a list in words; "" if there are none."""
     if before is None:
         return ""
     if after is None:

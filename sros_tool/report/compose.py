@@ -1,4 +1,4 @@
-"""The picture of one source, or the overlay of two sources, from rights and governance.
+"""Compose the picture of one source, or the overlay of two, from rights and governance.
 
 A wildcard is replaced by the known names that it matches, and denials override permissions.  Known
 names are the exact names in the rights of all sources.  An action is shown as one name, also for a
@@ -53,7 +53,7 @@ _OVERLAYS = {
     "drift": Overlay("drift", "only in the policy", "only in what was signed"),
     "worlds": Overlay("worlds", "not in the rules of Zenoh", "only in the rules of Zenoh"),
 }
-"""The kinds of overlays, by name."""
+"""The kinds of comparisons of two sources, by name, with their labels."""
 _ONE_WAY = ("publish", "subscribe")
 
 
@@ -61,10 +61,11 @@ _ONE_WAY = ("publish", "subscribe")
 class PictureSource:
     """The content of one source of a picture.
 
-    ``nodes`` maps enclaves to their nodes; ``enclaves`` has the enclaves with their certificates;
-    ``scope`` has the enclaves that the source is about, or None for all.  ``protections`` are what
-    a policy says about the protection of names, and ``policy`` is that policy.  ``keystore`` is the
-    one that it was read from.
+    ``rights`` are the rights and denials in the source.  ``nodes`` maps paths of enclaves to names
+    of nodes; ``enclaves`` has the enclaves with data of their certificates; ``scope`` has the paths
+    of the enclaves that the source describes, None for all.  ``protections`` are the protection
+    levels that a policy states, and ``policy`` is that policy.  ``keystore`` is the keystore from
+    which the source was read.
     """
 
     origin: SourceTitle
@@ -82,10 +83,10 @@ class PictureSource:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """Information that is not in the sources.
+    """What a picture needs besides its sources.
 
-    ``common`` are the rights that every node needs; ``hosts`` maps enclaves, or namespaces of
-    enclaves, to the hosts that they run on.
+    ``common`` are the rights that every node needs; ``hosts`` maps paths of enclaves, or of their
+    namespaces, to names of hosts.
     """
 
     common: Sequence[Right] = ()
@@ -106,7 +107,7 @@ def compose(first: PictureSource, context: Context = _NO_CONTEXT) -> Picture:
 def overlay(
     first: PictureSource, second: PictureSource, kind: str, context: Context = _NO_CONTEXT
 ) -> Picture:
-    """Return the overlay of two sources; ``kind`` is a key of `_OVERLAYS`."""
+    """Return a picture that compares two sources; ``kind`` is a key of `_OVERLAYS`."""
     scope = first.scope if second.scope is None else second.scope
     rights = [
         frozenset(right for right in side.rights if scope is None or right.enclave in scope)
@@ -139,9 +140,10 @@ def overlay(
 def with_requirements(
     picture: Picture, requirements: Requirements, governance: Governance | None = None
 ) -> Picture:
-    """Return a picture in which the uses that break requirements are marked.
+    """Return a picture in which the rights that break requirements are marked.
 
-    A use of a name that the picture does not have, such as one that only wildcards match, is added.
+    A right to a name that the picture does not have is added, such as a name that only wildcards
+    match.
     """
     broken = {
         (use.enclave, use.kind, use.name, use.right): use
@@ -174,7 +176,7 @@ def with_requirements(
 
 
 def union(sources: Sequence[PictureSource]) -> PictureSource:
-    """Return several observations as one source."""
+    """Return one source with the rights and nodes of several observations."""
     nodes: dict[str, set[str]] = defaultdict(set)
     for source in sources:
         for path, names in source.nodes.items():
@@ -228,7 +230,7 @@ def _picture(
 
 
 def _sides(edges: Iterable[Edge]) -> Mapping[tuple[str, str], list[bool]]:
-    """Map names to two flags: an enclave may send to the name; an enclave may receive from it."""
+    """Map kind and name to two flags: some enclave may send, some enclave may receive."""
     sides: dict[tuple[str, str], list[bool]] = defaultdict(lambda: [False, False])
     for edge in edges:
         if edge.qualifier is ALLOW:
@@ -239,7 +241,7 @@ def _sides(edges: Iterable[Edge]) -> Mapping[tuple[str, str], list[bool]]:
 
 
 def _lack(protection: Protection, sends: bool, receives: bool) -> Lack:
-    """Return the side of a name (send or receive) that no enclave may take."""
+    """Return the side of a name (senders or receivers) on which no enclave is allowed."""
     if sends and not receives and protection.read_control:
         return Lack.RECEIVER
     if receives and not sends and protection.write_control:
@@ -248,7 +250,7 @@ def _lack(protection: Protection, sends: bool, receives: bool) -> Lack:
 
 
 def edge_order(edge: Edge) -> tuple[str, int, str, str, tuple[str, ...], str]:
-    """Return the sort key of an edge."""
+    """Return the sort key of a drawn right."""
     right = RIGHT_ORDER[edge.right]
     return edge.enclave, right, edge.name, edge.qualifier, edge.parts, edge.mark
 
@@ -300,10 +302,13 @@ def namespace_of(name: str) -> str:
 
 
 def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) -> list[Edge]:
-    """Return the edges of both sources, marked with the side that has the edge.
+    """Return the rights of both sources, marked with the source that has them.
 
-    An edge on both sides keeps its wildcards only if both sides have it by wildcards.  With
-    ``allowed_by``, only the first side counts: an observed right always has an exact name.
+    Args:
+        first: drawn rights of the first source.
+        second: drawn rights of the second source.
+        allowed_by: for a right of both sources, show the wildcards of the first source only.
+            Without it, wildcards are shown if the right is by wildcards in both sources.
     """
     sides = [{_identity(edge): edge for edge in side} for side in (first, second)]
     edges = []
@@ -320,7 +325,7 @@ def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) 
 
 
 def _neutral(edge: Edge, unseen: frozenset[str]) -> Edge:
-    """Return ``edge``, marked BOTH if it is a denial or its enclave was not observed."""
+    """Return ``edge`` marked BOTH if it is a denial, or its enclave is in ``unseen``."""
     neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
     return replace(edge, mark=OverlaySide.BOTH) if neutral else edge
 
@@ -373,7 +378,7 @@ def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
 
 
 class Known:
-    """The known exact names of topics, services and actions in rights."""
+    """The exact names of topics, services and actions that appear in rights."""
 
     def __init__(self, rights: Iterable[Right]) -> None:
         rights = frozenset(rights)
@@ -395,7 +400,7 @@ class Known:
         self._open = {kind: _Wild(names) for kind, names in wild.items()}
 
     def reached(self, kind: str, name: str) -> tuple[str, ...]:
-        """Return the known names that an expression matches."""
+        """Return the exact names of this kind that an expression matches."""
         if not is_expression(name):
             return (name,)
         key = (kind, name)
@@ -404,9 +409,9 @@ class Known:
         return self._matched[key]
 
     def drawn(self, right: Right) -> tuple[str, ...]:
-        """Return the names to draw for a right: known names, and wildcards without known names.
+        """Return the names to draw for a right: exact names, and wildcards that match none.
 
-        A wildcard without known names is drawn for every ALLOW that overlaps with it, and for every
+        A wildcard that matches no exact name is drawn for each ALLOW that overlaps it, and for each
         DENY that covers it.
         """
         if not is_expression(right.name):
@@ -429,14 +434,14 @@ class Known:
 
 
 class _Wild:
-    """Wildcards that match no known name."""
+    """The wildcards in rights that match no known name."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = Names(names)
         self._drawn: dict[tuple[Qualifier, str], tuple[str, ...]] = {}
 
     def drawn(self, qualifier: Qualifier, name: str) -> tuple[str, ...]:
-        """Return the wildcards to draw: overlapping ones for an ALLOW, covered ones for a DENY."""
+        """Return the wildcards that ``name`` overlaps (ALLOW), or that it covers (DENY)."""
         key = (qualifier, name)
         if key not in self._drawn:
             meeting = self._names.meeting(name)
@@ -458,7 +463,7 @@ _Found = dict[Qualifier, set[str]]
 
 
 def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = ()) -> list[Edge]:
-    """Return the edges, unsorted: one for each right or denial and each name that it matches.
+    """Return one edge for each right or denial and each name that it matches, unsorted.
 
     A wildcard that matches no known name is drawn as a name.  ``common`` are the rights that every
     node of any enclave needs.
@@ -504,7 +509,7 @@ def _action_edges(
     qualifier: Qualifier,
     members: dict[tuple[str, str], set[str]],
 ) -> Iterable[Edge]:
-    """Yield one edge for a right to the whole action, or for each right to some of its parts."""
+    """Yield one edge for a right to the whole action, or one for each right to parts of it."""
     remaining = dict(members)
     for right, needed in _WHOLE.items():
         if needed <= members.keys():
@@ -521,7 +526,7 @@ def _action_edges(
 
 
 def _by(names: set[str], *, action: bool = False) -> tuple[str, ...]:
-    """Return the expressions in ``names``; () if "" is among them, which marks an exact name."""
+    """Return the wildcards in ``names``; () if it contains "", which stands for the exact name."""
     if "" in names:
         return ()
     return tuple(
@@ -572,7 +577,7 @@ _ORDER = list(WireLevel)
 
 
 class _Demanded:
-    """The protection that a policy requires, for pictures without governance."""
+    """The protection that a policy demands for names; used if there is no governance."""
 
     def __init__(self, stated: Iterable[StatedProtection]) -> None:
         topics_of: dict[WireLevel, list[str]] = defaultdict(list)
@@ -582,7 +587,7 @@ class _Demanded:
         self._names = {level: Names(topics) for level, topics in topics_of.items()}
 
     def protection(self, kind: str, name: str) -> Protection | None:
-        """Return the weakest protection required for the topics of a name, or None."""
+        """Return the weakest protection demanded for the topics of a name, or None if none is."""
         levels = [self._level(topic) for topic in _topics(kind, name)] if self._names else []
         least = min(levels, key=_ORDER.index, default=WireLevel.UNKNOWN)
         return None if least is WireLevel.UNKNOWN else Protection(least)

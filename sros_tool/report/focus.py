@@ -1,4 +1,4 @@
-"""The picture of one name or enclave with the enclaves that influence it, or that it influences.
+"""The part of a picture about one name or enclave: who influences it, and whom it influences.
 
 Who may use a name, and who influences whom, is decided by `sros_tool.reach` for all names that
 rights and governance allow, known or not.  Between two enclaves, the picture has the known names by
@@ -134,7 +134,7 @@ class FocusFlow:
 
     @classmethod
     def of(cls, picture: Picture) -> FocusFlow:
-        """Return the flow of a picture, which has a focus."""
+        """Return the flow of information of a picture that has a focus."""
         own = frozenset(focus.name for focus in picture.focus if focus.kind == _ENCLAVE)
         wanted = [(focus.kind, focus.name) for focus in picture.focus if focus.kind != _ENCLAVE]
         targets = frozenset(
@@ -171,20 +171,20 @@ class FocusFlow:
         return replace(flow, stages={key: stage for key, stage in stages.items() if stage})
 
     def ends(self, edge: Edge, stage: int) -> tuple[bool, bool]:
-        """Return whether an edge leads to its name at a stage, and whether it leads away."""
+        """Return whether a right is drawn to its name, and from it, in the column ``stage``."""
         if stage not in self.stages.get((edge.kind, edge.name), ()):
             return False, False
         before, after = self._stages(edge)
         return stage in before, stage in after
 
     def has(self, edge: Edge) -> bool:
-        """Return whether an edge is a part of the flow at any stage."""
+        """Return whether a right is a part of the flow in any column."""
         return any(
             any(self.ends(edge, stage)) for stage in self.stages.get((edge.kind, edge.name), ())
         )
 
     def _stages(self, edge: Edge) -> tuple[set[int], set[int]]:
-        """Return the stages of a name at which an enclave could write the name, and read it."""
+        """Return the columns of a name in which an enclave could write it, and could read it."""
         writes: set[int] = set()
         reads: set[int] = set()
         before, after = self.before.get(edge.enclave, 0), self.after.get(edge.enclave, 0)
@@ -220,7 +220,7 @@ def _may_read(edge: Edge) -> bool:
 
 
 class _System:
-    """The rights and the governance of the sources of a picture."""
+    """The rights and governance of the sources from which a picture was composed."""
 
     def __init__(self, picture: Picture, sources: Sequence[PictureSource]) -> None:
         self._picture = picture
@@ -246,9 +246,12 @@ class _System:
         self._paths: list[HopPath] = []
 
     def meant(self, word: str) -> Iterator[tuple[str, str]]:
-        """Yield kind and name of every name or enclave that ``word`` can mean.
+        """Yield kind and name of every name or enclave that ``word`` can stand for.
 
         An exact name counts if a right states it, or if the wildcard of a right matches it.
+
+        Raises:
+            UsageError: there is none.
         """
         enclaves = [enclave.path for enclave in self._picture.enclaves]
         kinds = [_ENCLAVE] * (word in enclaves)
@@ -269,7 +272,7 @@ class _System:
             yield kind, word
 
     def focus(self, kind: str, name: str) -> Focus:
-        """Return the answer for a name (its users and who influences them), or for an enclave."""
+        """Return who may use a name and who influences its users, or the same for an enclave."""
         if kind == _ENCLAVE:
             influencing = self._influences(self._network.influencing({name}))
             influenced = self._influences(self._network.influenced({name}), 0)
@@ -302,7 +305,7 @@ class _System:
         return tuple(sorted(influences, key=lambda influence: (influence.hops, influence.enclave)))
 
     def with_shortest_paths(self, picture: Picture) -> Picture:
-        """Return a picture with all hops of shortest paths, also hops without a known name."""
+        """Return a picture with all names of shortest paths, even names that no right states."""
         allowed = [edge for edge in picture.edges if edge.qualifier is ALLOW]
         drawn = {
             (edge.enclave, edge.kind, edge.name, fits)
@@ -331,7 +334,7 @@ class _System:
         )
 
     def _by_wildcards(self, kind: str, name: str) -> Iterator[Edge]:
-        """Yield the edges of a name that only wildcards match."""
+        """Yield the rights to a name that is matched only by wildcards."""
         if (kind, name) in self._known:
             return
         by_right: dict[tuple[str, str], list[Right]] = defaultdict(list)
@@ -353,7 +356,10 @@ def _meets(right: Right, kind: str, word: str) -> bool:
 
 
 def _commands(kind: str, name: str) -> Iterator[str]:
-    """Yield DDS topics by which a sender can command, without requests that only ask."""
+    """Yield the DDS topics of a name by which a sender can command its receivers.
+
+    Requests of services that only answer questions are left out.
+    """
     if kind == "dds":
         yield name
     elif kind == "actions":
@@ -389,14 +395,14 @@ def _sentence(
 
 
 def _several(influences: Sequence[Influence], direct: int) -> str:
-    """Return a number of enclaves as text, and how many of them are one hop away."""
+    """Return the number of enclaves in words, and how many of them are ``direct`` hops away."""
     near = sum(influence.hops == direct for influence in influences)
     text = counted(len(influences), "enclave") if influences else "no enclave"
     return text if near == len(influences) else f"{text} ({near} directly)"
 
 
 def _who(enclaves: Collection[str]) -> str:
-    """Return a few enclaves by name, or many enclaves by their number."""
+    """Return the paths of a few enclaves, or the number of many enclaves, in words."""
     if not enclaves:
         return "no enclave"
     if len(enclaves) > _NAMED:
@@ -414,12 +420,13 @@ _ROOM = {"names": 66, "enclave": 24, "group": 24}
 
 
 def flow_scene(picture: Picture, hops: int = HOPS, *, placed: bool = True) -> Scene:
-    """Return the scene of a picture with a focus; without ``placed``, without y and frames.
+    """Return the scene of a picture with a focus.
 
     Args:
         picture: a picture with a focus.
-        hops: how far enclaves are drawn on both sides, from 1.
-        placed: for formats that place cards themselves: without y and frames.
+        hops: how many hops to the left and to the right are drawn, at least 1.
+        placed: whether cards get a y and groups get frames; formats that place cards themselves
+            need neither.
     """
     draft = _Draft(picture, FocusFlow.of(picture), hops)
     cards = draft.in_columns()
@@ -452,7 +459,7 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, placed: bool = True) -> Sc
 
 
 class _Stage(NamedTuple):
-    """Bundles of names in one ``column``, with their ties to the left and to the right."""
+    """Bundles of names in one ``column``, with the rights of enclaves on both sides of it."""
 
     column: int
     bundles: tuple[tuple[Bundle, tuple[Tie, ...], tuple[Tie, ...]], ...]
@@ -481,7 +488,7 @@ class _Draft:
         return middle + (1 - 2 * hop if before else 2 * hop - 1)
 
     def _folded(self) -> Mapping[tuple[bool, str], str]:
-        """Map each enclave before or after the focus to the node that is drawn for the enclave."""
+        """Map side of the focus and enclave to the id of the card that stands for the enclave."""
         nodes = {}
         for before, side in ((True, self._flow.before), (False, self._flow.after)):
             columns: dict[int, list[str]] = defaultdict(list)
@@ -528,7 +535,7 @@ class _Draft:
         )
 
     def _node(self, side: int, stage: int, enclave: str) -> str:
-        """Return the card id of an enclave on one side of a stage's names (0: left)."""
+        """Return the id of an enclave's card on one side of the names in a column (0: left)."""
         before = stage > 0 or (stage == 0 and side == 0)
         return f"{'s' if before else 'l'}{self._nodes[before, enclave]}"
 
@@ -641,7 +648,7 @@ class _Draft:
         return [*links, *self._further_links(cards)]
 
     def _further_links(self, cards: Mapping[str, Card]) -> Iterator[Link]:
-        """Yield a link for each card at the last hop that an enclave beyond influences."""
+        """Yield a link to each last drawn card from the card of the enclaves further away."""
         for before, paths in zip((True, False), self._further, strict=True):
             if not paths:
                 continue
@@ -658,7 +665,7 @@ class _Draft:
         return self._flow.before if before else self._flow.after
 
     def _next_to(self, before: bool) -> set[str]:
-        """Return the enclaves at the last drawn hop that share an edge with enclaves beyond."""
+        """Return the enclaves at the last drawn hop that share a name with further enclaves."""
         stage = self._hops if before else -self._hops
         return {e.enclave for e in self._picture.edges if any(self._flow.ends(e, stage))}
 

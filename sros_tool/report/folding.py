@@ -1,10 +1,10 @@
-"""Draw equal robots, namespaces and enclaves of a picture as one.
+"""Draw robots, namespaces or enclaves that differ only in their names as one.
 
-Units are the robots of a fleet.  Without a fleet they are sibling namespaces or enclaves that
-contain nearly the same enclaves.  Two units are equal if their drawings differ in their own names
-alone.  The drawing of a unit has each right and denial of its enclaves, and those of other enclaves
-to its names.  Where a unit names other units, such as the robots whose poses a robot reads, only
-their number has to be equal.
+A unit is a robot of a fleet.  Without a fleet, units are sibling namespaces or enclaves that
+contain nearly the same enclaves.  Two units are equal if their drawings differ only in the names of
+the units.  The drawing of a unit has the rights and denials of its enclaves, and the rights and
+denials of other enclaves to its names.  If a unit has rights to names of other units, such as the
+robots whose poses a robot reads, only the number of these units has to be equal.
 
 A label such as ``{r01…r50}`` stands for each equal unit: ``/{r01…r50}/base`` may publish
 ``/{r01…r50}/odom`` means that each robot may publish its own topic.
@@ -47,7 +47,7 @@ from sros_tool.report.picture import (
 from sros_tool.wording import counted
 
 _MARKS = "{}…"
-"""Characters of labels; no ROS name has them. A picture that has them is not folded."""
+"""Characters of labels, which ROS names cannot have; a picture with one is not folded."""
 _WORD = re.compile(r"[A-Za-z0-9_]+")
 _MOST_PIECES = 16
 """Maximum number of pieces of a word (split at underscores) that are compared with unit names."""
@@ -131,7 +131,10 @@ class _Unit(NamedTuple):
 
 @dataclass(frozen=True)
 class _Text:
-    """A text split where units are named; a unit is stored with the number of its value."""
+    """A text, split where it has the name of a unit.
+
+    A unit is stored as its number, and the number of the word in its ``values``.
+    """
 
     parts: tuple[str, ...]
     named: tuple[tuple[int, int], ...] = ()
@@ -147,7 +150,7 @@ class _Text:
         return self.parts, tuple(number for _, number in self.named)
 
     def fill(self, word: Callable[[int, int], str]) -> str:
-        """Return the text with units replaced: ``word`` gets unit and value number."""
+        """Return the text with ``word(unit, value)`` in place of units."""
         named = (word(*named_unit) for named_unit in self.named)
         first, *rest = self.parts
         return first + "".join(value + part for value, part in zip(named, rest, strict=True))
@@ -174,11 +177,11 @@ class _Draft:
         self._find_words()
 
     def _find_words(self) -> None:
-        """Find the words that name units, and the enclaves of all units.
+        """Find the words that are names of units, and the unit of each enclave.
 
-        An enclave belongs to the unit that its path names, also if it is outside of the unit's
-        namespace; if the path names several units, to none.  A unit can be folded only if the path
-        of each of its enclaves names the unit.
+        An enclave belongs to the unit whose name is in its path, even if it is outside of the
+        unit's namespace; it belongs to none if its path has the names of several units.  A unit can
+        be folded only if the path of each of its enclaves has the unit's name.
         """
         number = Counter(value for unit in self._units for value in unit.values)
         dropped: set[int] = set()
@@ -258,7 +261,11 @@ class _Draft:
         return _Text(tuple(parts), tuple(named))
 
     def _longest(self, pieces: Sequence[str], at: int) -> tuple[tuple[int, int] | None, int]:
-        """Return the unit with the longest name from piece ``at``, and its number of pieces."""
+        """Return the unit with the longest name that begins at piece ``at``, and the name's length.
+
+        The unit is its number and the number of the word in its ``values``, or None; the length is
+        a number of pieces.
+        """
         for size in range(min(len(pieces) - at, _MOST_PIECES), 0, -1):
             unit = self._words.get("_".join(pieces[at : at + size]))
             if unit:
@@ -269,13 +276,14 @@ class _Draft:
         return self._units[unit].values[position]
 
     def _owner(self, enclave: str) -> _Text:
-        """Return the path of an enclave, split at its own unit only."""
+        """Return the path of an enclave, split only at the name of the enclave's own unit."""
         return self._text(enclave).only(self._of.get(enclave), self._word)
 
     def _sightings(self) -> Iterator[tuple[int, tuple[int, ...], Edge | str]]:
-        """Yield each drawn enclave or edge that names units: its kind, the units, and the thing.
+        """Yield each enclave and drawn right whose texts have names of units.
 
-        The kind is a number; things of the same kind differ in their units alone.
+        Yields the number of a kind, the units, and the enclave or right; those of the same kind
+        differ only in their units.
         """
         alarming = {
             finding.enclave for finding in self._picture.findings if finding.severity == "error"
@@ -347,7 +355,7 @@ class _Draft:
         }
 
     def _by_name(self, unit: int) -> tuple[object, ...]:
-        """Return a natural sort key: r2 comes before r10."""
+        """Return a sort key by which r2 comes before r10."""
         parts = re.split(r"(\d+)", self._units[unit].name)
         return tuple(
             (len(part.lstrip("0")), part) if number % 2 else part
@@ -355,7 +363,7 @@ class _Draft:
         )
 
     def _views(self) -> list[Counter[object]]:
-        """Return the drawing of each unit, in which the other units of its family look the same."""
+        """Return the drawing of each unit, with equal names for other units of its family."""
         views: list[Counter[object]] = [Counter() for _ in self._units]
         for kind, units, _what in self._seen:
             for unit in set(units):
@@ -366,7 +374,7 @@ class _Draft:
         return tuple(_SELF if other == unit else self._symbols[other] for other in units)
 
     def _named_by(self, families: Container[int]) -> Counter[int]:
-        """Count, for each unit, the other units of its family that name it."""
+        """Return how many other units of its family have rights to names of each unit."""
         pairs = {
             (unit, owner)
             for _kind, units, what in self._seen
@@ -413,7 +421,7 @@ class _Draft:
         )
 
     def _label(self, unit: int, position: int = 0) -> str:
-        """Return the label of a unit's class, or the unit's own word if no other unit is equal."""
+        """Return the label for a unit's class; for a unit equal to no other, its own word."""
         if unit not in self._inside:
             return self._word(unit, position)
         first, *_, last = self._classes[self._inside[unit]]
@@ -424,7 +432,7 @@ class _Draft:
         return unit not in self._inside or self._classes[self._inside[unit]][0] == unit
 
     def _path(self, enclave: str) -> str:
-        """Return the path that is drawn for an enclave."""
+        """Return the path that is drawn for an enclave, with labels for units."""
         text, unit = self._owner(enclave), self._of.get(enclave)
         path = text.fill(self._label)
         if unit in self._inside and path not in self._enclaves:
@@ -432,7 +440,7 @@ class _Draft:
         return path
 
     def _each(self, text: _Text, colour: int) -> Iterator[str]:
-        """Yield the text once for each unit of a class, with the name of that unit."""
+        """Yield the text once for each unit of a class, with that unit's name."""
         for unit in self._classes[colour]:
             yield text.fill(partial(self._instead, unit))
 
@@ -440,7 +448,7 @@ class _Draft:
         return self._word(unit, position)
 
     def _edges(self, odd: Set[Edge | str]) -> Iterator[Edge]:
-        """Yield the edges to draw: of the drawn units, and of all enclaves outside of units."""
+        """Yield the rights to draw: of drawn units, and of enclaves that belong to no unit."""
         others = self._others()
         for edge in self._picture.edges:
             unit = self._of.get(edge.enclave)
@@ -461,13 +469,13 @@ class _Draft:
             yield replace(edge, enclave=path, name=shown, by=by, differs=edge in odd)
 
     def _is_counted(self, unit: int, other: int) -> bool:
-        """Return whether ``other``, which a unit names, is drawn only as part of a number."""
+        """Return whether ``unit`` shows only a number for ``other`` and similar units."""
         if other == unit or self._symbols[other] < 0:
             return False
         return other in self._inside or unit in self._inside
 
     def _others(self) -> Callable[[Edge, int, int, int], str]:
-        """Return a function that gives the text for other units that a unit names: their number."""
+        """Return a function that tells how many other units a right is for, as text."""
         others: dict[object, set[int]] = defaultdict(set)
         families: dict[int, list[int]] = defaultdict(list)
         for n in sorted(set(self._of.values()), key=self._by_name):
@@ -499,7 +507,7 @@ class _Draft:
         return several
 
     def _named(self, kind: str, name: _Text) -> Iterable[str]:
-        """Return the real names behind a drawn name."""
+        """Yield the real names that a drawn name with labels stands for."""
         if len(name.named) == 1:
             return self._each(name, self._inside[name.units[0]])
         if self._alike is None:
@@ -550,7 +558,10 @@ class _Draft:
     # ── what differs ───────────────────────────────────────────────────────────────────────
 
     def _differing(self) -> tuple[tuple[DifferentUnit, ...], Set[Edge | str]]:
-        """Return the units that differ slightly from most of their family, with the differences."""
+        """Return the units that differ slightly from most units of their family.
+
+        Also returns the drawn enclaves and rights in which they differ.
+        """
         near = {
             n: usual
             for n in set(self._of.values())
@@ -584,7 +595,7 @@ class _Draft:
     def _said(
         self, drawn: Sequence[Edge | str], unit: int, instead: int | None = None
     ) -> Iterator[str]:
-        """Yield enclaves and rights in words, as ``unit`` would have them."""
+        """Yield enclaves and rights in words; the name of ``unit`` replaces that of ``instead``."""
 
         def word(named: int, position: int) -> str:
             return self._label(unit if named == instead else named, position)
@@ -600,7 +611,7 @@ class _Draft:
 
 
 def _classes(views: Sequence[Counter[object]], before: Sequence[int]) -> dict[int, list[int]]:
-    """Return classes of units with equal views, as a subdivision of the earlier classes."""
+    """Divide classes of units, so that only units with equal views stay in the same class."""
     numbers: dict[object, int] = {}
     classes: dict[int, list[int]] = defaultdict(list)
     for unit, view in enumerate(views):
@@ -611,7 +622,7 @@ def _classes(views: Sequence[Counter[object]], before: Sequence[int]) -> dict[in
 
 
 def _alike(view: Collection[object], other: Collection[object]) -> bool:
-    """Return whether two views have at least half of their content in common."""
+    """Return whether two drawings of units have at least half of their content in common."""
     return 2 * len(set(view).intersection(other)) >= max(len(view), len(other))
 
 
@@ -670,7 +681,7 @@ def _by_first(paths: Iterable[tuple[str, str]]) -> dict[str, dict[str, str]]:
 
 
 def _roles(picture: Picture) -> Mapping[str, tuple[object, ...]]:
-    """Map enclaves to their roles in the focus of a picture."""
+    """Map enclaves to what they are in the focus of a picture: sender, receiver, number of hops."""
     roles_of: dict[str, list[object]] = defaultdict(list)
     for number, focus in enumerate(picture.focus):
         roles_of[focus.name].append((number, "focus"))

@@ -1,4 +1,7 @@
-"""Render a scene as SVG; or as DOT or Mermaid, whose tools place the cards themselves."""
+"""Render a scene as SVG, DOT or Mermaid.
+
+The SVG has the positions of the scene; tools that read DOT or Mermaid place the cards themselves.
+"""
 
 from __future__ import annotations
 
@@ -151,6 +154,7 @@ def render_svg(picture: Picture, scene: Scene) -> str:
 
 
 def _summary(picture: Picture, scene: Scene) -> str:
+    """Return how many enclaves and names a scene shows, and how many names it leaves out."""
     text = f"{counted(len(picture.enclaves), 'enclave')}, {counted(scene.shown, 'name')}"
     return text + (f", {scene.hidden} left out that every node needs" if scene.hidden else "")
 
@@ -303,6 +307,7 @@ _MOST_LABELS = 8
 
 
 def _row(rows: Iterable[tuple[str, str]]) -> str:
+    """Return one row of the legend as SVG, from pairs of symbol (SVG) and text."""
     x, found = 0, []
     for drawn, text in rows:
         room = 68 if "M20 -4h40" in drawn else (48 if "h40" in drawn else (20 if drawn else 0))

@@ -190,9 +190,13 @@ def scenes_of(
 
     With few enclaves, the first scene leaves out the rights that every node needs, and the second
     one has everything.  With many enclaves, the first scene has the groups and the links between
-    them, and each group has another scene with its neighbours.  Without ``placed``, scenes have no
-    y and no frames, for formats that place cards themselves.  ``drawn_as`` are names to count in
-    place of those that are drawn.
+    them, and each group has another scene with its neighbours.
+
+    Args:
+        picture: the picture.
+        placed: whether cards get a y and groups get frames; formats that place cards themselves
+            need neither.
+        drawn_as: the real names behind drawn names, which are counted instead.
     """
     groups = {enclave.path: enclave.group for enclave in picture.enclaves}
     titles = sorted(set(groups.values()))
@@ -297,11 +301,11 @@ class _Draft:
                     self._ties[*ends, tie.qualifier, bool(tie.by), *marks].add(tie.right)
 
     def _looks(self, tie: Tie) -> bool:
-        """Return whether a tie is drawn as a letter instead of a line."""
+        """Return whether a right is drawn as a letter on the card of the name, not as a line."""
         return is_plain(tie) and (tie.node, tie.right) in self._looking
 
     def _alone(self, bundle: Bundle) -> str:
-        """Return the only node, except onlookers, with ties to these names, or ""."""
+        """Return the only node, apart from onlookers, with a right to these names, or ""."""
         looking = {tie.node for tie in bundle.ties if self._looks(tie)}
         drawn = {tie.node for tie in bundle.ties if not self._looks(tie)}
         if not all(map(is_plain, bundle.ties)):
@@ -311,7 +315,7 @@ class _Draft:
         return nodes.pop() if len(nodes) == 1 else ""
 
     def scene(self, name: str, title: str) -> Scene:
-        """Return the scene without positions (y is 0), frames and number of names."""
+        """Return the scene before placement: without y, frames and the number of names."""
         cards = {card.id: card for card in self._cards()}
         width = 2 * (MARGIN + _SIDE_WIDTH + _GUTTER) + _NAMES_WIDTH
         return Scene(
@@ -602,7 +606,7 @@ def linked(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link, ...]
 def _tops(
     columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]
 ) -> dict[str, float]:
-    """Map cards to their y; the tallest column is packed, other columns are aligned with it."""
+    """Map cards to their y, for the tallest column without gaps, the others aligned with it."""
     extent = [_extent(column) for column in columns]
     tallest = max(range(len(columns)), key=lambda number: (extent[number], number % 2 == 1))
     tops: dict[str, float] = {}
@@ -741,8 +745,8 @@ def place_column(
 ) -> dict[str, float]:
     """Map items to y positions near their ``wanted`` y, without overlaps.
 
-    Items keep their order, with ``gap`` between them, and are not above ``top``; there is ``lead``
-    more space above the first item of each group.
+    Items keep their order, with ``gap`` between them, and none is above ``top``.  The first item of
+    each group has ``lead`` more space above it.  All lengths are in pixels.
     """
     offsets, at, group = [], 0.0, None
     for item in column:

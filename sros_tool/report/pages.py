@@ -1,9 +1,9 @@
-"""HTML pages of a picture, a demo and a fleet; they load nothing else.
+"""HTML pages of a picture, of a demo's result and of a fleet's status, each in a single file.
 
-The content security policy allows only the script and style in the file, by their digests.  The
-data is JSON in which every character that could end its element is escaped, and the script inserts
-it only as text.  The pages of a demo and of a fleet have no script; their input is what
-``sros demo --json`` and ``sros fleet status --json`` print.
+The pages load no other files: the content security policy allows only the script and style in the
+file, by their digests.  The data is JSON in which every character that could end its element is
+escaped, and the script inserts it only as text.  The pages of a demo and of a fleet have no script;
+their input is what ``sros demo --json`` and ``sros fleet status --json`` print.
 """
 
 from __future__ import annotations
@@ -36,9 +36,14 @@ _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 def render_page(
     picture: Picture, scenes: tuple[Scene, ...], now: datetime, drawn: Picture | None = None
 ) -> str:
-    """Return the HTML page of a picture and its scenes.
+    """Return the HTML page of a picture.
 
-    ``now`` is the date of its findings, ``drawn`` the picture in which equal units are one.
+    Args:
+        picture: the picture, with all its enclaves.
+        scenes: the drawings that the page offers.
+        now: the time for which the findings were decided.
+        drawn: the picture in which equal robots, namespaces and enclaves are drawn as one; None if
+            there are none.
     """
     script, style = _asset("view.js"), _asset("view.css")
     origins = ", ".join(f"{origin.kind} {origin.title}" for origin in picture.origins)
@@ -55,8 +60,8 @@ def render_page(
 def escape(text: str) -> str:
     """Escape ``text`` for the content of an HTML element or an attribute value.
 
-    What no XML document can have, and what could steer a terminal that shows the file or begin a
-    line in it, becomes a visible escape.
+    A character that XML forbids, a control character or a line break becomes a visible escape: it
+    could steer a terminal that shows the file.
     """
     return html.escape(visible_line(text))
 
@@ -98,6 +103,7 @@ def _safe_json(value: object) -> str:
 
 
 def _digest(text: str) -> str:
+    """Return the source expression of the content security policy for a script or style."""
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     return f"'sha256-{digest}'"
 
@@ -106,7 +112,11 @@ def _digest(text: str) -> str:
 
 
 def _data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[str, Any]:
-    """Return the script's data: bundles of names, which take less space than edges."""
+    """Return the data of the page's script, as values for JSON.
+
+    Rights are grouped by names with equal rights (bundles), which takes less space than one entry
+    for each right.
+    """
     return {
         "headlines": picture.headlines,
         "overlay": as_plain(picture.overlay),
@@ -123,7 +133,7 @@ def _data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[s
 
 
 def _enclave(enclave: PicturedEnclave) -> dict[str, Any]:
-    """Return an enclave as JSON; of its statements, only those with wildcards."""
+    """Return an enclave as JSON; of its rights, only those to names with wildcards."""
     wild = [
         _with_deny(as_plain(statement))
         for statement in enclave.statements
@@ -153,7 +163,7 @@ def _bundle(bundle: Bundle) -> dict[str, Any]:
 
 
 def _row(bundle: Bundle) -> dict[str, Any]:
-    """Return one table row for a name: who may send, who may receive, who is denied."""
+    """Return a row of the table of names: who may send, who may receive, who is denied."""
     ties = [tie for tie in bundle.ties if tie.qualifier is ALLOW]
     return {
         "kind": bundle.kind,
@@ -175,7 +185,7 @@ def _scene(scene: Scene) -> dict[str, Any]:
 
 
 def _table(rows: list[dict[str, Any]]) -> list[list[Any]]:
-    """Return rows with equal keys in compact form: the keys, then a list of values for each row."""
+    """Return ``rows``, which have the same keys, as a list of keys and then lists of values."""
     if not rows:
         return []
     keys = list(rows[0])
@@ -196,7 +206,7 @@ def render_demo_page(result: Json) -> str:
 
 
 def without_folders(value: Any, folders: Sequence[str]) -> Any:
-    """Return a JSON value with these folder paths replaced by "…" in all its texts."""
+    """Return a JSON value in which "…" replaces these folder paths in all texts."""
     if isinstance(value, str):
         for folder in sorted(folders, key=len, reverse=True):
             value = value.replace(folder, "…") if len(folder) > 1 else value
@@ -209,6 +219,7 @@ def without_folders(value: Any, folders: Sequence[str]) -> Any:
 
 
 def _sentence(text: str) -> str:
+    """Return ``text`` as a sentence escaped for HTML, with a capital letter and a full stop."""
     return escape(f"{text[:1].upper()}{text[1:].rstrip('.')}.") if text else ""
 
 
@@ -256,12 +267,12 @@ def _demo_head(result: Json) -> str:
 
 
 def _good(rows: Sequence[Json]) -> int:
-    """Return the number of rows that were run and are as expected."""
+    """Return the number of rows that were run and had the expected result."""
     return sum(bool(row["as_expected"]) and row["observed"] != _SKIPPED for row in rows)
 
 
 def _not_tried(scenario: Json) -> Sequence[str]:
-    """Return what a proof of a user's keystore needs but the demo did not try."""
+    """Return the attempts that a proof of a user's keystore needs, but that were not made."""
     keystore = scenario.get("keystore")
     return keystore["not_tried"] if keystore else ()
 

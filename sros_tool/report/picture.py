@@ -21,7 +21,7 @@ from sros_tool.wording import counted, first_few
 SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
     ("subscribe", "reply", "execute"), False
 )
-"""Whether a right's arrow points to the name, because the enclave sends first."""
+"""Whether an enclave with the right is a sender, so that its arrow points to the name."""
 
 _ASKED = tuple(f"/{name}" for name in READING_SERVICES)
 _KINDS = (*RIGHTS, "dds")
@@ -78,12 +78,12 @@ UNKNOWN = Protection(WireLevel.UNKNOWN)
 )
 @dataclass(frozen=True, slots=True, order=True)
 class Edge:
-    """A right or denial of one enclave for one name.
+    """A right or denial of one enclave for one name, drawn as an arrow.
 
-    ``by`` are the expressions that match the name, empty if the right has the exact name. ``parts``
+    ``by`` are the wildcards that match the name; empty if the right has the exact name.  ``parts``
     are the parts of an action, such as feedback, if the right is not for the whole action.
     ``common``: every node needs the right to start.  ``violates``: the right breaks a requirement.
-    ``differs``: equal units do not have the right.
+    ``differs``: similar robots, namespaces or enclaves do not have the right.
     """
 
     enclave: str
@@ -120,7 +120,7 @@ class Edge:
 
 
 class Lack(StrEnum):
-    """The side of a name that no enclave may take, although an enclave may take the other side."""
+    """The side of a name, senders or receivers, on which no enclave is allowed."""
 
     NOTHING = ""
     SENDER = "sender"
@@ -476,7 +476,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Tie:
-    """A right or denial of an enclave, or group of enclaves, for all names of a bundle."""
+    """A right or denial of an enclave, or of a group of enclaves, for all names of a bundle."""
 
     node: str
     right: str
@@ -495,7 +495,7 @@ class Tie:
 
 
 def is_plain(tie: Tie) -> bool:
-    """Return whether a tie is no denial, no difference, and breaks no requirement."""
+    """Return whether a right is allowed, not marked as different, and breaks no requirement."""
     same = tie.mark is OverlaySide.BOTH and not tie.differs
     return tie.qualifier is ALLOW and same and not tie.violates
 
@@ -524,10 +524,13 @@ def fold(
     *,
     apart: bool = False,
 ) -> tuple[Bundle, ...]:
-    """Group the names that have an edge into bundles, sorted by kind and first name.
+    """Group the names to which an enclave has a right into bundles, by kind and first name.
 
-    ``owner`` maps an enclave to the node that represents it: itself, or its group.  With ``apart``,
-    services whose requests change nothing have bundles of their own.
+    Args:
+        names: the names.
+        edges: the rights and denials for the names.
+        owner: returns the node that stands for an enclave: the enclave, or its group.
+        apart: whether services whose requests change nothing have bundles of their own.
     """
     ties: dict[tuple[str, str], set[Tie]] = defaultdict(set)
     for edge in edges:
@@ -567,7 +570,7 @@ def fold(
 
 
 def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
-    """Return bundles with the same senders joined; they do not show who receives which name.
+    """Return bundles joined if they have the same senders, whoever receives their names.
 
     Denials and differences stay separate, because users look for them.
     """

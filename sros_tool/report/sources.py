@@ -1,7 +1,7 @@
-"""Read the sources of pictures: policies, permissions, keystores and observations.
+"""Read what pictures show: policies, permissions, keystores and observations.
 
-A picture shows only the base name of a source, because paths of this machine are private.
-Enclave keys are read only to report faults such as a key that does not fit its certificate.
+A picture shows only the base name of a source, because paths of this machine are private. Keys of
+enclaves are read only to report faults, such as a key that does not fit its certificate.
 """
 
 from __future__ import annotations
@@ -84,13 +84,15 @@ _AUTHORITY_FILES = "*_ca.cert.pem"
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """The request for a picture: one source, or two to compare, and options.
+    """What a picture has to show: one source, or two sources to compare, and options.
 
-    ``observed`` are observations of a single source; ``template`` is the keystore template whose
-    protection policies get; ``hosts`` are texts ``HOST=ENCLAVE``; ``fleets`` has the robots for the
-    placeholders of each source; ``focus`` are the names or enclaves to look at.
-    With ``checked``, the picture has the findings of ``sros check``, and with a file of
-    ``requirements`` what breaks them, for a robot in ``zone``.
+    ``sources`` are paths of policies, permissions, enclaves, keystores or observations;
+    ``observed`` are paths of observations to compare with a single source.  ``template`` is the
+    keystore template whose protection policies get; ``hosts`` are texts ``HOST=ENCLAVE``;
+    ``fleets`` has, for each source, the fleet whose robots fill in the placeholders; ``focus`` are
+    names or paths of enclaves.  With ``checked``, the picture has the findings of ``sros check``;
+    with a file of ``requirements``, also the rights that break a requirement.  Dates in permissions
+    are read in the time zone ``zone``.
     """
 
     sources: Sequence[Path]
@@ -108,8 +110,10 @@ class Drawing:
 def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     """Return a picture, and the same picture with equal units drawn as one.
 
+    Equal units are robots, namespaces or enclaves that differ only in their names.
+
     Raises:
-        UsageError: there are too many sources, or a choice does not fit them.
+        UsageError: there are too many sources, or an option does not fit them.
         SrosError: a source or the requirements cannot be read.
     """
     sources, fleets = drawing.sources, drawing.fleets
@@ -154,7 +158,11 @@ def _routers(keystore: Keystore | None) -> int:
 
 
 def _compared(read: Sequence[PictureSource], context: Context, *, use: bool) -> Picture:
-    """Return the picture of one source, or a comparison: use, change, worlds or drift."""
+    """Return the picture of one source, or the comparison of two sources.
+
+    The comparison is "use" if the second source was observed, "change" for two sources of the same
+    kind, "worlds" if one is for Zenoh, and else "drift" (of a keystore from its policy).
+    """
     if len(read) == 1:
         return compose(read[0], context)
     first, second = read
@@ -172,7 +180,10 @@ def _compared(read: Sequence[PictureSource], context: Context, *, use: bool) -> 
 
 
 def _read(path: Path, fleet: Fleet | None, drawing: Drawing) -> PictureSource:
-    """Read a source, with the findings of ``sros check`` where these can be computed."""
+    """Read a source; if ``drawing`` asks for it, with findings of ``sros check``.
+
+    A source that ``sros check`` cannot read has no findings.
+    """
     source = read_source(path, now=drawing.now, fleet=fleet)
     if not drawing.checked:
         return source
@@ -202,9 +213,17 @@ def drawn_difference(
     letters: int,
     arrows: int,
 ) -> str | None:
-    """Draw a difference, with other users of its names, in Mermaid; "" if that is impossible.
+    """Return a Mermaid diagram of added and removed rights, and of other rights to the same names.
 
-    Returns None if the picture has more than so many ``letters`` or ``arrows``.
+    Args:
+        first: the rights before.
+        second: the rights after.
+        difference: the rights that only one of both has.
+        letters: the maximum length of the diagram, in characters.
+        arrows: the maximum number of arrows.
+
+    Returns None if the diagram is too large, and "" if nothing differs or both are of different
+    kinds.
     """
     if first.kind != second.kind or not difference:
         return ""
@@ -230,7 +249,7 @@ def drawn_difference(
 
 
 def _check_no_governance(sources: Sequence[Path], read: Sequence[PictureSource]) -> None:
-    """Raise `UsageError` if a source has its own signed governance, so no template applies."""
+    """Raise `UsageError` if --template is used with a source that has a governance of its own."""
     for path, source in zip(sources, read, strict=True):
         kind = source.origin.kind
         if kind in ("keystore", "enclave"):
@@ -243,7 +262,11 @@ def _check_no_governance(sources: Sequence[Path], read: Sequence[PictureSource])
 
 
 def _hosts(words: Iterable[str]) -> dict[str, str]:
-    """Map the enclaves in texts ``HOST=ENCLAVE`` to their hosts."""
+    """Map the path of each enclave in texts ``HOST=ENCLAVE`` to its host.
+
+    Raises:
+        UsageError: a text has another form.
+    """
     hosts = {}
     for word in words:
         host, equals, enclave = word.partition("=")
@@ -258,7 +281,10 @@ def _hosts(words: Iterable[str]) -> dict[str, str]:
 
 
 def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str, Robot]:
-    """Map the enclaves of a source to their robots, for grouping."""
+    """Map the paths of a source's enclaves to the robots that they belong to.
+
+    Enclaves of no robot are left out; without a fleet, the result is empty.
+    """
     if source.keystore:
         fleet = load_fleet(source.keystore)
     elif fleet and source.origin.kind == "policy":
@@ -273,13 +299,18 @@ def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str,
 def _with_requirements(
     picture: Picture, file: Path, drawing: Drawing, opened: Keystore | None
 ) -> Picture:
-    """Return the picture with violations of requirements, decided as ``sros check`` does."""
+    """Return the picture with the rights that break requirements, as ``sros check`` decides.
+
+    Raises:
+        UsageError: there are two sources.
+        SrosError: the requirements cannot be read.
+    """
     from sros_tool.proof.findings import assumption_text, decide_all, decided_findings
     from sros_tool.proof.requirements import demand, read_requirements
     from sros_tool.proof.system import load_system
 
     if len(drawing.sources) > 1:
-        raise UsageError("--requirements takes one policy or keystore", "", "Draw one of them.")
+        raise UsageError("--requirements takes one policy or keystore", "", "Name only one SOURCE.")
     wanted = read_requirements(file)
     system = load_system(
         drawing.sources[0],
@@ -313,7 +344,7 @@ def _with_requirements(
 
 
 def _pictured(finding: Finding, enclaves: Container[str]) -> PicturedFinding:
-    """Return a finding for the picture; a subject that is no enclave goes into the text."""
+    """Return a finding for the picture; if its subject is no enclave, the text names it."""
     known = finding.subject in enclaves
     about = "" if known or finding.subject == finding.file else finding.subject
     text = _finding_text(finding, about)
@@ -322,7 +353,7 @@ def _pictured(finding: Finding, enclaves: Container[str]) -> PicturedFinding:
 
 
 def _finding_text(finding: Finding, about: str = "") -> str:
-    """Return the text of a finding, with its subject, file name and line."""
+    """Return the text of a finding, after its file name, line and subject ``about``."""
     place = f"{Path(finding.file).name}:{finding.line}" if finding.line else ""
     return ": ".join(filter(None, (place, about, finding.text)))
 
@@ -331,10 +362,10 @@ def _finding_text(finding: Finding, about: str = "") -> str:
 
 
 def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> PictureSource:
-    """Return the source at ``path``: a policy, permissions, an enclave, a keystore, an observation.
+    """Read a policy, permissions, an enclave, a keystore or an observation at ``path``.
 
     An observation is a learned policy, or the output of ``sros generate_policy --json``.  Faults of
-    a keystore become findings.  ``fleet`` has the robots that placeholders in a policy stand for.
+    a keystore become findings.  ``fleet`` has the robots that fill in placeholders of a policy.
 
     Raises:
         DocumentError: ``path`` is none of these.
@@ -370,7 +401,7 @@ def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> Pic
 def _with_findings(
     source: PictureSource, path: Path, findings: Iterable[PicturedFinding]
 ) -> PictureSource:
-    """Return ``source`` with more findings, whose texts do not contain its ``path``.
+    """Return ``source`` with more findings, in whose texts the file name replaces the path.
 
     A finding keeps its enclave only if the source has an enclave of that name.
     """
@@ -383,7 +414,10 @@ def _with_findings(
 
 
 def _base_name(path: Path) -> str:
-    """Return the file name of a source, in characters that all formats support."""
+    """Return the file name of a source, without unprintable characters.
+
+    U+FFFD replaces them.
+    """
     name = path.absolute().name or "/"
     return "".join(
         letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in name
@@ -391,15 +425,17 @@ def _base_name(path: Path) -> str:
 
 
 def common_rights() -> tuple[Right, ...]:
-    """Return the rights that every node needs, from the policy that ships with sros."""
+    """Return the rights that every node needs, from ``defaults/node_basics.xml``."""
     policy = read_policy(policies_dir() / "defaults" / "node_basics.xml")
     return tuple(sorted(policy_rights(policy)))
 
 
 def _template_governance(choice: str, stated: Sequence[StatedProtection] = ()) -> Governance:
-    """Return the governance of a keystore made from a template and a policy.
+    """Return the governance that a keystore with this template would have.
 
-    ``stated`` is what the policy says about the protection of names.
+    Args:
+        choice: the name or path of the template.
+        stated: the protection of names that a policy states; it is added to the template's.
     """
     from sros_tool.dds.domains import DomainSet
 
@@ -540,13 +576,16 @@ def _without_paths(finding: PicturedFinding, places: Mapping[str, str]) -> Pictu
 
 
 def _places(path: Path) -> Mapping[str, str]:
-    """Map all forms of a source's path to its file name, the longest first."""
+    """Map the path of a source, as given, absolute and resolved, to its file name.
+
+    Longer paths come first, so that they are replaced before paths that they contain.
+    """
     places = sorted({str(path), str(path.absolute()), os.path.realpath(path)}, key=len)
     return {place: _base_name(path) for place in reversed(places) if "/" in place and place != "/"}
 
 
 def _without_path(text: str, places: Mapping[str, str]) -> str:
-    """Return ``text`` with the file name of the source instead of its path."""
+    """Return ``text`` with the paths in ``places`` replaced by their file names."""
     for place, name in places.items():
         text = text.replace(place, name)
     return _LINK.sub(r"\1", text)

@@ -1,8 +1,9 @@
-"""The access control of one vendor: who may join, publish and subscribe under two documents.
+"""The access control of one vendor: who may join, publish and subscribe.
 
-A decision chooses the grant of the subject (`choose_grant`), takes its rules for the domain
-(`_rules_for`), applies them to a topic (`_GrantRules`), and combines the result with the access
-control that the governance requires (`GovernedDomain`, `_decide_join`, `Access`).
+The governance and the permissions of a participant decide.  A decision chooses the grant of the
+subject (`choose_grant`), takes its rules for the domain (`_rules_for`), applies them to a topic
+(`_GrantRules`), and combines the result with the access control that the governance requires
+(`GovernedDomain`, `_decide_join`, `Access`).
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 def choose_grant(
     traits: VendorTraits, permissions: Permissions, subject: str, *, at: datetime, zone: tzinfo
 ) -> int | Refusal:
-    """Return the index of the grant that decides, or a refusal if there is none."""
+    """Return the index of the grant that decides for ``subject``, or why there is none."""
     if not subject and traits.crashes_on_empty_subject:
         text = f"{traits.title} ends with an error at a certificate with an empty subject."
         return Refusal("empty-subject", text, Outcome.CRASHES)
@@ -77,7 +78,7 @@ def choose_grant(
 def _state(
     traits: VendorTraits, index: int, grant: Grant, now: float, zone: tzinfo
 ) -> Refusal | None:
-    """Return the reason why the grant is not valid now, or None if it is valid."""
+    """Return why a grant is not valid at the moment ``now``, or None if it is valid."""
     begin = read_moment(traits.moments, grant.not_before, zone)
     end = read_moment(traits.moments, grant.not_after, zone)
     name = f"grant {grant.name!r}" if grant.name else f"grant {index + 1}"
@@ -98,7 +99,7 @@ def _state(
 
 
 def holds_for(rule: OpenRange, domains: DomainSet, domain: int) -> bool | None:
-    """Return whether ``domain`` is in ``domains``; None if the vendor crashes."""
+    """Return whether ``domain`` is in ``domains``; None if the vendor's process crashes."""
     for part in domains.ranges:
         first, last = part.first, part.last
         if first is None:
@@ -120,7 +121,10 @@ NumberedRule = tuple[int, Rule]
 
 
 class RuleVerdict(NamedTuple):
-    """The verdict of the rules: ALLOWED, DENIED or CRASHES, why, by which rule and expression."""
+    """What the rules of a grant decide, why, and by which rule and expression.
+
+    The outcome is ALLOWED, DENIED or CRASHES.
+    """
 
     outcome: Outcome
     reason: str
@@ -177,7 +181,7 @@ def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
 
 
 class _GrantRules:
-    """The rules of a grant in order, for publish or subscribe, or for both at once."""
+    """The rules of a grant in order, for publishing, for subscribing, or for both at once."""
 
     def __init__(
         self,
@@ -186,7 +190,7 @@ class _GrantRules:
         otherwise: RuleVerdict,
         *verbs: str,
     ) -> None:
-        """Take ``rules``; ``otherwise`` is the verdict if no rule matches."""
+        """Keep the rules for some verbs; ``otherwise`` is the verdict if no rule matches."""
         self._traits = traits
         self._rules = rules
         self._otherwise = otherwise
@@ -194,7 +198,7 @@ class _GrantRules:
 
     @cached_property
     def _entries(self) -> Sequence[_Entry]:
-        """The topics of the rules in order."""
+        """The topics of the rules, in order."""
         traits = self._traits
         entries: list[_Entry] = []
         count = 0
@@ -223,7 +227,7 @@ class _GrantRules:
         return ExpressionIndex(self._traits.style, texts)
 
     def ask(self, topic: str, partitions: tuple[str, ...]) -> RuleVerdict:
-        """Return the verdict on an endpoint of ``topic`` in ``partitions`` (none: default)."""
+        """Return the verdict on an endpoint of ``topic``; () stands for the default partition."""
         wanted = partitions or _DEFAULT_PARTITION
         passed = 0
         for position in self._index.matching(topic):
@@ -237,14 +241,14 @@ class _GrantRules:
         return self._otherwise
 
     def ask_topic(self, topic: str) -> RuleVerdict:
-        """Return the verdict on a topic, whatever the partitions."""
+        """Return the verdict on a topic; partitions are ignored."""
         position = self._index.first(topic)
         if position is None:
             return self._otherwise
         return self._entries[position].verdict(fits=True)
 
     def crash(self, topic: str) -> RuleVerdict | None:
-        """Return the verdict that ends a process which reads all criteria for a topic, or None."""
+        """Return the verdict if a topic crashes a process that reads all its criteria, or None."""
         passed = 0
         for position in self._index.matching(topic):
             entry = self._entries[position]
@@ -254,11 +258,11 @@ class _GrantRules:
         return None
 
     def only_allows(self) -> bool:
-        """Return whether no topic is denied by a rule, or crashes the process."""
+        """Return whether no rule denies a topic or crashes the process."""
         return all(entry.allow and entry.expression for entry in self._entries)
 
     def safe_names(self) -> NameSet:
-        """Return the topics for which `crash` returns None."""
+        """Return the topics for which `crash` finds no crash."""
         from sros_tool.automata import NameSet
 
         groups = groupby(self._entries, key=lambda entry: entry.criteria)
@@ -268,8 +272,8 @@ class _GrantRules:
     def _crashing(self, group: Sequence[_Entry]) -> NameSet | None:
         """Return the topics on which a criteria crashes the process; None if it never does.
 
-        Only the first matching ``<topic>`` of a criteria counts: an empty ``<topic>`` crashes the
-        process unless an earlier one matches.
+        An empty ``<topic>`` crashes the process, unless an earlier ``<topic>`` of the criteria
+        matches.
         """
         before = list(takewhile(lambda entry: entry.expression, group))
         return _every_topic() - self._names_of(before) if len(before) < len(group) else None
@@ -296,7 +300,10 @@ class _GrantRules:
         return NameSet.first(self._deciding(self._entries), self._otherwise.allowed)
 
     def _deciding(self, entries: Iterable[_Entry]) -> Iterator[tuple[NameSet, bool]]:
-        """Yield verdicts with their topics; neighbouring entries with one verdict are merged."""
+        """Yield pairs of topics and whether they are allowed, in the order of the rules.
+
+        Entries in a row with the same verdict are joined.
+        """
         for allowed, some in groupby(
             entries, key=lambda entry: entry.allow and bool(entry.expression)
         ):
@@ -329,13 +336,13 @@ def _named(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
 
 
 def _usable_expression(traits: VendorTraits, text: str) -> str:
-    """Replace an expression that crashes the vendor by one that matches every name."""
+    """Return an expression, or one that matches every name if it crashes the vendor's process."""
     text = _trimmed(traits, text)
     return text or "*" if traits.crashes_on_empty_texts else text
 
 
 def _trimmed(traits: VendorTraits, text: str) -> str:
-    """Return the text of an element, stripped if the vendor strips it."""
+    """Return the text of an element, without spaces around it if the vendor ignores them."""
     return text.strip(" \t\v\r\n") if traits.trims_texts else text
 
 
@@ -352,7 +359,7 @@ def _partitions(
 
 
 class GovernedDomain:
-    """The governance of a domain as a vendor applies it; prepared once for many subjects.
+    """The governance of a domain, as a vendor applies it to all subjects.
 
     ``rule`` is the first domain rule that lists the domain, or None.
     """
@@ -380,7 +387,7 @@ class GovernedDomain:
         return None if position is None else self._topic_rules[position]
 
     def names_by_rule(self) -> Iterator[tuple[NameSet, TopicRule]]:
-        """Yield the topic rules in order, each with all topics that its expression matches."""
+        """Yield each topic rule in order, with all topics that its expression matches."""
         for rule in self._topic_rules:
             text = _usable_expression(self._traits, rule.topic_expression)
             yield _of_texts(self._traits.style, (text,)), rule
@@ -394,9 +401,9 @@ class GovernedDomain:
 
 
 def _verdict_text(verdict: RuleVerdict, asked: str, domain: int, *, by_peers: bool = False) -> str:
-    """Return ``verdict`` on ``asked`` (``publish rt/a``) as a clause.
+    """Return ``verdict`` on ``asked``, such as ``publish rt/a``, as a clause.
 
-    With ``by_peers``, the participant itself allows it, and its peers do not.
+    ``by_peers``: the participant itself allows the access, and its peers deny it.
     """
     rule = "" if verdict.rule is None else f"rule {verdict.rule + 1}"
     peers = f" for domain {domain}, and peers enforce that" if by_peers else ""
@@ -421,7 +428,7 @@ def _verdict_text(verdict: RuleVerdict, asked: str, domain: int, *, by_peers: bo
 
 
 class _Joining(NamedTuple):
-    """The outcome of joining, its reason for programs, and a clause for messages."""
+    """Whether a participant may join, the reason as a word for programs, and as a clause."""
 
     outcome: Outcome
     reason: str
@@ -436,7 +443,10 @@ def _decide_join(
     rules: list[NumberedRule],
     otherwise: RuleVerdict,
 ) -> _Joining:
-    """Return whether the participant may join: ``otherwise`` if none of the ``rules`` matches."""
+    """Return whether a participant may join a domain, by the rules of its grant.
+
+    If none of the ``rules`` matches, ``otherwise`` decides.
+    """
     where = f"domain {governed.domain}"
     if traits.always_needs_allow_rule and not any(rule.allow for rule in grant.rules):
         text = "the grant has no allow rule, so the participant does not start"
@@ -473,7 +483,7 @@ def _decide_join(
 
 
 class _Kind(Enum):
-    """How access to the topics of a governance topic rule is decided."""
+    """What decides on access to the topics of a governance topic rule."""
 
     NOTHING = auto()
     """All access is denied."""
@@ -521,9 +531,10 @@ _ENDPOINTS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 
 
 class GrantedAccess:
-    """What the rules of a grant alone decide in a domain: without governance, validity and joining.
+    """What the rules of a grant alone decide in a domain.
 
-    The participant itself and its peers each apply them; both have to allow it.
+    Governance, validity and joining are not considered.  The participant itself and its peers each
+    apply the rules, and both have to allow the access.
     """
 
     def __init__(self, traits: VendorTraits, grant: Grant, domain: int) -> None:
@@ -540,7 +551,7 @@ class GrantedAccess:
         return allowed if self.peers is self.own else allowed & self.peers[verb].names()
 
     def reason(self, verb: AccessVerb, topic: str) -> str:
-        """Return which rule allows or denies ``verb`` on a topic in the default partition."""
+        """Return which rule allows or denies ``verb`` on a topic, in the default partition."""
         verdict, by_peers = self.own[verb].ask(topic, ()), False
         if verdict.allowed and self.peers is not self.own:
             verdict, by_peers = self.peers[verb].ask(topic, ()), True
@@ -553,7 +564,7 @@ class GrantedAccess:
 
     @cached_property
     def peers(self) -> dict[AccessVerb, _GrantRules]:
-        """The rules as peers apply them; the same object as `own` if they are equal."""
+        """The rules as peers apply them; the same object as `own` if they do not differ."""
         relays = ("relay",) if self._traits.relays_count_for_readers else ()
         if self._own_rules is self.rules and not relays:
             return self.own
@@ -563,14 +574,14 @@ class GrantedAccess:
         }
 
     def deciding(self, rules: Sequence[NumberedRule], *verbs: str) -> _GrantRules:
-        """Return rules in order, for one verb or several at once."""
+        """Return the rules that decide on the verbs, in order."""
         return _GrantRules(self._traits, rules, self.otherwise, *verbs)
 
 
 class Access:
-    """The access control of one vendor for one subject; prepared once, queried often.
+    """The access control of one vendor for one subject.
 
-    Peers are assumed to have the same governance, clock and zone, and every right.
+    Peers are assumed to have the same governance, clock and time zone, and every right.
     """
 
     def __init__(
@@ -615,7 +626,7 @@ class Access:
         return self._endpoint(AccessVerb.SUBSCRIBE, topic, partitions)
 
     def governed(self, topic: str) -> Decision | None:
-        """Return the decision by which the governance forbids endpoints of ``topic``, or None."""
+        """Return the decision if the governance forbids all endpoints of ``topic``, or None."""
         rule = self._governed.topic_rule(topic)
         if rule is None:
             return self._without_topic_rule(topic)
@@ -625,16 +636,16 @@ class Access:
         return None
 
     def topics(self, verb: AccessVerb) -> NameSet:
-        """Return the topics without wildcard characters on which `decide` allows ``verb``.
+        """Return the topics without wildcard characters for which `decide` allows ``verb``.
 
-        Topics are decided in the default partition, and names of any length count.
+        The topics are in the default partition, and their names may have any length.
         """
         return self.ruled_topics(verb) & _usable_topics(self._traits.topic_names)
 
     def ruled_topics(self, verb: AccessVerb) -> NameSet:
-        """Return `topics`, also those whose names DDS does not take; all that ROS 2 has are taken.
+        """Return `topics`, and also names that DDS does not accept, which ROS 2 never uses.
 
-        Where documents have the same meaning for two vendors, both sets are mostly equal.
+        For two vendors by which documents have the same meaning, these sets are mostly equal.
         """
         from sros_tool.automata import NameSet
 
@@ -660,7 +671,7 @@ class Access:
         return tuple((names, domain, rule) for names, rule in self._governed.names_by_rule())
 
     def _kind_of(self, verb: AccessVerb, rule: TopicRule) -> _Kind:
-        """Return how access to the topics of a topic rule is decided, consistent with `_ruled`."""
+        """Return what decides on access to the topics of a topic rule; it agrees with `_ruled`."""
         if self._traits.crashes_on_empty_texts and not rule.topic_expression.strip():
             return _Kind.NOTHING
         writes, reads = rule.enable_write_access_control, rule.enable_read_access_control
@@ -701,11 +712,11 @@ class Access:
 
     @cached_property
     def _either(self) -> _GrantRules:
-        """The grant's rules for creating a topic if one list of both directions decides."""
+        """The grant's rules for both directions in one list, to decide on creating a topic."""
         return self._granted.deciding(self._granted.rules, *_ENDPOINTS)
 
     def _creation(self, verb: AccessVerb, topic: str) -> RuleVerdict:
-        """Return the verdict on creating a topic, which opening it for ``verb`` needs first."""
+        """Return the verdict on creating a topic, which has to precede an endpoint for ``verb``."""
         if not self._traits.asks_both_directions:
             return self._either.ask_topic(topic)
         directions = sorted(_ENDPOINTS, key=lambda endpoint: endpoint is not verb)
@@ -715,7 +726,7 @@ class Access:
         return next(filter(None, crashes), None) or next(allowed, verdicts[0])
 
     def _creatable_names(self) -> NameSet:
-        """Return the topics whose `_creation` is allowed."""
+        """Return the topics that may be created."""
         if not self._traits.asks_both_directions:
             return self._either.topic_names()
         publish, subscribe = (self._own[direction] for direction in _ENDPOINTS)
@@ -745,7 +756,7 @@ class Access:
         return decision
 
     def _ruled(self, verb: AccessVerb, topic: str, partitions: tuple[str, ...]) -> Decision:
-        """Return the decision of governance and grant for a participant that starts."""
+        """Return the decision by governance and grant for a participant that starts."""
         join, traits = self._join, self._traits
         rule = self._governed.topic_rule(topic)
         if stopped := self.governed(topic):

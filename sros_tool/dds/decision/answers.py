@@ -46,12 +46,12 @@ ReasonWord = Annotated[str, "Why, as a stable word such as `no-rule`."]
 
 @shows("outcome", "reason", "expression")
 class Decision(NamedTuple):
-    """An outcome and what decided it.
+    """The outcome of a question to access control, and what decided it.
 
-    ``reason`` is a stable word for programs (one of `_REASONS`), ``text`` a sentence for people.
+    ``reason`` is a fixed word for programs (one of `_REASONS`), ``text`` a sentence for people.
     ``grant`` is an index in the permissions, ``rule`` an index in the grant, ``expression`` the
-    ``<topic>`` that matched, ``topic_rule`` the rule of the governance for the topic.
-    ``hits_peers`` says that the processes of peers crash, and its own does not.
+    ``<topic>`` that matched, ``topic_rule`` the rule of the governance for the topic. With
+    ``hits_peers``, the processes of peers crash, but not the participant's own.
     """
 
     outcome: OutcomeWord
@@ -65,7 +65,7 @@ class Decision(NamedTuple):
 
     @property
     def clause(self) -> str:
-        """The text without the vendor's name before it and the full stop after it."""
+        """The text without the vendor's name at the beginning and the full stop at the end."""
         _, colon, text = self.text.partition(": ")
         return (text if colon else self.text).removesuffix(".")
 
@@ -98,12 +98,12 @@ _REASONS = {
 
 
 class Refusal(NamedTuple):
-    """The reason why a vendor does not accept a document; ``outcome`` is REFUSED or CRASHES."""
+    """Why a vendor does not accept a document; ``outcome`` is REFUSED or CRASHES."""
 
     reason: str
     text: str
     outcome: Outcome = Outcome.REFUSED
 
     def decision(self) -> Decision:
-        """Return the decision on every access: this refusal."""
+        """Return the decision on any access: it fails with this refusal."""
         return Decision(self.outcome, self.reason, self.text)

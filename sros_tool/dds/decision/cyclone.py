@@ -133,7 +133,11 @@ class _Reader:
             element.children.append(self._element(depth + 1))
 
     def _opens(self) -> bool:
-        """Return whether the next token begins an element; raise if it is malformed."""
+        """Return whether the next token begins an element.
+
+        Raises:
+            UnreadableError: the token is malformed.
+        """
         self._skip()
         text, index = self._text, self._index
         if text[index : index + 1] == "<" and not text.startswith(_CDATA, index):
@@ -195,9 +199,9 @@ def _decoded(text: str) -> str:
 _SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")
 _IGNORED = ("relay", "value", "name", "tag", "data_tags")
 _NOTHING = "["
-"""An expression that matches no name: a set that is never closed."""
+"""An expression that matches no name: a set of characters without its closing bracket."""
 _LONGEST_NUMBER = 4000
-"""Largest number of digits that is converted; a 64-bit number has at most 20."""
+"""Maximum number of digits that are converted; a 64-bit number has at most 20."""
 _INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]*|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
 
 
@@ -242,8 +246,9 @@ def read_governance(xml: bytes) -> Governance:
 def read_permissions(xml: bytes) -> Permissions:
     """Return the permissions in ``xml``; raise `UnreadableError` if Cyclone DDS refuses them.
 
-    A ``<topic>`` without text is "", a rule without domains has a range that is open at both ends,
-    and a ``<default>`` may be empty: Cyclone DDS crashes when it evaluates one of these.
+    Three kinds of content are accepted, although a decision that uses them crashes Cyclone DDS: a
+    ``<topic>`` without text is read as "", a rule without domains as a range that is open at both
+    ends, and a ``<default>`` may be empty.
     """
     dds = _Node.root(xml, _PERMISSIONS, _IGNORED)
     parent = dds.last("permissions")
@@ -254,7 +259,7 @@ def read_permissions(xml: bytes) -> Permissions:
 
 
 class _Node:
-    """An element at an allowed place, with its known children."""
+    """An XML element and its known child elements."""
 
     def __init__(
         self,

@@ -70,7 +70,10 @@ def _read(
 
 @lru_cache(maxsize=8)  # all enclaves of a keystore have the same governance
 def canonical_governance(document: bytes) -> Governance | None:
-    """Return the governance in a document as sros writes it, or None; all vendors read it alike."""
+    """Return the governance in a document if it is exactly as sros writes it, else None.
+
+    All vendors read such a document alike.
+    """
     with suppress(DocumentError):
         governance = parse_governance(document)
         if is_plain_governance(governance) and _is_written(render_governance(governance), document):
@@ -79,7 +82,10 @@ def canonical_governance(document: bytes) -> Governance | None:
 
 
 def canonical_permissions(permissions: Permissions, document: bytes) -> bool:
-    """Return whether every vendor reads a document as these permissions, as sros wrote them."""
+    """Return whether a document is exactly what sros writes for these permissions.
+
+    All vendors read such a document alike.
+    """
     written = is_plain_permissions(permissions)
     return written and _is_written(render_permissions(permissions), document)
 
@@ -89,7 +95,7 @@ def _is_written(written: bytes, document: bytes) -> bool:
 
 
 def is_plain_governance(governance: Governance) -> bool:
-    """Return whether all vendors read the same texts, values and domain ranges in a governance."""
+    """Return whether all vendors read the texts, values and domains of a governance alike."""
     texts = []
     for rule in governance.domain_access_rules:
         if not (_are_plain_domains(rule.domains) and rule.topic_access_rules):
@@ -108,7 +114,7 @@ def _has_valid_values(rule: DomainRule | TopicRule) -> bool:
 
 
 def is_plain_permissions(permissions: Permissions) -> bool:
-    """Return whether all vendors read the same texts and domain ranges in the permissions."""
+    """Return whether all vendors read the texts and domains of permissions alike."""
     texts = []
     for grant in permissions.grants:
         if not (grant.name and grant.rules):

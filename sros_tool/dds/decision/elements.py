@@ -1,4 +1,4 @@
-"""XML elements as the vendors' parsers see them, and documents read by the schemas of the standard.
+"""XML elements as vendors' parsers read them, and documents read by the standard's schemas.
 
 Source: DDS-Security 1.1, the schemas omg_shared_ca_permissions and omg_shared_ca_governance of
 20170901.
@@ -26,9 +26,9 @@ from sros_tool.xml import tag_of
 
 
 class UnreadableError(Exception):
-    """A document that a vendor does not accept.
+    """The reason why a vendor does not accept a document.
 
-    ``missing`` says that it lacks content on which some releases crash
+    ``missing`` says that the document lacks content, on which some releases crash
     (`VendorTraits.crashes_on_missing_content`).
     """
 
@@ -55,7 +55,7 @@ class NodeMark(Enum):
 
 @dataclass(slots=True)
 class XmlElement:
-    """An element; ``children`` are its nodes in order, text and CDATA as strings.
+    """An XML element; ``children`` has its nodes in order, with text and CDATA as strings.
 
     ``name`` and the names of ``attributes`` are kept as written, with their prefixes.
     """
@@ -139,7 +139,7 @@ def read_governance(xml: bytes) -> Governance:
 
 
 def _root(xml: bytes) -> etree._Element:
-    """Return the root; blanks may stand before the XML declaration."""
+    """Return the root element; spaces and line ends may precede the XML declaration."""
     parser = etree.XMLParser(
         remove_pis=True, resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False
     )

@@ -1,6 +1,7 @@
-"""A vendor's topic expressions as sets of names, to decide for all names at once.
+"""The sets of names that a vendor's topic expressions match.
 
-fnmatch of glibc, or Cyclone DDS's own loop, read the sets of letters in an expression.
+How a vendor reads ``[...]`` in an expression follows fnmatch of glibc, or the matching of Cyclone
+DDS.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _CLASSES = {
 
 
 def pieces_of(style: Style, expression: str) -> list[Letters | None]:
-    """Return the sequence of letters that an expression matches, with None for ``*``."""
+    """Return the characters allowed at each place of an expression, with None for ``*``."""
     take_set = _FnmatchSets(expression).take if style is Style.FNMATCH else _cyclone_set
     pieces: list[Letters | None] = []
     index = 0
@@ -82,17 +83,17 @@ def pattern_of(letters: Letters) -> str:
 
 
 class _FnmatchSets:
-    """A parser of ``[...]`` sets as glibc reads them, in linear time."""
+    """A parser of ``[...]`` in expressions, as glibc reads it, in linear time."""
 
     def __init__(self, text: str) -> None:
         self._text = text
         self._known: dict[int, tuple[bool, bool]] = {}
 
     def take(self, text: str, start: int) -> tuple[Letters, int]:
-        """Return the set after ``[``, and the index after the set.
+        """Return the characters of the set after ``[``, and the index after the set.
 
         After an unknown class or symbol, and after a range without its end, no further character
-        matches.  In all other cases, or if ``[`` was in it before, an unclosed set is a plain
+        matches.  A set that is not closed is a plain ``[`` in all other cases, and also if it has a
         ``[``.
         """
         index = start
@@ -114,9 +115,9 @@ class _FnmatchSets:
         return _set_of(members, negated), index + 1
 
     def _end_of(self, index: int, *, first: bool) -> tuple[bool, bool]:
-        """Return whether a set is closed after ``index``, and if not, whether its ``[`` is literal.
+        """Return whether a set is closed after ``index``; if not, whether its ``[`` is literal.
 
-        The results are cached: many unclosed sets would take quadratic time.
+        Results are cached, because many sets that are not closed would take quadratic time.
         """
         text = self._text
         path: list[tuple[int, bool | None]] = []
@@ -149,10 +150,10 @@ def _set_of(members: list[Letters], negated: bool) -> Letters:
 
 
 def _token(text: str, index: int) -> tuple[Letters | None, bool, int]:
-    """Return the letters of a class, a range or a character, whether it is a range, and what
-    follows.
+    """Return the characters that a token of a set stands for.
 
-    None stands for a member that glibc does not know.
+    Also returns whether the token is a range, and the index after it.  The characters are None for
+    something that glibc does not know.
     """
     if found := _CLASS.match(text, index):
         return _CLASSES.get(found[1]), False, found.end()
@@ -168,7 +169,10 @@ def _token(text: str, index: int) -> tuple[Letters | None, bool, int]:
 
 
 def _member(text: str, index: int) -> tuple[str | None, int]:
-    """Return one character of a set, also if written ``[.a.]``; None without one."""
+    """Return one character of a set, even if written ``[.a.]``, and the index after it.
+
+    The character is None if there is none.
+    """
     if text[index : index + 2] != "[.":
         return (text[index] if index < len(text) else None), index + 1
     end = text.find(".]", index + 2)
@@ -178,10 +182,11 @@ def _member(text: str, index: int) -> tuple[str | None, int]:
 
 
 def _cyclone_set(text: str, start: int) -> tuple[Letters, int]:
-    """Return the set after ``[`` as Cyclone DDS 0.10 reads it, and the index after the set.
+    """Return the characters of the set after ``[``, and the index after it (Cyclone DDS 0.10).
 
-    Its loop takes the closing bracket for a member before it ends, and looks for a range there,
-    too: ``[ab]`` also matches ``]``, and ``[ab]-x`` is one set with the range ``]`` to ``x``.
+    The loop of Cyclone DDS takes the closing bracket for a member before it ends, and looks for a
+    range there, too: ``[ab]`` also matches ``]``, and ``[ab]-x`` is one set with the range ``]`` to
+    ``x``.
     """
     index = start
     negated = text[index : index + 1] == "!"

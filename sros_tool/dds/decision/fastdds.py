@@ -139,7 +139,7 @@ def _decoded(text: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return the text up to a NUL, with line ends normalized and character references resolved."""
+    """Return the text up to a NUL, with normalized line ends and resolved references."""
     if "&" not in text:
         return _decoded(_LINE_END.sub("\n", text) if "\r" in text or "\n" in text else text)
     # TinyXML-2 writes into the text that it reads: for a lone "&" it writes nothing, so the old
@@ -166,7 +166,7 @@ def _plain(text: str) -> str:
 
 
 def _referred(found: re.Match[str]) -> str | None:
-    """Return the bytes of a reference, or None if it is malformed."""
+    """Return the bytes of a character reference such as ``&amp;``, or None if it is malformed."""
     if found[2]:
         return _ENTITIES[found[2]]
     # TinyXML-2 reads the digits backwards, from the last one to the mark before them.
@@ -220,7 +220,11 @@ def _first(root: XmlElement, name: str) -> XmlElement:
 
 
 def _all(parent: XmlElement, name: str) -> list[XmlElement]:
-    """Return the children of ``parent``; raise if it has none, or one not called ``name``."""
+    """Return the children of ``parent``, which all have to be named ``name``.
+
+    Raises:
+        UnreadableError: there are no children, or one has another name.
+    """
     children = parent.elements
     if not children or any(child.name != name for child in children):
         raise UnreadableError(f"<{parent.name}> needs <{name}> elements and nothing else")
@@ -228,7 +232,7 @@ def _all(parent: XmlElement, name: str) -> list[XmlElement]:
 
 
 class _Sequence:
-    """The child elements of one element, taken in order."""
+    """The child elements of an element, which are read one after another."""
 
     def __init__(self, element: XmlElement) -> None:
         self._name = element.name
@@ -240,7 +244,7 @@ class _Sequence:
         return self._index < len(self._children) and self._children[self._index].name == name
 
     def next(self, name: str) -> XmlElement:
-        """Take the next child; raise `UnreadableError` if it has another name."""
+        """Return the next child and go on; raise `UnreadableError` if it has another name."""
         if not self.is_next(name):
             there = f", where it has <{self.rest()[0].name}>" if self.rest() else ""
             raise UnreadableError(f"<{self._name}> lacks <{name}> at its position{there}")
@@ -248,11 +252,11 @@ class _Sequence:
         return self._children[self._index - 1]
 
     def rest(self) -> list[XmlElement]:
-        """Return the children not taken yet."""
+        """Return the children that were not read yet."""
         return self._children[self._index :]
 
     def while_named(self, *names: str) -> list[XmlElement]:
-        """Take the children up to the first one with another name."""
+        """Return the children up to the first one with another name, and go on after them."""
         elements = []
         while self._index < len(self._children):
             if self._children[self._index].name not in names:
@@ -262,7 +266,7 @@ class _Sequence:
         return elements
 
     def end(self) -> None:
-        """Raise `UnreadableError` if another child follows."""
+        """Raise `UnreadableError` if there is another child."""
         if self.rest():
             raise UnreadableError(f"<{self._name}> contains an unexpected <{self.rest()[0].name}>")
 
@@ -271,7 +275,7 @@ class _Sequence:
 
 
 def _text(element: XmlElement) -> str | None:
-    """Return the first node that is not a comment, if it is text; else None."""
+    """Return the text of an element if its first node is text (comments aside), else None."""
     for child in element.children:
         if child is not NodeMark.COMMENT:
             return child if isinstance(child, str) else None
@@ -286,7 +290,11 @@ def _required(element: XmlElement) -> str:
 
 
 def _first_text(element: XmlElement) -> str:
-    """Return the text of a number or a flag; nothing may precede it, not even a comment."""
+    """Return the text of a number or flag, which has to be the first node of its element.
+
+    Raises:
+        UnreadableError: the first node is something else, even a comment.
+    """
     first = element.children[0] if element.children else None
     if not isinstance(first, str):
         raise UnreadableError(f"<{element.name}> does not begin with its value")
@@ -301,7 +309,7 @@ def _number(element: XmlElement) -> int:
 
 
 def _integer(found: re.Match[str]) -> int:
-    """Parse a number as sscanf does: a number beyond 64 bits becomes the largest one."""
+    """Return a number as sscanf reads it: above 64 bits, it is the largest 64-bit number."""
     if found[1]:
         return min(int(found[1], 16), 2**64 - 1)
     digits = found[2].lstrip("+-").lstrip("0")

@@ -21,14 +21,14 @@ _MOST_PARTS = 20  # Cyclone DDS refuses a grant's subject of more
 
 
 class ComparisonCrash(Exception):  # noqa: N818
-    """The vendor's process crashes when it compares these subjects."""
+    """The comparison of these two subjects crashes the vendor's process."""
 
 
 def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
     """Return whether a grant for ``granted`` applies to the certificate subject ``certified``.
 
     Raises:
-        ComparisonCrash: the vendor's process ends.
+        ComparisonCrash: the comparison crashes the vendor's process.
     """
     return _COMPARE[rule](granted, certified)
 
@@ -36,9 +36,9 @@ def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
 def also_fitting(
     traits: VendorTraits, certified: Mapping[str, str], granted: Mapping[str, Collection[str]]
 ) -> dict[str, tuple[str, ...]]:
-    """Map each enclave to the other enclaves whose permissions fit its certificate.
+    """Map each enclave to the other enclaves whose permissions also fit its certificate.
 
-    ``certified`` are the subjects of certificates, ``granted`` those of the grants.
+    ``certified`` are the subjects of certificates, ``granted`` those of grants, by enclave.
     """
     plain = _PLAIN_PARTS.get(traits.subjects)
     if plain is None:  # all others compare the whole subject
@@ -83,10 +83,11 @@ def _exact(granted: str, certified: str) -> bool:
 
 
 def _whole_attributes(granted: str, certified: str) -> bool:
-    """Compare subjects split at commas (also escaped ones), ignoring blanks around the parts.
+    """Return whether subjects are equal, split at commas and without blanks around parts.
 
-    Source: Fast DDS 2.9.1, Permissions.cpp (rfc2253_string_compare).  A part of less than three
-    bytes keeps some of its blanks, and what stands behind an empty part does not count.
+    Escaped commas split as well.  A part of less than three bytes keeps some of its blanks, and
+    what stands behind an empty part is ignored.  Source: Fast DDS 2.9.1, Permissions.cpp
+    (rfc2253_string_compare).
     """
     ours, theirs = granted.encode(), certified.encode(errors="surrogateescape")
     our_start = their_start = 0
@@ -100,9 +101,10 @@ def _whole_attributes(granted: str, certified: str) -> bool:
 
 
 def _trimmed(text: bytes, start: int, end: int) -> bytes:
-    """Strip blanks from ``text[start:end]`` as Fast DDS 2.9.1 does, which does not remove all.
+    """Return ``text[start:end]`` without blanks, as far as Fast DDS 2.9.1 removes them.
 
-    Each side stops where the part would have one byte left, and not at the end of a shorter part.
+    On each side it stops when one byte would be left, but it does not stop at the end of a shorter
+    part.
     """
     last = end - 1
     try:
@@ -127,7 +129,7 @@ _BEFORE = {
     wanted: re.compile(rf'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\{wanted}])*', re.DOTALL)
     for wanted in "=,"
 }
-"""Matches the text before the first wanted character outside of escapes and quotes."""
+"""Maps a character to a pattern for the text before it, outside of escapes and quotes."""
 
 
 def _any_order(granted: str, certified: str) -> bool:
@@ -141,7 +143,10 @@ def _any_order(granted: str, certified: str) -> bool:
 
 
 def _types_and_values(name: str) -> list[tuple[str, str]]:
-    """Return a name's attributes up to the first malformed one (DistinguishedName.cpp, 2.14)."""
+    """Return types and values of a subject's attributes, up to the first malformed one.
+
+    Source: Fast DDS 2.14, DistinguishedName.cpp.
+    """
     pairs: list[tuple[str, str]] = []
     rest = name.lstrip(" ")
     while rest and len(pairs) < _MOST_ATTRIBUTES:
@@ -169,7 +174,7 @@ _EQUALS = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^="\\])*', re.DOTALL)
 
 
 def _attributes(name: str) -> list[tuple[str, str]]:
-    """Return (type, unescaped value) of a name's attributes up to the first malformed one."""
+    """Return types and unescaped values of a subject's attributes up to the first malformed one."""
     attributes = []
     index = 0
     while index < len(name):
@@ -209,7 +214,7 @@ def _subset(granted: str, certified: str, *, plain: Callable[[str], str] = str) 
 
 
 def _without_blanks(part: str) -> str:
-    """Return a part of a subject without the blanks around its name and its value."""
+    """Return a part of a subject (``NAME = VALUE``) without blanks around name and value."""
     return "=".join(text.strip(" ") for text in part.split("=", 1))
 
 
@@ -217,7 +222,7 @@ _PLAIN_PARTS: dict[Subjects, Callable[[str], str]] = {
     Subjects.SUBSET: str,
     Subjects.TRIMMED_SUBSET: _without_blanks,
 }
-"""How rules that split subjects read each part."""
+"""How each rule that splits subjects reads the parts."""
 
 _COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
     Subjects.EXACT: _exact,
@@ -245,10 +250,10 @@ _FARTHEST = timedelta(hours=12)
 
 @lru_cache(maxsize=64)  # the enclaves of a keystore share most of their dates
 def read_moment(rule: Moments, text: str, zone: tzinfo) -> float | None:
-    """Return the moment that ``text`` means; None if the vendor calls the document malformed.
+    """Return the time that a date means, in seconds since 1970; None if it is malformed.
 
     ``zone`` is the host's time zone.  A date that Cyclone DDS cannot read is minus infinity: as a
-    begin or an end it has always passed.
+    beginning or as an end, it has always passed.
     """
     match rule:
         case Moments.LOCAL:

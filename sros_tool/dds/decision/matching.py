@@ -19,7 +19,7 @@ _BEFORE_SPECIAL = re.compile(r"[^*?\[]*")
 
 @lru_cache(maxsize=65536)
 def _matcher(style: Style, expression: str) -> _Matcher | None:
-    """Return a function that matches names; None if ``expression`` matches only itself."""
+    """Return a function that tells whether names match; None if only ``expression`` itself does."""
     if _SPECIAL.isdisjoint(expression):
         return None
     segments = [""]  # the text between stars
@@ -32,9 +32,9 @@ def _matcher(style: Style, expression: str) -> _Matcher | None:
 
 
 def _patterns(style: Style, expression: str) -> Iterable[str]:
-    """Return a regular expression for every letter of an expression, and "" for ``*``.
+    """Return a regular expression for each character of an expression, and "" for ``*``.
 
-    Only the sets of letters are read in a vendor's own way.
+    Vendors differ only in how they read sets of characters.
     """
     if "[" in expression:
         from sros_tool.dds.decision.expressions import pattern_of, pieces_of
@@ -45,9 +45,9 @@ def _patterns(style: Style, expression: str) -> Iterable[str]:
 
 
 def _joined(segments: list[str]) -> str:
-    """Return the regular expression for segments that are separated by ``*``.
+    """Return one regular expression for parts of an expression that ``*`` separates.
 
-    Each segment matches a fixed number of characters, so the first fit is as good as a later one.
+    Each part matches a fixed number of characters, so its first match is as good as a later one.
     The atomic group tries only that one; otherwise many stars would take exponential time.
     """
     first, *rest = segments
@@ -64,10 +64,10 @@ def matches(style: Style, expression: str, name: str) -> bool:
 
 
 class ExpressionIndex:
-    """An index of ordered expressions, to find fast those that match a name.
+    """An index of a list of expressions, to find those that match a name.
 
-    Expressions without wildcards are looked up by name, the others by the text before the first
-    wildcard, so that a query on thousands of expressions costs little more than on one.
+    An expression without wildcards is looked up by the name, any other by the text before its first
+    wildcard.  So a search in thousands of expressions takes little longer than one comparison.
     """
 
     def __init__(self, style: Style, texts: Iterable[str], *, both_ways: bool = False) -> None:

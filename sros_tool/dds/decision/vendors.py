@@ -1,9 +1,9 @@
-"""The vendors of DDS Security, and the differences of their decisions, as data.
+"""The vendors of DDS Security, and how their decisions differ, as data.
 
-Fast DDS 2.6.12, 2.9.1, 2.14.5, 2.14.6, 3.2.5 and 3.6.2 and Cyclone DDS 0.10.2, 0.10.5 and 11.0.1
-were measured on the real libraries; Fast DDS 2.14.5 and 2.14.6 decide alike, and so do Cyclone DDS
-0.10.2 and 0.10.5.  Vendors that were never measured, such as OpenDDS and Connext, are taken to
-follow the standard, as their manuals say.
+The decisions of Fast DDS 2.6.12, 2.9.1, 2.14.5, 2.14.6, 3.2.5 and 3.6.2 and Cyclone DDS 0.10.2,
+0.10.5 and 11.0.1 were measured on the real libraries; Fast DDS 2.14.5 and 2.14.6 decide alike, and
+so do Cyclone DDS 0.10.2 and 0.10.5.  Vendors that were never measured, such as OpenDDS and Connext,
+are assumed to follow the standard, as their manuals say.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from enum import Enum, StrEnum, auto
 
 
 class Style(Enum):
-    """The rules for expressions with wildcards."""
+    """The rules by which a topic expression with wildcards matches names."""
 
     FNMATCH = auto()
     """POSIX fnmatch of glibc, without escapes, where ``*`` crosses ``/``."""
@@ -23,44 +23,44 @@ class Style(Enum):
 
 
 class Subjects(Enum):
-    """The comparison of a grant's subject with a certificate's subject."""
+    """When a grant's subject matches the subject of a certificate."""
 
     EXACT = auto()
     """The same attributes in the same order; spaces around them do not count."""
     WHOLE_ATTRIBUTES = auto()
-    """The same texts between commas, escaped or not, without blanks (Fast DDS 2.6 and 2.9)."""
+    """The same texts between commas, even escaped ones; spaces are ignored (Fast DDS 2.6, 2.9)."""
     ANY_ORDER = auto()
     """The same attributes in any order (Fast DDS 2.14)."""
     SUBSET = auto()
-    """The grant's subject has all parts of the certificate's, split at ``, / |`` (Cyclone)."""
+    """The grant has every part of the certificate's subject, split at ``, / |`` (Cyclone DDS)."""
     TRIMMED_SUBSET = auto()
-    """The grant's subject has all parts of the certificate's, spaces around them aside (11)."""
+    """As `SUBSET`, but spaces around parts are ignored (Cyclone DDS 11)."""
 
 
 class Moments(Enum):
-    """The reading of dates in a grant."""
+    """How the dates in a grant are read."""
 
     STANDARD = auto()
     """A date has the offset that it names, or else is in UTC."""
     LOCAL = auto()
     """A date is in the host's standard time; its offset is ignored (Fast DDS)."""
     CYCLONE = auto()
-    """As in the standard; a date before 1970, after 2262 or incomplete is in the past."""
+    """As in the standard, but before 1970, after 2262 or incomplete means "in the past"."""
 
 
 class OpenRange(Enum):
-    """The meaning of a range of domains with one end."""
+    """What a range of domains means that has only a minimum or only a maximum."""
 
     OPEN = auto()
     """``min N`` alone means N and above; ``max N`` alone means 0 to N."""
     SINGLE = auto()
     """``min N`` alone means only N; ``max N`` alone means 0 to N (Fast DDS)."""
     CRASHES = auto()
-    """``min N`` alone means only N; ``max N`` alone is a crash (Cyclone DDS)."""
+    """``min N`` alone means only N; ``max N`` alone crashes the process (Cyclone DDS)."""
 
 
 class TopicNames(Enum):
-    """The names that a topic may have."""
+    """The characters that a topic's name may have."""
 
     ANY = auto()
     WORDS = auto()
@@ -70,29 +70,29 @@ class TopicNames(Enum):
 
 
 class DenyPartitions(Enum):
-    """The partitions of an endpoint that a deny rule must name to apply to it."""
+    """Which partitions of an endpoint a deny rule must name in order to apply to the endpoint."""
 
     ANY_OR_ALL = auto()
-    """At least one partition of the endpoint; a rule without partitions applies to all."""
+    """One of the endpoint's partitions; a rule without partitions applies to all."""
     ANY_OR_DEFAULT = auto()
-    """At least one partition; a rule without any applies to the default partition (Cyclone DDS)."""
+    """One of them; a rule without partitions applies to the default one (Cyclone DDS)."""
     IGNORED = auto()
-    """No partition: a deny rule applies in all, even if it names some (Fast DDS)."""
+    """None: a deny rule applies to all partitions, even if it names some (Fast DDS)."""
 
 
 class Signers(Enum):
-    """The accepted signers of governance and permissions."""
+    """Who may sign governance and permissions."""
 
     AUTHORITY = auto()
     """The permissions CA itself, whose certificate is in the message."""
     LISTED = auto()
-    """Anyone with a certificate in the file of the permissions CA; no chain is verified (2.14)."""
+    """Anyone with a certificate in the permissions CA's file; no chain is verified (2.14)."""
     CHAIN = auto()
-    """Anyone with a certificate for S/MIME in the message that has a chain to that CA."""
+    """Anyone whose certificate in the message is for S/MIME and has a chain to that CA."""
 
 
 class Hashes(Enum):
-    """The signatures that CAs and identities may have."""
+    """The signature algorithms that the certificates of CAs and enclaves may have."""
 
     ANY = auto()
     SHA256 = auto()
@@ -100,7 +100,7 @@ class Hashes(Enum):
 
 
 class Keys(Enum):
-    """The keys that identities and their CA may have."""
+    """The kinds of keys that enclaves and their CA may have."""
 
     ANY = auto()
     EC_AND_RSA = auto()
@@ -122,97 +122,101 @@ class DocumentReader(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VendorTraits:
-    """The names of one vendor, and its rules where vendors differ.
+    """The names of one vendor, and how it decides where vendors differ.
 
-    The default of each rule is the rule of the standard.
+    The default of a field is what the standard demands.
     """
 
     title: str
-    """The name and version for messages."""
+    """The name and version, for messages."""
     product: str = ""
-    """The name without a version, which its releases share."""
+    """The name without a version, which all releases of the product share."""
     measured: bool = False
-    """Whether these rules were compared with the decisions of the real library."""
+    """Whether this data was compared with the decisions of the real library."""
     reader: DocumentReader = DocumentReader.STANDARD
     style: Style = Style.FNMATCH
     governance_both_ways: bool = False
-    """A topic rule also applies if the topic's name, used as a pattern, matches its expression."""
+    """A topic rule also applies if its expression matches the topic's name used as a pattern."""
     trims_texts: bool = False
-    """Spaces around the text of an element do not count."""
+    """Spaces around the text of an XML element are ignored."""
     subjects: Subjects = Subjects.EXACT
     escapes_subjects: bool = False
-    """A character beyond ASCII in a certificate's subject is compared as ``\\C3\\B6``."""
+    r"""Characters of a subject beyond ASCII are compared as escapes (``\C3\B6``)."""
     longest_subject: int | None = None
-    """Number of bytes of a certificate's subject that are compared; the rest is ignored."""
+    """Number of bytes of a certificate's subject that are compared; None for all."""
     drops_expired: bool = False
-    """Running participants lose each other when the certificate of either expires.
+    """Running participants lose each other when the certificate of one expires.
 
-    Since Fast DDS 2.6.12 and 3.2.5 (CVE-2025-67108); 2.14.6 and 3.6.2 keep them (all measured).
+    Since Fast DDS 2.6.12 and 3.2.5 (CVE-2025-67108); in 2.14.6 and 3.6.2 they stay connected (all
+    measured).
     """
     expiry_overflows: bool = False
     """A certificate that expires more than 292 years from now counts as expired.
 
-    Its nanoseconds overflow 64 bits, so it is accepted again from 584 years on, and so forth.
+    Its time in nanoseconds overflows 64 bits.  From 584 years on it is accepted again, and so
+    forth.
     """
     crashes_on_empty_subject: bool = False
-    """A certificate without any attribute in its subject crashes the process, and its peers'."""
+    """A certificate with an empty subject crashes its process and those of its peers."""
     moments: Moments = Moments.STANDARD
     passes_over_outdated_grants: bool = False
-    """A later grant is used if the first grant of the subject is not valid now."""
+    """A later grant is used if the subject's first grant is not valid now."""
     open_range: OpenRange = OpenRange.OPEN
     filters_own_domain: bool = True
-    """The participant itself ignores its rules for other domains (peers always ignore them)."""
+    """The participant itself ignores its rules for other domains, as peers always do."""
     relays_count_for_readers: bool = False
-    """For a reader, peers also check ``<relay>``, after the ``<subscribe>`` of the same rule."""
+    """Peers also check a reader by ``<relay>``, after ``<subscribe>`` of the same rule."""
     topic_decides: bool = False
-    """The first rule whose topic matches decides, even if its partitions then do not match."""
+    """The first rule with the topic decides, even if its partitions do not match."""
     deny_partitions: DenyPartitions = DenyPartitions.ANY_OR_ALL
     honours_default: bool = True
-    """Where no rule matches, the ``<default>`` of the grant decides."""
+    """The ``<default>`` of the grant decides if no rule matches."""
     crashes_on_missing_content: bool = False
-    """An empty ``<topic_expression>``, ``<not_after>`` or document of permissions crashes the
-    process, where others refuse it (Fast DDS before 3)."""
+    """An empty document or element crashes the process; other vendors only refuse it.
+
+    The elements are ``<topic_expression>`` and ``<not_after>`` (Fast DDS before 3).
+    """
     crashes_on_empty_texts: bool = False
-    """An expression or a default without text crashes the process when a decision reaches it."""
+    """A decision crashes the process if it reads an expression or default without text."""
     topic_names: TopicNames = TopicNames.ANY
     longest_topic_name: int | None = None
-    """Length of a name, in bytes, above which a topic is created but never matched."""
+    """Longest name of a topic that is matched, in bytes; a longer one is created all the same."""
     creates_topics: bool = False
-    """A topic is created before its endpoint, and needs a right in either direction.
+    """A topic is created before its endpoint, by a right in either direction.
 
-    The first rule that names the topic, for either direction, decides.
+    The first rule with the topic decides, whether it is to publish or to subscribe.
     """
     asks_both_directions: bool = False
-    """Creating a topic needs a right in one direction; each direction has its own first rule."""
+    """Creating a topic needs a right to publish or to subscribe; each has its own first rule."""
     always_needs_allow_rule: bool = False
-    """Without any allow rule the participant does not start, even without join control."""
+    """A participant without allow rules never starts, even without join control."""
     needs_domain_rule: bool = True
-    """A participant does not start on a domain that the governance does not list."""
+    """A participant does not start in a domain that the governance does not list."""
     shares_open_topics: bool = False
-    """A participant that peers refuse still exchanges unprotected topics with them (measured).
+    """A participant still exchanges unprotected topics with peers that refuse it.
 
-    Access control in the direction of the participant prevents this.
+    Access control in the direction of the participant prevents this (measured).
     """
     ignores_unauthenticated: bool = False
-    """Participants without an identity are refused, even if the governance allows them (2.9)."""
+    """Participants without identity are refused even if governance allows them (2.9)."""
     refuses_open_rtps: bool = False
-    """Unauthenticated participants together with RTPS protection are refused."""
+    """RTPS protection is refused if unauthenticated participants are allowed."""
     signers: Signers = Signers.AUTHORITY
     reads_first_authority: bool = False
-    """Only the first CA of a file is trusted."""
+    """Only the first CA in a file is trusted."""
     reads_lists_of_authorities: bool = False
-    """Revocation lists in the file of the identity CA are read, besides ``crl.pem``."""
+    """Revocation lists in the file of the identity CA count, as well as ``crl.pem``."""
     verifies_authorities: bool = False
-    """The first certificate of a CA file is verified, strictly, when it is loaded.
+    """The first certificate of a CA file is strictly verified when it is loaded.
 
     If the vendor does not accept its hash, the process crashes, because it uses freed memory.
     """
     verifies_policies: bool = False
-    """Certificate policies and the root CA's own signature are verified, too (Fast DDS)."""
+    """Certificate policies and the root CA's own signature are verified (Fast DDS)."""
     reads_trusted_certificates: bool = True
     """A certificate may be in a PEM block ``TRUSTED CERTIFICATE``."""
     reads_files_as_text: bool = False
-    """In files with certificates or lists, a zero byte ends the line, or even the file."""
+    """A zero byte in a file of certificates or lists ends the line, or even the file."""
     hashes: Hashes = Hashes.ANY
     keys: Keys = Keys.ANY
     reads_tokens: bool = True
@@ -279,15 +283,15 @@ _CYCLONE_0_10 = VendorTraits(
 class Vendor(StrEnum):
     """A DDS implementation, or the specification itself.
 
-    To add a vendor that decides by the standard, add an entry: options, texts and comparisons
-    follow.  `sros_tool.runtime.rmw` maps RMWs to vendors.  The first release of a
-    product is the one that options name without a version.
+    To add a vendor that decides by the standard, add an entry here: options, texts and comparisons
+    use all entries.  `sros_tool.runtime.rmw` maps RMWs to vendors.  Of a product with several
+    releases, the first entry is meant if an option names no version.
     """
 
     traits: VendorTraits
 
     def __new__(cls, word: str, traits: VendorTraits = _STANDARD) -> Vendor:
-        """Make the member whose value is ``word``."""
+        """Create the member whose value is ``word``."""
         member = str.__new__(cls, word)
         member._value_ = word
         member.traits = traits
@@ -359,7 +363,7 @@ class Vendor(StrEnum):
 
     @property
     def release(self) -> str:
-        """The version in the title, such as ``2.14``; only of a vendor that was measured."""
+        """The version in the title, such as ``2.14``; only for measured vendors."""
         return self.title.removeprefix(self.traits.product).strip()
 
     @property
@@ -372,7 +376,7 @@ MEASURED = tuple(vendor for vendor in Vendor if vendor.traits.measured)
 """The vendors whose decisions were compared with the real library."""
 
 PRINCIPAL = tuple({vendor.traits.product: vendor for vendor in reversed(MEASURED)}.values())[::-1]
-"""The release of each measured implementation that options name without a version."""
+"""For each measured product, the release that is meant if an option names no version."""
 
 
 def _releases(product: str) -> tuple[Vendor, ...]:
@@ -396,7 +400,7 @@ WHOLE_PRODUCTS = {
 
 
 def words_of(vendors: Iterable[Vendor]) -> list[str]:
-    """Return the fewest words of options that name the vendors."""
+    """Return the shortest list of option values that names these vendors."""
     left = list(vendors)
     words = []
     for word, releases in WHOLE_PRODUCTS.items():
@@ -407,10 +411,10 @@ def words_of(vendors: Iterable[Vendor]) -> list[str]:
 
 
 def together(titles: Iterable[str]) -> list[str]:
-    """Return titles of vendors with the releases of each product together, for messages.
+    """Return titles of vendors, with the releases of one product joined into one title.
 
-    All measured releases of a product are the product itself, and some are ``Fast DDS 2.14/3.6``.
-    Other texts, such as ``Zenoh``, stay as they are.
+    All measured releases become the name of the product, and some of them a title such as ``Fast
+    DDS 2.14/3.6``.  Other texts, such as ``Zenoh``, stay as they are.
     """
     of_title = {vendor.title: vendor for vendor in MEASURED}
     releases: dict[str, list[Vendor]] = {}
