@@ -34,7 +34,7 @@ class Subjects(Enum):
     SUBSET = auto()
     """The grant has every part of the certificate's subject, split at ``, / |`` (Cyclone DDS)."""
     TRIMMED_SUBSET = auto()
-    """As `SUBSET`, but spaces around parts are ignored (Cyclone DDS 11)."""
+    """The grant has every part of the certificate's subject, without spaces around parts (11)."""
 
 
 class Moments(Enum):
@@ -143,7 +143,7 @@ class VendorTraits:
     escapes_subjects: bool = False
     r"""Characters of a subject beyond ASCII are compared as escapes (``\C3\B6``)."""
     longest_subject: int | None = None
-    """Number of bytes of a certificate's subject that are compared; None for all."""
+    """Number of bytes of a certificate's subject that are compared; the rest is ignored."""
     drops_expired: bool = False
     """Running participants lose each other when the certificate of one expires.
 
