@@ -38,7 +38,7 @@ from sros_tool.cli.common import (
     words_argument,
 )
 from sros_tool.cli.program import VerbGroup
-from sros_tool.errors import NOT_DONE, Note, UsageError
+from sros_tool.errors import NOT_DONE, Note, SrosError, UsageError
 from sros_tool.terminal import echo, echo_document, visible_line
 from sros_tool.values import file_change, shows
 from sros_tool.wording import counted, first_few
@@ -213,11 +213,19 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     shell_complete=complete_robot,
     help="Accept an earlier message from this robot, because its disk was restored.",
 )
+@click.option(
+    "--publish",
+    "folder",
+    type=PATH,
+    metavar="PUB",
+    help="Publish afterwards, as `sros fleet publish ROOT PUB` does.",
+)
 @allow_refusal_option
 @dry_run_option
 @json_option
 def _collect(
     words: tuple[str, ...],
+    folder: Path | None,
     restored: tuple[str, ...],
     allow_refusal: tuple[Vendor, ...],
     dry_run: bool,
@@ -236,11 +244,12 @@ def _collect(
       3 robots: 2 kept, 1 refused; 1 request renewed
       r3: refused: it is signed by /r4/base, an enclave of r4
       renewed /r1/base for the key 6f5bbd292e91c5d0...
+      $ sros fleet collect keystore inbox --publish pub
 
-    The exit status is 0 if nothing was refused, 1 if a message or request was refused or the fleet
-    file does not allow a request, and 2 if the CAs cannot sign.
+    The exit status is 0 if nothing was refused, 1 if a message, request or release was refused or
+    the fleet file does not allow a request, and 2 if the CAs cannot sign or it cannot be published.
     """
-    from sros_tool.keystore.delivery.collect import collect
+    from sros_tool.keystore.delivery.collect import PublishedAnswers, collect
 
     root, inbox = root_and_file(words, "fleet collect takes a keystore and one folder")
     with progress("collecting"):
@@ -253,12 +262,29 @@ def _collect(
             keyring=keyring(),
             dry_run=dry_run,
         )
+    published = None
+    problem: SrosError | None = None
+    if folder:
+        from sros_tool.keystore.delivery.publish import publish
+
+        try:
+            with progress("publishing"):
+                published = publish(root, folder, now=now(), keyring=keyring(), dry_run=dry_run)
+            new, refused = published.names("published"), published.names("refused")
+            collected = collected._replace(published=PublishedAnswers(folder, new, refused))
+        except SrosError as error:
+            problem = error  # what was collected is printed first
     if as_json:
         print_json(collected)
     else:
-        for line in _collected_lines(collected):
+        for line in (
+            *_collected_lines(collected),
+            *(_published_lines(published) if published else ()),
+        ):
             echo(line)
-    print_notes(collected.notes)
+    print_notes((*collected.notes, *(published.notes if published else ())))
+    if problem:
+        raise problem
     if collected.not_signed:
         return NOT_DONE
     return 0 if collected.complete else 1
@@ -603,6 +629,10 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
         yield f"{state} {', '.join(named)}{f' of {since}' if since else ''}"
     if len(groups) > _MOST_GROUPS:
         yield f"more, see --robot {robot.robot}"
+    if robot.fetches and (robot.published or 0) != (robot.release or 0):
+        yield f"release {robot.release or 'none'}, published is {robot.published or 'none'}"
+    elif robot.fetches and robot.pending:
+        yield "not published yet"
     if robot.restart:
         yield f"processes of {first_few(robot.restart, _MOST_GROUPS)} run with earlier files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):

@@ -33,6 +33,7 @@ from sros_tool.keystore.confirmation import (
     enclave_of,
     last_confirmation,
 )
+from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.fleet import enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -148,7 +149,17 @@ class ConfirmedFile:
 
 @shows(
     *("robot", "state", "enclaves", "revoked", "unrecorded", "sharing_name", "received", "clock"),
-    *("fetches", "release", "stage", "files", "pending", "restart", "running", "crl_in_force"),
+    *(
+        "fetches",
+        "release",
+        "published",
+        "stage",
+        "files",
+        "pending",
+        "restart",
+        "running",
+        "crl_in_force",
+    ),
     *("expiry", "dds", "problems", "notes"),
     null_if_empty=("stage",),
 )
@@ -180,6 +191,8 @@ class RobotStatus:
     release: int | None
     """Number of the release that the robot's agent installed last, 0 for none; null if it does not
     say it."""
+    published: int | None
+    """Number of the release that was published last for the robot; null for none."""
     stage: Annotated[str, Words(("unknown", "before", "distribute", "reissue", "complete"))]
     """The stage of a CA rotation that the robot's CA files have reached; null if it confirmed no CA
     file. ``before``: it does not trust the new CA yet; ``complete``: it trusts only the new CA."""
@@ -497,6 +510,10 @@ class _Known:
         self._root = keystore.root
         self.has_list = keystore.has(CRL)
         """Whether the keystore has a revocation list."""
+        self.published = {
+            name: robot.release.number for name, robot in read_published(keystore).robots.items()
+        }
+        """Robots with the numbers of their releases that were published last."""
         self._fleet = fleet
         self._issued: dict[str, Entry] = {}
         self._revoked_serials: set[str] = set()
@@ -619,6 +636,7 @@ def _status(
         confirmed.time if confirmed else None,
         bool(received and received.message),
         confirmed.release if confirmed else None,
+        known.published.get(compared.robot.name),
         stages.of(compared),
         {kind: counts[kind] for kind in (*_KINDS.values(), _ZENOH) if kind in counts},
         different,
@@ -751,6 +769,15 @@ def fleet_metrics(
                 Sample(robot.release, labels)
                 for labels, robot in robots
                 if robot.release is not None
+            ),
+        ),
+        Metric(
+            "sros_fleet_published_release",
+            "Number of the release that was published last for a robot.",
+            tuple(
+                Sample(robot.published, labels)
+                for labels, robot in robots
+                if robot.published is not None
             ),
         ),
         Metric(

@@ -390,8 +390,8 @@ def _fleet_head(status: Json) -> str:
 def _fleet_table(status: Json) -> str:
     rows = sorted(status["robots"], key=lambda robot: (robot["state"] in _GOOD, robot["robot"]))
     heads = (
-        *("robot", "state", "confirmed", "release", "enclaves", "first expiry", "CA stage"),
-        "what differs",
+        *("robot", "state", "confirmed", "release", "published", "enclaves", "first expiry"),
+        *("CA stage", "what differs"),
     )
     return (
         f"<table><thead><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead>"
@@ -411,12 +411,11 @@ def _fleet_row(robot: Json) -> str:
     due = [f"processes of {name} run with earlier files" for name in robot["restart"] or ()]
     if robot["crl_in_force"] is False and robot["received"]:
         due.append("the revocation list is not in force")
-    release = "" if robot["release"] is None else str(robot["release"])
     cells = (
         f"<code>{escape(robot['robot'])}</code>",
         f'<span class="{_fleet_class(robot["state"])}">{escape(robot["state"])}</span>',
         escape(robot["received"] or ""),
-        release,
+        *("" if robot[key] is None else str(robot[key]) for key in ("release", "published")),
         str(robot["enclaves"]),
         escape(min(robot["expiry"].values(), default="")),
         escape(robot["stage"] or ""),

@@ -422,7 +422,7 @@ CASES: dict[str, tuple[Case, ...]] = {
     "fleet collect": (
         Case("crew from_crew", 1),
         Case("crew from_crew --dry-run", 1),
-        Case("fresh good", before=("fleet collect fresh good",)),
+        Case("fresh good --publish pub", before=("fleet collect fresh good",)),
         Case("fresh from_fresh", 1),
         Case("fresh from_fresh", 1, before=("renew fresh /a",)),
         Case("unable from_crew", 2),

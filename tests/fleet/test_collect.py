@@ -27,6 +27,7 @@ from sros_tool.keystore.delivery.collect import (
     CollectedMessage,
     collect,
 )
+from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.layout import key_on_robot
 from sros_tool.keystore.reader import Keystore, read_certificate
 from sros_tool.pki import smime
@@ -495,3 +496,25 @@ def test_cas_that_cannot_sign(home: Home) -> None:
     for key in home.folder.glob("*.key.pem"):
         key.rename(home.root / "private" / key.name)
     assert home.of("r1", DUE).requests[0].outcome == "renewed", "the same message is enough"
+
+
+def test_what_was_renewed_is_published_at_once(home: Home) -> None:
+    """The status compares what the robot has installed with what was published last."""
+    home.run("renew", "ks", "/r1/base")
+    ended = sros("fleet", "collect", "ks", "inbox", "--publish", "pub", "--json", cwd=home.folder)
+    said = json.loads(ended.out)["published"]
+    assert ended.status == 0 and said == {"folder": "pub", "robots": [*ROBOTS], "refused": []}
+    number = read_published(Keystore(home.root)).robots["r1"].release.number
+    home.send("r1", datetime.now(UTC), release=number - 1)
+    ended = sros("fleet", "collect", "ks", "inbox", "--publish", "pub", cwd=home.folder).ok()
+    assert "unchanged: 3 robots" in ended.out
+    status = json.loads(sros("fleet", "status", "ks", "--json", cwd=home.folder).out)
+    found = {robot["robot"]: (robot["release"], robot["published"]) for robot in status["robots"]}
+    assert found["r1"] == (number - 1, number) and found["r3"][0] is None
+    text = sros("fleet", "status", "ks", cwd=home.folder).out
+    assert f"release {number - 1}, published is {number}" in text
+    home.run("renew", "ks", "/r1/base")
+    home.send("r1", datetime.now(UTC), release=number)
+    ended = sros("fleet", "collect", "ks", "inbox", "--publish", "ks", cwd=home.folder)
+    assert ended.status == 2 and "1 kept" in ended.out, "what was collected stays"
+    assert "not published yet" in sros("fleet", "status", "ks", cwd=home.folder).out

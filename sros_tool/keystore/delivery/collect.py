@@ -113,6 +113,17 @@ class CollectedMessage(NamedTuple):
     """The requests for renewal in the message."""
 
 
+class PublishedAnswers(NamedTuple):
+    """What was published after an inbox was taken in."""
+
+    folder: Path
+    """The publishing folder, as it was named."""
+    robots: Sequence[str]
+    """Robots with a new release, sorted by name."""
+    refused: Sequence[str]
+    """Robots whose release was refused, because an enclave cannot run."""
+
+
 class CollectedInbox(NamedTuple):
     """The messages of an inbox, and what was done with them."""
 
@@ -123,13 +134,17 @@ class CollectedInbox(NamedTuple):
     """The robots of the fleet, sorted by name."""
     not_signed: str
     """Why the CAs could not sign requests, as a clause: the exit status is 2; else empty."""
+    published: PublishedAnswers | None
+    """What ``--publish`` published; null without it, or if it failed."""
     dry_run: DryRun
     changes: FileChanges
     notes: Notes
 
     @property
     def complete(self) -> bool:
-        """Whether no message and no request was refused, and all that are allowed were signed."""
+        """Whether no message, request or release was refused, and what is allowed was signed."""
+        if self.published and self.published.refused:
+            return False
         requests = (request for robot in self.robots for request in robot.requests)
         return all(robot.outcome != "refused" for robot in self.robots) and all(
             request.outcome in _GOOD for request in requests
@@ -193,6 +208,7 @@ def collect(
         inbox,
         [message.result() for message in taken],
         not_signed,
+        None,
         dry_run,
         changes,
         [*_unknown_names(inbox, fleet), *notes],
