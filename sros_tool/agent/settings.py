@@ -18,12 +18,11 @@ from sros_tool.errors import DocumentError, InvalidNameError, KeystoreError
 from sros_tool.files import read_toml, replace_file
 from sros_tool.fleet.robots import name_problem
 from sros_tool.folders import Folder
+from sros_tool.keystore.layout import AGENT
 from sros_tool.names import check_enclave_name
 from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
 from sros_tool.xml import read_bytes
 
-AGENT = ".agent"
-"""The folder of the agent in the security folder."""
 SETTINGS_FILE = "agent.toml"
 _UNIT = re.compile(r"[A-Za-z0-9:_.\\@-]{1,250}\.(?:service|target)\Z")
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")

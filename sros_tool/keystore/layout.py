@@ -48,6 +48,8 @@ RETIRED = "retired"
 """The folder for certificates and keys of replaced CAs."""
 STAGE = ".sros-transaction"
 """The folder of a transaction that is in progress, or was interrupted."""
+AGENT = ".agent"
+"""The folder of `sros agent` in the security folder of a robot."""
 LOCK = ".sros-lock"
 """The file that a writing process locks; it exists only while that process writes."""
 

@@ -50,6 +50,19 @@ def test_the_files_of_a_folder_are_replaced(place: Place) -> None:
     assert not beside(place)
 
 
+def test_the_folder_of_an_agent_stays(place: Place) -> None:
+    agent = Path(place.path, ".agent/metadata")
+    agent.mkdir(parents=True)
+    (agent / "root.json").write_text("trusted")
+    assert place.read() == OLD and place.is_closed()
+    install(place, NEW)
+    assert place.read() == NEW and place.is_closed()
+    assert (agent / "root.json").read_text() == "trusted"
+    (Path(place.path) / "enclaves/.agent").mkdir()
+    with pytest.raises(RefusedError, match="not a file of an enclave"):
+        place.read()
+
+
 def test_what_somebody_else_put_there_gives_way(place: Place) -> None:
     """Where a file or folder belongs, something else can have appeared since it was read."""
     top = Path(place.path, "enclaves")

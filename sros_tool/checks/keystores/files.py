@@ -14,6 +14,7 @@ from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.layout import (
+    AGENT,
     CONFIRMED,
     ENCLAVES,
     FLEET,
@@ -204,7 +205,7 @@ UNKNOWN_FILE = FindingKind(
     "Delete it, or keep it elsewhere.",
 )
 
-_KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
+_KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED, AGENT)
 _MOST_READ = 65536
 _KNOWN = (
     *REQUIRED_FILES,
@@ -305,6 +306,8 @@ def _below(
                 continue
             yield from _writers(path, info, trusted)
             yield from _openness(path, root, info.st_mode, home)
+        if parent == root and AGENT in folders:
+            folders.remove(AGENT)  # of `sros agent`, closed to others
         inside = os.path.relpath(parent, root)
         for name in sorted(files):
             path = os.path.join(parent, name)

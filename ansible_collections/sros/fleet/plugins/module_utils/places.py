@@ -28,6 +28,7 @@ _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _OF_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 _MOST_LINKS = 40
+_AGENT = ".agent"
 _LONGEST_WAIT = 60.0
 
 
@@ -45,6 +46,8 @@ class Place:
     - ``.keystore.sros-remove``: the change is decided.  What the new files lack is removed.
     - ``.keystore.sros-apply``: each new file takes its place.
     - ``.keystore.sros-old``: folders that are removed.
+
+    The folder ``.agent`` in it is that of ``sros agent``, and stays as it is.
 
     Whoever comes after a process that was killed ends a change that was decided, and drops another.
     ``.keystore.sros-restart`` lists the enclaves whose processes still have files of before, and
@@ -101,6 +104,7 @@ class Place:
         try:
             for folder, folders, files, handle in os.fwalk(".", dir_fd=top, onerror=_fail):
                 below = os.path.relpath(folder, ".")
+                self._leave_out_agent(below, folders, handle)
                 names = [(each, True) for each in folders] + [(each, False) for each in files]
                 for name, is_folder in names:
                     path = name if below == "." else f"{below}/{name}"
@@ -131,7 +135,8 @@ class Place:
 
     def is_closed(self) -> bool:
         """Return whether owners and modes are as `replace` leaves them."""
-        for _folder, _, files, handle in os.fwalk(self.path):
+        for folder, folders, files, handle in os.fwalk(self.path):
+            self._leave_out_agent(os.path.relpath(folder, self.path), folders, handle)
             state = os.fstat(handle)
             if state.st_uid != self._uid or stat.S_IMODE(state.st_mode) != 0o700:
                 return False
@@ -140,6 +145,11 @@ class Place:
                 if state.st_uid != self._uid or stat.S_IMODE(state.st_mode) != _mode(name):
                     return False
         return True
+
+    def _leave_out_agent(self, below: str, folders: list[str], handle: int) -> None:
+        """Take the agent's folder off the list of folders at the top."""
+        if below == "." and _AGENT in folders and self._is_kept(_AGENT, handle):
+            folders.remove(_AGENT)
 
     # ── changing ───────────────────────────────────────────────────────────────────────────
 
@@ -234,7 +244,9 @@ class Place:
                 os.rename(remove, self.path)
             else:
                 with _opened(remove) as new, _opened(self.path) as present:
-                    self._remove_others(new, present)
+                    has_agent = _AGENT in os.listdir(present) and self._is_kept(_AGENT, present)
+                    kept = frozenset({_AGENT} if has_agent else ())
+                    self._remove_others(new, present, kept)
                 os.rename(remove, apply)
             _flush(self._parent)
         if os.path.lexists(apply):
@@ -248,10 +260,10 @@ class Place:
             shutil.rmtree(old)
         _flush(self._parent)
 
-    def _remove_others(self, new: int, present: int) -> None:
-        """Remove what the open folder ``present`` has and ``new`` lacks."""
+    def _remove_others(self, new: int, present: int, but: frozenset[str] = frozenset()) -> None:
+        """Remove what the open folder ``present`` has and ``new`` lacks, except ``but``."""
         wanted = set(os.listdir(new))
-        for name in os.listdir(present):
+        for name in set(os.listdir(present)) - but:
             is_folder = name in wanted and _is_folder(name, new)
             fits = self._is_kept if is_folder else _is_no_folder
             if name not in wanted or not fits(name, present):

@@ -1,0 +1,194 @@
+"""The verbs of the agent, from what home publishes to what it takes in, with every part real."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sros_tool.keystore.reader import read_certificate
+from sros_tool.pki.certificates import validity_of
+from tests.cli.test_json import Seen
+from tests.support.harness import Ended, policy_text, publish, snapshot, sros
+
+FLEET = """
+[groups.renewing]
+renewal = "allowed"
+[robots]
+r1 = { groups = ["renewing"] }
+r2 = {}
+"""
+NAMES = ("/r1/a", "/r1/b")
+
+
+@dataclass
+class World:
+    """A keystore with a fleet, what it publishes, the folder of r1, and an inbox."""
+
+    folder: Path
+    monkeypatch: pytest.MonkeyPatch
+
+    def run(self, *words: object) -> Ended:
+        return sros(*words, cwd=self.folder)
+
+    def go_to(self, moment: datetime) -> None:
+        """Set the clock of home and of the robot."""
+        self.monkeypatch.setattr("sros_tool.cli.common._clock", lambda: moment)
+
+    def agent(self, *words: object) -> Ended:
+        return self.run("agent", "run", "robot", "--once", *words)
+
+    def collected(self) -> dict[str, Any]:
+        """Return what home takes in of r1."""
+        said = json.loads(self.run("fleet", "collect", "ks", "inbox", "--json").out)
+        return next(robot for robot in said["robots"] if robot["robot"] == "r1")
+
+    def status(self) -> dict[str, Any]:
+        said = json.loads(self.run("fleet", "status", "ks", "--json").out)
+        return next(robot for robot in said["robots"] if robot["robot"] == "r1")
+
+
+INIT = (
+    *("agent", "init", "robot", "--robot", "r1", "--from", "pub", "--inbox", "inbox"),
+    *("--root", "pub/metadata/1.root.json"),
+)
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The keystore, published, and the robot's folder before its agent; only to be copied."""
+    folder = tmp_path_factory.mktemp("agent")
+    (folder / "fleet.toml").write_text(FLEET)
+    names = {f"/{{robot}}/{name}": publish("/x") for name in ("a", "b")}
+    (folder / "p.xml").write_text(policy_text(names))
+    for words in (
+        "generate_artifacts -k ks -p p.xml --fleet fleet.toml",
+        "distribute_key ks --robot r1 robot",
+        "fleet publish ks pub",
+    ):
+        sros(*words.split(), cwd=folder).ok()
+    (folder / "inbox").mkdir()
+    return folder
+
+
+@pytest.fixture
+def world(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+    shutil.copytree(prepared, tmp_path / "world", symlinks=True)
+    yield World(tmp_path / "world", monkeypatch)
+
+
+def test_from_home_to_the_robot_and_back(world: World) -> None:
+    seen = Seen()
+    planned = world.run(*INIT, "--dry-run", "--json").ok()
+    assert not (world.folder / "robot/.agent").exists()
+    made = world.run(*INIT, "--json").ok()
+    assert json.loads(planned.out)["changes"] == json.loads(made.out)["changes"]
+    again = world.run(*INIT)
+    assert again.status == 2 and "already has an agent" in again.err
+    for ended in (planned, made):
+        seen.check("agent init", ended)
+    assert world.run("agent", "status", "robot").status == 1, "it has not run yet"
+    first = world.agent().ok()
+    said, sent = first.out.splitlines()
+    assert said.startswith("release ") and said.endswith(": nothing new")
+    assert sent == "sent to home"
+    assert world.collected()["outcome"] == "kept"
+    assert world.status()["state"] == "current"
+    world.run("revoke", "ks", "--robot", "r2").ok()
+    world.run("fleet", "publish", "ks", "pub").ok()
+    assert world.status()["state"] != "current"
+    second = world.agent("--json").ok()
+    seen.check("agent run", second)
+    value = json.loads(second.out)
+    assert value["changed"] == [*NAMES] and value["sent"] and not value["problems"]
+    assert (world.folder / "robot/enclaves/r1/a/crl.pem").exists()
+    assert world.collected()["outcome"] == "kept"
+    status = world.run("agent", "status", "robot", "--json")
+    seen.check("agent status", status)
+    for verb in ("agent init", "agent run", "agent status"):
+        assert seen.unseen(verb) == []
+    assert json.loads(status.out)["release"] == value["release"] > int(said.split()[1].rstrip(":"))
+    world.run("verify", "robot").ok()
+
+
+def test_renewal_without_anybody_at_the_robot(world: World) -> None:
+    world.run(*INIT).ok()
+    world.agent().ok()
+    certificate = world.folder / "robot/enclaves/r1/a/cert.pem"
+    before = read_certificate(certificate)
+    validity = validity_of(before)
+    late = validity.not_after - (validity.not_after - validity.not_before) / 4
+    world.go_to(late)
+    world.run("renew", "ks", "/r1/b").ok()
+    world.run("fleet", "publish", "ks", "pub").ok()
+    asked = world.agent()
+    assert "asked for renewal of 1 enclave" in asked.out, asked
+    took = world.collected()
+    assert [request["outcome"] for request in took["requests"]] == ["renewed"], took
+    world.go_to(late + timedelta(minutes=10))
+    world.run("fleet", "publish", "ks", "pub").ok()
+    done = world.agent()
+    assert "changed 1 enclave" in done.out, done
+    after = read_certificate(certificate)
+    assert validity_of(after).not_before > validity.not_before
+    assert after.public_key() == before.public_key()
+    assert "asked for" not in done.out
+    world.run("verify", "robot").ok()
+
+
+def test_a_robot_that_was_away_for_a_month_goes_on(world: World) -> None:
+    world.run(*INIT).ok()
+    world.agent().ok()
+    before = snapshot(world.folder / "robot/enclaves")
+    world.go_to(datetime.now(UTC) + timedelta(days=30))
+    frozen = world.agent()
+    assert frozen.status == 1 and "expired" in frozen.err and "set the clock" in frozen.err
+    assert "sent to home" in frozen.out
+    assert snapshot(world.folder / "robot/enclaves") == before
+    world.run("renew", "ks", "/r1/a").ok()
+    world.run("fleet", "publish", "ks", "pub").ok()
+    assert "changed 1 enclave" in world.agent().ok().out
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("--robot", "../r1"), "not the name of a robot"),
+        (("--from", "ftp://x"), "neither a URL"),
+        (("--unit", "camera.service"), "names no enclave"),
+        (("--unit", "camera=/r1/a"), "not the name of a service"),
+        (("--ca", "x"), "neither a certificate file nor"),
+        (("--root", "ks/sros.toml"), "not the root metadata"),
+        (("--systemctl", ""), "systemctl is empty"),
+    ],
+)
+def test_wrong_options_set_up_nothing(words: tuple[str, ...], why: str, world: World) -> None:
+    refused = world.run(*INIT, *words)
+    assert refused.status == 2 and why in refused.err, refused
+    assert len(refused.err.splitlines()) == 1
+    assert not (world.folder / "robot/.agent/agent.toml").exists()
+    assert world.agent().status == 2
+
+
+def test_a_keystore_with_its_cas_gets_no_release(world: World) -> None:
+    words = [word if word != "robot" else "ks" for word in INIT]
+    world.run(*words).ok()
+    before = snapshot(world.folder / "ks/enclaves")
+    ended = world.run("agent", "run", "ks", "--once")
+    assert ended.status == 1 and "is a keystore with CAs" in ended.err
+    assert snapshot(world.folder / "ks/enclaves") == before
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs a folder of another user")
+def test_root_is_no_agent_of_another_user(world: World) -> None:
+    world.run(*INIT).ok()
+    os.chown(world.folder / "robot", 1000, 1000)
+    ended = world.agent()
+    assert ended.status == 2 and "belongs to user" in ended.err
