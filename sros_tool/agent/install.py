@@ -45,7 +45,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     search_enclaves,
 )
-from sros_tool.keystore.reader import OpenedEnclave, weaknesses
+from sros_tool.keystore.reader import OpenedEnclave, open_enclave, weaknesses
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.certificates import (
@@ -57,6 +57,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.crl import last_update, list_number, next_update, read_lists, signed_by
 from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem, load_key
+from sros_tool.validity import iso
 
 _OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
 _OF_ENCLAVE = (*sorted(RELEASE_FILES), *KEY_FILES, REQUEST, SEAL)
@@ -305,6 +306,7 @@ def _change(
     problems += _weak(state)
     if problems:
         raise KeystoreError("its new files cannot be used", "; ".join(problems))
+    _check_not_older(folder, place, state, now)
     change = _Change()
     for file, data in files.items():
         if _content(folder, f"{place}/{file}") != data:
@@ -318,6 +320,42 @@ def _change(
         if file not in files and folder.state(f"{place}/{file}")
     ]
     return change
+
+
+def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datetime) -> None:
+    """Raise `KeystoreError` if the enclave has newer files, which a play or `sros import` brought.
+
+    Only files that a process could load count: the owner of the folder can write anything into it.
+    """
+    if folder.state(f"{place}/{CERTIFICATE_FILE}") is None:
+        return
+    present = open_enclave(folder.path / place, now=now)
+    if present.problems or not (present.certificate and sent.certificate):
+        return
+    same_authority = present.files.get(PERMISSIONS_CA_FILE) == sent.files.get(PERMISSIONS_CA_FILE)
+    newer = [
+        f"its {what} is valid from {iso(here)}, that of the release from {iso(there)}"
+        for what, here, there in (
+            (
+                "certificate",
+                validity_of(present.certificate).not_before,
+                validity_of(sent.certificate).not_before,
+            ),
+            ("grant", _begin_of_grant(present), _begin_of_grant(sent)),
+        )
+        if here and there and here > there
+    ]
+    if same_authority and newer:
+        raise KeystoreError(
+            "it has newer files than the release",
+            f"{newer[0]}; publish again at home",
+        )
+
+
+def _begin_of_grant(state: OpenedEnclave) -> datetime | None:
+    with suppress(SrosError):
+        return state.grant.validity.not_before if state.grant else None
+    return None
 
 
 def _weak(state: OpenedEnclave) -> list[str]:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+
+import pytest
 
 from sros_tool.keystore.delivery.export import exported_files
 from sros_tool.keystore.delivery.release import Release, seal_releases
@@ -79,7 +81,9 @@ def make_home(folder: Path) -> Home:
     sros("distribute_key", root, *NAMES, delivered).ok()
     authority = authority_of(root)
     first = release_of(files_of(root), 1, authority)
-    sros("renew", root, "/r1/a").ok()
+    with pytest.MonkeyPatch.context() as patch:  # certificates count in seconds
+        patch.setattr("sros_tool.cli.common._clock", lambda: moment() + timedelta(hours=1))
+        sros("renew", root, "/r1/a").ok()
     renewed = release_of(files_of(root), 2, authority)
     sros("revoke", root, "/r2/x").ok()
     return Home(root, delivered, first, renewed, release_of(files_of(root), 3, authority))

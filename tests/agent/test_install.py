@@ -16,6 +16,7 @@ import pytest
 from sros_tool.agent.install import Installation, install_release
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.delivery.release import Release
+from sros_tool.pki import smime
 from sros_tool.pki.certificates import digest, make_request
 from sros_tool.pki.keys import generate_key
 from tests.agent.releases import NAMES, Home, authority_of, files_of, moment, release_of
@@ -104,6 +105,7 @@ def test_units_and_containers_keep_their_view_through_many_installations(
 ) -> None:
     """A unit of `sros units` sees one enclave alone, a container the folder of another one."""
     key = (robot / B / "key.pem").read_bytes()
+    governance = smime.parse(home.first.files[f"{A}/governance.p7s"]).document
     script = VIEW.format(robot=robot, spare=tmp_path / "spare")
     user = [] if os.geteuid() == 0 else ["--map-root-user"]
     command = ["unshare", *user, "--mount", "sh", "-c", script]
@@ -121,8 +123,9 @@ def test_units_and_containers_keep_their_view_through_many_installations(
         full = seen()
         assert full == f"b {hashlib.sha256(key).hexdigest()}  - 6 6 \n"
         for number in range(10, 60 if LONG else 20):
-            files = home.renewed.files if number % 2 else home.first.files
-            assert install(robot, home.release(files, number)).changed == ("/r1/a",) or number == 10
+            signed = home.authority.sign(governance, "the governance")  # again, so other bytes
+            files = {**home.first.files, f"{A}/governance.p7s": signed}
+            assert install(robot, home.release(files, number)).changed == ("/r1/a",)
         assert seen() == full
         assert install(robot, home.revoked).changed == NAMES
         assert seen() == full.replace("6 6", "7 7"), "the revocation list comes into both"
@@ -272,6 +275,22 @@ def test_an_enclave_that_the_release_does_not_have_goes(home: Home, robot: Path)
     assert done.removed == ("/r1/b", "/r1/c")
     assert not (robot / B).exists() and os.listdir(robot / C) == ["notes.txt"]
     assert (robot / "enclaves/r1/new/key.pem").exists(), "it waits for its answer"
+
+
+def test_what_a_play_brought_meanwhile_is_not_taken_back(home: Home, robot: Path) -> None:
+    """Home renewed an enclave and delivered it, and did not publish it yet."""
+    assert install(robot, home.revoked).changed == NAMES
+    done = install(robot, home.release({**home.revoked.files, **older_a(home)}))
+    assert set(done.kept) == {"/r1/a"} and "newer files than the release" in done.kept["/r1/a"]
+    assert has(robot, home.revoked)
+    (robot / A / "permissions.p7s").write_text("mine")
+    done = install(robot, home.release({**home.revoked.files, **older_a(home)}))
+    assert done.changed == ("/r1/a",), "files that no process can load are not newer"
+
+
+def older_a(home: Home) -> dict[str, bytes]:
+    """Return the files of /r1/a as first delivered, with the present revocation list."""
+    return {path: data for path, data in home.first.files.items() if in_one_of(path, ("/r1/a",))}
 
 
 def test_a_new_enclave_with_a_key_of_this_robot_and_its_next_key(
