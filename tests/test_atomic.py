@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import KeystoreError
-from sros_tool.files import new_files, replace_file, write_new_folder
+from sros_tool.files import new_files, replace_file, write_new_file, write_new_folder
 
 
 def test_a_file_keeps_its_mode_and_a_link_its_target(tmp_path: Path) -> None:
@@ -51,6 +51,17 @@ def test_a_device_is_never_replaced(tmp_path: Path) -> None:
 
 
 FILES = {"a.xml": b"a", "common/node/b.xml": b"b"}
+
+
+def test_only_its_owner_can_read_a_new_file_that_is_never_one_of_before(
+    tmp_path: Path, free_umask: None
+) -> None:
+    path = tmp_path / "secret"
+    write_new_file(path, b"secret")
+    assert (path.read_bytes(), stat.S_IMODE(path.stat().st_mode)) == (b"secret", 0o600)
+    with pytest.raises(FileExistsError):
+        write_new_file(path, b"another")
+    assert path.read_bytes() == b"secret"
 
 
 def tree(folder: Path) -> dict[str, bytes]:

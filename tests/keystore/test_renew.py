@@ -26,6 +26,7 @@ from sros_tool.policy.document import read_policy
 from tests.support.harness import (
     certificate,
     check_whole,
+    made_once,
     policy_text,
     publish,
     snapshot,
@@ -41,10 +42,12 @@ RENEWED = {"cert.pem", "permissions.p7s", "permissions.xml"}
 
 
 def made(root: Path, *names: str, template: str = "production", **more: timedelta) -> Path:
-    choices = replace(load_template(template), **more)  # type: ignore[arg-type]
-    create_keystore(root, template=choices, now=NOW)
-    create_enclaves(root, names, now=NOW)
-    return root
+    def make(root: Path) -> None:
+        choices = replace(load_template(template), **more)  # type: ignore[arg-type]
+        create_keystore(root, template=choices, now=NOW)
+        create_enclaves(root, names, now=NOW)
+
+    return made_once(root, make, names, template, *more.items())
 
 
 def changed(before: dict[str, tuple[int, bytes]], root: Path) -> set[str]:

@@ -26,17 +26,27 @@ from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import validity_of
 from sros_tool.pki.crl import REASONS, SUPERSEDED, RevocationList
 from tests.support.children import run
-from tests.support.harness import certificate, check_whole, policy_text, publish, snapshot, sros
+from tests.support.harness import (
+    certificate,
+    check_whole,
+    made_once,
+    policy_text,
+    publish,
+    snapshot,
+    sros,
+)
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
 DAY = timedelta(days=1)
 
 
 def made(root: Path, *names: str, template: str = "production", **more: timedelta) -> Path:
-    choices = replace(load_template(template), **more)  # type: ignore[arg-type]
-    create_keystore(root, template=choices, now=NOW)
-    create_enclaves(root, names, now=NOW)
-    return root
+    def make(root: Path) -> None:
+        choices = replace(load_template(template), **more)  # type: ignore[arg-type]
+        create_keystore(root, template=choices, now=NOW)
+        create_enclaves(root, names, now=NOW)
+
+    return made_once(root, make, names, template, *more.items())
 
 
 def serial(root: Path, name: str) -> int:
@@ -246,7 +256,8 @@ def test_an_ended_list_locks_everybody_out_until_it_is_refreshed(tmp_path: Path)
 
 def test_a_list_of_another_authority_is_seen(tmp_path: Path) -> None:
     """Also where that has the same name, as all of ros2/sros2 have."""
-    roots = [made(tmp_path / name, "/a", "/b", template="sros2") for name in ("one", "two")]
+    both = {"one": ("/a", "/b"), "two": ("/b", "/a")}  # made apart, by CAs of their own
+    roots = [made(tmp_path / name, *names, template="sros2") for name, names in both.items()]
     for root in roots:
         revoke(root, ["/a"], now=NOW)
     crls = [root / "public/identity_ca.crl.pem" for root in roots]

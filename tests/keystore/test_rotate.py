@@ -32,7 +32,15 @@ from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.policy.document import read_policy
 from tests.keystore.test_transaction import DIED, in_child
 from tests.support import made_by_ros2
-from tests.support.harness import check_enclave_whole, policy_text, publish, remains, snapshot, sros
+from tests.support.harness import (
+    check_enclave_whole,
+    made_once,
+    policy_text,
+    publish,
+    remains,
+    snapshot,
+    sros,
+)
 from tests.support.long_form import ONLY_LONG, some
 
 NOW = datetime.now(UTC)
@@ -53,18 +61,23 @@ def separate(tmp_path: Path) -> Path:
 def make(folder: Path, template: str) -> Path:
     policy = folder / "policy.xml"
     policy.write_text(policy_text({name: publish(f"t{name}") for name in NAMES}))
-    create_keystore(folder / "ks", template=load_template(template), now=NOW)
-    generate_artifacts(folder / "ks", policies=[read_policy(policy)], now=NOW)
-    return folder / "ks"
+
+    def make(root: Path) -> None:
+        create_keystore(root, template=load_template(template), now=NOW)
+        generate_artifacts(root, policies=[read_policy(policy)], now=NOW)
+
+    return made_once(folder / "ks", make, template)
 
 
 def check(root: Path, now: datetime = NOW) -> None:
-    """Every enclave can be loaded by its first CA alone (Cyclone DDS), and openssl agrees."""
+    """Every enclave can be loaded by its first CA alone (Cyclone DDS); openssl agrees for some."""
     assert not remains(root.parent)
-    for name in list_enclaves(root):
+    names = list_enclaves(root)
+    for name in names:
+        assert open_enclave(enclave_path(root, name), now=now).problems == (), name
+        check_enclave_whole(enclave_path(root, name))
+    for name in some(names, 1):
         folder = enclave_path(root, name)
-        assert open_enclave(folder, now=now).problems == (), name
-        check_enclave_whole(folder)
         identity, permissions = (folder / f"{r}_ca.cert.pem" for r in ("identity", "permissions"))
         openssl("verify", "-x509_strict", "-CAfile", identity, folder / "cert.pem")
         for document in ("permissions", "governance"):

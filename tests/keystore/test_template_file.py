@@ -87,6 +87,18 @@ def test_the_shipped_ones_read_back(name: str) -> None:
     assert template.separate_authorities or name == "sros2"
 
 
+@pytest.mark.parametrize("name", template_names())
+def test_what_the_shipped_ones_protect(name: str) -> None:
+    template = load_template(name)
+    everything = TopicProtection(Level.ENCRYPT, Level.ENCRYPT, True, True, True, True)
+    rtps = Level.ENCRYPT if name == "production" else Level.SIGN
+    whole = DomainProtection(rtps, Level.ENCRYPT, Level.ENCRYPT, False, True, everything)
+    assert template.protection == whole
+    denies = name == "production"
+    assert template.default_permissions == (NODE_BASICS if denies else EVERYTHING)
+    assert template.unique_subject is denies
+
+
 @pytest.mark.parametrize(
     ("enclave", "longest"),
     [("/operator/look", 1), ("/operator/a/b", 1), ("/operator", None), ("/robot", None)],

@@ -61,7 +61,7 @@ class Change:
                 place.write_bytes(text.encode() if isinstance(text, str) else text)
         self.git("add", "--all", "--force")
         self.git("commit", "--quiet", "--allow-empty", "--message", "x")
-        commit = self.git("rev-parse", "HEAD")
+        commit = (self.folder / ".git/refs/heads/main").read_text().strip()
         self.base = self.base or commit
         return commit
 

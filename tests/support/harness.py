@@ -5,12 +5,13 @@ from __future__ import annotations
 import gc
 import io
 import os
+import shutil
 import signal
 import stat
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -28,6 +29,21 @@ from sros_tool.pki import smime
 from tests.support.children import Forked
 
 STAGES = (".sros-transaction", ".sros-")
+
+_KEPT: dict[Hashable, Path] = {}
+"""Keystores that were made in this process, by how they were made; only to be copied."""
+
+
+def made_once(root: Path, make: Callable[[Path], object], *how: Hashable) -> Path:
+    """Make a keystore at ``root``; another one of the same ``how`` is a copy, with the same CAs."""
+    key = (make.__qualname__, make.__module__, *how)
+    if key not in _KEPT:
+        make(root)
+        kept = root.parents[1] / f"kept-{len(_KEPT)}"
+        _KEPT[key] = Path(shutil.copytree(root, kept, symlinks=True))
+    else:
+        shutil.copytree(_KEPT[key], root, symlinks=True)
+    return root
 
 
 @dataclass(frozen=True)
