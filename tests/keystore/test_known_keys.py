@@ -67,6 +67,15 @@ CERTIFIED: dict[str, Callable[[Path, bytes], object]] = {
 }
 
 
+def test_a_revoked_key_is_known_without_the_ledger(keystore: Path) -> None:
+    key = (keystore / "enclaves/a/key.pem").read_bytes()
+    revoke(keystore, ["/a"], now=NOW)
+    for file in ("ledger.jsonl", "ledger.p7s"):
+        (keystore / file).unlink()
+    with pytest.raises(KeystoreError, match="was revoked"):
+        sign(keystore, key, "/new")
+
+
 @pytest.mark.parametrize("way", CERTIFIED)
 @pytest.mark.parametrize("state", REVOKED)
 def test_a_revoked_key_is_not_certified_again(state: str, way: str, keystore: Path) -> None:

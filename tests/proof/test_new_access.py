@@ -296,6 +296,16 @@ def test_a_governance_that_opens_a_topic(made: Path) -> None:
     assert "- more protection: protection.data NONE -> ENCRYPT" in back.out
 
 
+def test_an_enclave_that_only_joins_is_new_access(tmp_path: Path) -> None:
+    (tmp_path / "before.xml").write_text(policy_text({"/a": publish("/x")}))
+    (tmp_path / "after.xml").write_text(policy_text({"/a": publish("/x"), "/new": ""}))
+    for words, status in ((("before", "after"), 1), (("after", "before"), 0)):
+        files = (f"{word}.xml" for word in words)
+        ended = sros("diff_policy", "--no-new-access", *files, cwd=tmp_path)
+        assert ended.status == status, ended
+        assert ("+ /new join the domain" in ended.out) is bool(status), ended
+
+
 LOOSER = {
     "topics": ("--rule", "topic /wheels data=NONE metadata=NONE"),
     "writing": ("--rule", "topic /wheels write_access_control=false"),

@@ -110,6 +110,16 @@ def test_the_first_of_two_variables_counts_as_for_getenv(proc: Proc) -> None:
     assert (process.user, process.network) == (8, "net:[1]")
 
 
+@pytest.mark.parametrize(("enable", "loads"), [("true", True), ("True", False), ("", False)])
+def test_only_a_process_with_security_loads_an_enclave(
+    enable: str, loads: bool, proc: Proc
+) -> None:
+    variables = f"ROS_SECURITY_ENABLE={enable}", "ROS_SECURITY_KEYSTORE=/k"
+    proc.add(5, *ROS, environment="\0".join(variables).encode())
+    (process,) = proc.look().processes
+    assert (process.enclave is not None) is loads
+
+
 def test_endless_texts_are_not_looked_at_and_named(proc: Proc) -> None:
     folder = proc.add(7, *ROS)
     with (folder / "environ").open("wb") as file:
