@@ -1,0 +1,214 @@
+"""The recipe for nginx in docs/fetching.md, with a real nginx between robots and home."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import re
+import shutil
+import socket
+import ssl
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sros_tool.agent.fetch import ClientCertificate, fetch_release, pin_root
+from sros_tool.agent.inbox import send
+from sros_tool.errors import SrosError, UnavailableError
+from sros_tool.keystore.confirmation import MAX_BYTES, MESSAGE_FILE
+from tests.support.harness import policy_text, publish, sros
+from tests.support.messages import said_by, signed_message
+
+NGINX = "/usr/sbin/nginx"
+PAGE = Path(__file__).parents[2] / "docs/fetching.md"
+pytestmark = pytest.mark.skipif(not Path(NGINX).exists(), reason="nginx is needed")
+
+_AROUND = """
+pid {folder}/nginx.pid;
+error_log {folder}/error.log;
+{user}
+events {{}}
+http {{
+    access_log off;
+    proxy_temp_path {folder}/t1;
+    fastcgi_temp_path {folder}/t2;
+    uwsgi_temp_path {folder}/t3;
+    scgi_temp_path {folder}/t4;
+    include {folder}/fleet.conf;
+}}
+"""
+
+
+@dataclass
+class Server:
+    """Home with the web server of the recipe: a keystore, what is published, and an inbox."""
+
+    folder: Path
+    run: Path
+    """Folder of the configuration and the process of nginx."""
+    port: int = 0
+
+    @property
+    def address(self) -> str:
+        return f"https://127.0.0.1:{self.port}"
+
+    @property
+    def tls_ca(self) -> Path:
+        return self.folder / "etc/server.cert.pem"
+
+    def certificate(self, robot: str) -> ClientCertificate:
+        """Return the files with which a robot identifies itself: those of its enclave."""
+        place = self.folder / robot / f"enclaves/{robot}/base"
+        return ClientCertificate(place / "cert.pem", place / "key.pem")
+
+    def put(self, robot: str, message: bytes, to: str = "") -> None:
+        """Send a message as the agent of ``robot``, to the inbox of ``to``."""
+        send(
+            f"{self.address}/inbox",
+            to or robot,
+            message,
+            client_certificate=self.certificate(robot),
+            tls_ca=self.tls_ca,
+        )
+
+    def ask(self, robot: str, method: str, path: str, body: bytes = b"") -> int:
+        """Return the status that the server answers to a request of a robot; "" is nobody."""
+        context = ssl.create_default_context(cafile=str(self.tls_ca))
+        if robot:
+            context.load_cert_chain(*self.certificate(robot))
+        connection = http.client.HTTPSConnection("127.0.0.1", self.port, context=context)
+        try:
+            connection.request(method, path, body or None)
+            return connection.getresponse().status
+        finally:
+            connection.close()
+
+    def message(self, robot: str) -> bytes:
+        folder = self.folder / robot
+        said = said_by(folder, robot, datetime.now(UTC))
+        return signed_message(folder, f"/{robot}/base", said)
+
+    def start(self, *, with_list: bool = False) -> None:
+        """Start nginx as the page says, with the paths and a free port of this machine."""
+        (block,) = re.findall(r"```nginx\n(.*?)```", PAGE.read_text(), re.DOTALL)
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        text = block.replace("/etc/nginx/fleet/", f"{self.folder}/etc/")
+        text = text.replace("/srv/fleet", str(self.folder / "srv"))
+        text = text.replace("listen 443", f"listen 127.0.0.1:{self.port}")
+        if with_list:
+            text = text.replace("#ssl_crl", "ssl_crl")
+        self.run.mkdir()
+        (self.run / "fleet.conf").write_text(text)
+        user = "user root;" if os.geteuid() == 0 else ""
+        (self.run / "nginx.conf").write_text(_AROUND.format(folder=self.run, user=user))
+        assert self._nginx() == 0, (self.run / "error.log").read_text()
+
+    def stop(self) -> None:
+        self._nginx("-s", "stop")
+
+    def _nginx(self, *words: str) -> int:
+        command = [NGINX, "-p", str(self.run), "-c", str(self.run / "nginx.conf"), *words]
+        return subprocess.run(command, capture_output=True, check=False).returncode
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    folder = tmp_path_factory.mktemp("nginx")
+    made = Server(folder, folder / "nginx")
+    (folder / "fleet.toml").write_text("[robots]\nr1 = {}\nr2 = {}\nr3 = {}\n")
+    (folder / "policy.xml").write_text(policy_text({"/{robot}/base": publish("/x")}))
+    for line in (
+        "create_keystore ks --template production",
+        "generate_artifacts -k ks -p policy.xml --fleet fleet.toml",
+        *(f"distribute_key ks --robot {robot} {robot}" for robot in ("r1", "r2", "r3")),
+        "fleet publish ks srv/pub",
+    ):
+        sros(*line.split(), cwd=folder).ok()
+    (folder / "srv/inbox").mkdir()
+    (folder / "etc").mkdir()
+    shutil.copy(folder / "ks/public/identity_ca.cert.pem", folder / "etc")
+    subprocess.run(
+        [
+            *("openssl", "req", "-x509", "-newkey", "ec", "-nodes", "-subj", "/CN=home"),
+            *("-pkeyopt", "ec_paramgen_curve:prime256v1", "-addext", "subjectAltName=IP:127.0.0.1"),
+            *("-keyout", folder / "etc/server.key.pem", "-out", folder / "etc/server.cert.pem"),
+        ],
+        check=True,
+        capture_output=True,
+    )
+    made.start()
+    yield made
+    made.stop()
+
+
+def test_a_robot_writes_its_own_message_alone(server: Server) -> None:
+    """Whoever else writes, reads or lists is refused; the message is what home takes in."""
+    message = server.message("r1")
+    place = server.folder / "srv/inbox"
+    for other in ("r2", "r9", "..", "r1/..%2fr2"):
+        with pytest.raises(UnavailableError, match=r"answers 40[034]"):
+            server.put("r1", message, to=other)
+    assert list(place.iterdir()) == []
+    server.put("r1", message)
+    assert (place / "r1" / MESSAGE_FILE).read_bytes() == message
+    server.put("r2", server.message("r2"))
+    path = f"/inbox/r1/{MESSAGE_FILE}"
+    for robot in ("r1", "r2"):
+        assert server.ask(robot, "GET", path) == 403
+        assert server.ask(robot, "DELETE", path) == 403
+    for path in ("/inbox/", "/inbox/r1/", "/inbox/r1/other", "/ks/sros.toml", "/"):
+        assert {server.ask("r1", method, path, b"x") for method in ("GET", "PUT")} == {404}, path
+    assert server.ask("r1", "PUT", f"/inbox/r1/{MESSAGE_FILE}", bytes(MAX_BYTES + 1)) == 413
+    assert (place / "r1" / MESSAGE_FILE).read_bytes() == message
+    ended = sros("fleet", "collect", "ks", "srv/inbox", cwd=server.folder).ok()
+    assert ended.out.startswith("3 robots: 2 kept, 1 missing")
+
+
+def test_a_robot_reads_what_is_published_and_writes_nothing_there(
+    server: Server, tmp_path: Path
+) -> None:
+    pub = server.folder / "srv/pub"
+    now = datetime.now(UTC)
+    pin_root(tmp_path, (pub / "metadata/1.root.json").read_bytes(), now=now)
+    fetched = fetch_release(
+        tmp_path,
+        f"{server.address}/pub",
+        "r1",
+        now=now,
+        client_certificate=server.certificate("r1"),
+        tls_ca=server.tls_ca,
+    )
+    assert fetched and fetched.robot == "r1"
+    timestamp = (pub / "metadata/timestamp.json").read_bytes()
+    for method in ("PUT", "DELETE"):
+        assert server.ask("r1", method, "/pub/metadata/timestamp.json", b"{}") == 403
+    assert (pub / "metadata/timestamp.json").read_bytes() == timestamp
+    assert server.ask("r1", "GET", "/pub/") == 403, "nothing is listed"
+    with pytest.raises(SrosError):
+        fetch_release(tmp_path, f"{server.address}/pub", "r1", now=now, tls_ca=server.tls_ca)
+
+
+def test_who_has_no_certificate_of_the_keystore(server: Server) -> None:
+    """Nobody, another keystore, and a robot that was revoked, once nginx has the list."""
+    path = "/pub/metadata/timestamp.json"
+    assert server.ask("", "GET", path) == 400
+    other = server.folder / "other"
+    sros("create_keystore", other).ok()
+    sros("create_enclave", other, "/other/base").ok()
+    assert server.ask("other", "GET", path) == 400
+    assert server.ask("r3", "GET", path) == 200
+    sros("revoke", "ks", "--robot", "r3", cwd=server.folder).ok()
+    shutil.copy(server.folder / "ks/public/identity_ca.crl.pem", server.folder / "etc")
+    listed = Server(server.folder, server.folder / "listed")
+    listed.start(with_list=True)
+    try:
+        assert listed.ask("r3", "GET", path) == 400
+        assert listed.ask("r2", "GET", path) == 200
+    finally:
+        listed.stop()
