@@ -148,6 +148,11 @@ def _upwards(name: str) -> Iterator[str]:
         name = name.rpartition("/")[0]
 
 
+def folders_of_robots(fleet: Fleet, robots: Collection[str]) -> tuple[str, ...]:
+    """Return the sorted enclave folders, such as ``/r3``, that any of the robots has."""
+    return tuple(sorted(path for path, of in _folders(fleet).items() if not of.isdisjoint(robots)))
+
+
 def _folders(fleet: Fleet) -> Mapping[str, frozenset[str]]:
     """Map enclave folders of robots, such as ``/r3``, to the names of the robots (usually one).
 

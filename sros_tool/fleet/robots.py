@@ -18,7 +18,7 @@ from sros_tool.errors import DocumentError, UsageError
 from sros_tool.names import expression_problem
 from sros_tool.validity import parse_duration
 
-MAX_ROBOTS = 10_000
+MAX_ROBOTS = 100_000
 RENEWAL_ALLOWED, _RENEWAL_REFUSED = "allowed", "refused"
 ROUTERS = "/{robot}/router"
 """Default path of the enclave of each robot's Zenoh router."""

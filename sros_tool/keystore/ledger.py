@@ -273,6 +273,7 @@ class LedgerFile:
         self._follow_link = follow_link
         self._files: _Files | None = None
         self._readings: dict[bytes, _Reading] = {}
+        self._recorded: Sequence[str] | None = None
 
     def ledger(self) -> Ledger:
         """Return the ledger; empty for a keystore that has none (of ros2/sros2).
@@ -316,6 +317,16 @@ class LedgerFile:
             return max(state.lines, state.number) + 1
         return self.ledger().next_number()
 
+    def recorded_enclaves(self) -> Sequence[str] | None:
+        """Return the sorted enclaves whose last certificate was not revoked; None without an index.
+
+        They may be missing in the keystore, and enclaves that were put there by hand lack.
+        """
+        if self._recorded is None and (index := self._opened().ledger_index):
+            with suppress(SrosError):  # a damaged index is read no more
+                self._recorded = sorted(index.names())
+        return self._recorded
+
     @property
     def is_indexed(self) -> bool:
         """Whether an index finds entries, so that few of them take little time."""
@@ -342,13 +353,8 @@ class LedgerFile:
 
         if index := self._opened().ledger_index:
             return IndexUpdate(index)
-        update = IndexUpdate(None)
         with _open(self.root, self._follow_link) or io.BytesIO() as file:
-            for line in file:
-                text = line.removesuffix(b"\n")
-                if entry := _parse(text):
-                    update.add(entry, text)
-        return update
+            return _index_of(file)
 
     def content(self) -> Iterator[bytes]:
         """Yield the bytes of all lines, in blocks."""
@@ -401,6 +407,12 @@ class LedgerFile:
         from sros_tool.keystore.ledger_index import LedgerIndex
 
         index = LedgerIndex.open(self.root, head.lines, head.last, head.index_root)
+        if index is None and not self._follow_link:
+            # The keystore is locked, so that the index can be made again, from the same lines.
+            made = _index_of(file)
+            if made.root() == head.index_root:
+                made.save(self.root)
+                index = LedgerIndex.open(self.root, head.lines, head.last, head.index_root)
         ends_so = index and _last_line(file, index.state.size) == head.last
         file.seek(0)
         return index if ends_so else None
@@ -494,6 +506,18 @@ class LedgerFile:
         unrecorded = [fault for fault in faults if fault.line >= last_recorded]
         sound = not (faults or read.unchained)
         return _Reading(ledger, unrecorded, read.previous, read.ended, sound)
+
+
+def _index_of(file: BinaryIO) -> IndexUpdate:
+    """Return the index of all lines of a ledger."""
+    from sros_tool.keystore.ledger_index import IndexUpdate
+
+    index = IndexUpdate(None)
+    for line in iter(lambda: file.readline(_LONGEST_LINE), b""):
+        text = line.removesuffix(b"\n")
+        if entry := _parse(text):
+            index.add(entry, text)
+    return index
 
 
 _Terms: TypeAlias = Collection[tuple[str, str]]

@@ -8,7 +8,8 @@ not used, and is made again from the ledger when the keystore is next changed.
 
 A *term* is the value of a field of an entry, such as the name of an enclave.  A *posting* says
 that a line has a term, where the line is, and what its digest is.  Postings are kept in buckets by
-the first bits of their terms; the root is the digest of the digests of all buckets.
+the first bits of their terms, each with the names of the enclaves whose postings are in it and
+whose last certificate was not revoked; the root is the digest of the digests of all buckets.
 """
 
 from __future__ import annotations
@@ -21,22 +22,25 @@ import struct
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 from urllib.parse import quote
 
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import LEDGER_INDEX
+from sros_tool.pki.crl import SUPERSEDED
 
 _NEW = f"{LEDGER_INDEX}.new"
 _BUCKETS = 4096
 _POSTING = struct.Struct(">16sIQI32s")
 _DIGEST = 32
-_EMPTY = hashlib.sha256().digest()
+_EMPTY = hashlib.sha256().digest() * 2
+"""The digests of the names and of the postings of an empty bucket."""
 _FIELDS = ("enclave", "serial", "sha256", "key")
 _FREQUENT = ("certificate", "permissions")
 """Kinds of entries that are half of a ledger each, so that no index helps to find them."""
 _SCHEMA = (
-    "CREATE TABLE buckets (bucket INTEGER PRIMARY KEY, postings BLOB NOT NULL)",
+    "CREATE TABLE buckets (bucket INTEGER PRIMARY KEY, names BLOB NOT NULL, "
+    "postings BLOB NOT NULL)",
     "CREATE TABLE state (lines INTEGER NOT NULL, size INTEGER NOT NULL, number INTEGER NOT NULL, "
     "last TEXT NOT NULL, digests BLOB NOT NULL)",
 )
@@ -88,6 +92,14 @@ class IndexedEntry(Protocol):
         """Kind of the entry."""
 
     @property
+    def enclave(self) -> str:
+        """Name of the enclave, or ""."""
+
+    @property
+    def reason(self) -> str:
+        """Reason of a revocation, or ""."""
+
+    @property
     def number(self) -> int:
         """Number of an answer, or 0."""
 
@@ -104,6 +116,14 @@ def _term(name: str, value: str) -> bytes:
 
 def _bucket_of(term: bytes) -> int:
     return int.from_bytes(term[:2], "big") % _BUCKETS
+
+
+def _joined(names: Iterable[str]) -> bytes:
+    return "\n".join(sorted(names)).encode("utf-8", "surrogatepass")
+
+
+def _split(names: bytes) -> set[str]:
+    return {name for name in names.decode("utf-8", "surrogatepass").split("\n") if name}
 
 
 def _terms(entry: IndexedEntry) -> Iterator[bytes]:
@@ -137,7 +157,7 @@ class LedgerIndex:
         try:
             _check_file(path)
             with closing(_connect(path, "ro")) as connection:
-                row = connection.execute(_STATE, (_BUCKETS * _DIGEST,)).fetchone()
+                row = connection.execute(_STATE, (_BUCKETS * len(_EMPTY),)).fetchone()
         except (OSError, sqlite3.Error, ValueError, SrosError):
             return None
         if not row or [type(value) for value in row] != [int, int, int, str, bytes]:
@@ -149,7 +169,7 @@ class LedgerIndex:
 
     @property
     def digests(self) -> bytes:
-        """The SHA-256 of every bucket, one after the other."""
+        """The SHA-256 of the names and of the postings of every bucket, one after the other."""
         return self._digests
 
     def postings(self, name: str, value: str) -> Iterator[Posting]:
@@ -159,7 +179,7 @@ class LedgerIndex:
             IndexDamagedError: the bucket with them is not what it was when the head was signed.
         """
         term = _term(name, value)
-        postings = self.bucket(_bucket_of(term))
+        _, postings = self.bucket(_bucket_of(term))
         at = postings.find(term)
         while at >= 0:
             if at % _POSTING.size == 0:
@@ -167,22 +187,40 @@ class LedgerIndex:
                 yield Posting(*where)
             at = postings.find(term, at + 1)
 
-    def bucket(self, bucket: int) -> bytes:
-        """Return the postings in a bucket, verified.
+    def names(self) -> set[str]:
+        """Return the enclaves whose last certificate in the ledger was not revoked.
+
+        Raises:
+            IndexDamagedError: they are not what they were when the head was signed.
+        """
+        names = set()
+        there = dict(self._rows("SELECT bucket, names FROM buckets"))
+        for bucket in range(_BUCKETS):
+            names |= _split(self._checked(there.get(bucket, b""), 2 * bucket))
+        return names
+
+    def bucket(self, bucket: int) -> tuple[bytes, bytes]:
+        """Return the names and the postings in a bucket, verified.
 
         Raises:
             IndexDamagedError: it is not what it was when the head was signed.
         """
+        rows = self._rows("SELECT names, postings FROM buckets WHERE bucket = ?", bucket)
+        names, postings = rows[0] if rows else (b"", b"")
+        return self._checked(names, 2 * bucket), self._checked(postings, 2 * bucket + 1)
+
+    def _rows(self, query: str, *values: int) -> list[tuple[Any, ...]]:
         try:
-            query = "SELECT postings FROM buckets WHERE bucket = ?"
-            row = self._read_only().execute(query, (bucket,)).fetchone()
+            return self._read_only().execute(query, values).fetchall()
         except (OSError, sqlite3.Error, ValueError, SrosError) as error:
             raise IndexDamagedError(f"'{self._path}' cannot be read") from error
-        postings = row[0] if row else b""
-        digest = self._digests[bucket * _DIGEST : (bucket + 1) * _DIGEST]
-        if type(postings) is not bytes or hashlib.sha256(postings).digest() != digest:
+
+    def _checked(self, data: Any, number: int) -> bytes:
+        """Return what was read of a bucket, if its digest is the one with this number."""
+        digest = self._digests[number * _DIGEST : (number + 1) * _DIGEST]
+        if type(data) is not bytes or hashlib.sha256(data).digest() != digest:
             raise IndexDamagedError(f"'{self._path}' is not as the ledger's head states")
-        return postings
+        return data
 
     def _read_only(self) -> sqlite3.Connection:
         """Return the connection of this process: SQLite's does not survive a fork."""
@@ -203,6 +241,8 @@ class IndexUpdate:
         self.state = base.state if base else IndexState(0, 0, 0, "")
         self._base = base
         self._added: dict[int, bytearray] = {}
+        self._names: dict[str, bool] = {}
+        self._buckets: dict[int, tuple[bytes, bytes]] = {}
         self._digests = b""
 
     def add(self, entry: IndexedEntry, line: bytes) -> None:
@@ -212,6 +252,10 @@ class IndexUpdate:
         for term in _terms(entry):
             posting = _POSTING.pack(term, lines + 1, size, len(line), digest.digest())
             self._added.setdefault(_bucket_of(term), bytearray()).extend(posting)
+        if entry.what == "certificate":
+            self._names[entry.enclave] = True
+        elif entry.what == "revocation" and entry.reason != SUPERSEDED:
+            self._names[entry.enclave] = False
         number = max(number, entry.number)
         self.state = IndexState(lines + 1, size + len(line) + 1, number, digest.hexdigest())
 
@@ -222,10 +266,17 @@ class IndexUpdate:
             IndexDamagedError: the present index is not what it was when the head was signed.
         """
         digests = bytearray(self._base.digests if self._base else _EMPTY * _BUCKETS)
-        for bucket, added in self._added.items():
-            if self._base:
-                added[:0] = self._base.bucket(bucket)
-            digests[bucket * _DIGEST : (bucket + 1) * _DIGEST] = hashlib.sha256(added).digest()
+        changed: dict[int, dict[str, bool]] = {bucket: {} for bucket in self._added}
+        for name, is_there in self._names.items():
+            changed[_bucket_of(_term("enclave", name))][name] = is_there
+        for bucket, names in changed.items():
+            before, postings = self._base.bucket(bucket) if self._base else (b"", b"")
+            left = {name for name in _split(before) if names.get(name, True)}
+            left.update(name for name, is_there in names.items() if is_there)
+            parts = _joined(left), postings + self._added.pop(bucket)
+            self._buckets[bucket] = parts
+            digest = b"".join(hashlib.sha256(part).digest() for part in parts)
+            digests[bucket * len(_EMPTY) : (bucket + 1) * len(_EMPTY)] = digest
         self._digests = bytes(digests)
         return self.state.root(self._digests)
 
@@ -262,8 +313,8 @@ class IndexUpdate:
 
     def _write(self, connection: sqlite3.Connection) -> None:
         with connection:
-            buckets = ((bucket, bytes(added)) for bucket, added in self._added.items())
-            connection.executemany("REPLACE INTO buckets VALUES (?, ?)", buckets)
+            buckets = ((bucket, *parts) for bucket, parts in self._buckets.items())
+            connection.executemany("REPLACE INTO buckets VALUES (?, ?, ?)", buckets)
             connection.execute("DELETE FROM state")
             row = (*self.state, self._digests)
             connection.execute("INSERT INTO state VALUES (?, ?, ?, ?, ?)", row)

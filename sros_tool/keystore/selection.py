@@ -12,13 +12,21 @@ from shlex import quote
 from typing import NamedTuple
 
 from sros_tool.errors import InvalidNameError, KeystoreError, Note, SrosError
-from sros_tool.fleet.enclaves import Unrecorded, robot_of, unrecorded_enclaves
+from sros_tool.fleet.enclaves import (
+    Unrecorded,
+    folders_of_robots,
+    robot_of,
+    unrecorded_enclaves,
+)
+from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, load_fleet, words_for
 from sros_tool.keystore.layout import (
     FLEET,
     PRIVATE,
     REVOKED,
     SETTINGS,
+    enclaves_below,
+    has_enclave,
 )
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.reader import Keystore
@@ -106,11 +114,29 @@ def select_to_revoke(
     chosen = dict.fromkeys(select_enclaves(keystore, names, patterns, every=every))
     unrecorded: dict[str, Unrecorded] = {}
     if fleet := checked_fleet(keystore) if robots else None:
-        unrecorded = unrecorded_enclaves(fleet, keystore.names, set(robots))
+        near = _near_robots(keystore, fleet, robots)
+        unrecorded = unrecorded_enclaves(fleet, near, set(robots))
     chosen |= dict.fromkeys(_of_robots(keystore, robots, True, unrecorded))
     below = [name for each in unrecorded.values() for name in each.below]
     left = {name for each in unrecorded.values() for name in each.naming} - chosen.keys()
     return tuple(chosen), tuple(_unrecorded_notes(keystore.root, sorted(below), sorted(left)))
+
+
+def _near_robots(keystore: Keystore, fleet: Fleet, robots: Sequence[str]) -> Sequence[str]:
+    """Return all enclaves that could be those of ``robots``, and perhaps others.
+
+    In a keystore with an index, these are the enclaves in the folders of the robots, and those that
+    the ledger has with the name of a robot or such a folder in their paths.
+    """
+    recorded = keystore.ledger_file.recorded_enclaves()
+    if recorded is None:
+        return keystore.names
+    folders = folders_of_robots(fleet, robots)
+    texts = (*robots, *folders)
+    near = {name for name in recorded if any(text in name for text in texts)}
+    for folder in folders:
+        near.update((folder, *enclaves_below(keystore.root, folder)))
+    return sorted(name for name in near if has_enclave(keystore.root, name))
 
 
 def _unrecorded_notes(root: Path, below: list[str], left: list[str]) -> Iterator[Note]:

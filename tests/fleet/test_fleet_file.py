@@ -162,7 +162,7 @@ def test_a_value_that_is_not_valid(line: str, problem: str) -> None:
         ('enclaves = ["/{robot:a}/{robot:b}"]\n[robots.r]', "different groups"),
         ('enclaves = ["{robot}"]\n[robots.r]', "does not start with '/'"),
         ('enclaves = ["/{robot}*"]\n[robots.r]', "wildcard"),
-        ("[robots]\n" + "".join(f"r{i} = {{}}\n" for i in range(10_001)), "more than 10000"),
+        ("[robots]\n" + "".join(f"r{i} = {{}}\n" for i in range(100_001)), "more than 100000"),
     ],
 )  # fmt: skip
 def test_a_file_that_is_not_valid(text: str, problem: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import sys
 from collections.abc import Callable
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
@@ -21,6 +22,7 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.certificates import make_request
+from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import generate_key, load_key
 from tests.support.harness import certificate
 
@@ -63,6 +65,35 @@ def test_an_index_answers_as_the_whole_ledger_does(root: Path) -> None:
     check_answers(root)
     with pytest.raises(KeystoreError, match="was revoked"):
         sign_request(root, make_request(generate_key(), "/b"), now=NOW)
+
+
+def test_a_second_revocation_reaches_the_others_and_reads_none_of_them(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    create_enclaves(root, ["/c", "/d", "/e"], now=NOW)
+    revoke(root, ["/b"], now=NOW)
+    create_enclaves(root, ["/late"], now=NOW)
+    read: list[str] = []
+    ways = {"open", "os.listdir", "os.scandir"}
+    monkeypatch.setattr(sys, "_index_hook", read.append, raising=False)
+
+    def hook(event: str, what: tuple[object, ...]) -> None:
+        if event in ways and (note := getattr(sys, "_index_hook", None)):
+            note(str(what[0]))
+
+    sys.addaudithook(hook)
+    renew(root, ["/c"], now=NOW)
+    result = revoke(root, ["/c"], now=NOW)
+    monkeypatch.delattr(sys, "_index_hook")
+    assert any("enclaves/c" in path for path in read)
+    # One that stays is asked whether vendors take the new list.
+    assert [path for path in read if "enclaves/d" in path or "enclaves/e" in path] == []
+    assert result.restart == ("/a", "/d", "/e", "/late")
+    for name in result.restart:
+        listed = load_crl((root / f"enclaves{name}/crl.pem").read_bytes(), "").revoked
+        assert len(listed) == 3
+    with pytest.raises(KeystoreError, match="does not exist"):
+        revoke(root, ["/none"], now=NOW)
 
 
 def cut(index: Path) -> None:

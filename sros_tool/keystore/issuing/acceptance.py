@@ -64,7 +64,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.pki.crl import may_sign_lists, read_list, sign_crl
+from sros_tool.pki.crl import may_sign_lists, next_update, read_list, sign_crl
 from sros_tool.pki.keys import generate_key
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
@@ -81,7 +81,8 @@ _LOADED = (
 )
 """The files that DDS loads, except the key, which never changes without its certificate."""
 _NEEDED = _LOADED[:5]
-_ONLY_IDENTITY = {IDENTITY_CA_FILE, CRL.rpartition("/")[2]}
+_CRL_NAME = CRL.rpartition("/")[2]
+_ONLY_IDENTITY = {IDENTITY_CA_FILE, _CRL_NAME}
 """Shared files that vendors do not use to verify governance or permissions."""
 _CHOSEN = {Fault.DOCUMENT_SIZE, Fault.KEY_ON_TOKEN}
 """Faults that follow from the user's own choices; notes report them."""
@@ -405,6 +406,24 @@ class _FilesOfChange:
         has_list = self._keystore.has(CRL)
         return _listed(self._keystore.read(CRL, "revocation list") if has_list else b"") | of_ledger
 
+    def with_a_newer_list(self) -> set[str] | None:
+        """Return enclaves that show whether vendors take a list as they take the present one.
+
+        These are one that stays, and all whose certificates only the new list has.  Return None if
+        the lists differ in more than entries, number and dates, or no index finds those enclaves.
+        """
+        before, after = self.content(CRL), self.content_after(CRL)
+        ledger = self._keystore.ledger_file
+        recorded = ledger.recorded_enclaves()
+        if recorded is None or not before or _form_of_list(before) != _form_of_list(after):
+            return None
+        added = [f"{serial:x}" for serial in _listed(after) - _listed(before)]
+        entries = ledger.with_values("serial", added).entries
+        listed = {entry.enclave for entry in entries if entry.enclave}
+        there = (name for name in recorded if has_enclave(self.transaction.root, name))
+        kept = next((name for name in there if enclave_folder(name) not in self.changed), None)
+        return listed | ({kept} if kept else set())
+
     def was_revoked(self, name: str) -> bool:
         """Return whether the enclave's certificate, before and after, was revoked before."""
         path = f"{enclave_folder(name)}/{CERTIFICATE_FILE}"
@@ -466,7 +485,9 @@ def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
         for folder, changed_files in changed.items()
         if folder.split("/", 1)[0] == ENCLAVES and not changed_files.isdisjoint(_LOADED)
     }
-    if shared:
+    if shared == {_CRL_NAME} and (others := files.with_a_newer_list()) is not None:
+        names.update(others)
+    elif shared:
         names.update(files.transaction.enclaves)
     present = {name for name in names if has_enclave(root, name)}
     lists: dict[str, frozenset[int]] = {}
@@ -518,6 +539,16 @@ def _listed(crl: bytes) -> frozenset[int]:
         return frozenset(entry.serial_number for entry in read_list(crl, ""))
     except SrosError:
         return frozenset()
+
+
+def _form_of_list(crl: bytes) -> tuple[object, ...] | None:
+    """Return the parts of a revocation list that a vendor could refuse; None if unreadable."""
+    try:
+        read = read_list(crl, "")
+        extensions = tuple((part.oid, part.critical) for part in read.extensions)
+        return read.issuer, read.signature_algorithm_oid, extensions, bool(next_update(read))
+    except (SrosError, ValueError):
+        return None
 
 
 def _signers(message: bytes) -> tuple[object, ...] | None:

@@ -357,6 +357,8 @@ class KeystoreChange:
             return
         lists = self.revocation_lists()
         revocations = lists.superseded(replaced)
+        if names is None:
+            names = lists.recipients()
         self.restart = self.names if names is None else tuple(names)
         self.entries += lists.sign(revocations, self.restart, incomplete=False)[1]
         self.remarks += lists.remarks

@@ -144,6 +144,17 @@ class RevocationListSigner:
         self.remarks: list[Note] = []
         self.present = self._authentic(keystore.revocation_list)
 
+    def recipients(self) -> Sequence[str] | None:
+        """Return the enclaves that have the list already; None if perhaps not all have it.
+
+        In a keystore with an index, these are the enclaves that the ledger has, once a first list
+        was signed: each enclave that is made later gets it.  In a rotation, files of all enclaves
+        may have to change.
+        """
+        if not self.present or read_rotation(self._keystore).stage is not RotationStage.NONE:
+            return None
+        return self._keystore.ledger_file.recorded_enclaves()
+
     # ── what is revoked ────────────────────────────────────────────────────────────────────
 
     def revocations(
@@ -281,7 +292,8 @@ class RevocationListSigner:
     ) -> tuple[datetime, list[Entry]]:
         """Sign and stage the lists; return their first expiry (UTC) and the new ledger entries.
 
-        ``revocations`` are the entries of new revocations; the enclaves ``names`` get the lists.
+        ``revocations`` are the entries of new revocations; the enclaves ``names`` get the lists,
+        except the `recipients`, who have them.
         Each list has all serial numbers: the ledger does not say which of two CAs issued a
         certificate, and a serial number of the other CA does no harm.
 
@@ -304,7 +316,8 @@ class RevocationListSigner:
         signed_lists = [signed]
         if second := self._sign_second(new_entries, names, expiries, incomplete=incomplete):
             signed_lists.append(second)
-        _link_everywhere(self._transaction, names)
+        if self.recipients() is None:
+            _link_everywhere(self._transaction, names)
         self._note_lack()
         return min(signed.end for signed in signed_lists), [
             *revocations,

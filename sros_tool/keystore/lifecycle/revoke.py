@@ -21,6 +21,7 @@ from sros_tool.keystore.layout import (
     REVOKED,
     ZENOH_FILES,
     enclave_folder,
+    has_enclave,
 )
 from sros_tool.keystore.ledger import Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
@@ -98,7 +99,9 @@ def revoke(
         lists = change.revocation_lists()
         gone = frozenset(names)
         last = {name: _move_away(change, name) for name in dict.fromkeys(names)}
-        change.restart = tuple(name for name in change.names if name not in gone)
+        recipients = lists.recipients()
+        everybody = change.names if recipients is None else recipients
+        change.restart = tuple(name for name in everybody if name not in gone)
         next_update, change.entries = lists.sign(
             lists.revocations(last, reason), change.restart, incomplete=until_retired
         )
@@ -142,13 +145,13 @@ def refresh_crl(
 
 def _check_names(change: KeystoreChange, names: Sequence[str]) -> None:
     """Raise an error unless all ``names`` are enclaves of the keystore."""
-    existing = frozenset(change.names)
     router = change.template.zenoh.router if change.template.zenoh else None
     for name in names:
         check_enclave_name(name)
-        if name == router and name in existing:
+        exists = has_enclave(change.root, name)
+        if name == router and exists:
             raise _is_router(change, name)
-        if name not in existing:
+        if not exists:
             raise no_such_enclave(change.keystore, name, change.names, may_create=False)
 
 
