@@ -84,7 +84,7 @@ class PolicyLine(NamedTuple):
 
 @shows("source", "xml", spread=("source",))
 class GroupEdit(NamedTuple):
-    """A group of a policy, such as ``<topics>``, to replace or remove."""
+    """A group of a policy, such as ``<topics>``, that a change replaces or removes."""
 
     source: Source
     xml: str
@@ -162,7 +162,7 @@ class AppliedProtection(NamedTuple):
 
 @shows("part", "decision", spread=("part", "decision"))
 class DecidedPart(NamedTuple):
-    """The decision on a DDS endpoint."""
+    """A DDS endpoint, and the decision on it."""
 
     part: Part
     decision: Decision
@@ -177,14 +177,13 @@ class DecidedPart(NamedTuple):
 class Answer(NamedTuple):
     """The decision of a DDS vendor on a question.
 
-    ``decision`` determines the outcome; ``part`` is the endpoint decided on, or None for
-    the decision on joining.  ``grant`` and ``domain_rule`` are the parts of the documents
-    that apply.
+    ``decision`` has the outcome; ``part`` is the endpoint that it is about, or None for joining.
+    ``grant`` and ``domain_rule`` are the parts of the documents that apply.
 
     `sros_tool.explain.explanation` fills in the other fields.  ``lines`` are the lines of the
-    policy file that the deciding rule comes from, and ``provenance`` says whether the permissions
-    were made from that file.  ``sign`` says that the present policy file, once signed, allows the
-    access.
+    policy file from which the deciding rule comes, and ``provenance`` says whether the permissions
+    were made from that file.  ``sign`` says that the present policy file would allow the access
+    once it is signed.
     """
 
     vendor: Vendor
@@ -337,9 +336,9 @@ _CREATED = {
 
 
 def recorded_policy(keystore: Keystore, signed: bytes) -> str:
-    """Return the SHA-256 (hex) of the policy that signed permissions were made from, or "".
+    """Return the SHA-256 (hexadecimal) of the policy from which permissions were made.
 
-    The ledger of the keystore has the digest; without a ledger or entry the result is "".
+    The ledger of the keystore has it; without a ledger or an entry, the result is "".
     """
     digest = hashlib.sha256(signed).hexdigest()
     ledger = keystore.ledger_with("sha256", digest)
@@ -348,10 +347,10 @@ def recorded_policy(keystore: Keystore, signed: bytes) -> str:
 
 
 def template_default(digest: str) -> str:
-    """Return the default policy of keystore templates that has this digest, or "".
+    """Return which default policy of keystore templates has this digest, or "".
 
-    ``digest`` is from `recorded_policy`.  The result is "everything" or "node_basics", as in the
-    template's ``permissions.default``.
+    ``digest`` is from `recorded_policy`.  The result is "everything" or "node_basics", as in
+    ``permissions.default`` of a template.
     """
     from sros_tool.files import policies_dir
     from sros_tool.policy.document import read_policy
@@ -361,9 +360,9 @@ def template_default(digest: str) -> str:
 
 
 def deciding_lines(policy: Enclave, answer: Answer) -> tuple[PolicyLine, ...]:
-    """Return the lines of an enclave's policy that the deciding rule of an answer comes from.
+    """Return the lines of an enclave's policy from which the deciding rule of an answer comes.
 
-    Several nodes of an enclave may have the same right, so there may be several lines.
+    There may be several lines, because several nodes of an enclave may have the same right.
     """
     expression, part = answer.decision.expression, answer.part
     if part is None or not expression or answer.grant is None:
@@ -407,7 +406,7 @@ _WORST_FIRST = (
 
 
 class Evaluator:
-    """An evaluator of questions to one vendor about one enclave; reusable for many questions."""
+    """Answers questions to one vendor about one enclave."""
 
     def __init__(self, vendor: Vendor, enclave: LoadedEnclave, context: JoinContext) -> None:
         self.vendor = vendor
@@ -418,7 +417,7 @@ class Evaluator:
 
     @property
     def access(self) -> Access | None:
-        """Access of a process on this vendor; None if it cannot run, or if no peer accepts it."""
+        """Access of a process on this vendor; None if it cannot start, or no peer accepts it."""
         return self._participant.access
 
     def answer(self, question: Question) -> Answer:
@@ -440,7 +439,7 @@ class Evaluator:
         own: Sequence[tuple[Part | None, Decision]],
         asked: tuple[DecidedPart, ...] = (),
     ) -> Answer:
-        """Return the answer that follows from the decisions on the process and its endpoints."""
+        """Return the answer that follows from the decisions on the process and on its endpoints."""
         decided = [*own, *asked]
         outcome = min((decision.outcome for _, decision in decided), key=_WORST_FIRST.index)
         # The first topic of the question explains an allowed outcome; any other outcome is

@@ -1,6 +1,7 @@
-"""Open the enclave of a question, from a keystore, a folder or a policy, and interpret its name.
+"""Open the enclave that a question is about, and find out what the question's name means.
 
-The command line and the Python API both use this module.
+The enclave is in a keystore, a folder or a policy.  The command line and the Python API both use
+this module.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ class AskedEnclave(NamedTuple):
 
 
 def rights_naming(keystore: Keystore, name: str) -> Iterator[Right]:
-    """Yield the rights of all enclaves of a keystore whose permissions contain a ROS name.
+    """Yield the rights in those permissions of a keystore that contain a ROS name.
 
     Unreadable permissions are left out; permissions without the name are not parsed.
     """
@@ -105,7 +106,7 @@ def _may_have(document: bytes, name: str) -> bool:
 
 
 def _rights_in(enclave: str, data: bytes) -> Iterator[Right]:
-    """Yield the rights in a permissions document, from the first grant for each subject."""
+    """Yield the rights in a permissions document; of each subject, only the first grant counts."""
     from sros_tool.pki import smime
     from sros_tool.translate import grant_rights
 
@@ -228,10 +229,10 @@ def _planned_enclave(
 def _action_meant(
     evaluator: Evaluator, question: Question, others: Callable[[], Iterable[Right]]
 ) -> Question | None:
-    """Return the question about an action, if the rights show that the name is an action, or None.
+    """Return the same question about an action if rights show that the name is one; else None.
 
-    The rights of the enclave are read first; ``others``, such as the rights in its policy and
-    keystore, only if the service is denied.
+    The rights of the enclave are read first.  If they deny the service, ``others`` returns more
+    rights, such as those in its policy and keystore.
     """
     if question.word not in ("call", "serve"):
         return None
@@ -245,7 +246,7 @@ def _action_meant(
 
 
 def taken_for_action(question: Question, action: Question) -> Note:
-    """Return the note that a question about a service was answered for an action."""
+    """Return a note that a question about a service is answered for an action."""
     text = (
         f"{action.name} is an action in these rights, not a service: {question.word} is taken "
         f"for '{action}'; --type service asks about a service."
@@ -256,7 +257,7 @@ def taken_for_action(question: Question, action: Question) -> Note:
 def meant(
     evaluator: Evaluator, asked: AskedEnclave, question: Question, kind: str | None
 ) -> tuple[Question, tuple[Note, ...]]:
-    """Return the question to answer, and a note if it differs from the given question."""
+    """Return the question to answer, and a note if it is not the question that was asked."""
     if not kind:
         action = _action_meant(evaluator, question, lambda: asked.other_rights(question.name))
         if action:

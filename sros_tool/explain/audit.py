@@ -1,12 +1,12 @@
-"""Find the rights that observed ROS nodes use and a policy or a keystore denies.
+"""Find the rights that observed ROS nodes use and that a policy or keystore denies.
 
-DDS Security has no permissive mode: a rule denies, or there is no security.  So nothing is enforced
-here.  The decision engine decides every endpoint of the graph, in the enclave in which its process
-would run; the denials are the ones that a secured robot would log.
+DDS Security cannot only log denials: either its rules are enforced, or there is no security.  So
+nothing is enforced here.  The decision engine decides on each endpoint in the ROS graph, in the
+enclave in which its process would run; the denials are those that a secured robot would log.
 
-The graph of a robot without security shows the enclave / for most processes.  The enclave is then
-found by the node's name: in the profiles of the policy, or in the services of nodes that the
-permissions of a keystore name.
+On a robot without security, the graph shows the enclave / for most processes.  Then the name of the
+node tells the enclave: by the profiles of the policy, or by the services of nodes that permissions
+of a keystore name.
 
 Nodes that were not observed are not judged: the result names the nodes of the policy or keystore
 that did not appear, and everything in the graph that belongs to no enclave.
@@ -68,12 +68,15 @@ _USE = "use"
 
 @dataclass(frozen=True, slots=True)
 class EnclaveNodes:
-    """The nodes of each enclave; their names may have wildcards."""
+    """The names of the nodes of each enclave, perhaps with wildcards."""
 
     by_enclave: Mapping[str, tuple[str, ...]]
 
     def enclaves_for(self, node: str) -> frozenset[str]:
-        """Return the enclaves for the node with this full name; exact names win over wildcards."""
+        """Return the enclaves for the node with this full name.
+
+        Enclaves with exactly this name are preferred to those with wildcards.
+        """
         exact = frozenset(name for name, nodes in self.by_enclave.items() if node in nodes)
         return exact or frozenset(
             name
@@ -83,7 +86,7 @@ class EnclaveNodes:
 
     @property
     def expected(self) -> frozenset[EnclaveNode]:
-        """The nodes of the whole robot, without the tools that observe it."""
+        """The nodes that should run on the robot; tools that observe it are left out."""
         return frozenset(
             EnclaveNode(enclave, node)
             for enclave, nodes in self.by_enclave.items()
@@ -114,7 +117,7 @@ def _is_of(node: str, name: str) -> bool:
 
 @dataclass(frozen=True)
 class AuditedEnclaves:
-    """The enclaves of a policy or keystore (``what``), with the evaluator of each enclave."""
+    """The enclaves of a policy or keystore (``what``), with an evaluator for each."""
 
     what: str
     nodes: EnclaveNodes
@@ -134,10 +137,10 @@ class AuditedEnclaves:
 def audited_enclaves(
     path: Path, vendor: Vendor, context: JoinContext, fleet: Fleet | None = None
 ) -> AuditedEnclaves:
-    """Return the enclaves of the policy or keystore at ``path``, as a vendor decides for them.
+    """Return the enclaves of the policy or keystore at ``path``, with a vendor's decisions.
 
-    A policy counts as signed with the governance of the default template; ``fleet`` has the robots
-    that its placeholders stand for.
+    A policy counts as signed, with the governance of the default template; ``fleet`` has the robots
+    that fill in its placeholders.
 
     Raises:
         UsageError: ``path`` is neither a policy nor a keystore, or is a keystore with ``fleet``.
@@ -208,10 +211,10 @@ def keystore_enclaves(
 class DeniedRight:
     """A right that nodes of an enclave use, and that DDS would deny.
 
-    ``nodes`` are the full names of the nodes.  ``right.name`` is a DDS topic if it has no ROS
-    name.  ``endpoints`` are the denied endpoints of the right.  ``by_rule`` says that a deny rule
-    denies the right, so that a new allow rule would not help; ``new_enclave`` says that the node
-    has no enclave yet, and that the enclave of ``right`` is a proposal.
+    ``nodes`` are the full names of the nodes.  ``right.name`` is a DDS topic if it has no ROS name.
+    ``endpoints`` are the endpoints that the nodes need.  With ``by_rule``, a deny rule denies the
+    right, so that a new allow rule would not help.  With ``new_enclave``, the node has no enclave
+    yet, and that of ``right`` is a proposal.
     """
 
     right: Right
@@ -281,10 +284,10 @@ class AuditResult(NamedTuple):
 class Audit:
     """The result of an audit of observed nodes.
 
-    ``refused`` maps enclaves in which no process could start, or find peers, to the reason.
-    ``observation`` has the judged nodes, each with the enclaves in which it was judged.
-    ``unseen`` are the ``expected`` nodes of the policy or keystore that did not appear, and
-    ``unjudged`` says in words which observed things were not judged.
+    ``refused`` maps enclaves to the reason why no process could start there, or find peers.
+    ``observation`` has the judged nodes, each with the enclaves in which it was judged. ``unseen``
+    are the ``expected`` nodes of the policy or keystore that did not appear.  ``unjudged`` says in
+    words what was observed but not judged.
     """
 
     denied: tuple[DeniedRight, ...]
@@ -315,9 +318,9 @@ class Audit:
 def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "") -> Audit:
     """Return the rights that observed nodes use and that their enclaves would be denied.
 
-    If several enclaves match the nodes of a process, all of them are judged, with a note.
-    ``observer`` is the enclave of the observing process, if it has one: an enclave without named
-    nodes counts as seen if this process runs in it.
+    If the nodes of a process match several enclaves, each is judged, with a note. ``observer`` is
+    the enclave of the process that observed, or "": an enclave without named nodes counts as seen
+    if that process runs in it.
     """
     unjudged = _unjudged(observation)
     notes = [note for note, _ in unjudged]
@@ -397,7 +400,7 @@ _STRAYS = "not judged, because the writers or readers of these topics belong to 
 
 
 def _unjudged(observation: Observation) -> list[tuple[Note, str]]:
-    """Return notes on observed things that are not judged, each with a count in words.
+    """Return notes on what was observed but not judged, each with its number in words.
 
     The words are "" for tools that only observe.
     """
@@ -428,7 +431,7 @@ _OF_EVERY_NODE = ("/rosout", "/parameter_events")
 
 
 def _only_observes(node: ObservedNode) -> bool:
-    """Return whether a node only has what every node has: its own services, and logging."""
+    """Return whether a node has only its own services and its log, as every node has."""
     own = expand("~/", node.ns, node.name)
     folded = fold(node.endpoints)
     return not (folded.halves or folded.foreign) and all(
@@ -441,7 +444,7 @@ def _enclaves_of(
 ) -> tuple[frozenset[str], bool]:
     """Return the enclaves that a process may run in, and whether they match all its nodes.
 
-    The enclave that the graph shows counts, even if it is for other nodes.
+    The enclave that the graph shows counts even if it is meant for other nodes.
     """
     shown = process[0].enclaves
     if shown and shown != UNSHOWN:
@@ -457,7 +460,7 @@ def _enclaves_of(
 
 @dataclass(frozen=True, slots=True)
 class _Judgement:
-    """The rights that a process would be denied in an enclave; ``refused`` if it cannot run."""
+    """The rights that a process would be denied in an enclave; ``refused`` if it cannot start."""
 
     denied: tuple[DeniedRight, ...]
     refused: str = ""
@@ -528,7 +531,7 @@ def _by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
 
 
 def _used(denied: Iterable[DeniedRight], observation: Observation) -> Observation:
-    """Return the nodes with the endpoints of denied rights, unless a deny rule denies the right."""
+    """Return the nodes with the endpoints of denied rights, unless a deny rule denies a right."""
     wanted: dict[tuple[str, str], set[Endpoint]] = {}
     for right in denied:
         if right.by_rule:

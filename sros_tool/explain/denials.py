@@ -1,12 +1,13 @@
-"""Read denied topics from the logs of secured nodes, and propose the missing rules.
+"""Read denied topics in the logs of secured nodes, and propose the missing rights.
 
-The texts are in `sros_tool.runtime.vendor_log`.  Fast DDS names the topic and, in a line nearby,
-whether it was a writer or a reader.  Cyclone DDS first checks whether a topic may be used at all;
-the direction of such a denial is only in the next message of rcl.  Cyclone DDS logs nothing if the
+The texts of the logs are in `sros_tool.runtime.vendor_log`.  Fast DDS names the topic and, in a
+line nearby, whether it is for a writer or a reader.  Cyclone DDS first checks whether a topic may
+be used at all; only the next message of rcl has the direction.  Cyclone DDS logs nothing if the
 governance protects the discovery of the topic.
 
-A log is no proof: a process can print any line, also one that looks like a denial, and so ask for
-rights that it should not have.  So each denial says which process printed it, and a person decides.
+A log is no proof: a process can print any line, even one that looks like a denial, and so ask for
+rights that it should not have.  So each denial names the process that printed it, and a person
+decides.
 """
 
 from __future__ import annotations
@@ -56,17 +57,17 @@ from sros_tool.runtime.vendor_log import (
 )
 
 _NEAR_LINES = 3
-"""Number of log lines after a denial that can still belong to the denial."""
+"""Number of log lines after a denial that are searched for its direction."""
 
 
 @dataclass(frozen=True, slots=True)
 class Denial:
-    """A denied DDS topic (raw name); ``direction`` is "publish", "subscribe", or "" if unknown.
+    """A denied DDS topic, and ``direction``: "publish", "subscribe", or "" if unknown.
 
-    ``by_rule`` says that a deny rule denies it, so that an allow rule would not help; ``remote``
-    says that a peer's permissions deny it.  ``enclave`` is "" if the log does not name it.
-    ``process`` is the label of the process that printed the denial, "" without a label, and
-    ``line`` the number of its line, from 1.
+    With ``by_rule`` a deny rule denies it, so that an allow rule would not help; with ``remote``
+    the permissions of a peer deny it.  ``enclave`` is "" if the log does not name it. ``process``
+    is the label of the process that printed the denial, or "", and ``line`` the number of its line,
+    from 1.
     """
 
     topic: str
@@ -81,10 +82,11 @@ class Denial:
 
 @dataclass(frozen=True, slots=True)
 class MissingRights:
-    """The rights that nodes lack according to denials, by enclave ("" if the log names none).
+    """The rights that nodes lack according to denials in logs, by enclave ("" if not named).
 
-    The user has to handle denials without a direction (``unclear``), by a deny rule (``by_rule``),
-    by a peer's permissions (``remote``), and of topics without a ROS name (``foreign``).
+    No rights are proposed for other denials: those without a direction (``unclear``), by a deny
+    rule (``by_rule``), by the permissions of a peer (``remote``), and of topics without a ROS name
+    (``foreign``).
     """
 
     rights: dict[str, frozenset[NodeRight]]
@@ -110,7 +112,7 @@ def read_denials(text: str) -> tuple[Denial, ...]:
 
 
 def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denial]:
-    """Yield the denials in the lines of one process, which have numbers and no label."""
+    """Yield the denials in lines of one process, given as pairs of number and text."""
     enclave = ""
     lines = [line for _, line in numbered]
     for index, (number, line) in enumerate(numbered):
@@ -125,7 +127,7 @@ def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denia
 
 
 def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
-    """Return whether a peer is denied, and the direction, from a denial and the lines after it."""
+    """Return whether a peer is denied, and the direction, by a denial and the lines after it."""
     for line in lines:
         other = denied_topic(line)
         if other and other[1]["topic"] != topic:
@@ -144,10 +146,10 @@ def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
 
 
 def propose(denials: Iterable[Denial]) -> MissingRights:
-    """Return the rights that would have prevented the denials, as far as the log shows them.
+    """Return the rights without which the denials happened, as far as the log shows them.
 
-    A node stops at its first refusal.  So one denied topic of a service leads to a right to the
-    service, and one denied service of an action to a right to the action.
+    A node stops at the first refusal.  So a denied topic of a service leads to a right to the
+    service, and a denied service of an action to a right to the action.
     """
     rights: dict[str, set[NodeRight]] = {}
     rest: dict[str, list[Denial]] = {"unclear": [], "by_rule": [], "remote": [], "foreign": []}
@@ -170,7 +172,7 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
 
 
 def serving_node(denial: Denial) -> str:
-    """Return the full name of a node that was denied one of its standard services, or ""."""
+    """Return the full name of a node that was denied a service that every node offers, or ""."""
     service, begin = service_of(denial.topic)
     if denial.remote or not service:
         return ""
@@ -225,7 +227,7 @@ _SEVERAL = Note(
 )
 
 _NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")
-"""Common parts, the largest first: a node that lacks a right of a part probably lacks the part."""
+"""Files to include, the largest first: a node without a right in it lacks the include."""
 
 
 def learned_from_logs(
@@ -236,7 +238,7 @@ def learned_from_logs(
     place: tuple[str, str] | None,
     present: Policy | None,
 ) -> tuple[Learned, list[AskingLine], bool]:
-    """Return the rights that logs show as missing, the log lines, and whether there is any denial.
+    """Return the rights that are missing by logs, explanations, and whether there is a denial.
 
     Args:
         logs: the texts of the logs by their paths.
@@ -339,7 +341,7 @@ def _by_place(
     node: tuple[str, str] | None,
     present: Mapping[tuple[str, str], frozenset[NodeRight]],
 ) -> dict[tuple[str, str], frozenset[NodeRight]]:
-    """Return the rights by namespace and name of their profile."""
+    """Return the rights by the profile to which they are added: its namespace and node name."""
     if node is not None:
         return {node: rights}
     own = nodes_served((right.right, right.name) for right in rights)
@@ -354,7 +356,7 @@ def _by_place(
 
 
 def _place(fqn: str, present: Iterable[tuple[str, str]]) -> tuple[str, str]:
-    """Return namespace and name of the profile for a node, perhaps with wildcards."""
+    """Return namespace and name of the profile for the node ``fqn``, perhaps with wildcards."""
     ns, _, name = fqn.rpartition("/")
     return next((each for each in present if covers(_fqn(each), fqn)), (ns or "/", name))
 
@@ -369,7 +371,7 @@ def _whole_parts(
     has: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
-    """Return the first common part with a denied right of a node that has no right of the part."""
+    """Return the first common part of which a node has no right and was denied one, or ()."""
     if is_expression(place[1]):
         return ()
     for part in _NODE_PARTS:

@@ -95,7 +95,7 @@ def _provenance(enclave: LoadedEnclave, recorded: str) -> Provenance | None:
 
 
 def _states_policy(enclave: LoadedEnclave) -> bool:
-    """Return whether the grant that DDS reads has the rules of the policy on its domains."""
+    """Return whether the rules of the grant that DDS reads are those of the policy."""
     from sros_tool.translate import permissions_for
 
     assert enclave.policy
@@ -113,7 +113,7 @@ def _states_policy(enclave: LoadedEnclave) -> bool:
 
 
 def _changed(evaluator: Evaluator, answer: Answer) -> Answer | None:
-    """Return the answer with the change of the policy that would allow it, or None."""
+    """Return the answer with the change of the policy that would allow the access, or None."""
 
     change = _smallest_change(evaluator, answer)
     if change is None:
@@ -153,7 +153,7 @@ _BY_REASON: dict[str, str | Fault] = {
     "invalid-name": "Use a name of letters, digits, '_' and '/'.",
     "partition": "Leave partitions out of permissions; sros never writes them.",
 }
-"""Faults or remedies by the reason of a denial that the policy did not cause."""
+"""Faults, or remedies, by the reason of a denial that no change of the policy can resolve."""
 
 _SHARED = {
     GOVERNANCE_FILE: GOVERNANCE_P7S,
@@ -209,7 +209,7 @@ def _filled(text: str, root: str, enclave: str, file: str) -> str:
 
 
 def _is_own_copy(keystore: Path, enclave: str, file: str) -> bool:
-    """Return whether an enclave has a copy of a file instead of a link to the keystore's."""
+    """Return whether an enclave has its own copy of a file, and no link to the keystore's file."""
     own, common = enclave_path(keystore, enclave) / file, keystore / _SHARED.get(file, "")
     return file in _SHARED and own.is_file() and common.is_file() and not own.samefile(common)
 
@@ -225,7 +225,7 @@ def _is_rotating(keystore: Path) -> bool:
 
 
 def _is_latest(keystore: Path, enclave: str) -> bool:
-    """Return whether an enclave has the permissions that the ledger says were signed last."""
+    """Return whether an enclave's permissions are those that were signed last, by the ledger."""
     from sros_tool.keystore.reader import Keystore
 
     try:
@@ -249,10 +249,10 @@ _NO_RULE = frozenset({"no-rule", "default"})
 
 
 def _smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | None:
-    """Return the smallest change of the policy that makes the vendor allow a denied question.
+    """Return the smallest change of the policy by which the vendor allows a denied question.
 
-    The change is relative to the enclave's policy or, if it is not known, to the rights in its
-    permissions.  Returns None if no policy could allow the question.
+    The change is for the enclave's policy or, if there is none, for the rights in its permissions.
+    Returns None if no policy could allow the question.
     """
     enclave, question = evaluator.enclave, answer.question
     if not question.right:
@@ -298,7 +298,7 @@ def policy_of(name: str, rights: Iterable[Right]) -> Enclave:
 
 
 def _present_rights(policy: Enclave | None, name: str, answer: Answer) -> set[Right]:
-    """Return the present rights of an enclave, except those that no policy can state."""
+    """Return the rights that an enclave has now, except those that no policy can state."""
     rights: Iterable[Right] = ()
     if policy:
         rights = (r for profile in policy.all_profiles() for r in profile_rights(name, profile))
@@ -308,10 +308,10 @@ def _present_rights(policy: Enclave | None, name: str, answer: Answer) -> set[Ri
 
 
 def _blocking(rights: Iterable[Right], answer: Answer) -> list[Right]:
-    """Return the denials that the deciding expression of an answer comes from.
+    """Return the denials from which the deciding expression of an answer comes.
 
-    Denials of the other direction count only if there is no other: Cyclone DDS denies a whole topic
-    because of a denial in either direction.
+    Denials of the other direction count only if there are no others: Cyclone DDS denies a whole
+    topic because of a denial in either direction.
     """
     expression = answer.decision.expression or ""
     publishes = answer.part is not None and answer.part.verb is AccessVerb.PUBLISH
@@ -328,7 +328,7 @@ def _blocking(rights: Iterable[Right], answer: Answer) -> list[Right]:
 
 
 _ANY_NODE = ("/", "*")
-"""Namespace and name of a profile for any node: DDS decides by the enclave alone."""
+"""Namespace and name of a profile for any node, because DDS only checks the enclave."""
 
 
 def _addition(right: Right, places: Iterable[tuple[str, str]]) -> str:
@@ -373,11 +373,11 @@ _ALIKE = 0.9
 
 
 def likely_names(answer: Answer) -> tuple[str, ...]:
-    """Return at most three allowed names with which the denied name may have been confused.
+    """Return at most three allowed names that may be meant instead of the denied name.
 
-    For a standard service of a node, these are the same services of the enclave's nodes.  For any
-    other name, they are names with the same last part (a forgotten remapping), or else names with
-    a similar spelling.
+    For a service that every node offers, they are the same services of the enclave's nodes.  For
+    any other name, they are names with the same last part (a forgotten remapping), or else names
+    with a similar spelling.
     """
     question, enclave = answer.question, answer.enclave
     names = {
@@ -402,7 +402,7 @@ _SHOWN = 3
 
 
 def _edits(lift: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
-    """Yield a replacement for each group of the policy that contains denials from ``lift``."""
+    """Yield a replacement for each group of the policy that has denials of ``lift``."""
     groups: dict[Source, Group] = {}
     lifted: dict[Source, set[tuple[str, str]]] = {}
     for right in lift:

@@ -1,4 +1,4 @@
-"""Explain security messages in a log by cause and remedy, and examine the enclaves it names.
+"""Explain security messages in a log, and examine the enclaves that the log names.
 
 The log may mix lines of several processes, with labels of ros2 launch, journald or Docker Compose,
 and may contain colours and tracebacks.
@@ -62,10 +62,10 @@ from sros_tool.translate_zenoh.rights import name_of_key
 from sros_tool.values import shows
 
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
-"""Patterns for words in a log line: without punctuation, or with the punctuation of topics."""
+"""Patterns that split a log line into words: without punctuation, or with that of topics."""
 _NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
 _LONGEST = 8000
-"""Number of characters that are read of a line, as a line may have many megabytes."""
+"""Number of characters of a line that are read, because a line may have many megabytes."""
 
 
 @shows(
@@ -124,13 +124,13 @@ class ExplainedLog(NamedTuple):
 
 
 class SearchedKeystore:
-    """An index of a keystore that finds the enclaves of peers and nodes."""
+    """An index of the enclaves of a keystore, by peers and nodes that a log names."""
 
     def __init__(self, root: Path) -> None:
         self._keystore = Keystore(root)
 
     def peer(self, guid: str) -> str:
-        """Return the enclave of the participant with a GUID in a vendor's spelling, or ""."""
+        """Return the enclave of the participant with a GUID, as a vendor prints it; or ""."""
         identity = guid.replace(".", "")
         if ":" in guid:
             identity = "".join(word.zfill(8) for word in guid.split(":"))
@@ -167,7 +167,7 @@ class SearchedKeystore:
 
 
 FindEnclave = Callable[[str], LoadedEnclave | None]
-"""A function that loads an enclave by name ("" is the enclave that the user named), or None."""
+"""Function that loads an enclave by name ("": the one that the user named), or returns None."""
 
 
 def explain_log_of(
@@ -175,8 +175,8 @@ def explain_log_of(
 ) -> ExplainedLog:
     """Explain the security messages of a log, and examine the enclaves that it names.
 
-    ``name`` is the enclave (or its folder) whose processes wrote the log, or "" if the log names
-    the enclave.
+    ``name`` is the enclave, or its folder, whose processes wrote the log; "" if the log names the
+    enclave itself.
 
     Raises:
         UsageError: ``name`` is an enclave, and there is no keystore.
@@ -232,8 +232,8 @@ def explain_log(
 ) -> tuple[LogFinding, ...]:
     """Return the security messages of a log, each once, in the order of the log.
 
-    ``context`` gives domain and time for an enclave; ``root`` is the keystore's path in commands;
-    ``keystore`` is the keystore that is searched for the enclaves of peers and nodes.
+    ``find`` loads an enclave; ``context`` returns domain and time for it.  ``root`` is the path of
+    the keystore in commands; ``keystore`` is searched for the enclaves of peers and nodes.
     """
     plain = plain_text(text)
     examiner = _Examiner(find, context, root, keystore)
@@ -254,7 +254,7 @@ def explain_log(
 
 @dataclass(frozen=True, slots=True)
 class _Hit:
-    """A line that matches the table of texts; ``fields`` are the groups of the text's pattern."""
+    """A log line with a known text; ``fields`` are the groups of the text's pattern."""
 
     line: int
     text: str
@@ -274,14 +274,14 @@ class _Hit:
 
     @property
     def kind(self) -> str:
-        """The key by which lines are grouped into one finding."""
+        """A key that is equal for lines that are reported as one finding."""
         if self.meaning is not UNKNOWN:
             return f"{self.meaning.id} {self.cause}"
         return _NUMBERS.sub("", plain_refusal(self.text))
 
 
 def _joined(lines: list[str]) -> Iterator[tuple[int, str]]:
-    """Yield the lines with their numbers; an error stack of OpenSSL joins the line before it."""
+    """Yield lines with their numbers; an error stack of OpenSSL is joined to the line before."""
     number, current = 0, ""
     for index, line in enumerate(lines, 1):
         if current and CONTINUED.match(line):
@@ -319,10 +319,9 @@ def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
 
 
 def _broken(process: str, line: str, rest: str, following: str) -> str:
-    """Return a message that was broken into two lines, for instance by a terminal, or "".
+    """Return a message that was broken into two lines, for instance by a terminal; else "".
 
-    A line is taken for broken if neither ``line`` nor ``following`` has a known meaning, but both
-    together have one.
+    ``line`` counts as broken if it and ``following`` have no known meaning, but both together do.
     """
     if not UNKNOWN.pattern.search(rest):  # first, because it is fast
         return ""
@@ -348,7 +347,7 @@ def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
 
 
 def _strongest(hits: Iterable[_Hit], reported: set[str]) -> Iterator[_Hit]:
-    """Yield the hits; leave out a weak hit if the same process has a strong hit.
+    """Yield the hits, without weak hits if the same process has a stronger one.
 
     ``reported`` are the processes whose denied topics are reported separately.
     """
@@ -370,7 +369,7 @@ def _grouped(hits: Iterable[_Hit]) -> Iterator[list[_Hit]]:
 def _lines_naming(
     lines: list[str], topics: set[str]
 ) -> Mapping[tuple[str, str], list[tuple[int, str]]]:
-    """Map (process, topic) to the numbers and texts of the lines that name the topic."""
+    """Map pairs of process and topic to the numbers and texts of lines that name the topic."""
     lines_of = defaultdict[tuple[str, str], list[tuple[int, str]]](list)
     for number, line in enumerate(lines, 1):
         process, text = labelled_line(line)
@@ -396,7 +395,7 @@ _DROPPED: Mapping[tuple[str, bool], str] = {
     ("Reply", False): "call",
     ("Declare Queryable", False): "call",
 }
-"""Denied access of a remote process, by kind of dropped message and whether it was incoming."""
+"""The right of a remote process that is denied, by message kind and whether it came in."""
 _GRAPH: Mapping[tuple[str, bool], str] = {
     ("Liveliness Token", True): "announce this node, topic or service in the graph",
     ("Liveliness Token", False): "see this node, topic or service in the graph",
@@ -406,7 +405,7 @@ _GRAPH: Mapping[tuple[str, bool], str] = {
 
 
 def _dropped(lines: Iterable[str], root: str) -> Iterator[LogFinding]:
-    """Yield a finding for each missing right because of which Zenoh dropped messages."""
+    """Yield a finding for each right whose lack made Zenoh drop messages."""
     numbered = ((n, *labelled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
     groups: dict[tuple[str, str, str], list[DroppedMessage]] = {}
     for message in dropped_messages(numbered):
@@ -453,7 +452,7 @@ def _of_dropped(dropped: DroppedMessage, what: str, root: str) -> str:
 
 
 class _Examiner:
-    """A search for the causes of log messages in the enclaves that they name."""
+    """Searches the enclaves that a log names for the causes of its messages."""
 
     def __init__(
         self,
@@ -469,7 +468,7 @@ class _Examiner:
         self._evaluators: dict[tuple[Vendor, str], Evaluator] = {}
 
     def matters(self, hit: _Hit) -> bool:
-        """Return whether a hit is a real message, and not about an enclave that exists."""
+        """Return whether a hit is a security message; one line is not if the enclave "/" exists."""
         return hit.meaning is not RUNS_OPEN or self._find("/") is None
 
     def message(self, hits: list[_Hit]) -> LogFinding:
@@ -517,7 +516,7 @@ class _Examiner:
         )
 
     def _with_names(self, text: str, enclave: LoadedEnclave | None, hit: _Hit) -> str:
-        """Return a remedy, its placeholders replaced by keystore, enclave and the hit's fields."""
+        """Return a remedy with keystore, enclave and the hit's fields for its placeholders."""
         own = "" if hit.meaning in (NO_ENCLAVE, RUNS_OPEN) or not enclave else enclave.name
         names = {"KEYSTORE": self._root, "ENCLAVE": own}
         for word, name in names.items():
@@ -528,7 +527,7 @@ class _Examiner:
         return text.format(**hit.quoted)
 
     def _peer(self, finding: LogFinding, hits: Sequence[_Hit]) -> LogFinding:
-        """Return the finding with causes and remedies from the enclaves of the peers in the log."""
+        """Return the finding with causes and remedies in the enclaves of the peers in the log."""
         shown = dict.fromkeys(hit.fields["peer"] for hit in hits if hit.fields.get("peer"))
         names = (
             [self._keystore.peer(peer) for peer in islice(shown, _MOST_PEERS)]
@@ -560,7 +559,7 @@ class _Examiner:
         return replace(finding, found=tuple(known), checked=bool(known), remedy=text)
 
     def denial(self, denial: Denial, named: list[tuple[int, str]]) -> LogFinding:
-        """Return the finding for a denied topic; ``named`` are the lines that name it."""
+        """Return the finding for a denied topic; ``named`` are the lines that name the topic."""
         line, text = named[0][0], " ".join(named[0][1].split())
         right, name = _in_ros_terms(denial)
         who = "a peer" if denial.remote else denial.enclave or "the process"
@@ -661,7 +660,7 @@ class _Examiner:
     def _causes(
         self, enclave: LoadedEnclave, answer: Answer, faults: tuple[Fault, ...]
     ) -> Iterator[tuple[str, str]]:
-        """Yield the enclave's faults with remedies: the ones in ``faults``, or else all."""
+        """Yield faults of the enclave with remedies: those in ``faults``, or else all of them."""
         fitting = [problem for problem in answer.problems if problem.fault in faults]
         for problem in fitting or answer.problems:
             yield str(problem), remedy(problem.fault, self._root, enclave.name, problem.file)
@@ -713,7 +712,7 @@ _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events")
 
 
 def _nodes(answer: Answer) -> tuple[str, ...]:
-    """Return a clause that names the nodes in the permissions of an enclave, in a tuple."""
+    """Return a clause on the nodes that an enclave's permissions name, in a tuple; or ()."""
     nodes = _served(answer)
     if nodes:
         return (f"its permissions are for {_listed(nodes)}",)
@@ -758,7 +757,7 @@ _HALVES = {
 
 
 def _in_ros_terms(denial: Denial) -> tuple[str, str]:
-    """Return the denied operation, as a word of `question.WORDS`, and the ROS name."""
+    """Return the denied operation (a word of `question.WORDS`) and the ROS name."""
     prefix, topic = denial.topic[:2], denial.topic[2:]
     if prefix in SERVICE_ENDS and topic.endswith(SERVICE_ENDS[prefix]):
         name, part, _ = topic.removesuffix(SERVICE_ENDS[prefix]).partition(ACTION_SEPARATOR)
@@ -770,7 +769,7 @@ def _in_ros_terms(denial: Denial) -> tuple[str, str]:
 
 
 def _words_to_ask(denial: Denial, name: str) -> tuple[str, ...]:
-    """Return the operations that `sros explain` can be asked about a denied topic."""
+    """Return the operations to ask `sros explain` about for a denied topic."""
     right, _ = _in_ros_terms(denial)
     either = ("call", "serve") if denial.topic[:2] in SERVICE_ENDS else (PUBLISH, SUBSCRIBE)
     words = either if right == "use" else (right,)

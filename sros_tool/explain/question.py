@@ -60,7 +60,7 @@ OWN_PARTS = (
     Part(AccessVerb.PUBLISH, ROS_DISCOVERY_TOPIC, "node names"),
     Part(AccessVerb.SUBSCRIBE, ROS_DISCOVERY_TOPIC, "node names"),
 )
-"""The endpoints that every ROS 2 process needs to start."""
+"""The endpoints that every process of ROS 2 needs in order to start."""
 
 
 @shows("word", "type", "right", "name", null_if_empty=("type", "right", "name"))
@@ -144,11 +144,10 @@ _OF_ACTIONS = {"call": "call", "serve": "execute"}
 
 
 def about_action(question: Question, rights: Iterable[Right]) -> Question | None:
-    """Return the question about the action with this name, if the rights have no such service.
+    """Return the question about the action with this name, if rights show that it is one.
 
-    "call" and "serve" are used for services and actions, whose names look alike.
-    Returns None if ``rights`` do not show that the name is an action, or if the question
-    is about something else.
+    "call" and "serve" are for services and actions, whose names look the same.  Returns None if
+    ``rights`` do not show an action, or if the question is about something else.
     """
     if question.type != "service" or question.word not in _OF_ACTIONS:
         return None

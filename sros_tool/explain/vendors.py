@@ -1,4 +1,4 @@
-"""Decisions of DDS vendors for one enclave, and for all enclaves of a keystore."""
+"""The decisions of DDS vendors on one enclave, or on all enclaves of a keystore."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ DdsExplanation = VendorExplanation | Comparison
 
 
 class Compared(Enum):
-    """Whose decisions are compared."""
+    """Whose decisions are compared: those of all vendors, or of all distributions."""
 
     VENDORS = auto()
     DISTRIBUTIONS = auto()
@@ -153,10 +153,10 @@ def explain_on_dds(
     kind: str | None = None,
     every: Compared | None = None,
 ) -> DdsExplanation:
-    """Return the decision of the chosen vendor, or the decisions of all vendors or distributions.
+    """Return the decision of the chosen vendor, or those of all vendors or distributions.
 
-    ``chosen`` is the vendor and the reason to choose it; ``kind`` is the type of the name if the
-    user gave it.
+    ``chosen`` is the vendor and the reason to choose it; ``kind`` is the kind of the name (topic,
+    service or action) if the user gave it; ``every`` says what is compared.
     """
     vendor, why = chosen
     enclave = asked.enclave
@@ -200,7 +200,7 @@ def _vendor_differences(answers: Sequence[Answer]) -> str:
 
 
 def _differences(who: str, decided: Sequence[tuple[str, Outcome]]) -> str:
-    """Return a sentence on those that decide otherwise than the first; all with their titles."""
+    """Return a sentence on those whose outcome differs from the first one's, by their titles."""
     title, first = decided[0]
     others = [f"{other} ({outcome})" for other, outcome in decided if outcome != first]
     if not others:
@@ -227,7 +227,7 @@ def _provenance_notes(answer: Answer) -> Iterator[Note]:
 
 
 def _other_type(evaluator: Evaluator, answer: Answer, kind: str | None) -> Iterator[Note]:
-    """Yield a note if the enclave may not call a service, but may call an action of this name."""
+    """Yield a note if the enclave may not call the service, but an action with this name."""
     question = answer.question
     if question.word == "call" and question.type == "service" and not kind and not answer.allowed:
         action = ask("call", question.name, "action")
@@ -261,7 +261,7 @@ def _other_name(answer: Answer) -> Iterator[Note]:
 
 
 def _beside(enclave: LoadedEnclave, question: Question, context: JoinContext) -> ZenohBeside | None:
-    """Return Zenoh's decision, or why it is not known; None if the keystore has no Zenoh files."""
+    """Return Zenoh's decision, or why it is unknown; None if the keystore has no Zenoh files."""
     keystore = enclave.keystore
     if keystore is None or enclave.state is None or not is_keystore(keystore.root):
         return None
@@ -278,7 +278,7 @@ def _beside(enclave: LoadedEnclave, question: Question, context: JoinContext) ->
 
 
 def _runs_on_zenoh(keystore: Keystore, name: str) -> bool:
-    """Return whether an enclave has a Zenoh configuration, or the keystore is set up for Zenoh.
+    """Return whether an enclave has Zenoh files, or the keystore is set up for Zenoh.
 
     If the settings have no [zenoh] part, other enclaves are not examined: there may be thousands.
     """
@@ -346,7 +346,7 @@ class WhoByVendor(NamedTuple):
 
 
 class VendorOfKeystore(NamedTuple):
-    """A vendor that decides for the enclaves ``names`` of a keystore; without names, for all."""
+    """The decisions of a vendor on the enclaves ``names`` of a keystore; without names, on all."""
 
     keystore: Keystore
     vendor: Vendor

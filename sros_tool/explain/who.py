@@ -1,4 +1,4 @@
-"""Decide a question for all enclaves of a keystore, and follow whom an enclave can influence."""
+"""Decide a question for all enclaves of a keystore, and find whom an enclave can influence."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ _Outcome = TypeVar("_Outcome", bound=EnclaveOutcome)
 
 
 class Decider(Protocol):
-    """A DDS vendor, or Zenoh, that decides for the enclaves of a keystore."""
+    """A DDS vendor, or Zenoh, and the keystore on whose enclaves it decides."""
 
     @property
     def keystore(self) -> Keystore:
-        """The keystore whose enclaves are decided for."""
+        """The keystore on whose enclaves it decides."""
 
     @property
     def title(self) -> str:
@@ -79,9 +79,9 @@ class Everybody(NamedTuple):
 
 
 def ask_everybody(decider: Decider, question: Question, kind: str | None) -> Everybody:
-    """Return the decisions for all enclaves; a name of an action is taken for the action.
+    """Return the decisions on all enclaves; the name of an action is taken for the action.
 
-    ``kind`` is the type of the name if the user gave it.
+    ``kind`` is the kind of the name (topic, service or action) if the user gave it.
     """
     outcomes = decider.outcomes(question)
     taken: tuple[Note, ...] = ()
@@ -106,7 +106,7 @@ def callable_action(decider: Decider, question: Question) -> Note | None:
 
 
 def of_each(names: Sequence[str], decide: Callable[[str], _Outcome]) -> tuple[_Outcome, ...]:
-    """Return the decision for each of the named enclaves, sorted by name; runs on all cores."""
+    """Return the decision on each of the enclaves, sorted by name; uses all cores."""
     from sros_tool.parallel import map_slices, tick  # a question about one enclave needs none
 
     def work(part: Sequence[str]) -> list[_Outcome]:
@@ -221,10 +221,9 @@ def follow_reach(source: RightsSource, enclave: str, *, infrastructure: bool) ->
 
 
 def _rights_of_router(source: RightsSource, router: str) -> Iterator[Right]:
-    """Yield the rights of a router, as rights to send and receive.
+    """Yield what a router may send and receive, as rights.
 
-    They are the opposite of the rights of its enclaves, and what other routers let it send and
-    receive.
+    It may receive what its enclaves may send, and the reverse; and what other routers allow it.
     """
     links = source.links
     for right in source.rights:

@@ -1,7 +1,7 @@
-"""The assumptions of a comparison of two sides, and the parts that it leaves out on purpose.
+"""The assumptions under which two sides are compared, and what is not compared on purpose.
 
-A policy does not state its governance and, except for robots of a fleet, not its domains.
-Permissions do not state their governance.
+A side is a policy, a keystore or permissions.  A policy states no governance and, except for robots
+of a fleet, no domains.  Permissions state no governance.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from sros_tool.zenoh.configuration import Mode
 
 
 def completed(side: AccessSource, other: AccessSource) -> AccessSource:
-    """Return a side with its domains and access control filled in, to compare it with another.
+    """Return a side with the domains and access control that it does not state itself.
 
-    Enclaves of robots are for the domain of their robot.  Without a governance of its own, a side
-    has access control of everything, in the domains of the other side and in its own ones.
+    Enclaves of robots are for the domain of their robot.  A side without a governance gets access
+    control of everything, in its own domains and those of the other side.
     """
     domains = domains_of_robots(side, other)
     permissions = _certified_as(side, other)
@@ -48,10 +48,10 @@ def completed(side: AccessSource, other: AccessSource) -> AccessSource:
 
 
 def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permissions]:
-    """Return a side's permissions; permissions of a policy get the subjects of the other side.
+    """Return the permissions of a side; those of a policy get the subjects of the other side.
 
-    If the other side is a keystore with unique subjects, further enclaves get a unique subject,
-    too.
+    If the other side is a keystore with unique subjects, enclaves that only the policy has get a
+    unique subject, too.
     """
     if side.kind != "policy" or other.kind == "policy":
         return side.permissions
@@ -69,7 +69,7 @@ def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permi
 
 
 def domains_of_robots(side: AccessSource, other: AccessSource) -> dict[str, int]:
-    """Map the enclaves of robots that have a domain in the fleet to this ROS domain."""
+    """Map enclaves to the ROS domain of their robot, if the fleet states one."""
     robots = side.fleet or other.fleet
     if side.kind != "policy" or robots is None:
         return {}
@@ -92,7 +92,10 @@ def _for_domain(permissions: Permissions, domain: int) -> Permissions:
 
 
 def _granted(side: AccessSource) -> DomainSet:
-    """Return the domains for which permissions have rules; empty for a policy, which fits any."""
+    """Return the domains for which the permissions have rules; empty for a policy.
+
+    A policy fits any domain.
+    """
     if side.kind == "policy":
         return DomainSet(())
     return DomainSet(
@@ -107,7 +110,7 @@ def _granted(side: AccessSource) -> DomainSet:
 
 
 def _controlling(governance: Governance | None, more: DomainSet) -> Governance | None:
-    """Return a governance with access control of everything, also in further domains."""
+    """Return a governance with access control of everything, also for the domains ``more``."""
     if governance is None:
         return None
     strict = governance_for(strict_protection(), more).domain_access_rules[0]
@@ -137,7 +140,7 @@ def _controlling(governance: Governance | None, more: DomainSet) -> Governance |
 
 
 def assumptions(base: AccessSource, head: AccessSource) -> tuple[str, ...]:
-    """Return the assumptions about sides that do not state everything, as clauses."""
+    """Return, as clauses, what is assumed about a side that does not state everything."""
     return tuple(_assumed(base, head))
 
 

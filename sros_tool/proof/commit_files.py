@@ -49,10 +49,10 @@ def checked_path(text: str) -> str:
 
 @dataclass(slots=True)
 class CommitFiles:
-    """The files of a commit that were requested, written below the private folder ``folder``.
+    """The requested files of a commit, which are written to the private folder ``folder``.
 
-    ``name`` is what messages call the commit.  ``fell_back`` has the includes whose file is not in
-    the commit, so that their fallback counts; ``refused`` why a file was not read.
+    ``name`` is the commit's name in messages.  ``fell_back`` has the includes that use their
+    fallback because the commit lacks the file; ``refused`` has the reasons why files were not read.
     """
 
     repository: Repository
@@ -68,7 +68,7 @@ class CommitFiles:
         return self.repository.find(self.commit, path)
 
     def file(self, path: str) -> Path | None:
-        """Write the file at a path of the commit; return where, or None if it does not exist.
+        """Write the file at a path of the commit; return its location, or None without such a file.
 
         Raises:
             DocumentError: the path is not a file, but for instance a link.
@@ -81,13 +81,13 @@ class CommitFiles:
         return self._write(path, entry, self.repository.content(entry.id))
 
     def policies(self, path: str, *, placeholders: bool) -> list[Path]:
-        """Write the policies at a path, a file or folder, and return their locations.
+        """Write the policies at a path, which is a file or a folder; return their locations.
 
-        Included files are written, too.  The list is empty if the path does not exist.
+        Included files are written, too.  If the path does not exist, the result is empty.
 
         Raises:
-            DocumentError: the path is no file or folder, a possible policy is damaged, or
-                the folder has links, submodules, or too much.
+            DocumentError: the path is no file or folder, a file that may be a policy is damaged, or
+                the folder has links, submodules, or too many files.
         """
         entry = self.entry(path)
         if entry is None:
@@ -104,7 +104,7 @@ class CommitFiles:
             raise DocumentError(*texts) from error
 
     def tree(self, path: str) -> Path | None:
-        """Write a folder such as a keystore with all content; return its location, or None.
+        """Write a folder with all its content, such as a keystore; return its location, or None.
 
         Raises:
             DocumentError: not a folder, too large, or with a submodule or a link that leads out.
@@ -227,7 +227,7 @@ _OF_POLICIES = (
     *((b"<policy", b"version"), (b"<enclaves", b"path"), (b"<profile", b" ns=")),
     *((b"<topics", b"ALLOW"), (b"<services", b"ALLOW"), (b"<actions", b"ALLOW")),
 )
-"""The texts by which an XML file is recognized as a policy or a part, with the next character."""
+"""Texts by which an XML file is recognized as a policy, or as a part of one."""
 _EBCDIC = b"\x4c\x6f\xa7\x94"
 """The beginning of an XML file in EBCDIC (XML 1.0, appendix F)."""
 _ENCODING = re.compile(rb"encoding ?= ?[\"']([^\"']*)")
@@ -242,7 +242,7 @@ _WHOLE = re.compile(r"(?:xpointer\(/(?:\*|[\w.-]+)(?P<below>/\*)?\))?")
 
 
 def may_be_policy(content: bytes) -> bool:
-    """Return whether a file could be a policy or a part of a policy, whatever its name."""
+    """Return whether a file may be a policy, or a part of one; its name does not matter."""
     text = content.replace(b"\0", b"")  # UTF-16 has a zero in each letter
     if text.startswith(_EBCDIC):
         return True
@@ -296,7 +296,7 @@ def is_whole_policy(content: bytes) -> bool:
 
 
 def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) -> dict[str, bool]:
-    """Map files that policies include completely to whether their root element is included, too.
+    """Map files that policies include completely to whether their root element is included.
 
     Args:
         policies: the paths of the policies.
@@ -315,13 +315,13 @@ def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) 
 
 
 def includes_files(content: bytes) -> bool:
-    """Return whether a file may be XML, so that it can include other files."""
+    """Return whether a file may include other files: whether it may be XML."""
     begin = content[:_BEGIN].replace(b"\0", b"").lstrip(_BEFORE)
     return not begin or begin.startswith((b"<", _EBCDIC))
 
 
 def users_of(parts: Iterable[str], files: Mapping[str, bytes]) -> set[str]:
-    """Return the files that include one of the parts, directly or through other files."""
+    """Return the files that include one of ``parts``, directly or through other files."""
     includes = {
         path: {target for target, _ in _includes(path, data)} for path, data in files.items()
     }

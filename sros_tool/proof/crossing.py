@@ -1,8 +1,8 @@
-"""Find names that pass between Zenoh routers on one side of a comparison, and not on the other.
+"""Find names that pass between Zenoh routers on one side of a comparison only.
 
-Two enclaves at one router exchange all that their rights allow.  At two routers they exchange only
-names that may cross at both.  So a wider ``crossing`` lets more pass, and so does a router that is
-gone, or an enclave that moves to the router of another one.
+Two enclaves at the same router exchange all that their rights allow.  At two routers they exchange
+only names that both routers let cross.  So more names pass if ``crossing`` gets wider, if a router
+is removed, or if an enclave moves to the router of another one.
 
 This module reads no files.
 """
@@ -25,20 +25,20 @@ _ABSOLUTE = valid_topics("", "")
 
 
 def limits_crossing(side: AccessSource) -> bool:
-    """Return whether the settings or the fleet of a side limit what crosses between routers."""
+    """Return whether the settings or the fleet of a side limit which names cross."""
     network = _network(side, side)
     return network is not None and _limited(network)
 
 
 def states_routers(side: AccessSource) -> bool:
-    """Return whether settings or a fleet say which routers there are, and what crosses there."""
+    """Return whether settings or fleet of a side name the routers, and what crosses there."""
     return _network(side, side) is not None
 
 
 def more_crossing(
     old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield what the settings or the fleet of ``new`` let cross, and those of ``old`` do not."""
+    """Yield changes of settings and fleet by which more names cross in ``new`` than in ``old``."""
     before, after = _network(old, new), _network(new, old)
     if before is None or not _limited(before):
         return
@@ -63,7 +63,7 @@ def more_crossing(
 def _moved(
     before: ZenohNetwork, after: ZenohNetwork, enclaves: set[str], limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield the routers whose enclaves are at another router, where more of their names pass."""
+    """Yield changes by which enclaves move to another router, where more of their names pass."""
     places: dict[tuple[str, str], str] = {}
     for enclave in sorted(enclaves):
         places.setdefault((_router(before, enclave), _router(after, enclave)), enclave)
@@ -89,9 +89,10 @@ def _moved(
 def more_passed_on(
     old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield what the rules of routers in ``new`` let other routers do, and those of ``old`` do not.
+    """Yield changes of routers' rules by which they allow other routers more than in ``old``.
 
-    A router that is gone counts only if settings do not say to which router its enclaves go.
+    A removed router counts only if the settings do not say which router its enclaves connect to
+    now.
     """
     if new.routers and not (states_routers(old) and states_routers(new)):
         for router in sorted({*old.passing} - {*new.routers}):
@@ -119,11 +120,11 @@ def more_passed_on(
 
 
 _Crossing = tuple[tuple[str, ...], ...]
-"""Lists of expressions; a name crosses if each list has one that matches it."""
+"""Lists of expressions; a name crosses if it matches an expression of every list."""
 
 
 def _more(before: _Crossing, after: _Crossing, limit: SearchLimit) -> str:
-    """Return a name that crosses by ``after`` and not by ``before``, or ""."""
+    """Return a name that crosses by ``after`` but not by ``before``; "" if there is none."""
     names = _names(after) - _names(before)
     return (names & _ABSOLUTE).example(limit) or names.example(limit) or ""
 
@@ -160,9 +161,9 @@ def _limited(network: ZenohNetwork) -> bool:
 
 
 def _network(side: AccessSource, other: AccessSource) -> ZenohNetwork | None:
-    """Return the network of a side: of its settings, or of its fleet and else the other's settings.
+    """Return the Zenoh network of a side, or None if neither side says anything about routers.
 
-    None if neither says anything about routers.
+    The settings of the side state it; else its fleet, with the settings of the other side.
     """
     if side.later is not None:
         return side.later.zenoh

@@ -1,8 +1,9 @@
-"""Decide requirements in a world, for all names, with a witness for each broken requirement.
+"""Decide whether requirements hold in a world, for all names.
 
-To do something is to write one of its DDS topics: whoever may write the requests of a service can
-have them executed, even if it may not read the replies.  To subscribe is to read.  Only what an
-enclave must be able to do needs all of its topics.
+For each broken requirement there is a witness, which shows how it is broken.  "To do" something
+means to write one of its DDS topics: whoever may write the requests of a service can have them
+executed, even without the right to read the replies.  "To subscribe" means to read.  Only a
+requirement of what an enclave must be able to do needs all topics.
 
 This module reads no files.
 """
@@ -47,9 +48,10 @@ from sros_tool.reach import OF_EVERY_NODE, QUESTIONS
 
 @dataclass(frozen=True, slots=True)
 class Use:
-    """An enclave that may write or read a DDS topic, for a ``right`` to the ROS name ``name``.
+    """A use of a DDS topic by an enclave, which writes or reads it.
 
-    ``right`` is "" where the topic belongs to no right, such as a DDS topic without a ROS name.
+    ``right`` is the right to the ROS name ``name`` to which the topic belongs; "" if it belongs to
+    none, such as a DDS topic without a ROS name.
     """
 
     enclave: str
@@ -61,10 +63,10 @@ class Use:
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """The reason that a requirement does not hold: a shortest list of forbidden or missing uses.
+    """The reason why a requirement does not hold: a shortest list of forbidden or missing uses.
 
-    For influence it is a chain: each use that writes is followed by the one that reads it.
-    ``others`` are further enclaves that break the requirement, each on its own.
+    For influence, the uses are a chain: after each use that writes comes the use that reads.
+    ``others`` are further enclaves that break the requirement as well.
     """
 
     uses: tuple[Use, ...]
@@ -86,10 +88,10 @@ class Verdict:
     """The decision on a requirement in one world.
 
     ``witness`` is None if the requirement holds.  ``empty`` are names and enclaves in the
-    requirement that do not occur in the world, so that it cannot fail for them.  ``always`` says
-    why it cannot fail whatever rights the enclaves get, or is "".  ``assumed`` is a name whose
-    protection is not stated but assumed, or "".  ``kept`` is a use that the requirement demands and
-    that other enclaves do not get, because it does not pass between routers of Zenoh; or None.
+    requirement that the world does not have.  ``always`` is a clause that says why the requirement
+    cannot fail whatever rights enclaves get, or "".  ``assumed`` is a name whose protection is
+    assumed because the policy does not state it, or "".  ``kept`` is a demanded use that does not
+    pass between Zenoh routers, so other enclaves do not get it; or None.
     """
 
     requirement: Requirement
@@ -102,16 +104,16 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class KeptUse:
-    """A use that does not pass to or from ``others``, enclaves at other routers of Zenoh."""
+    """A use that does not pass between routers of Zenoh to or from the enclaves ``others``."""
 
     use: Use
     others: tuple[str, ...]
 
 
 class Worlds:
-    """Worlds in which requirements are decided; worlds with equal access share a decision.
+    """Several worlds in which requirements are decided.
 
-    The engine of each world confirms the witness.
+    Worlds with equal access share a decision; the engine of each world confirms the witness.
     """
 
     def __init__(self, worlds: Iterable[World]) -> None:
@@ -124,10 +126,10 @@ class Worlds:
     def decide(
         self, requirement: Requirement, limit: SearchLimit
     ) -> Iterator[tuple[World, Verdict]]:
-        """Yield each world with its decision.
+        """Yield each world with its verdict.
 
         Raises:
-            DocumentError: as `decide`.
+            DocumentError: there are too many wildcards to decide it.
         """
         known: dict[World, Verdict] = {}
         for world, first in self._first_alike.items():
@@ -176,7 +178,11 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
 
 
 def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
-    """Ask the engine of the world about each use of a witness: it must agree."""
+    """Check that the engine of the world decides on each use of a witness as the witness says.
+
+    Raises:
+        AssertionError: it does not.
+    """
     if isinstance(requirement, Protected):
         return
     may = not isinstance(requirement, Must)
@@ -195,7 +201,7 @@ _HERE = "\0"
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """A DDS topic of a right, by the text before and after the name."""
+    """A DDS topic that a right needs, by the text before and after the name."""
 
     writes: bool
     begin: str
@@ -223,12 +229,12 @@ def _parts_of(right: str) -> tuple[_Part, ...]:
 
 @lru_cache(maxsize=16)
 def _doing(right: str) -> tuple[_Part, ...]:
-    """Return the DDS topics of a right; access to a single one of them is enough to act."""
+    """Return the DDS topics of a right; access to one of them is enough to do a part of it."""
     return tuple(part for part in _parts_of(right) if part.writes or right == "subscribe")
 
 
 def _each(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
-    """Yield the topics of rights, each with its right."""
+    """Yield the DDS topics of some rights, each with its right."""
     for right, names in rights:
         for name in names:
             for part in _doing(right):
@@ -236,7 +242,7 @@ def _each(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
 
 
 def _match(patterns: Sequence[str], enclave: str) -> bool:
-    """Return whether a pattern of the list matches an enclave and no exception does."""
+    """Return whether an enclave matches a pattern of the list, and none of its exceptions."""
     return any(
         fnmatchcase(enclave, pattern) for pattern in patterns if pattern[0] != EXCEPT
     ) and not any(fnmatchcase(enclave, pattern[1:]) for pattern in patterns if pattern[0] == EXCEPT)
@@ -247,7 +253,7 @@ def _use(enclave: str, right: str, part: _Part, topics: Topics, topic: str) -> U
 
 
 def _better(use: Use) -> tuple[int, str, str]:
-    """Return a sort key for uses: short names first."""
+    """Return a sort key for uses, by which short names come first."""
     return len(use.name), use.name, use.enclave
 
 
@@ -262,7 +268,7 @@ def _not_alone(requirement: Only | Nobody, world: World, limit: SearchLimit) -> 
 def _first_uses(
     rights: RightNames, world: World, limit: SearchLimit, without: Sequence[str] = ()
 ) -> dict[str, Use]:
-    """Map each enclave that has one of the rights to its shortest use, except ``without``."""
+    """Map enclaves with one of the rights to their shortest use; leave out ``without``."""
     uses: dict[str, Use] = {}
     for right, part, topics in _each(rights):
         for met in world.side(part.writes).meeting(topics, limit):
@@ -282,7 +288,7 @@ def _first_of(uses: Collection[Use]) -> Witness | None:
 
 
 def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | None:
-    """Return a witness with the shortest name for which an enclave lacks a topic of a right."""
+    """Return a witness with the shortest name for which an enclave lacks a part of its right."""
     enclave = requirement.enclave
     lacking = []
     for right, names in requirement.rights:
@@ -305,7 +311,7 @@ def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | 
 
 
 def _kept_from_others(requirement: Must, world: World, limit: SearchLimit) -> KeptUse | None:
-    """Return a demanded use that enclaves at other routers have the right for, and do not get."""
+    """Return a demanded use that does not reach enclaves at other routers that may receive it."""
     enclave = requirement.enclave
     for right, names in requirement.rights:
         for part, name in product(_parts_of(right), names):
@@ -325,7 +331,7 @@ def _kept_from_others(requirement: Must, world: World, limit: SearchLimit) -> Ke
 
 
 def _own(world: World, enclave: str, writes: bool) -> NameSet:
-    """Return the topics that an enclave may write, or read, by its own permissions."""
+    """Return the topics that an enclave may write (or read) by its own permissions."""
     access = world.own.get(enclave)
     if access is None:
         return NameSet()
@@ -333,10 +339,9 @@ def _own(world: World, enclave: str, writes: bool) -> NameSet:
 
 
 def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness | None:
-    """Return a witness with a name that too many enclaves may use, and enough of them.
+    """Return a witness with a name that more enclaves may use than the requirement allows.
 
-    An enclave that may write one topic of an action can do a part of the action, and counts as
-    having the right.
+    An enclave that may write one topic of an action can do a part of the action, so it counts.
     """
     most = requirement.most
     best: tuple[Use, ...] = ()
@@ -379,9 +384,9 @@ def _shared_by(
     expression: str,
     limit: SearchLimit,
 ) -> str | None:
-    """Return a name of an expression that at least ``count`` holders may use, or None.
+    """Return a name matching an expression that at least ``count`` holders may use, or None.
 
-    A name that some enclave states is better than one that only wildcards match.
+    A name that an enclave states is preferred to a name that only wildcards match.
     """
     exactly: Counter[str] = Counter()  # by holders without wildcards
     stated: set[str] = set()
@@ -441,7 +446,7 @@ _READ_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/parameter_events"))
 
 
 def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Witness | None:
-    """Return a witness with the shortest name to which an enclave has a further right."""
+    """Return a witness with the shortest name for which an enclave has another right."""
     enclaves = [enclave for enclave in world.enclaves if _match(requirement.enclaves, enclave)]
     uses: dict[str, Use] = {}
     for writes, ordinary in ((True, _WRITTEN_BY_EVERY_NODE), (False, _READ_BY_EVERY_NODE)):
@@ -462,7 +467,7 @@ def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Wit
 
 
 def _both(requirement: NotBoth, world: World, limit: SearchLimit) -> Witness | None:
-    """Return a witness: an enclave with the shortest use of each of the two sets of rights."""
+    """Return a witness with an enclave that has rights of both sets: its shortest use of each."""
     sides = [
         _first_uses(rights, world, limit) for rights in (requirement.first, requirement.second)
     ]
@@ -474,7 +479,7 @@ def _both(requirement: NotBoth, world: World, limit: SearchLimit) -> Witness | N
 
 
 def _unprotected(requirement: Protected, world: World, limit: SearchLimit) -> Witness | None:
-    """Return the shortest name whose messages are not protected as demanded."""
+    """Return a witness with the shortest name that is protected less than demanded."""
     weak = world.weaker(requirement.level)
     if weak is None:
         return None
@@ -486,7 +491,7 @@ def _unprotected(requirement: Protected, world: World, limit: SearchLimit) -> Wi
 
 
 def _assumed(requirement: Requirement, world: World, limit: SearchLimit) -> str:
-    """Return the shortest name whose protection is assumed in the world, or ""."""
+    """Return the shortest name whose protection is only assumed, or ""."""
     if not isinstance(requirement, Protected) or world.demanded is None:
         return ""
     names = []
@@ -497,7 +502,7 @@ def _assumed(requirement: Requirement, world: World, limit: SearchLimit) -> str:
 
 
 def _of_kinds(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
-    """Yield the DDS topics of names of topics, services and actions, without duplicates."""
+    """Yield the DDS topics of names, given as pairs of kind and name, without duplicates."""
     return iter(
         dict.fromkeys(
             part.topics(name)
@@ -512,7 +517,7 @@ def _of_kinds(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
 
 
 def _influence(requirement: Apart, world: World, limit: SearchLimit) -> Witness | None:
-    """Return a chain with the fewest hops from a source to a target, past ``through``."""
+    """Return a witness with a shortest chain from a source to a target, not through ``through``."""
     through = {enclave for enclave in world.enclaves if _match(requirement.through, enclave)}
     inside = [enclave for enclave in world.enclaves if enclave not in through]
     sources = [name for name in inside if _match(requirement.sources, name)]
@@ -524,7 +529,7 @@ def _influence(requirement: Apart, world: World, limit: SearchLimit) -> Witness 
 
 
 def _uses(hop: TopicHop) -> Iterator[Use]:
-    """Yield the two uses of a hop: the source writes the topic, the target reads it."""
+    """Yield the two uses of a hop: its source writes the topic, its target reads the topic."""
     for enclave, writes in ((hop.source, True), (hop.target, False)):
         right, name = right_to_use(hop.topic, writes=writes)
         yield Use(enclave, right, name, hop.topic, writes)
@@ -603,7 +608,7 @@ def _named(right: str, name: str) -> str:
 
 
 def _anybody(world: World, parts: Iterable[_Part], name: str, limit: SearchLimit) -> bool:
-    """Return whether any enclave may use a DDS topic of the name."""
+    """Return whether some enclave may use one of the DDS topics of a name."""
     for part in parts:
         met = world.side(part.writes).meeting(part.topics(name), limit)
         if any(meeting.stated for meeting in met) or any(
@@ -645,9 +650,9 @@ def _shortest_chain(
     without: Container[str],
     limit: SearchLimit,
 ) -> _Chain:
-    """Return a chain with the fewest hops from a source to another enclave in ``targets``, or ().
+    """Return a shortest chain of hops from a source to one of ``targets``, or ().
 
-    No chain leads through the enclaves ``without``.
+    It does not pass through the enclaves ``without``.
     """
     starts = list(sources)
     # A target can be a source, too, and must be reached from another one: so two are kept.
@@ -695,7 +700,10 @@ def influencers(world: World, limit: SearchLimit) -> dict[str, set[str]]:
 
 
 class _Flow:
-    """The hops of a world; topics shared by wildcards are searched once for each pair."""
+    """The hops between the enclaves of a world.
+
+    Topics that are shared only by wildcards are searched once for each pair of enclaves.
+    """
 
     def __init__(self, world: World, limit: SearchLimit) -> None:
         self._world = world
@@ -707,9 +715,10 @@ class _Flow:
         is_unused: Callable[[str], bool],
         is_new: Callable[[str], bool],
     ) -> Iterator[tuple[str, str]]:
-        """Yield topic and reader for the hops from an enclave to readers for which ``is_new``.
+        """Yield pairs of a topic and a reader to which information goes from an enclave.
 
-        Exact topics come first, each only if it is unused.
+        Only readers for which ``is_new`` returns True are considered.  Exact topics come first, and
+        only those for which ``is_unused`` returns True.
         """
         written = self._world.side(True).of[enclave] - _IGNORED
         around = written.around()

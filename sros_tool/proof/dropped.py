@@ -1,7 +1,7 @@
 """Find requirements that a new version of a requirements file drops or weakens.
 
-Whoever changes a policy can change its requirements, too.  A requirement is kept if some
-requirements of the new file demand at least as much, under whatever name and in whatever order.
+Whoever changes a policy can also change its requirements.  A requirement counts as kept if
+requirements of the new file together demand at least as much, whatever their names and order.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from sros_tool.values import shows
 class DroppedRequirement:
     """A requirement of the earlier file that the new file drops or weakens.
 
-    ``requirement`` has its place in the earlier file; ``kept`` are the requirements of the new file
+    ``requirement`` has its place in the earlier file; ``kept`` are requirements of the new file
     about some of the same names or enclaves.
     """
 
@@ -46,7 +46,7 @@ class DroppedRequirement:
 
     @property
     def change(self) -> str:
-        """``dropped`` if the new file demands nothing like it, else ``weakened``."""
+        """``dropped`` if the new file demands nothing similar, else ``weakened``."""
         return "weakened" if self.kept else "dropped"
 
     @property
@@ -89,9 +89,9 @@ class DroppedRequirement:
 def dropped_requirements(
     before: Iterable[Requirement], after: Iterable[Requirement]
 ) -> tuple[DroppedRequirement, ...]:
-    """Return the requirements of ``before`` that ``after`` does not demand in full, in order.
+    """Return the requirements of ``before`` that ``after`` does not fully demand, in order.
 
-    A requirement that is not returned holds wherever all of ``after`` hold.
+    All other requirements of ``before`` hold wherever all requirements of ``after`` hold.
     """
     now = [(part, whole) for whole in after for part in _parts(whole)]
     dropped = []
@@ -107,7 +107,10 @@ def dropped_requirements(
 def dropped_findings(
     before: Iterable[Requirement], after: Iterable[Requirement], file: str
 ) -> list[Finding]:
-    """Return a finding for each requirement that ``after``, of ``file``, does not demand."""
+    """Return a finding for each requirement that ``after`` does not fully demand.
+
+    ``file`` is the path of the requirements ``after``.
+    """
     return [
         DROPPED.found(
             ": ".join(filter(None, (requirement.name, requirement.demand))),
@@ -123,7 +126,7 @@ def dropped_findings(
 
 
 def _parts(requirement: Requirement) -> Iterator[Requirement]:
-    """Split a requirement into requirements about a single name that together demand the same."""
+    """Yield requirements about a single name that together demand the same as ``requirement``."""
     match requirement:
         case Widest(rights=rights, enclaves=enclaves):
             for right in rights:
@@ -157,7 +160,7 @@ def _parts(requirement: Requirement) -> Iterator[Requirement]:
 
 
 def _one_by_one(enclaves: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Split a list into lists with one enclave or pattern, each with all exceptions of the list."""
+    """Yield lists with one enclave or pattern of a list, each with all its exceptions."""
     excepted = tuple(enclave for enclave in enclaves if enclave.startswith(EXCEPT))
     yield from ((enclave, *excepted) for enclave in enclaves if not enclave.startswith(EXCEPT))
 
@@ -168,7 +171,7 @@ def _single_rights(rights: RightNames) -> Iterator[tuple[str, tuple[str, ...]]]:
 
 
 def _implies(new: Requirement, old: Requirement) -> bool:
-    """Return whether one part holds wherever another part holds; false if that is not certain."""
+    """Return whether ``old`` certainly holds wherever ``new`` holds."""
     match new, old:
         case Nobody(), Only() | AtMost() | Nobody():
             return _right_within(old, new)
@@ -211,18 +214,18 @@ def _implies(new: Requirement, old: Requirement) -> bool:
 
 
 def _right_within(part: OfRights, wide: OfRights) -> bool:
-    """Return whether the right of a part is among those of another part."""
+    """Return whether the right of ``part`` is among the rights of ``wide``."""
     ((right, (name,)),), ((wide_right, (wide_name,)),) = part.rights, wide.rights
     return right == wide_right and covers(wide_name, name)
 
 
 def _all_within(narrow: Iterable[str], wide: Sequence[str]) -> bool:
-    """Return whether some pattern of ``wide`` covers each pattern of ``narrow``."""
+    """Return whether each pattern of ``narrow`` is covered by a pattern of ``wide``."""
     return all(any(covers(one, name) for one in wide) for name in narrow)
 
 
 def _enclaves_within(narrow: Sequence[str], wide: Sequence[str]) -> bool:
-    """Return whether a list of enclaves has no enclave that another list does not have."""
+    """Return whether all enclaves of the list ``narrow`` are in the list ``wide``."""
     ours, others = ([name[1:] for name in of if name.startswith(EXCEPT)] for of in (narrow, wide))
     some = [name for name in narrow if not name.startswith(EXCEPT)]
     more = [name for name in wide if not name.startswith(EXCEPT)]
@@ -231,7 +234,7 @@ def _enclaves_within(narrow: Sequence[str], wide: Sequence[str]) -> bool:
 
 
 def _is_alike(new: Requirement, old: Requirement) -> bool:
-    """Return whether two parts are about some of the same names, or enclaves, in the same way."""
+    """Return whether both requirements are of one kind, about some equal names or enclaves."""
     if type(new) is not type(old):
         return False
     match new, old:

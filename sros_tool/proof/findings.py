@@ -41,9 +41,9 @@ from sros_tool.proof.worlds import World
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One use of a witness, and the right that states it; None if nothing does.
+    """A use in a witness, with the right that states it, or None.
 
-    ``lender`` is the enclave that has this right, if the use is by its permissions, or "".
+    ``lender`` is the enclave whose permissions the use is by, if it is another enclave; else "".
     """
 
     use: Use
@@ -64,9 +64,10 @@ class Step:
         return f"{text} with the permissions of {self.lender}" if self.lender else text
 
     def drawn(self) -> tuple[str, str, str, str]:
-        """Return right, kind and name as a policy states them, and the wildcard that allows it.
+        """Return right, kind and name as a policy states them, and the wildcard that allows them.
 
-        A part of an action is shown as the right that was given: to the action, or to the part.
+        A part of an action is shown as the right that the policy states: to the action or to the
+        part.
         """
         right, name, stated = self.use.right, self.use.name, self.place and self.place.right
         whole = KIND_OF.get(right) == "actions"
@@ -85,11 +86,11 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """A broken requirement, the steps of its witness, and the worlds in which it does not hold.
+    """A broken requirement, the steps that show it, and the worlds in which it does not hold.
 
-    ``worlds`` is empty if it holds in none of those that were decided.  ``missing`` is an enclave
-    of the witness that does not exist, or "".  ``idle`` says that no process could start with the
-    files of the enclave, whatever its rights are.
+    ``worlds`` is empty if it holds in no decided world.  ``missing`` is an enclave in the witness
+    that does not exist, or "".  With ``idle``, no process could start with the enclave's files,
+    whatever rights it has.
     """
 
     requirement: Requirement
@@ -102,11 +103,11 @@ class Violation:
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """All decisions: broken requirements, and why (parts of) requirements cannot fail.
+    """All decisions on requirements: which are broken, and why others cannot fail.
 
-    ``assumed`` are requirements that hold only with the protection of the default template, which
-    is assumed, each with a name whose protection the policy does not state.  ``kept`` are those
-    that hold, with a use that does not pass between routers of Zenoh.
+    ``assumed`` are requirements that hold only with the assumed protection of the default template,
+    each with a name whose protection the policy does not state.  ``kept`` are requirements that
+    hold, each with a use that does not pass between routers of Zenoh.
     """
 
     violations: tuple[Violation, ...]
@@ -153,7 +154,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
 
 
 def _step(use: Use, world: World, system: System) -> Step:
-    """Return a use with the right that allows it, which may belong to another enclave."""
+    """Return a use with the right that allows it, which another enclave may have."""
     lender = world.lender(use.enclave, use.writes, use.topic)
     stating = replace(use, enclave=lender) if lender else use
     return Step(use, system.places.find(stating), lender)
@@ -259,7 +260,7 @@ def _fact(violation: Violation) -> str:
 
 
 def _chain(steps: Sequence[Step]) -> str:
-    """Return text such as ``/a -publish /x-> /b -publish /y-> /c``."""
+    """Return a chain of steps as text, such as ``/a -publish /x-> /b -publish /y-> /c``."""
     hops = zip(steps[::2], steps[1::2], strict=True)
     return " ".join(
         (steps[0].use.enclave, *(f"-{step.does()}-> {heard.use.enclave}" for step, heard in hops))
@@ -305,7 +306,7 @@ def _not_crossing(requirement: Requirement, kept: KeptUse) -> Finding:
 
 
 def assumption_text(name: str) -> str:
-    """Return a clause on a name whose protection the policy does not state, but is assumed."""
+    """Return a clause that says that the protection of a name is assumed, not stated."""
     assumed = f"that of the template {DEFAULT_TEMPLATE} is assumed"
     return f"the policy does not say how {name} is protected, and {assumed}"
 
@@ -323,7 +324,7 @@ _WIDE_LIST = 50
 
 
 def suggest(rights: Iterable[Right], worlds: Sequence[World]) -> tuple[Requirement, ...]:
-    """Propose requirements that hold in all worlds; ``rights`` are the allowed rights.
+    """Propose requirements that hold in all worlds, by the allowed ``rights``.
 
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
@@ -340,7 +341,7 @@ def suggest(rights: Iterable[Right], worlds: Sequence[World]) -> tuple[Requireme
 
 
 def _joined(requirement: Requirement, other: Requirement) -> Requirement | None:
-    """Join two requirements of a kind that demand the same of different names, or return None."""
+    """Return a requirement that demands the same as two, or None if they cannot be joined."""
     match requirement, other:
         case (
             Nobody(rights=(("request", some),)),
@@ -353,7 +354,7 @@ def _joined(requirement: Requirement, other: Requirement) -> Requirement | None:
 
 
 class _Stated:
-    """The enclaves that state each right to a name, and the wildcards of each right."""
+    """Which enclaves state each right to a name, and the wildcards of each right."""
 
     def __init__(self, rights: Iterable[Right]) -> None:
         self.users: dict[tuple[str, str], set[str]] = defaultdict(set)
@@ -386,7 +387,7 @@ def _candidates(stated: _Stated, worlds: Sequence[World]) -> Iterator[Requiremen
 
 
 def _alone(stated: _Stated, right: str) -> Iterator[Only]:
-    """Yield a requirement for each enclave that alone has a right to names that others receive."""
+    """Yield a requirement for each enclave that is the only one with a right to a received name."""
     other = OTHER_SIDE[right]
     names: dict[str, list[str]] = defaultdict(list)
     for name in stated.names(right):
@@ -398,7 +399,7 @@ def _alone(stated: _Stated, right: str) -> Iterator[Only]:
 
 
 def _unused_services(stated: _Stated) -> Iterator[Nobody]:
-    """Yield requirements against calls of unused services that change a node's state."""
+    """Yield requirements that nobody calls services that change a node and that no enclave uses."""
     last = {name.rpartition("/")[2] for name in stated.names("reply") if name.count("/") > 1}
     for each in sorted(last.difference(READING_SERVICES)):
         yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{each}",)),))
@@ -416,7 +417,7 @@ def _limits(stated: _Stated) -> Iterator[AtMost]:
 
 
 def _gates(world: World) -> Iterator[Apart]:
-    """Yield requirements that enclaves can be influenced only through one gate enclave."""
+    """Yield requirements that some enclaves can be influenced only by way of one other enclave."""
     for target, sources in sorted(influencers(world, SearchLimit()).items()):
         if len(sources) == 1:
             yield Apart(source=_NOWHERE, sources=("*",), targets=(target,), through=tuple(sources))
@@ -431,10 +432,10 @@ _HEAD = """\
 
 
 def render_requirements(requirements: Iterable[Requirement], of: str) -> str:
-    """Return requirements as TOML with their demands as comments; ``of`` names the source on top.
+    """Return requirements as TOML, with their demands as comments.
 
-    `sros_tool.proof.requirements.parse_requirements` returns equal requirements, except for their
-    places.
+    ``of`` names the source at the top.  `sros_tool.proof.requirements.parse_requirements` returns
+    equal requirements, with other places.
     """
     lines = [_HEAD.format(of=json.dumps(of))]
     for requirement in requirements:

@@ -1,7 +1,7 @@
 """Find access that HEAD grants and BASE does not, and the reverse, for all names.
 
-Each vendor's rules are compared as sets of topics, and each name that is reported was confirmed by
-the decision of that vendor on this name.  An empty result means that no name at all is added.
+The rules of each vendor are compared as sets of topics.  Each reported name is confirmed by that
+vendor's decision on it.  An empty result means that no name is added.
 
 This module reads no files.
 """
@@ -57,7 +57,7 @@ _JOIN = "join"
 )
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """An access that enclaves have on one side of the comparison only.
+    """An access that enclaves have on only one side of a comparison.
 
     ``name`` and ``domains`` are examples.
     """
@@ -219,17 +219,17 @@ class NewAccess(NamedTuple):
 
 
 def compare_access(base: AccessSource, head: AccessSource) -> Growth:
-    """Compare the access of two sides, in both directions.
+    """Return the access that ``head`` adds to ``base`` and removes from it.
 
-    A policy counts as signed with access control of everything.  As BASE, it stands for encryption
+    A policy counts as signed, with access control of everything.  As BASE it stands for encryption
     wherever it demands no other protection, so a keystore that protects less has lost protection.
-    As HEAD, it lowers no protection of a keystore.  A policy is for the domains of the other side;
+    As HEAD it lowers no protection of a keystore.  A policy is for the domains of the other side;
     enclaves of a fleet's robots are for the domain of their robot.
 
     Raises:
-        DocumentError: it cannot be decided, because of too many wildcards, permissions that a
-            vendor does not accept, contradicting protection or unknown settings of Zenoh; the last
-            two only if nothing else is new.
+        DocumentError: the comparison cannot be decided: there are too many wildcards, or
+            permissions that a vendor does not accept; or, if nothing else is new, demands of
+            protection contradict each other or settings of Zenoh are unknown.
     """
     limit = SearchLimit()
     scope = None
@@ -270,10 +270,10 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
 def _less(
     old: AccessSource, new: AccessSource, limit: SearchLimit, *, rules: bool
 ) -> Iterator[SettingChange]:
-    """Yield weaker protection in ``new``, and what more crosses between routers there.
+    """Yield changes by which ``new`` protects less than ``old``, or lets more names cross.
 
-    With ``rules``, the rules between routers are compared, too, unless settings state the cause:
-    rights that are new would change these rules.
+    With ``rules``, rules between routers of Zenoh are compared, too, unless the settings state the
+    cause: new rights would change these rules.
     """
     yield from less_protection(old, new, limit)
     crossing = tuple(more_crossing(old, new, limit))
@@ -281,7 +281,7 @@ def _less(
 
 
 def _not_compared(base: AccessSource, head: AccessSource) -> Iterator[str]:
-    """Yield clauses on the parts of HEAD that cannot be compared."""
+    """Yield clauses on parts of HEAD that could not be compared."""
     if found := contradiction(head):
         yield f"the protection of HEAD: {found}"
     yield from unknown_settings(base.zenoh_files, head.zenoh_files)
@@ -297,7 +297,7 @@ def _not_compared(base: AccessSource, head: AccessSource) -> Iterator[str]:
 
 
 def _fits(vendor: Vendor, side: AccessSource, name: str, subject: str) -> bool:
-    """Return whether the permissions of an enclave fit a certificate with a subject."""
+    """Return whether a vendor accepts the permissions of an enclave for a certificate's subject."""
     text = certified_text(vendor.traits, subject)
     with suppress(ComparisonCrash):
         return any(
@@ -312,7 +312,7 @@ def _fits(vendor: Vendor, side: AccessSource, name: str, subject: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Access:
-    """Access of an enclave in one world and domain: sets of topics, and decisions to confirm."""
+    """The access of an enclave in one world and domain: sets of topics, and a test of one."""
 
     topics: Mapping[AccessVerb, NameSet]
     decide: Callable[[AccessVerb, str], bool]
@@ -323,14 +323,14 @@ _NO_ACCESS = _Access(dict.fromkeys(_VERBS, NameSet()), lambda verb, topic: False
 
 
 _AccessOf = Callable[[AccessSource, str, int], _Access]
-"""A function that returns the access of an enclave of a side in a domain."""
+"""Function that returns the access of an enclave: from the side, the enclave and the domain."""
 _Lenders = Callable[[AccessSource, str], tuple[str, ...]]
-"""The other enclaves of a side whose permissions fit the certificate of an enclave as well."""
+"""Function that returns the enclaves whose permissions also fit an enclave's certificate."""
 
 
 @dataclass(frozen=True, slots=True)
 class _World:
-    """A vendor, or Zenoh, with the domains that are compared there."""
+    """A DDS vendor, or Zenoh, with the domains in which access is compared."""
 
     title: str
     style: Style
@@ -361,7 +361,10 @@ def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
 
 
 def _zenoh_domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
-    """Return one domain of each kind, by rules of Zenoh, and domains of sides without rules."""
+    """Return one domain for each group of domains with the same rules of Zenoh.
+
+    Domains of sides without rules of Zenoh are included.
+    """
     domains: set[DomainSet] = set()
     for side, other in ((base, head), (head, base)):
         domains.update(DomainSet.of((e, e)) for e in domains_of_robots(side, other).values())
@@ -404,9 +407,9 @@ def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
     def access_by(
         side: AccessSource, governance: Governance, name: str, subject: str, at: int
     ) -> Access:
-        """Return the access that an enclave's permissions give to a certificate.
+        """Return the access that an enclave's permissions give to a certificate with a subject.
 
-        Permissions that do not fit the certificate count as if they did; `_not_compared` reports
+        Permissions that do not fit the certificate count as if they did: `_not_compared` reports
         them.
         """
         granted = (grant.subject for grant in side.permissions[name].grants[:1])
@@ -436,7 +439,7 @@ def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
 
 
 def _on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
-    """Return the access that rules of Zenoh give, or for a side without them its rights."""
+    """Return a function for access on Zenoh: by the rules of a side, or else by its rights."""
     stated = {
         id(side): _of_rights(side, domains_of_robots(side, other))
         for side, other in ((base, head), (head, base))
@@ -463,9 +466,9 @@ def _on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
 
 
 def _of_rights(side: AccessSource, robots: Mapping[str, int]) -> Callable[[str, int], _Access]:
-    """Return the access that rights in ROS terms give in a domain.
+    """Return a function for the access that ROS rights give in a domain.
 
-    ``robots`` maps a policy's enclaves to the domain of their robot, if it has one.
+    ``robots`` maps enclaves of a policy to the domain of their robot, if the fleet states one.
     """
     by_enclave = _by_enclave(side.rights)
 
@@ -530,7 +533,7 @@ def _gains(
     scope: Collection[str] | None,
     limit: SearchLimit,
 ) -> Iterator[Gain]:
-    """Yield the access that ``new`` gives and ``old`` does not, joined over the worlds."""
+    """Yield the access that only ``new`` gives; the same access in several worlds is joined."""
     gains: dict[tuple[object, ...], tuple[Gain, set[str], set[int]]] = {}
     for gain in _each_gain(old, new, worlds, scope, limit):
         key = gain.enclaves[0], gain.action, gain.right, gain.name or gain.topic
@@ -588,7 +591,7 @@ def _more(
     domain: int,
     limit: SearchLimit,
 ) -> Iterator[Gain]:
-    """Yield the topics that an enclave may use after a change and not before it: ``topics``."""
+    """Yield a gain for ``topics``, which an enclave may use only after a change."""
     before, after = sides
     for verb in _VERBS:
         more = topics[verb]
@@ -601,9 +604,9 @@ def _more(
 
 
 class AccessByVendors:
-    """The access of enclaves by their documents, compared between vendors.
+    """The access that enclaves have by their documents, compared between vendors.
 
-    Counted are names that ROS 2 can have, and those that documents name without wildcards.
+    Only names that ROS 2 can have, or that documents state without wildcards, are compared.
     """
 
     def __init__(self, source: AccessSource) -> None:
@@ -620,11 +623,12 @@ class AccessByVendors:
     ) -> Iterator[Gain]:
         """Yield the topics that an enclave may use by one of ``after``, and by none of ``before``.
 
-        ``after`` is what ``vendor`` makes of the permissions that fit its certificate, ``before``
-        what another vendor makes of them; ``names`` are those that they name without wildcards.
+        ``after`` has the permissions that fit the enclave's certificate as ``vendor`` decides,
+        ``before`` the same for another vendor.  ``names`` are the names that the permissions state
+        without wildcards.
 
         Raises:
-            DocumentError: it cannot be decided for so many wildcards.
+            DocumentError: there are too many wildcards to decide.
         """
         world = _World(
             vendor.title,
@@ -651,7 +655,7 @@ class AccessByVendors:
 
 
 def _joined(usable: Sequence[Access]) -> _Access:
-    """Return what several permissions that an enclave can use give it together."""
+    """Return what several permissions, which an enclave can all use, give together."""
     return _Access(
         {verb: NameSet.union([access.topics(verb) for access in usable]) for verb in _VERBS},
         lambda verb, topic: any(access.decide(verb, topic).outcome.ok for access in usable),
@@ -660,7 +664,7 @@ def _joined(usable: Sequence[Access]) -> _Access:
 
 
 def _same(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> bool:
-    """Return whether an enclave certainly has the same access on both sides."""
+    """Return whether an enclave certainly has the same access on both sides; False may be wrong."""
     if world.title == _ZENOH:
         return None not in (old.zenoh, new.zenoh) and old.enforcers == new.enforcers
     if old.governance != new.governance:
@@ -688,7 +692,7 @@ def _without_name(grant: Grant) -> Grant:
 
 
 class _Denials:
-    """The topics that an enclave is denied to write, or to read; ``names`` is the set of all."""
+    """The rights that deny an enclave to write, or to read; ``names`` is all that they deny."""
 
     def __init__(self, rights: Sequence[Right], verb: AccessVerb, style: Style) -> None:
         pairs = [(right, text) for right in rights for text in getattr(right.topics, verb)]
@@ -697,13 +701,13 @@ class _Denials:
         self.names = names_of(style, (text for _, text in pairs))
 
     def of(self, topic: str) -> Right | None:
-        """Return the first right that denies a topic."""
+        """Return the first right that denies a topic, or None."""
         at = self._index.first(topic)
         return None if at is None else self._rights[at]
 
 
 class _Stated:
-    """The rights that two sides state, to find the right that gives an added access."""
+    """The rights that both sides state, to find the right that gives an added access."""
 
     def __init__(self, old: AccessSource, new: AccessSource) -> None:
         self._old, self._new = old, new
@@ -726,7 +730,7 @@ class _Stated:
         domain: int,
         limit: SearchLimit,
     ) -> Iterator[Gain]:
-        """Yield a gain for each right that is stated for some of ``more``, and for the rest."""
+        """Yield a gain for each right that states some of the topics ``more``, and for the rest."""
         lenders = world.lenders(self._new, enclave)
         key = enclave, lenders, verb, more, world.style, world.longest  # often in several domains
         if key not in self._found:
@@ -779,7 +783,7 @@ class _Stated:
     def _example(
         self, names: NameSet, key: tuple[str, AccessVerb, str], world: _World, limit: SearchLimit
     ) -> str | None:
-        """Return an example name; if possible, the example of another world."""
+        """Return an example name; if possible, the same example as in another world."""
         for topic in self._examples[key]:
             if topic in names and (world.longest is None or len(topic.encode()) <= world.longest):
                 return topic
@@ -844,13 +848,16 @@ def _example(names: NameSet, expression: str, world: _World, limit: SearchLimit)
 
 
 _Edges = Mapping[str, Mapping[str, Hop]]
-"""Map (source, target) to a hop from one enclave to another."""
+"""Maps pairs of enclaves (source, target) to a hop from the first to the second."""
 _MOST_REACH = 10_000
 _MOST_HOPS = 200_000
 
 
 def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach]:
-    """Yield pairs of enclaves with an influence that is new in ``after``; none if unknown."""
+    """Yield pairs of enclaves of which the first influences the second only in ``after``.
+
+    Yields nothing if one side is not known (None).
+    """
     if before is None or after is None:
         return
     changed = {
@@ -874,7 +881,7 @@ def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach
 
 
 def _borrowed(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tuple[str, str]]:
-    """Yield pairs of an enclave and another one whose permissions it can use in a world."""
+    """Yield pairs of an enclave and another whose permissions it can also use in a world."""
     worlds = tuple(worlds)
     for enclave in side.permissions:
         lenders = (lender for world in worlds for lender in world.lenders(side, enclave))
@@ -882,9 +889,9 @@ def _borrowed(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tuple[st
 
 
 def _edges(side: AccessSource, borrowed: Iterable[tuple[str, str]]) -> _Edges | None:
-    """Return all hops, or None if there are too many to follow them.
+    """Return all hops between enclaves, or None if there are too many to follow.
 
-    An enclave that uses the permissions of another enclave counts as one more enclave, to which its
+    An enclave that uses the permissions of another one counts as a further enclave, to which its
     own denials do not apply.
     """
     rights = side.zenoh if side.kind == "zenoh" and side.zenoh is not None else side.rights
@@ -919,7 +926,7 @@ def _edges(side: AccessSource, borrowed: Iterable[tuple[str, str]]) -> _Edges | 
 
 
 def _reached(edges: _Edges, start: str) -> dict[str, Hop]:
-    """Return the enclaves that hops lead to, each with the last hop of a shortest path."""
+    """Return the enclaves that can be reached from ``start``, each with the last hop to it."""
     reached: dict[str, Hop] = {}
     row = [start]
     for here in row:

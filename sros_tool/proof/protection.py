@@ -1,4 +1,4 @@
-"""Find weaker protection of one side of a comparison: messages, trust, and protect= values.
+"""Find what is protected less on one side of a comparison: messages, trust, protect= values.
 
 A side without a governance, such as a policy, stands for a strict governance, so a keystore with a
 looser governance protects less.  A policy never lowers the protection of a keystore.
@@ -37,16 +37,16 @@ from sros_tool.translate import governance_for, protected_topics
 def strict_protection() -> DomainProtection:
     """Return the protection of a side without a governance: that of the template production.
 
-    Whole messages need only be signed, as in the template development, because their content is
-    encrypted separately.
+    Whole RTPS messages only have to be signed, as in the template development, because their
+    content is encrypted separately.
     """
     return replace(load_template("production").protection, rtps=Level.SIGN)
 
 
 def _demanded_governance(stated: Sequence[StatedProtection], domains: DomainSet) -> Governance:
-    """Return the least governance that a policy means: strict, except where it demands a level.
+    """Return the weakest governance that a policy allows: strict, except where it states a level.
 
-    If it demands both levels for a name, the higher level counts.
+    If it states both levels for a name, the stronger level counts.
     """
     (rule,) = governance_for(strict_protection(), domains).domain_access_rules
     (every,) = rule.topic_access_rules
@@ -67,7 +67,7 @@ def _demanded_governance(stated: Sequence[StatedProtection], domains: DomainSet)
 
 
 def _of_payloads(governance: Governance) -> Governance:
-    """Return a governance in which the data kind is the strongest protection of any layer."""
+    """Return a governance in which the protection of data is the strongest of all layers."""
 
     def strongest(domain: DomainRule, topic: TopicRule) -> TopicRule:
         kinds = (
@@ -93,7 +93,7 @@ def _of_payloads(governance: Governance) -> Governance:
 
 
 def contradiction(side: AccessSource) -> str:
-    """Return the first two statements of policies that demand different protection of a name."""
+    """Return, as a clause, two statements of policies that demand different protection; else ""."""
     for protection, other in contradictions(side.protections or ()):
         places = (
             side.shown_source(stated_protection.source) for stated_protection in (other, protection)
@@ -146,7 +146,7 @@ def less_protection(
 def _looser_later(
     old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield settings and robots of ``new`` that protect enclaves less if they are created later."""
+    """Yield changes by which enclaves that are created later would be protected less."""
     if old.later is None or new.later is None:
         return
     domains = DomainSet.of((0, 0))
@@ -175,7 +175,7 @@ def _looser_later(
 
 
 def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
-    """Yield the enclaves whose certificate names another enclave, or whose key belonged to one."""
+    """Yield enclaves whose certificate names another enclave, or has the key of another."""
     names = {enclave.key: enclave.name for enclave in old.certified.values()}
     for enclave, new_one in new.certified.items():
         before = names.get(new_one.key, enclave)
@@ -258,7 +258,7 @@ def _looser_topics(
 
 
 def _by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRule, NameSet]]:
-    """Group topics by protection: pairs of a rule without expression and all its topics."""
+    """Return pairs of a protection (a topic rule without expression) and all its topics."""
     rules = [
         (names_of(style, (topic_rule.topic_expression,)), replace(topic_rule, topic_expression="*"))
         for topic_rule in rule.topic_access_rules
@@ -272,7 +272,7 @@ def _by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRule, Name
 def _no_longer_stated(
     old: Iterable[StatedProtection], new: Iterable[StatedProtection], limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield the names whose protection ``new`` demands less than ``old``, or not at all."""
+    """Yield names for which ``new`` demands less protection than ``old``, or none."""
     later = tuple(new)
     for protection in old:
         enough = [

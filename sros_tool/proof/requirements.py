@@ -39,7 +39,7 @@ _LEVELS = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Requirement:
-    """Base of all requirements: position of the table, own name, and reason ("": none)."""
+    """Base class of requirements: place of its table in the file, its name and reason (or "")."""
 
     KIND: ClassVar[str]
 
@@ -58,7 +58,7 @@ RightNames = tuple[tuple[str, tuple[str, ...]], ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OfRights(Requirement):
-    """Base of requirements about ``rights`` to names."""
+    """Base class of requirements about ``rights`` to names."""
 
     rights: RightNames
 
@@ -90,7 +90,7 @@ class Must(OfRights):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AtMost(OfRights):
-    """At most ``most`` enclaves may use a single name, with a right or a part of the right."""
+    """At most ``most`` enclaves may use the same name, by a right or by a part of a right."""
 
     KIND = "at_most"
 
@@ -99,9 +99,9 @@ class AtMost(OfRights):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Widest(OfRights):
-    """Wildcards may give the enclaves the rights to these names only; without names, to no name.
+    """Wildcards may give the enclaves these rights only to these names; to none if none is listed.
 
-    What an enclave may use because its exact name is stated does not count.
+    A name that an enclave may use because a right states exactly that name does not count.
     """
 
     KIND = "widest"
@@ -177,7 +177,7 @@ def demand(requirement: Requirement) -> str:
 
 
 def _said(rights: RightNames, link: str = "or") -> str:
-    """Return rights as text, such as ``publish /cmd_vel or call action /dock``."""
+    """Return rights in words, such as ``publish /cmd_vel or call action /dock``."""
     texts = (
         f"{right}{' action' if KIND_OF[right] == 'actions' else ''} {_listed(names)}"
         for right, names in rights
@@ -186,7 +186,7 @@ def _said(rights: RightNames, link: str = "or") -> str:
 
 
 def _those(enclaves: Iterable[str]) -> str:
-    """Return a list of enclaves as text, with the excepted enclaves."""
+    """Return a list of enclaves in words, with its exceptions."""
     names = list(enclaves)
     excepted = [name[len(EXCEPT) :] for name in names if name.startswith(EXCEPT)]
     text = _listed(name for name in names if not name.startswith(EXCEPT))
@@ -194,7 +194,7 @@ def _those(enclaves: Iterable[str]) -> str:
 
 
 def _listed(names: Iterable[str]) -> str:
-    """Return a list as text; a long list is shortened."""
+    """Return names in words; a long list is shortened."""
     return first_few(list(names), 4) or "nothing"
 
 
@@ -202,21 +202,26 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def read_requirements(path: Path) -> tuple[Requirement, ...]:
-    """Read the requirements in a TOML file; return them in file order.
+    """Return the requirements in a TOML file, in their order.
 
     Raises:
-        DocumentError: the file cannot be read, or a part of it is not valid; names file and line.
+        DocumentError: the file cannot be read, or a part of it is not valid; the error has file and
+            line.
     """
     return parse_requirements(read_bytes(path, "requirements file", most=1024 * 1024), str(path))
 
 
 def read_all_requirements(paths: Iterable[Path]) -> tuple[Requirement, ...]:
-    """Read the requirements in several TOML files; raises what `read_requirements` raises."""
+    """Return the requirements in several TOML files.
+
+    Raises:
+        DocumentError: as `read_requirements`.
+    """
     return tuple(requirement for path in paths for requirement in read_requirements(path))
 
 
 def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
-    """Parse a TOML document of requirements; errors and sources call the document ``file``.
+    """Return the requirements in a TOML document, which errors and sources call ``file``.
 
     Raises:
         DocumentError: a part of it is not valid.
@@ -271,7 +276,7 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
 
 
 def _pairs(requirement: Requirement) -> int:
-    """Return the number of name pairs that a requirement with two lists compares."""
+    """Return how many pairs of names have to be compared for a requirement with two lists."""
     match requirement:
         case NotBoth(first=first, second=second):
             one, other = (sum(len(names) for _, names in each) for each in (first, second))
@@ -294,7 +299,7 @@ def _headers(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _places(text: str) -> dict[str, list[tuple[int, dict[str, int]]]]:
-    """Map each kind of requirement to its tables' lines, each with the lines of its keys."""
+    """Map each kind of requirement to its tables: the line of the table, and those of its keys."""
     places: dict[str, list[tuple[int, dict[str, int]]]] = {}
     keys: dict[str, int] = {}
     for number, line in enumerate(text.split("\n"), 1):
@@ -316,7 +321,11 @@ class _Table:
     lines: Mapping[str, int]
 
     def known(self, *keys: str) -> dict[str, Any]:
-        """Return the arguments of every requirement; raise if a key is unknown."""
+        """Return the arguments that all requirements have.
+
+        Raises:
+            DocumentError: a key of the table is not in ``keys``.
+        """
         every = (*keys, "name", "why")
         for key in self.values:
             if key not in every:

@@ -1,8 +1,8 @@
 """Review a change in git: findings in HEAD, and access that HEAD adds to BASE.
 
-Nobody whose change is reviewed steers the review: both sides are what two commits have, not what
-lies in a checkout (`sros_tool.proof.repository`, `sros_tool.proof.commit_files`), and what was not
-compared is in the result.
+Whoever makes the change cannot influence how it is reviewed: both sides are the content of two
+commits, not of a work tree (`sros_tool.proof.repository`, `sros_tool.proof.commit_files`), and the
+result names what was not compared.
 """
 
 from __future__ import annotations
@@ -68,12 +68,12 @@ _OK, _FOUND, _UNDECIDED = 0, 1, 2
 
 @dataclass(frozen=True, slots=True)
 class ReviewRequest:
-    """The request for a review; paths are relative to the top of the repository.
+    """What to review; paths are relative to the top of the repository.
 
-    ``base`` is the commit to compare with, or "" for none; ``head`` is the commit to review. With
-    ``allow_new_access``, new access is shown, but does not make the review fail. ``renew_within``
-    is the time before the expiry of an enclave from which on the review fails. ``left_out`` are
-    folders whose policies are not reviewed.
+    ``head`` is the commit to review, ``base`` the commit to compare with ("": none). With
+    ``allow_new_access``, new access is shown but does not make the review fail. The review fails if
+    an enclave expires within ``renew_within``.  ``left_out`` are folders whose policies are not
+    reviewed.
     """
 
     repository: Repository
@@ -111,7 +111,7 @@ class RightsChange:
 class DroppedRequirements:
     """Findings on requirements of BASE that HEAD drops or weakens, and the number of these.
 
-    Every such requirement gives a finding, and another one if HEAD breaks the requirement.
+    Each such requirement has a finding, and a second one if HEAD breaks it.
     """
 
     count: int
@@ -150,8 +150,8 @@ class ReviewStep:
     """One step of a review, with its exit status and result.
 
     ``kind`` is "files", "policy", "requirements", "requirements-before", "new-access", "rights",
-    "keystore" or "expiry"; ``subject`` is the path that it is about.  An error says why it could
-    not be decided.
+    "keystore" or "expiry"; ``subject`` is the path that the step is about.  If the result is an
+    error, it says why the step could not be decided.
     """
 
     kind: str
@@ -162,11 +162,10 @@ class ReviewStep:
 
 @dataclass(frozen=True, slots=True)
 class Review:
-    """All steps of a review, and clauses on the parts that were not reviewed.
+    """The steps of a review, and clauses on what was not reviewed.
 
-    ``base`` and ``head`` are full ids of commits; ``base`` is "" if nothing was compared.
-    ``head_folder`` and ``base_folder`` are the folders where the files were read, which `shown`
-    leaves out.
+    ``base`` and ``head`` are full ids of commits; ``base`` is "" if nothing was compared. The files
+    were read in ``head_folder`` and ``base_folder``, whose paths `shown` removes from texts.
     """
 
     base: str
@@ -246,7 +245,7 @@ class ReviewResult(NamedTuple):
 
 
 def review(request: ReviewRequest, folder: Path) -> Review:
-    """Review a change, and return the result; files of both commits are written below ``folder``.
+    """Return the review of a change; files of both commits are written below ``folder``.
 
     Args:
         request: what is reviewed.
@@ -281,7 +280,7 @@ class _Review:
 
     @property
     def _new_access(self) -> int:
-        """The exit status of a step that finds more access: 0 if the request allows new access."""
+        """The exit status of a step that finds new access: 0 if the request allows it, else 1."""
         return _OK if self.request.allow_new_access else _FOUND
 
     def all(self) -> Iterator[ReviewStep]:
@@ -358,7 +357,7 @@ class _Review:
     # ── files ──────────────────────────────────────────────────────────────────────────────
 
     def _fleet(self, side: CommitFiles | None) -> Generator[ReviewStep, None, Fleet | None]:
-        """Return the fleet of BASE or HEAD; None if there is no fleet."""
+        """Return the fleet of BASE or HEAD, None without one; yield the steps that read it."""
         path = self.request.fleet
         if not path or not side:
             return None
@@ -375,7 +374,7 @@ class _Review:
     def _policies(
         self, side: CommitFiles, fleet: Fleet | None
     ) -> Generator[ReviewStep, None, list[Path]]:
-        """Return the policy files of BASE or HEAD."""
+        """Return the policy files of BASE or HEAD; yield the steps that read them."""
         policies: list[Path] = []
         for path in self.request.policies:
             try:
@@ -389,7 +388,7 @@ class _Review:
         return policies
 
     def _keystores(self, side: CommitFiles) -> Generator[ReviewStep, None, dict[str, Path]]:
-        """Return the keystore folders of BASE or HEAD, by path."""
+        """Return the keystore folders of BASE or HEAD, by path; yield the steps that read them."""
         keystores: dict[str, Path] = {}
         for path in self.request.keystores:
             try:
@@ -405,7 +404,7 @@ class _Review:
         return keystores
 
     def _missing(self, path: str) -> DocumentError:
-        """Return the error that a file is missing in HEAD, with a hint such as a rename."""
+        """Return the error for a file that HEAD lacks, with a hint where it may have moved."""
         entry = self.base.entry(path) if self.base else None
         became = ""
         if entry:
@@ -419,7 +418,7 @@ class _Review:
 
     @staticmethod
     def _changed(side: CommitFiles, other: CommitFiles | None) -> Iterator[tuple[str, TreeEntry]]:
-        """Yield paths and entries of one commit that the other commit lacks or has differently."""
+        """Yield path and entry of files of a commit that are missing or different in the other."""
         tree = side.repository.tree(side.commit)
         before = other.repository.tree(other.commit) if other else ""
         return walk(side.repository, tree, most=_MOST_ENTRIES, other=before)
@@ -427,7 +426,7 @@ class _Review:
     def _places(
         self, base: tuple[list[Path], Fleet | None], head: tuple[list[Path], Fleet]
     ) -> tuple[int, Content] | None:
-        """Return the step on robots whose keys go to another place, or by another way."""
+        """Return the step on robots whose keys would go to another place, or in another way."""
         lines: list[tuple[str, str]] = []
         robots = base[1].robots if base[1] else {}
         for name, new in head[1].robots.items():
@@ -449,7 +448,7 @@ class _Review:
         return (self._new_access, Facts(tuple(lines))) if lines else None
 
     def _others(self, reviewed: Sequence[Path], fleet: Fleet | None) -> tuple[int, Content] | None:
-        """Return the step on policy files that changed but are not reviewed, or were renamed."""
+        """Return the step on policy files that were changed or renamed, but are not reviewed."""
         assert self.base
         lines: list[tuple[str, str]] = []
         status = _OK
@@ -489,7 +488,7 @@ class _Review:
         reviewed: Sequence[Path],
         fleet: Fleet | None,
     ) -> Iterator[str]:
-        """Yield policies that reviewed policies or keystores include only in part."""
+        """Yield changed policies of which reviewed policies or keystores include only a part."""
         named = {str(path.relative_to(self.head.folder)) for path in reviewed}
         content = self.request.repository.content
         known = {
@@ -516,7 +515,7 @@ class _Review:
     def _parts_used_in_part(
         self, parts: Mapping[str, bytes], named: Iterable[str]
     ) -> Iterator[str]:
-        """Yield files for includes that the reviewed policies use only in part."""
+        """Yield changed files for includes of which reviewed policies use only a part."""
         files = self.head.files
 
         def content(path: str) -> bytes | None:
@@ -593,7 +592,7 @@ class _Review:
     def _policies_among(
         self, entries: Iterable[tuple[str, TreeEntry]], side: CommitFiles, *, known: bool = True
     ) -> list[str]:
-        """Return the paths of entries that could be policies or parts of policies."""
+        """Return the paths of entries that may be policies, or parts of policies."""
         wanted = {
             path: entry
             for path, entry in entries
@@ -682,7 +681,7 @@ class _Review:
     def _read_requirements(
         self, side: CommitFiles
     ) -> Generator[ReviewStep, None, list[Requirement]]:
-        """Return the requirements in BASE or HEAD."""
+        """Return the requirements in BASE or HEAD; yield the steps that read them."""
         requirements: list[Requirement] = []
         for path in self.request.requirements:
             try:
@@ -775,17 +774,17 @@ class _Review:
 
 
 def _decisive_first(where: str) -> tuple[bool, str]:
-    """Return a sort key: variables of Ansible and of plays before the hosts that have them."""
+    """Return a sort key by which variables of Ansible come before the hosts that have them."""
     return not any(part in where for part in ("ansible_", "sros_")), where
 
 
 def _place(robot: Robot) -> str:
-    """Return where the keys of a robot go, as text: its address with the user, or its name."""
+    """Return where the keys of a robot are delivered, in words: user and address, or its name."""
     return f"{robot.user}@{robot.address}" if robot.user else robot.address or "its name"
 
 
 def _holders(files: Iterable[Path], fleet: Fleet | None) -> dict[str, Robot | None]:
-    """Map enclaves of policies to the robot that gets their keys; None for enclaves of no robot."""
+    """Map enclaves to the robot that gets their keys, or to None if they belong to no robot."""
     if fleet is None:
         return {enclave.path: None for file in files for enclave in read_policy(file).enclaves}
     policies = (FleetPolicy(read_policy(file, placeholders=True), fleet) for file in files)
@@ -810,10 +809,10 @@ def _decided(requirements: Sequence[Requirement], system: System) -> tuple[int, 
 
 
 def _together(files: Sequence[Path], fleet: Fleet | None) -> Policy:
-    """Return the policies of one robot or one fleet, joined into one.
+    """Return the policies of one robot or one fleet, joined into one policy.
 
     Raises:
-        PolicyError: there is none, or two have the same enclave.
+        PolicyError: there is no policy, or two policies have the same enclave.
     """
     if not files:
         raise PolicyError("requirements need a policy, and HEAD has no policy")

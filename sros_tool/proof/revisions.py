@@ -1,4 +1,4 @@
-"""Policies as they were at a revision of git, read without checking anything out."""
+"""Policies at a revision of git, read without checking out files."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _MOST_FILES = 300  # of a folder
 _MOST_BYTES = 64 * 1024 * 1024  # of its files
 _MOST_ENTRIES = 100_000
 _NOWHERE = Path("/dev/null/git")
-"""A path that never exists, so that no file on disk is taken for a file of a revision."""
+"""A path that never exists on disk, so that files of a revision are not mixed up with others."""
 
 
 @dataclass(frozen=True, slots=True)
 class Revision:
-    """A file or folder of a git revision; ``path`` is relative to the top of the repository.
+    """A file or folder at a revision of git; ``path`` is relative to the top of the repository.
 
-    ``commit`` is the full id that ``name`` stood for when it was read.
+    ``commit`` is the full id that ``name`` stood for when the revision was read.
     """
 
     repository: Repository
@@ -36,15 +36,15 @@ class Revision:
 
     @property
     def place(self) -> Path:
-        """A path for the policy reader; it does not exist on disk."""
+        """The path of the file or folder for the policy reader; it does not exist on disk."""
         return _NOWHERE / self.path
 
     def policies(self) -> tuple[Revision, ...]:
         """Return the policies in this folder and below, or this file.
 
         Raises:
-            DocumentError: what is there is perhaps a policy (`policy_files`), a link, or
-                a submodule: where these lead to is not followed.
+            DocumentError: a file may be a policy but is unreadable (`policy_files`), or there is a
+                link or a submodule, which are not followed.
         """
         entry = self.repository.find(self.commit, self.path)
         if entry is None or entry.mode != FOLDER:
@@ -82,8 +82,8 @@ class Revision:
 
         Raises:
             MissingFileError: the revision has no such file.
-            DocumentError: it is too large, or no file but for instance a link: where a link leads
-                to is not followed, so that what is there is not certain.
+            DocumentError: the file is too large, or is no file but for instance a link, which is
+                not followed.
         """
         path, shown = str(file.relative_to(_NOWHERE)), self.shown(str(file))
         entry = self.repository.find(self.commit, path)
@@ -96,7 +96,7 @@ class Revision:
         return self.repository.content(entry.id)
 
     def shown(self, text: str) -> str:
-        """Return a text in which the revision's paths read ``git:REVISION:PATH``."""
+        """Return a text in which ``git:REVISION:PATH`` replaces paths below `place`."""
         return text.replace(f"{_NOWHERE}/", f"{PREFIX}{self.name}:").replace(
             str(_NOWHERE), f"{PREFIX}{self.name}:"
         )

@@ -1,4 +1,8 @@
-"""Read the access of a side to compare: policy, keystore, permissions, Zenoh file or revision."""
+"""Read the access of one side of a comparison.
+
+A side is a policy, keystore, permissions, a configuration of Zenoh, or policies at a revision of
+git.
+"""
 
 from __future__ import annotations
 
@@ -70,18 +74,19 @@ UNCERTAIN = {
     "rights.zenoh-no-name",
     "rights.zenoh-strangers",
 }
-"""Ids of notes that mean that rights are unknown, so that new access cannot be excluded."""
+"""Ids of notes that say that rights are not fully known, so that access may be new."""
 
 
 KEYSTORE_ITSELF = "the keystore"
-"""Name that stands for the keystore's own CA and revocation list, for later enclaves."""
+"""Name that stands for the CA and revocation list that later enclaves will get."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trust:
     """The identity CAs that an enclave trusts, and the certificates of these CAs that it refuses.
 
-    A CA is the SHA-256 of its public key; ``revoked`` are pairs of a CA and a serial number.
+    A CA is given by the SHA-256 of its public key; ``revoked`` has pairs of a CA and a serial
+    number.
     """
 
     authorities: frozenset[str]
@@ -90,7 +95,7 @@ class Trust:
 
 @dataclass(frozen=True, slots=True)
 class CertifiedEnclave:
-    """Subject, common name and key digest of an enclave's certificate."""
+    """The subject, common name and key digest of an enclave's certificate."""
 
     subject: str
     name: str
@@ -160,11 +165,11 @@ ALL_DOMAINS = DomainSet.of((0, MAX_DOMAIN))
 
 
 def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
-    """Read the access that ``path`` gives; also a folder of policies or ``git:REVISION:PATH``.
+    """Read one side of a comparison: also a folder of policies, or ``git:REVISION:PATH``.
 
     Raises:
-        SrosError: it cannot be read, DDS would refuse a part of it, or a part of it has a meaning
-            that is not compared.
+        SrosError: it cannot be read, DDS would refuse a part of it, or a part of it cannot be
+            compared.
     """
     if str(path).startswith(PREFIX):
         return _of_revision(find_revision(str(path)), fleet)
@@ -285,7 +290,7 @@ def _zenoh_file(path: Path, document: ConfigurationDocument) -> SignedConfigurat
 
 
 def _of_all(root: Path, folders: Iterable[Path]) -> Governance:
-    """Return the governance of a keystore, after a check that each enclave loads the same one.
+    """Return the governance of a keystore, after a check that all enclaves have the same one.
 
     Raises:
         DocumentError: an enclave has another one, such as an earlier one with less protection.
@@ -308,7 +313,7 @@ def _of_all(root: Path, folders: Iterable[Path]) -> Governance:
 
 
 def _authorities(folders: Iterable[Path]) -> frozenset[tuple[str, str]]:
-    """Return role and fingerprint of the CAs that the enclaves in folders trust."""
+    """Return pairs of role and fingerprint of the CAs that the enclaves in folders trust."""
     authorities = {
         (role, read_bytes(folder / file, "certificate"))
         for folder in folders
@@ -324,7 +329,7 @@ _NEVER = "9999"
 
 
 def _expiries(root: Path) -> dict[int, str]:
-    """Map serial numbers to the expiry of certificates, from the keystore's ledger."""
+    """Map serial numbers of certificates to their expiry, by the ledger of the keystore."""
     if not (root / CRL).exists():
         return {}
     expiries: dict[int, str] = {}
@@ -338,14 +343,15 @@ def _expiries(root: Path) -> dict[int, str]:
 def _trusts(
     files: Mapping[str, tuple[Path, Path]], expiries: Mapping[int, str]
 ) -> dict[str, Trust]:
-    """Map enclaves to their trust, by identity CA and revocation list; skip enclaves without CA.
+    """Map enclaves to the CAs that they trust and the certificates that they refuse.
 
-    Certificates that had expired when a list was signed do not count: lists may leave them out.
+    Enclaves without a CA file are left out.  Certificates that had expired when a list was signed
+    are ignored: lists may leave them out.
 
     Raises:
-        DocumentError: a list is damaged, is of no CA that the enclave trusts, is not for all of its
-            certificates, has entries that may revoke nothing, or is one of several of its CA, of
-            which OpenSSL takes one: it is not certain what is revoked.
+        DocumentError: a list is damaged, is of no CA that the enclave trusts, does not cover all
+            certificates, or has entries that may revoke nothing; or there are several lists of a
+            CA, of which OpenSSL takes one: it is uncertain what is revoked.
     """
 
     @lru_cache(maxsize=8)  # most enclaves have the same files
@@ -401,12 +407,12 @@ def _governance(file: Path) -> Governance:
 
 
 AT = datetime(2026, 1, 1, tzinfo=UTC)
-"""The moment for which permissions are compared; all permissions count as valid."""
+"""The time for which permissions are compared; they all count as valid then."""
 _VALID = window(AT - timedelta(days=2), timedelta(days=9))
 
 
 def _without_dates(permissions: Permissions) -> Permissions:
-    """Return permissions that are valid at `AT`, as validity is not compared."""
+    """Return permissions with dates that are valid at `AT`, because dates are not compared."""
     begin, end = iso(_VALID.not_before), iso(_VALID.not_after)
     return Permissions(
         tuple(grant._replace(not_before=begin, not_after=end) for grant in permissions.grants)
@@ -427,7 +433,7 @@ _Read = tuple[Policy, Fleet | None]
 
 
 def _read(path: Path, fleet: Fleet | None, read: PolicyFiles | None = None) -> _Read:
-    """Return the policy in a file, and the fleet with the enclaves that it has there."""
+    """Return the policy in a file, and the fleet with the enclaves that the policy has."""
     if fleet is None:
         return read_policy(path, read=read), None
     expanded = FleetPolicy(read_policy(path, placeholders=True, read=read), fleet)
@@ -465,9 +471,9 @@ def _of_policies(shown: str, policies: list[_Read]) -> AccessSource:
 
 
 def load_policies(files: Iterable[Path], shown: str, fleet: Fleet | None = None) -> AccessSource:
-    """Return the access that the policies of one robot, or of one fleet, give together.
+    """Return the access that the policies of one robot, or one fleet, give together.
 
     Raises:
-        SrosError: one cannot be read, or two have the same enclave.
+        SrosError: a policy cannot be read, or two policies have the same enclave.
     """
     return _of_policies(shown, [_read(file, fleet) for file in files])

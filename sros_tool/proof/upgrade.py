@@ -1,7 +1,7 @@
-"""Find what the update to another distribution of ROS 2 changes for a keystore or policy.
+"""Find what changes for a keystore or policy with another distribution of ROS 2.
 
-The signed files stay the same, but another DDS reads them.  The rules of both DDS releases decide
-for each enclave, and for all names at once, whether it joins and which topics it may use.
+The signed files stay the same, but another release of DDS reads them.  For each enclave, the rules
+of both releases decide whether it joins and which topics it may use, for all names at once.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ _KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 
 @dataclass(frozen=True, slots=True)
 class DecidedFiles:
-    """The enclaves of a keystore or policy, on which two distributions decide.
+    """The enclaves of a keystore or policy, with what is needed to decide on them.
 
     ``domains`` are the ROS domains to decide for, None for examples of those in the documents of
     each enclave.  ``keystore`` is None for a policy, whose file is ``file``.  ``chosen`` are the
@@ -109,7 +109,7 @@ class DecidedFiles:
     chosen: frozenset[str] | None = None
 
     def domains(self, enclave: LoadedEnclave) -> tuple[int, ...]:
-        """Return the ROS domains to decide for."""
+        """Return the ROS domains for which to decide on an enclave."""
         if self.domain is not None:
             return (self.domain,)
         return example_domains(enclave.state) if enclave.state else (0,)
@@ -128,28 +128,31 @@ class DecidedFiles:
         return also_fitting(vendor.traits, subjects, granted)
 
     def decided(self) -> Iterator[tuple[str, LoadedEnclave]]:
-        """Yield the names and files of the enclaves to decide on."""
+        """Yield names and files of the enclaves to decide on."""
         for name, enclave in self.enclaves.items():
             if self.chosen is None or name in self.chosen:
                 yield name, enclave
 
     def only(self, enclaves: Iterable[str]) -> DecidedFiles:
-        """Return the files to decide only on ``enclaves``; permissions of others still count."""
+        """Return the same files, to decide only on ``enclaves``.
+
+        The permissions of other enclaves still count.
+        """
         return replace(self, chosen=frozenset(enclaves))
 
     def place(self, enclave: str, file: str) -> str:
-        """Return the path of a file of an enclave, or of the policy."""
+        """Return the path of a file of an enclave; for a policy, the path of the policy."""
         return f"{self.keystore.folder(enclave)}/{file}" if self.keystore else self.file
 
 
 def signed_files(
     keystore: Keystore, *, at: datetime, zone: tzinfo = UTC, domain: int | None = None
 ) -> DecidedFiles:
-    """Return the enclaves of a keystore as they are signed.
+    """Return the enclaves of a keystore with their signed files.
 
     Raises:
-        KeystoreError: it is no keystore.
-        DocumentError: its rights cannot be read.
+        KeystoreError: the folder is no keystore.
+        DocumentError: rights in it cannot be read.
     """
     keystore.check()
     names = enclave_names(keystore.root, hidden=True)
@@ -187,10 +190,10 @@ def _planned_files(policy: Policy, *, at: datetime, domain: int | None = None) -
 
 
 class UpgradeFindings(NamedTuple):
-    """The findings on an update, and the number of enclaves.
+    """The findings on an update, and numbers of enclaves.
 
-    ``compared`` is the number of enclaves on which both distributions decide; ``enclaves`` also
-    counts enclaves that are for the later distribution already.
+    ``compared`` is the number of enclaves on which both distributions decide; ``enclaves`` includes
+    enclaves that are for the later distribution already.
     """
 
     findings: list[Finding]
@@ -243,7 +246,7 @@ def _present(
     here: Distribution | None,
     later: Distribution,
 ) -> Mapping[Distribution, list[str]]:
-    """Map the distributions before the update to their enclaves."""
+    """Map each distribution before the update to the enclaves that are for it."""
     by_distribution: dict[Distribution, list[str]] = {}
     unknown: list[str] = []
     for name in files.enclaves:
@@ -282,7 +285,10 @@ def _upgrade(
 def _products(
     before: Distribution, after: Distribution, vendor: str
 ) -> Iterator[tuple[Shipped, Shipped]]:
-    """Yield the releases of each DDS product in both distributions, or only of ``vendor``'s."""
+    """Yield pairs of releases of a DDS product: in the earlier and the later distribution.
+
+    With ``vendor``, only the product of this vendor.
+    """
     product = Vendor(vendor).traits.product if vendor not in ("", _ZENOH) else ""
     for old in before.shipped if vendor != _ZENOH else ():
         if (new := after.of_product(old.product)) and product in ("", old.product):
@@ -292,7 +298,7 @@ def _products(
 def _vulnerabilities(
     before: Distribution, after: Distribution, vendor: str, advisories: Sequence[Advisory] | None
 ) -> Iterator[Finding]:
-    """Yield findings on vulnerabilities that only one distribution's latest release has."""
+    """Yield findings on vulnerabilities that the latest release of only one distribution has."""
     for releases in _products(before, after, vendor):
         known = [known_vulnerabilities(each.product, each.latest, advisories) for each in releases]
         if None in known or releases[0].latest == releases[1].latest:
@@ -345,7 +351,7 @@ def check_distributions(
 
 
 def _pairs(distributions: Sequence[Distribution]) -> Iterator[tuple[Shipped, Shipped]]:
-    """Yield pairs of a product's first release and another release that decides differently."""
+    """Yield pairs of releases of a product, in different distributions, that decide differently."""
     by_product: dict[str, dict[Vendor, Shipped]] = {}
     for distribution in distributions:
         for shipped in distribution.shipped:
@@ -365,7 +371,7 @@ _KINDS: Mapping[str, FindingKind] = {
 
 
 class DecisionChange(NamedTuple):
-    """A decision on an enclave that differs between two distributions."""
+    """A decision on an enclave that differs between two distributions of ROS 2."""
 
     kind: str
     enclave: str
@@ -375,7 +381,7 @@ class DecisionChange(NamedTuple):
 
 
 def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[DecisionChange]:
-    """Yield the decisions that differ between two distributions, on the first domain with any.
+    """Yield the decisions that differ between two releases, in the first domain with a difference.
 
     Raises:
         DocumentError: there are too many wildcards to decide.
@@ -399,9 +405,10 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
 
 
 class _Decided:
-    """The decision of one DDS release on an enclave: causes of refusal, and access.
+    """The decision of one release of DDS on an enclave: causes of a refusal, and access.
 
-    The access includes permissions of other enclaves (``lenders``) that fit its certificate.
+    The access includes permissions of other enclaves (``lenders``) that fit the enclave's
+    certificate.
     """
 
     def __init__(
@@ -471,7 +478,7 @@ def _of_enclave(
 
 
 def _words(gain: Gain) -> str:
-    """Return an access as people ask for it, such as ``publish topic /cmd_vel``."""
+    """Return an access in words, such as ``publish topic /cmd_vel``."""
     if gain.right is None:
         return f"{gain.action} DDS topic {gain.topic}"
     return gain.right._replace(name=gain.name).describe()
@@ -526,7 +533,7 @@ def _nodes(files: DecidedFiles, before: Distribution, after: Distribution) -> It
 
 
 def _on_zenoh(files: DecidedFiles, before: Distribution, after: Distribution) -> Iterator[Finding]:
-    """Yield what another release of rmw_zenoh changes for the Zenoh files of a keystore."""
+    """Yield findings on what another release of rmw_zenoh changes for a keystore's Zenoh files."""
     old, new = before.zenoh, after.zenoh
     if old == new or not files.keystore or not has_zenoh_files(files.keystore.root, hidden=True):
         return
@@ -550,11 +557,11 @@ def _on_zenoh(files: DecidedFiles, before: Distribution, after: Distribution) ->
 
 
 _OF_EACH = "_buf/*"
-"""Keys of single subscriptions, which have no example without a wildcard."""
+"""Keys that rmw_zenoh uses for single subscriptions; they have no example without a wildcard."""
 
 
 def _drops(enforcers: Sequence[Enforcement], right: Right, domain: int, below: str) -> bool:
-    """Return whether messages of a right pass on its key, and not on a key below it."""
+    """Return whether messages of a right pass on the key of its name, but not on keys below it."""
     remote = Remote(right.enclave)
     messages = [
         message

@@ -1,9 +1,8 @@
-"""Which enclaves may write and read which DDS topics in one world: with a vendor, or on Zenoh.
+"""The access of enclaves to DDS topics in one world: with one DDS vendor, or on Zenoh.
 
-A world holds the sets of all its enclaves, and finds those fast that have some name of an
-expression: exact topics are looked up, and only wildcards are compared.  Zenoh has keys in place of
-topics: a key stands for the topic that the same name has on DDS, so that all worlds speak of the
-same names.
+A world has an index of the topics of all its enclaves, which finds enclaves with access to names of
+an expression: exact topics are looked up, and only wildcards are compared.  On Zenoh, a key stands
+for the DDS topic of the same ROS name, so that all worlds use the same names.
 """
 
 from __future__ import annotations
@@ -48,7 +47,10 @@ class TopicAccess:
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """The DDS topics of the ROS names that match ``name``: prefix, name, suffix."""
+    """The DDS topics of the ROS names that match the expression ``name``.
+
+    A topic is the prefix, the name and the suffix.
+    """
 
     begin: str
     name: str
@@ -64,7 +66,7 @@ class Topics:
         return topic[len(self.begin) : len(topic) - len(self.end)]
 
     def every(self) -> NameSet:
-        """Return all topics, also those that no ROS node would use."""
+        """Return all these topics, even those that no ROS node would use."""
         return named(self.expression)
 
     def valid(self) -> NameSet:
@@ -74,13 +76,13 @@ class Topics:
 
 @lru_cache(maxsize=65536)
 def named(expression: str) -> NameSet:
-    """Return the names that an expression of a policy matches: all vendors agree on it."""
+    """Return the names that an expression of a policy matches, on which all vendors agree."""
     return names_of(Style.FNMATCH, (expression,))
 
 
 @lru_cache(maxsize=65536)
 def _wild(expression: str) -> Automaton | None:
-    """Return the automaton of an expression, or None if it has no wildcard."""
+    """Return an automaton for an expression, or None if it has no wildcard."""
     around = named(expression).around()
     return next(iter(around.automata), None) if around else None
 
@@ -101,12 +103,12 @@ def valid_topics(begin: str, end: str) -> NameSet:
 ROS_TOPICS = NameSet.union(
     valid_topics(begin, end) for begin, end in (("rt", ""), *SERVICE_ENDS.items())
 )
-"""The topics of all valid ROS names."""
+"""The DDS topics of all valid ROS names."""
 
 
 @dataclass(frozen=True, slots=True)
 class Meeting:
-    """The topics that an enclave may use: ``stated`` topics, and perhaps others by wildcards."""
+    """An enclave that may use some topics: the ``stated`` ones, and perhaps others by wildcards."""
 
     enclave: str
     names: NameSet
@@ -120,7 +122,7 @@ def shortest(names: Iterable[str]) -> str | None:
 
 
 class Side:
-    """An index of the topics that all enclaves may write, or that they may read."""
+    """An index of the topics that all enclaves may write, or of those that they may read."""
 
     def __init__(self, of: Mapping[str, NameSet]) -> None:
         self.of = of
@@ -142,9 +144,10 @@ class Side:
         self._backwards = sorted(name[::-1] for name in self.exact)
 
     def meeting(self, topics: Topics, limit: SearchLimit) -> list[Meeting]:
-        """Return the enclaves that perhaps may use some of the topics, sorted.
+        """Return the enclaves that may use some of the topics, sorted.
 
-        An enclave without ``stated`` topics may in truth have none: only an example shows.
+        An enclave without ``stated`` topics may be listed wrongly: whether it may really use a
+        topic is only known from an example.
         """
         stated: dict[str, list[str]] = {}
         for topic in self.among(topics.expression, limit):
@@ -166,7 +169,7 @@ class Side:
         ]
 
     def among(self, expression: str, limit: SearchLimit) -> Sequence[str]:
-        """Return the exact topics of all enclaves that match an expression."""
+        """Return the exact topics in rights of all enclaves that match an expression."""
         if expression not in self._found:
             limit.spend(len(self._wild))
             own = _wild(expression)
@@ -191,7 +194,10 @@ class Side:
     def perhaps_meeting(
         self, automata: Collection[Automaton] | None, limit: SearchLimit
     ) -> list[str]:
-        """Return the enclaves that may perhaps use a topic of the automata, or any (None)."""
+        """Return the enclaves that may use a topic that the automata accept (None: any topic).
+
+        An enclave may be listed wrongly.
+        """
         if automata is None:
             return sorted(self.of)
         enclaves = set(self._any)
@@ -222,12 +228,12 @@ class Side:
 
 
 def _starting(ordered: list[str], begin: str) -> range:
-    """Return the indexes of the texts in a sorted list that start with ``begin``."""
+    """Return the indexes of the texts in a sorted list that begin with ``begin``."""
     return range(bisect_left(ordered, begin), bisect_left(ordered, begin + _LAST))
 
 
 class Crossing:
-    """What several routers of Zenoh pass on to each other, by the rules of the receiving router.
+    """The topics that routers of Zenoh pass on to each other, by the rules of the receiving router.
 
     ``router_of`` maps enclaves to the routers that they connect to, and each router to itself;
     ``rules`` maps routers to their access control.
@@ -242,7 +248,7 @@ class Crossing:
         self._passing: dict[tuple[str, str], NameSet] = {}
 
     def between(self, writer: str, reader: str) -> NameSet | None:
-        """Return the topics that get from a writer to a reader; None for all, at one router."""
+        """Return the topics that can get from a writer to a reader; None for all (one router)."""
         sending, receiving = self.router_of.get(writer), self.router_of.get(reader)
         if sending is None or receiving is None or sending == receiving:
             return None
@@ -254,13 +260,14 @@ class Crossing:
 
 
 Confirm = Callable[[str, bool, str], bool]
-"""Whether an enclave may write (or else read) a topic, as the engine of the world decides."""
+"""Function (enclave, writes, topic): whether the world's engine allows writing (or reading)."""
 
 
 class World:
-    """The topics that all enclaves may write and read with one vendor, or on Zenoh.
+    """The topics that all enclaves may write and read, with one vendor or on Zenoh.
 
-    ``title`` names it, ``longest`` is the length in bytes of the longest topic that is used in it.
+    ``title`` is its name; ``longest`` is the length in bytes of the longest topic that is used in
+    it.
     """
 
     def __init__(
@@ -323,14 +330,14 @@ class World:
         return any(self.confirm_own(name, writes, topic) for name in able)
 
     def lender(self, enclave: str, writes: bool, topic: str) -> str:
-        """Return the enclave without whose permissions another one may not use a topic, or ""."""
+        """Return the enclave whose permissions another one needs to use a topic; "" for none."""
         if enclave not in self.lenders or self.confirm_own(enclave, writes, topic):
             return ""
         others = self.lenders[enclave]
         return next((each for each in others if self.confirm_own(each, writes, topic)), "")
 
     def gives_as(self, other: World) -> bool:
-        """Return whether another world has equal sets, so that all decisions are equal."""
+        """Return whether another world has equal sets of topics, so all decisions are equal."""
         return (
             (self.longest, self.needed, self.idle) == (other.longest, other.needed, other.idle)
             and self.stated == other.stated
@@ -353,10 +360,10 @@ class World:
         return self._writers if writes else self._readers
 
     def example(self, names: NameSet, topics: Topics, limit: SearchLimit) -> str | None:
-        """Return a name of a set among some topics, or None.
+        """Return a topic among ``topics`` whose name is in ``names``, or None.
 
-        A topic that an enclave names is better than one that only wildcards match, and a valid ROS
-        name is better than others; then the shortest one is.
+        A topic that an enclave states is preferred to one that only wildcards match, then a valid
+        ROS name to others, then the shortest.
         """
         if not is_expression(topics.expression):
             return topics.expression if topics.expression in names else None
@@ -378,7 +385,7 @@ class World:
         )
 
     def any_example(self, names: NameSet, limit: SearchLimit) -> str | None:
-        """Return a topic of a set, preferably a stated topic or one that nodes can have."""
+        """Return a topic of a set, preferably a stated one or one that nodes can have; or None."""
         sets = (names, *(names & name_set for name_set in _VALID))
         stated = (next(name_set.stated(), None) for name_set in sets)
         examples = (
@@ -387,7 +394,7 @@ class World:
         return next(filter(None, (*stated, *examples)), None)
 
     def use(self, met: Meeting, topics: Topics, limit: SearchLimit) -> str | None:
-        """Return the best example of the topics that an enclave may use."""
+        """Return the best example of ``topics`` that an enclave may use, or None."""
         if met.wild:
             return self.example(met.names, topics, limit)
         valid = valid_topics(topics.begin, topics.end)
@@ -400,17 +407,17 @@ class World:
         return self._readers_of[topic]
 
     def between(self, writer: str, reader: str) -> NameSet | None:
-        """Return the topics that get from one enclave to another one; None for all."""
+        """Return the topics that can get from one enclave to another; None for all."""
         return self.crossing.between(writer, reader) if self.crossing else None
 
     def router_of(self, enclave: str) -> str:
-        """Return the router that an enclave connects to, if there are several, or ""."""
+        """Return the router that an enclave connects to; "" if there are not several routers."""
         return self.crossing.router_of.get(enclave, "") if self.crossing else ""
 
     def shared(self, writer: str, reader: str, written: NameSet, limit: SearchLimit) -> str | None:
-        """Return a topic in ``written`` that the reader may read, and gets, or None.
+        """Return a topic in ``written`` that the reader may read and that gets to it, or None.
 
-        ``written`` depends on the writer alone.
+        ``written`` has to depend on the writer only.
         """
         if (writer, reader) not in self._shared:
             both = written & self._readers.of[reader]
@@ -425,7 +432,7 @@ class World:
         return self._shared[writer, reader]
 
     def weaker(self, level: Level) -> NameSet | None:
-        """Return the topics whose protection is weaker than a level; None if none can be."""
+        """Return the topics that are protected less than a level demands; None for no topics."""
         return self._weak.get(level)
 
 
@@ -451,9 +458,9 @@ _USES: dict[tuple[bool, str], tuple[tuple[Flow, Message], ...]] = {
     (True, "rr"): ((_IN, Message.REPLY), (_IN, Message.DECLARE_QUERYABLE)),
     (False, "rr"): ((_OUT, Message.REPLY), (_OUT, Message.DECLARE_QUERYABLE)),
 }
-"""The messages by which a process of an enclave writes, or reads, what a prefix stands for.
+"""The Zenoh messages by which a process writes or reads topics with a prefix.
 
-Each has to pass: replies without the offer to reply belong to the history of topics.
+All of them have to pass: replies without the offer to reply belong to the history of topics.
 """
 _TYPE = f"/{ANY_TYPE}"
 """Type and hash at the end of a key: rules that sros writes apply to all of them."""

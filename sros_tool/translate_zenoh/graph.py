@@ -55,9 +55,9 @@ _LETTER = "[a-zA-Z0-9_]"
 
 
 class AnnouncedNodes(NamedTuple):
-    """The nodes that an enclave may announce, as ``DOMAIN/NAMESPACE/NAME`` of their tokens.
+    """The nodes that an enclave may announce, without those in ``denied``.
 
-    ``denied`` are exceptions from ``allowed``.
+    A node is written as in its token: ``DOMAIN/NAMESPACE/NAME``, with ``%`` for ``/`` in a name.
     """
 
     allowed: tuple[str, ...]
@@ -65,7 +65,7 @@ class AnnouncedNodes(NamedTuple):
 
 
 def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes:
-    """Return the nodes that rules of `graph_rules` let an enclave announce."""
+    """Return the nodes that an enclave may announce by rules of `graph_rules`."""
     nodes: dict[bool, list[str]] = {True: [], False: []}
     for rule in rules:
         if rule.messages == _ANNOUNCING:
@@ -78,13 +78,13 @@ def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes
 
 
 def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName, ...]:
-    """Return the nodes that rules of `graph_rules` allow an enclave; denials are ignored."""
+    """Return the nodes that rules of `graph_rules` allow to an enclave; denials are ignored."""
     nodes = map(_node_of, announced_nodes(rules, enclave).allowed)
     return tuple(dict.fromkeys(nodes))
 
 
 def _node_of(place: str) -> NodeName:
-    """Return the node of ``DOMAIN/NAMESPACE/NAME`` as tokens have them."""
+    """Return the node that a token writes as ``DOMAIN/NAMESPACE/NAME``."""
     _, ns, name = (part.replace(ANY_PART, "*").replace("%", "/") for part in place.split("/"))
     return NodeName(ns, name)
 
@@ -92,12 +92,13 @@ def _node_of(place: str) -> NodeName:
 def graph_rules(
     enclave: str, domain: int, rights: Iterable[Right], nodes: Iterable[NodeName]
 ) -> Iterator[AccessRule]:
-    """Yield the rules of a process for the graph tokens of processes of an enclave.
+    """Yield the rules for the graph tokens of processes of an enclave.
 
-    The processes may see everything.  In the name of their enclave they may announce ``nodes``, the
-    nodes whose own services they may offer, and the topics and services in ``rights``.  Without any
-    such node, they may announce any node.  A node does not count if all its own services are
-    denied.  The right to ask has to have exactly the expression that rmw_zenoh asks for.
+    The processes may see all tokens.  For their enclave they may announce ``nodes``, the nodes
+    whose own services (such as set_parameters) they may offer, and the topics and services in
+    ``rights``.  If there is no such node, they may announce any node.  A node does not count if all
+    its own services are denied.  The expression for seeing tokens is exactly the one that rmw_zenoh
+    asks for.
     """
     rights, nodes = tuple(rights), tuple(nodes)
     offering, without = nodes_of_rights(rights), denied_nodes(rights)
@@ -120,7 +121,7 @@ def graph_rules(
 
 
 class _Tokens:
-    """The tokens of an enclave in a ROS domain."""
+    """The graph tokens of an enclave in a ROS domain."""
 
     def __init__(self, enclave: str, domain: int, nodes: Iterable[NodeName]) -> None:
         self._begin = f"{GRAPH}/{domain}/*/*/*"
@@ -133,7 +134,7 @@ class _Tokens:
         }
 
     def of(self, rights: Iterable[Right]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return the allowed key expressions, and the denied exceptions."""
+        """Return two tuples of key expressions: allowed tokens, and denied exceptions."""
         sides: dict[bool, dict[str, dict[str, None]]] = {True: {}, False: {}}
         for _, qualifier, right, name in rights:
             sides[qualifier is ALLOW].setdefault(right, {})[name] = None
@@ -158,7 +159,7 @@ class _Tokens:
         return tuple(allowed), tuple(denied)
 
     def of_every_kind(self, nodes: Sequence[NodeName]) -> tuple[str, ...]:
-        """Return the key expressions of nodes and of all entities that they could have."""
+        """Return key expressions for nodes, and for all endpoints that these nodes could have."""
         named = (
             # "$*" may stand for nothing: "/*" must not become the namespace "/", too.
             NodeName(f"/{_LETTER}*", node.name)
@@ -169,7 +170,7 @@ class _Tokens:
         return tuple(self._key(_EVERY_KIND, place, ANY_CHUNKS) for place in _places(named))
 
     def _announced(self, right: str, names: Mapping[str, None]) -> list[str]:
-        """Return the tokens of names, for every node that may have the name."""
+        """Return key expressions for the tokens of names, for each node that may use the name."""
         parts = [part for name in names for part in _parts(name)]
         owners = {part: self._owner(right, part) for part in parts}
         everybody = self._nodes
@@ -182,7 +183,7 @@ class _Tokens:
         ]
 
     def _owner(self, right: str, part: str) -> str:
-        """Return the node of a node's own service, such as set_parameters; "" for other names."""
+        """Return the node that a service such as set_parameters belongs to; "" for other names."""
         node, _, service = part.rpartition("%")
         return self._of_names.get(node, "") if right == "reply" and service in OWN_SERVICES else ""
 
@@ -191,7 +192,7 @@ class _Tokens:
 
 
 def _listed(name: str) -> list[str]:
-    """Return expressions whose only wildcard is ``*``; if too many, a wider expression."""
+    """Return expressions with ``*`` as only wildcard; a single wider one if there are too many."""
     try:
         return listed(name, _MOST_TOKENS)
     except TooManyNames:  # the keys of the name cannot be listed either, and are refused
@@ -207,7 +208,7 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _places(nodes: Iterable[NodeName]) -> tuple[str, ...]:
-    """Return the namespaces and names of nodes as tokens have them."""
+    """Return namespace and name of nodes in the form that tokens have."""
     places = (
         f"{_part(ns)}/{_part(name)}"
         for node in nodes
@@ -219,7 +220,7 @@ def _places(nodes: Iterable[NodeName]) -> tuple[str, ...]:
 
 
 def _part(name: str) -> str:
-    """Return a name as the part of a token."""
+    """Return a name in the form that tokens have: ``%`` for ``/``."""
     return canonical((name.replace("/", "%").replace("*", ANY_PART) or "%",))
 
 
@@ -227,12 +228,12 @@ def _part(name: str) -> str:
 
 
 class SharedNodes(NamedTuple):
-    """Nodes that several enclaves may announce, so that each can take them out of the graph."""
+    """Nodes that several enclaves may announce: each can remove the others' from the graph."""
 
     enclaves: tuple[str, ...]
     """The enclaves that may announce all of these nodes."""
     others: tuple[str, ...]
-    """Enclaves that may announce some of them."""
+    """Enclaves that may announce some of these nodes."""
     nodes: tuple[str, ...]
     """Full names of the nodes, perhaps with wildcards."""
 
@@ -298,7 +299,7 @@ def _is_wide(node: str) -> bool:
 
 
 def _included(nodes: AnnouncedNodes, in_order: Sequence[str]) -> Iterator[str]:
-    """Yield the nodes of ``in_order``, without wildcards, that ``nodes`` include."""
+    """Yield the nodes without wildcards in ``in_order`` that ``nodes`` include."""
     never = KeyExpressions(nodes.denied)
     for wide in nodes.allowed:
         begin = _begin(wide)
@@ -310,7 +311,7 @@ def _included(nodes: AnnouncedNodes, in_order: Sequence[str]) -> Iterator[str]:
 
 
 def _with_the_same_beginning(groups: Sequence[AnnouncedNodes]) -> Mapping[int, set[int]]:
-    """Map the position of a group to later groups with nodes that may begin with the same text."""
+    """Map the number of each group to later groups whose nodes may begin with the same text."""
     begins = sorted(
         {(_begin(node), at) for at, nodes in enumerate(groups) for node in nodes.allowed}
     )
@@ -325,7 +326,7 @@ def _with_the_same_beginning(groups: Sequence[AnnouncedNodes]) -> Mapping[int, s
 
 
 def _have_common(one: AnnouncedNodes, other: AnnouncedNodes) -> bool:
-    """Return whether some node is one of both."""
+    """Return whether some node is in both groups."""
     left, right = (names_of(nodes.allowed) - names_of(nodes.denied) for nodes in (one, other))
     return not (left & right).is_empty()
 
@@ -353,9 +354,9 @@ def example_token(
     key_expressions: Iterable[str],
     passes: Callable[[str], bool] = lambda _: True,
 ) -> str:
-    """Return an example of a token for a node of an enclave, if possible an allowed one.
+    """Return an example of a node's token for an enclave, if possible a token that may pass.
 
-    An allowed token is included in ``key_expressions`` and ``passes`` the denials.
+    Such a token is included in ``key_expressions``, and ``passes`` returns True for it.
     """
     begin = f"{GRAPH}/{domain}/"
     places = [
@@ -372,5 +373,5 @@ def example_token(
 
 
 def _any_as(name: str, part: str) -> str:
-    """Return a chunk of a token, or ``name`` if the chunk is only a wildcard."""
+    """Return ``part``, a chunk of a token, or ``name`` if the chunk is only a wildcard."""
     return name if part == "*" else part.replace(ANY_PART, "")

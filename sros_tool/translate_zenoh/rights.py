@@ -84,7 +84,7 @@ ANY_TYPE = "any::type/hash"
 """An example of a type and its hash: the rules of sros decide the same for every type."""
 _BELOW_TOPICS = (ANY_CHUNKS,) if any(release.below_topics for release in RELEASES) else ()
 _BELOW = {"publish": _BELOW_TOPICS, "subscribe": _BELOW_TOPICS}
-"""Chunks that some release of rmw_zenoh adds to the keys of a right."""
+"""Chunks that a release of rmw_zenoh adds to the keys of a right, by right."""
 _ADVANCED = f"@adv/{ANY_CHUNKS}"
 """Further keys of a topic with history (TRANSIENT_LOCAL), below its key."""
 _M = Message
@@ -121,7 +121,7 @@ The messages are on the key of the name, or (`_HISTORY`) on the keys of its hist
 
 
 class StatedRight(NamedTuple):
-    """A right to one topic or service, or its denial, and where the policy states it."""
+    """A right to one topic or service, or its denial, with the place that states it."""
 
     right: Right
     source: Source
@@ -137,7 +137,10 @@ def stated_rights(enclave: Enclave) -> tuple[StatedRight, ...]:
 
 
 def remote_rights(enclave: Enclave, domain: int) -> RemoteRights:
-    """Return what a process allows to processes of ``enclave`` in a ROS domain: `remote_of`."""
+    """Return what a process allows to processes of ``enclave`` in a ROS domain.
+
+    `remote_of` does the same for several domains.
+    """
     return remote_of(enclave.path, {domain: stated_rights(enclave)}, nodes_of(enclave))
 
 
@@ -146,10 +149,10 @@ def remote_of(
     stated: Mapping[int, Sequence[StatedRight]],
     nodes: Collection[NodeName] = (),
 ) -> RemoteRights:
-    """Return the rights that a process gives an enclave; ``stated`` maps ROS domains to rights.
+    """Return the rights that every process gives to processes of an enclave.
 
-    This includes the tokens of the graph, which every node needs: see `graph_rules` for the nodes
-    that the enclave may announce.
+    ``stated`` maps ROS domains to the enclave's rights.  The result includes the graph tokens,
+    which every node needs; `graph_rules` says which ``nodes`` the enclave may announce.
 
     Raises:
         PolicyError: rules of Zenoh cannot express a right; the text names the place.
@@ -170,7 +173,7 @@ def remote_of(
 
 
 def domains_of(control: AccessControl) -> set[int]:
-    """Return the ROS domains in which rules let processes ask for the graph, as every node does."""
+    """Return the ROS domains in which processes may ask for graph tokens, as all nodes do."""
     asked = {
         tuple(key.split("/"))
         for remote in control.remotes
@@ -182,7 +185,7 @@ def domains_of(control: AccessControl) -> set[int]:
 
 
 def stated_names(rules: Iterable[AccessRule]) -> list[tuple[str, str]]:
-    """Return the rights that rules of `remote_of` state, each with its name, sorted.
+    """Return pairs of a right and a name that rules of `remote_of` state, sorted.
 
     A name with wildcards is returned as Zenoh writes it.
     """
@@ -198,7 +201,7 @@ def stated_names(rules: Iterable[AccessRule]) -> list[tuple[str, str]]:
 
 
 def _name_in(key: str) -> str:
-    """Return the name in the key expression of a right, without domain, type and hash."""
+    """Return the name in the key expression of a right; domain, type and hash are left out."""
     chunks = untyped(key).split("/")[1:]
     last = chunks[-1:] if chunks[-1] == ANY_CHUNKS else []  # canonical: behind type and hash
     name = chunks[: len(chunks) - len(last) - len(_UNTYPED)]
@@ -206,7 +209,10 @@ def _name_in(key: str) -> str:
 
 
 def untyped(key: str) -> str:
-    """Return a right's key expression as other tools write it: any type, and nothing below."""
+    """Return the key expression of a right as other tools write it, for any type.
+
+    Keys below the key of the topic are not included.
+    """
     for below in ((), (ANY_CHUNKS,)):
         end = "/".join(("", *_TYPE, *below))
         if key.endswith(end):
@@ -215,16 +221,16 @@ def untyped(key: str) -> str:
 
 
 def as_router(router: str, own: RemoteRights) -> RemoteRights:
-    """Return what a process whose rights are ``own`` allows to its router.
+    """Return the rights that a process with the rights ``own`` gives to its router.
 
-    The router passes on messages, so it may send what the process may get, and get what the process
-    may send.
+    A router passes on messages, so it may send what the process may receive, and receive what the
+    process may send.
     """
     return own.mirrored(router)
 
 
 def crossing_rules(names: Iterable[str], domains: Iterable[int]) -> tuple[AccessRule, ...]:
-    """Return rules that allow everything about topics and services with these names."""
+    """Return rules that allow all messages about topics and services with these names."""
     place = Source("crossing", 0)
     rights = [
         StatedRight(Right("", ALLOW, right, name), place)
@@ -239,7 +245,7 @@ def crossing_rules(names: Iterable[str], domains: Iterable[int]) -> tuple[Access
 
 
 _EXACT_NAMES = re.compile(r"(?:/[^/#$*?\[]+)+")
-"""One or several names, joined: none has a wildcard, and all are valid keys of Zenoh."""
+"""Matches absolute names without wildcards, one or several joined, that are valid keys of Zenoh."""
 _NO_KEY = re.compile(r"[#$]|//|/\Z")
 """Text that no key of Zenoh may have."""
 
@@ -247,12 +253,12 @@ _NO_KEY = re.compile(r"[#$]|//|/\Z")
 def _allowed_keys(
     domain: int, stated: Iterable[StatedRight]
 ) -> Iterator[tuple[str, tuple[str, ...], Difference | None]]:
-    """Yield each right, its key expressions without denied names, and the difference.
+    """Yield each right with its allowed key expressions, and their `Difference`.
 
-    The difference is for names with wildcards; it is None for other names.
+    The key expressions leave out denied names.  The difference is None for names without wildcards.
 
     Raises:
-        PolicyError: a name, or a name without the denied part, cannot be expressed.
+        PolicyError: a name, or a name without its denied part, cannot be expressed.
     """
     allowed: dict[str, dict[str, Source]] = {}
     denied: dict[str, dict[str, Source]] = {}
@@ -296,7 +302,7 @@ def _forms(places: Mapping[str, Source]) -> frozenset[Chunks]:
 def _names_of(
     difference: Difference, right: str, allowed: Mapping[str, Source], denied: Mapping[str, Source]
 ) -> frozenset[Chunks]:
-    """Return the chunks of the names of a difference, as ``allowed`` and ``denied`` state it.
+    """Return the chunks of the names of a difference; ``allowed`` and ``denied`` tell their places.
 
     Raises:
         PolicyError: the names cannot be expressed, or take more than `MOST_EXPRESSIONS`.
@@ -333,7 +339,7 @@ def _cannot_deny(
 
 
 def _with_what_is_below(names: frozenset[Chunks] | set[Chunks]) -> set[Chunks] | frozenset[Chunks]:
-    """Return the same names, where a name and all names below it are one expression."""
+    """Return the same names, with one expression for a name and all names below it."""
     below = ("*", ANY_CHUNKS)
     if not any(name[-1] == ANY_CHUNKS for name in names):
         return names
@@ -376,7 +382,7 @@ def _too_many(name: str, place: Source) -> PolicyError:
 
 
 def _number_of_chunks(name: str) -> int:
-    """Return a lower bound of the result of `chunks_of`, which doubles with each ``*``."""
+    """Return a lower bound of the number of results of `chunks_of`: it doubles with each ``*``."""
     stars_within = len(re.findall(r"(?<=[^/*])\*+(?=[^/*])", name))
     return 1 << stars_within
 
@@ -443,10 +449,10 @@ _MOST_ANY_CHUNKS = 6
 
 @dataclass(frozen=True, slots=True)
 class RightsInRules:
-    """The rights that rules give to processes by the common name of their certificate.
+    """The rights that rules give to processes, by the common name of their certificate.
 
-    ``enclaves`` are the common names that rules name.  ``left_out`` are key expressions that do not
-    stand for ROS topics or services, sorted.
+    ``enclaves`` are the common names in the rules.  ``left_out`` are key expressions that stand for
+    no ROS topic or service, sorted.
     """
 
     rights: frozenset[Right]
@@ -486,7 +492,7 @@ def rights_in_rules(access: Enforcement) -> RightsInRules:
 
 
 def _uses(rule: AclRule) -> Iterator[tuple[str, str]]:
-    """Yield pairs of a right and a key expression, for all rights and key expressions of a rule."""
+    """Yield pairs of a right and a key expression that a rule allows or denies."""
     for (flow, message), right in _USE.items():
         if flow in rule.flows and message in rule.messages:
             # Below @adv is the history of a topic, which belongs to the same right.
@@ -494,7 +500,7 @@ def _uses(rule: AclRule) -> Iterator[tuple[str, str]]:
 
 
 def ros_names(key: str) -> tuple[str, ...]:
-    """Return the ROS names and expressions for which a key expression stands; () if there are none.
+    """Return the ROS names and expressions that a key expression stands for, perhaps none.
 
     The first chunk is the ROS domain, and the last two are the type and its hash.
     """
@@ -517,7 +523,7 @@ def ros_names(key: str) -> tuple[str, ...]:
 
 
 def _without_type(chunks: list[str]) -> list[str]:
-    """Return the chunks of the name; type and hash may stand before wildcards for any chunks.
+    """Return the chunks of the name; wildcards can stand for type and hash.
 
     In the canonical form, ``*`` stands before ``**``.
     """
@@ -539,13 +545,13 @@ _BELOW_KEYS = "@adv"
 _MOST_NAMES = 65536
 _EVERY_NAME = ("*", *_UNTYPED, ANY_CHUNKS)
 _DOMAIN = re.compile(r"\*|0|[1-9][0-9]{0,2}")
-"""The first part of a key of rmw_zenoh: what does not begin with a domain has no ROS name."""
+"""Matches the first chunk of a key of rmw_zenoh: a ROS domain, or a wildcard."""
 
 
 def name_of_key(key: str) -> tuple[str, str]:
     """Return the domain and the ROS name in a key or key expression of rmw_zenoh.
 
-    The name is "" for the graph, and for what is no key of a topic or a service.
+    The name is "" for keys of the graph, and for keys of no topic or service.
     """
     domain, _, rest = key.partition("/")
     chunks = rest.partition(f"/{_BELOW_KEYS}")[0].split("/")
@@ -559,7 +565,7 @@ def name_of_key(key: str) -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class _DecidingMessage:
-    """A message that decides whether a remote process has a right, and further needed messages."""
+    """The message that decides whether a remote process has a right, and other needed messages."""
 
     flow: Flow
     message: Message
@@ -577,7 +583,10 @@ _DECIDING_MESSAGES = {
 
 @dataclass(frozen=True, slots=True)
 class StatedName:
-    """A right to a ROS name, perhaps with wildcards; ``lacks`` are messages that it needs too."""
+    """A right to a ROS name, perhaps with wildcards.
+
+    ``lacks`` are messages that the right needs, too, and that are not allowed.
+    """
 
     right: str
     name: str
@@ -587,11 +596,11 @@ class StatedName:
 
 @dataclass(frozen=True, slots=True)
 class RightsBehindRules:
-    """What the rules allow to the processes that match a subject.
+    """The rights that rules give to the processes that match a subject.
 
-    ``names`` are the common names of their certificates, None for processes of any name.  With
-    ``own``, these are rights of the process that has the rules, which it can ignore.  ``unsaid``
-    are rights and keys that no ROS name states exactly; ``denied`` are denied rights and keys.
+    ``names`` are the common names of their certificates, None for any.  With ``own``, they are
+    rights of the process that has the rules, which can ignore them.  ``unsaid`` are rights and keys
+    that no ROS name expresses exactly; ``denied`` are denied rights and keys.
     """
 
     subject: str
@@ -621,7 +630,7 @@ def rights_behind(document: ConfigurationDocument) -> tuple[RightsBehindRules, .
 
 
 def is_self_limiting(document: ConfigurationDocument) -> bool:
-    """Return whether a session's rules name no other process, so that they bind only itself."""
+    """Return whether a session's rules name no other process, so that it limits only itself."""
     access = document.access
     used = [subject for subject in access.subjects if access.rules_of(subject.id)]
     return (
@@ -691,7 +700,7 @@ def _keys_of(domain: str, name: str) -> tuple[str, ...]:
 
 
 class _ByPrefix:
-    """Expressions by their text before the first wildcard, for a fast search."""
+    """An index of expressions by the text before the first wildcard."""
 
     def __init__(self, expressions: Iterable[str], limit: ComparisonLimit) -> None:
         self._limit = limit
@@ -713,7 +722,7 @@ class _ByPrefix:
 
 
 class _Names:
-    """The ROS names of allowed key expressions, without the denied names."""
+    """The ROS names in allowed key expressions, without denied names."""
 
     def __init__(
         self, allowed: Sequence[str], denied: Sequence[str], limit: ComparisonLimit
@@ -725,7 +734,7 @@ class _Names:
         self._said: list[str] = []
 
     def stated(self) -> list[tuple[str, str]]:
-        """Return domains and names, without names that another name of the same domain covers."""
+        """Return pairs of domain and name, without names that others of the same domain cover."""
         sound = dict.fromkeys(
             (domain, name)
             for key in self._allowed
@@ -753,7 +762,7 @@ class _Names:
         )
 
     def unsaid(self) -> list[str]:
-        """Return the key expressions that the names do not cover completely."""
+        """Return the key expressions that no name expresses completely."""
         said = _ByPrefix(dict.fromkeys(self._said), self._limit)
         return [
             key
@@ -763,7 +772,7 @@ class _Names:
 
 
 def _candidates(key: str) -> Iterator[tuple[str, str]]:
-    """Yield domains and names that may state a key expression, or a part of it."""
+    """Yield pairs of domain and name that may express a key expression, or a part of it."""
     domain, *chunks = key.split("/")
     if domain == ANY_CHUNKS:
         domain, chunks = "*", [ANY_CHUNKS, *chunks]
@@ -782,7 +791,7 @@ def _candidates(key: str) -> Iterator[tuple[str, str]]:
 
 
 def _texts(chunks: Sequence[str]) -> list[str]:
-    """Return names for chunks; a wildcard of ROS also matches "/", so there can be several."""
+    """Return the names that chunks stand for; several, because ``*`` of ROS also matches "/"."""
     if not chunks:
         return []
     text = "/".join(chunks)
@@ -793,7 +802,7 @@ def _texts(chunks: Sequence[str]) -> list[str]:
 
 
 def _pieces(key: str) -> list[str]:
-    """Return the expressions that together match the keys of topics and services in ``key``."""
+    """Return expressions for exactly the keys of topics and services in ``key``."""
     domain, *chunks = key.split("/")
     if domain == ANY_CHUNKS:
         domain, chunks = "*", [ANY_CHUNKS, *chunks]
@@ -810,7 +819,7 @@ def _pieces(key: str) -> list[str]:
 
 
 def enclave_of(rights: RightsBehindRules) -> tuple[str, ...]:
-    """Return the names of the enclaves of a subject, or ().
+    """Return the enclaves that a subject stands for, or ().
 
     For a session that limits itself, the name is the id of the subject: zenoh_security_tools writes
     the node's name there, and uses the enclave of that name.
@@ -827,7 +836,7 @@ def _is_enclave(name: str) -> bool:
 
 
 def policy_of(subjects: Iterable[RightsBehindRules]) -> Policy:
-    """Return a policy with the rights of subjects with names; it never has more rights.
+    """Return a policy with the rights of subjects that have names; it never gives more.
 
     The node of each profile is the last part of the enclave's name, as rules name no nodes; all
     names are absolute.

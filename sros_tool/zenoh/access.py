@@ -50,10 +50,10 @@ class Flow(StrEnum):
 
 
 class AccessRule(NamedTuple):
-    """Messages that are allowed or denied in one direction, on keys in ``key_expressions``.
+    """A rule that allows or denies messages in one direction, on keys in ``key_expressions``.
 
-    Only rules for graph tokens deny.  Nobody reads a token as a wildcard, so a denial inside a
-    wider permission holds for tokens.
+    Only rules for graph tokens deny.  No process reads a token as a wildcard, so a denial inside a
+    wider permission works for tokens.
     """
 
     flow: Flow
@@ -68,10 +68,10 @@ class AccessRule(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RemoteRights:
-    """What a remote process may send and get, if its certificate has this common name.
+    """What a remote process may send and receive if its certificate has this common name.
 
-    A denial can turn one key with wildcards into a list of keys.  ``made_of`` has the original keys
-    and what was subtracted, by direction and messages of the rule.
+    A denial can turn a key with wildcards into a list of keys.  ``made_of`` has the original keys
+    and what was subtracted from them, by direction and messages of the rule.
     """
 
     common_name: str
@@ -79,7 +79,10 @@ class RemoteRights:
     made_of: Mapping[_Use, tuple[Difference, ...]] = field(default_factory=dict, compare=False)
 
     def mirrored(self, common_name: str) -> RemoteRights:
-        """Return the rights that the remote process must give to this process, ``common_name``."""
+        """Return the rights that the remote process must give to this process.
+
+        ``common_name`` is the common name of this process.
+        """
         return RemoteRights(
             common_name,
             in_order(rule.mirrored() for rule in self.rules),
@@ -87,7 +90,7 @@ class RemoteRights:
         )
 
     def keys_of(self, rule: AccessRule) -> RuleKeys:
-        """Return the keys of one of the rules."""
+        """Return the keys of a rule."""
         made_of = self.made_of.get((rule.flow, rule.messages), ()) if rule.allows else ()
         return keys_of(frozenset(rule.key_expressions), made_of)
 
@@ -98,10 +101,10 @@ _Use = tuple[Flow, tuple[Message, ...]]
 
 @dataclass(frozen=True)
 class AccessControl:
-    """The access control of a process: each common name occurs once, everybody else is denied.
+    """The access control of a process: rules by common name; all other processes are denied.
 
-    A name that occurs twice would have the rights of both subjects; in Zenoh up to 1.5.1, it would
-    have the rights of a random one.
+    Each common name occurs only once.  A second subject with the same name would add its rights to
+    the first; in Zenoh up to 1.5.1, a random one of both would decide.
     """
 
     remotes: tuple[RemoteRights, ...]
@@ -120,11 +123,11 @@ class AccessControl:
         return bool(rules) and all(rules)
 
     def passing(self, common_name: str, flow: Flow, message: Message) -> KeyExpressions:
-        """Return the key expressions that are allowed for a message, to ask about many keys."""
+        """Return the key expressions for which a message is allowed, to ask about many keys."""
         return self._expressions(common_name, flow, message, allows=True)
 
     def denied(self, common_name: str, flow: Flow, message: Message) -> KeyExpressions:
-        """Return the key expressions that are denied for a message, whatever allows them."""
+        """Return the key expressions for which a message is denied, even if a rule allows them."""
         return self._expressions(common_name, flow, message, allows=False)
 
     def keys(self, common_name: str, flow: Flow, message: Message) -> NameSet:
@@ -141,7 +144,7 @@ class AccessControl:
         )
 
     def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
-        """Return what `Enforcement.decide` does for the same access control, read from its file."""
+        """Return the decision that `Enforcement.decide` makes with the file of these rules."""
         own = None if remote.common_name is None else self._by_name.get(remote.common_name)
         if own is None:
             stated = any(rights.rules for rights in self.remotes)
@@ -156,12 +159,12 @@ class AccessControl:
         return _decided(applying, (own.common_name,))
 
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
-        """Return the key expressions that rules allow, whatever others deny of them."""
+        """Return the key expressions that rules allow; denials are not subtracted."""
         rules = self._rules(common_name, flow, message)
         return tuple(key for rule in rules if rule.allows for key in rule.key_expressions)
 
     def key_expressions_of(self, rule: str) -> tuple[str, ...]:
-        """Return the key expressions of a rule of `decide`, by its id."""
+        """Return the key expressions of a rule, given by an id in a decision."""
         ids = ((id_, of) for remote in self.remotes for id_, of in self._with_ids(remote))
         return next(of.key_expressions for id_, of in ids if id_ == rule)
 
@@ -217,7 +220,10 @@ _NO_RULE_AT_ALL = "no rule is in force, and the default is DENY"
 
 
 def _decided(applying: Sequence[tuple[bool, str]], subjects: tuple[str, ...]) -> AccessDecision:
-    """Return the decision of the rules that apply, each with whether it allows: DENY wins."""
+    """Return the decision of the rules that apply to a message: if any rule denies, it is denied.
+
+    ``applying`` has, for each rule, whether it allows, and its id.
+    """
     if denied := tuple(rule for allows, rule in applying if not allows):
         return AccessDecision(False, denied, subjects, f"rule {denied[0]} denies it")
     allowed = tuple(rule for _, rule in applying)
@@ -241,10 +247,10 @@ def _search(expressions: tuple[str, ...]) -> KeyExpressions:
 
 
 def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
-    """Return fewer rules with the same meaning, in an order that does not depend on the input.
+    """Return rules with the same meaning, sorted, of which each use has only one.
 
-    Rules of the same direction and messages become one rule.  It has no key expression that another
-    of its key expressions includes.
+    Rules of the same direction and messages become one rule, without key expressions that others of
+    the rule include.
     """
     keys_of_use: dict[tuple[Flow, tuple[Message, ...], bool], list[tuple[str, ...]]] = {}
     for flow, messages, keys, allows in rules:
@@ -274,7 +280,7 @@ def in_order(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
 
 
 def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
-    """Return the rights of all enclaves together, for a process named ``name``."""
+    """Return the rights of all enclaves together, as the rights of a process named ``name``."""
     of_all = list(rights)
     made_of: dict[_Use, dict[Difference, None]] = {}
     for use, of in (item for rights in of_all for item in rights.made_of.items()):
@@ -287,14 +293,14 @@ def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
 
 
 class RightsBetween:
-    """What processes of two enclaves may send each other directly: only what both have rights for.
+    """What processes of two enclaves may send each other directly: only what both may.
 
-    So a process that obeys its own rules never sends or gets more than its rights, whatever the
-    other process does.
+    So a process that obeys its own rules never sends or receives more than its rights permit,
+    whatever the other process does.
     """
 
     def __init__(self, rights: Iterable[RemoteRights]) -> None:
-        """Take the rights of all enclaves, whose processes connect to each other."""
+        """Keep the rights of all enclaves whose processes connect to each other."""
         self._rules: dict[str, list[_RuleOfPeer]] = {}
         self._mirrored: dict[str, list[_RuleOfPeer]] = {}
         for peer in rights:
@@ -307,10 +313,10 @@ class RightsBetween:
         }
 
     def of_all(self, own: str) -> Iterator[RemoteRights]:
-        """Yield what a process of the enclave ``own`` allows to processes of all enclaves.
+        """Yield the rights that a process of the enclave ``own`` gives to each other enclave.
 
         Raises:
-            TooManyExpressions: that takes too many key expressions.
+            TooManyExpressions: the shared rights need too many key expressions.
         """
         mine = self._mirrored[own]
         denied = [own for own in mine if not own.rule.allows]
@@ -344,7 +350,7 @@ class RightsBetween:
 
 
 _Place = tuple[Flow, tuple[Message, ...], bool]
-"""Direction and messages of a rule, and whether it allows them."""
+"""Direction and messages of a rule, and whether the rule allows them."""
 
 
 class _RuleOfPeer(NamedTuple):
@@ -372,12 +378,13 @@ def _sorted(some: tuple[str, ...], others: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def narrowed(rights: RemoteRights, most: Iterable[AccessRule], kept: str) -> RemoteRights:
-    """Return those of some rights that ``most`` has, too, and all on keys that begin with ``kept``.
+    """Return the part of some rights that the rules ``most`` allow as well.
 
-    ``kept`` is for the graph, whose keys have names of nodes and topics as parts.
+    Keys that begin with ``kept`` are not narrowed: in keys of the graph, names of nodes and topics
+    are parts.
 
     Raises:
-        TooManyExpressions: that takes too many key expressions.
+        TooManyExpressions: the result needs too many key expressions.
     """
     graph = [rule for rule in rights.rules if rule.key_expressions[0].startswith(kept)]
     others = tuple(rule for rule in rights.rules if rule not in graph)
@@ -430,9 +437,9 @@ class Remote:
 
 @dataclass(frozen=True, slots=True)
 class AclRule:
-    """Messages in some directions, on keys that ``key_expressions`` include: allowed or denied.
+    """A rule that allows or denies messages in some directions, on some keys.
 
-    ``line`` is its line in the file.
+    ``key_expressions`` include the keys; ``line`` is the line of the rule in the file.
     """
 
     id: str
@@ -445,7 +452,10 @@ class AclRule:
 
 @dataclass(frozen=True, slots=True)
 class AclSubject:
-    """Remote processes that have one of the values of every property; None stands for any value."""
+    """Remote processes that have, for each property, one of the listed values.
+
+    None stands for any value of a property.
+    """
 
     id: str
     cert_common_names: tuple[str, ...] | None = None
@@ -456,7 +466,7 @@ class AclSubject:
     line: int = field(default=0, compare=False)
 
     def is_named(self) -> bool:
-        """Return whether it states who the process is, and not only how it connects."""
+        """Return whether the subject states who a process is, and not only how it connects."""
         return self.cert_common_names is not None or self.usernames is not None
 
     def overlaps(self, other: AclSubject) -> bool:
@@ -479,7 +489,7 @@ PROPERTIES = tuple(
 
 @dataclass(frozen=True, slots=True)
 class AclPolicy:
-    """Which rules hold for which subjects, by their ids: an entry of Zenoh's ``policies``."""
+    """An entry of Zenoh's ``policies``: which rules apply to which subjects, both by id."""
 
     rules: tuple[str, ...]
     subjects: tuple[str, ...]
@@ -489,8 +499,8 @@ class AclPolicy:
 class AccessDecision:
     """Whether a message passes, and why.
 
-    ``rules`` are the ids of the rules that decide it, none if the default does; ``subjects`` the
-    ids of all subjects that match the remote process; ``why`` is a clause that says the reason.
+    ``rules`` are the ids of the deciding rules, empty if the default decides; ``subjects`` are the
+    ids of all subjects that match the remote process; ``why`` is the reason, as a clause.
     """
 
     allowed: bool
@@ -500,7 +510,7 @@ class AccessDecision:
 
 
 class MessageFilter(Protocol):
-    """What decides on the messages that a process gets and sends."""
+    """An object that decides which messages a process receives and sends."""
 
     def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
         """Return whether a message from or to a remote process passes."""
@@ -509,7 +519,7 @@ class MessageFilter(Protocol):
         """Return the key expressions of a rule, by its id."""
 
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
-        """Return the key expressions that rules allow, whatever others deny of them."""
+        """Return the key expressions that rules allow; denials are not subtracted."""
 
     def rules_for(self, common_name: str) -> int:
         """Return the number of rules that name a remote process."""
@@ -521,12 +531,15 @@ class MessageFilter(Protocol):
 _OF_HISTORY = (Message.PUT, Message.QUERY)
 
 _Combination = tuple[str | None, ...]
-"""One value for each of `PROPERTIES`, None for any."""
+"""One value for each of `PROPERTIES`; None stands for any value."""
 
 
 @dataclass(frozen=True)
 class Enforcement:
-    """The access control of a process: whether it is on, its rules, subjects and policies."""
+    """The access control of a process, as any configuration may state it.
+
+    It has the default, the rules, the subjects and the policies.
+    """
 
     enabled: bool = False
     allows_by_default: bool = False
@@ -554,7 +567,7 @@ class Enforcement:
         )
 
     def unclear(self) -> str:
-        """Return why names alone do not decide what passes, as a clause; "" if they do."""
+        """Return why the common name alone does not decide what passes, as a clause, or ""."""
         for subject in self.subjects:
             stated = {name for name in PROPERTIES if getattr(subject, name) is not None}
             if subject.cert_common_names is not None and len(stated) > 1:
@@ -571,7 +584,7 @@ class Enforcement:
         return ""
 
     def _only_history(self, subject: str) -> str:
-        """Return a key whose history (``@adv``) a subject gets without the key itself, or ""."""
+        """Return a key of which a subject gets the history (``@adv``) but no messages, or ""."""
         keys: dict[Flow, list[str]] = {flow: [] for flow in Flow}
         history: dict[Flow, set[str]] = {flow: set() for flow in Flow}
         for rule in self.rules_of(subject):
@@ -596,10 +609,10 @@ class Enforcement:
     def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
         """Return whether a message from or to a remote process passes.
 
-        ``key`` is the key or key expression of the message: a rule applies if one of its own
-        includes that as a whole.  Subjects of the same values are one, and in it DENY wins.
-        Between different subjects that match, one that allows is enough; under default ALLOW that
-        is each one without a rule that denies.
+        ``key`` is the key or key expression of the message: a rule applies if one of its key
+        expressions includes the whole ``key``.  Subjects with the same values count as one, in
+        which DENY wins. Of different subjects that match, one that allows is enough; with the
+        default ALLOW, a subject allows if none of its rules denies.
         """
         if not self.enabled:
             return AccessDecision(True, (), (), "access control is off")
@@ -653,9 +666,10 @@ class Enforcement:
     def passing(
         self, remote: Remote, flow: Flow, message: Message, of: Callable[[Iterable[str]], NameSet]
     ) -> NameSet:
-        """Return the keys, without wildcards, of which `decide` lets a message pass.
+        """Return the keys without wildcards with which `decide` lets a message pass.
 
-        ``of`` returns the set of what key expressions include: of keys, or of other names for them.
+        ``of`` returns the set of names that key expressions include.  These names are the keys, or
+        other names that stand for keys.
         """
         everything = ~NameSet()
         if not self.enabled:
@@ -676,7 +690,7 @@ class Enforcement:
 
     @cached_property
     def _combinations(self) -> Mapping[_Combination, tuple[str, ...]]:
-        """The ids of the subjects for each combination of their values."""
+        """The ids of the subjects, by their values of all properties."""
         ids_of: dict[_Combination, list[str]] = {}
         for subject in self.subjects:
             values = (getattr(subject, name) or (None,) for name in PROPERTIES)

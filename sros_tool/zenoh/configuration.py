@@ -32,7 +32,7 @@ from sros_tool.zenoh.access import (
 
 
 class Mode(StrEnum):
-    """How a process takes part in the network."""
+    """How a process takes part in the Zenoh network."""
 
     ROUTER = "router"
     PEER = "peer"
@@ -43,12 +43,13 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ZenohRouter:
-    """A router of a host or a robot: its enclave, and the enclaves whose sessions connect to it.
+    """A router, and the enclaves whose sessions connect to it.
 
-    These sessions and other routers connect to ``endpoints`` (``HOST:PORT``).  The router listens
-    at ``listen``, or at the ports of ``endpoints`` on all its addresses.  ``enclaves`` are names,
-    in which ``*`` stands for any characters.  ``crossing`` are the names that may pass between this
-    router and others; if empty, ``crossing`` of the network decides.
+    ``name`` is the router's enclave.  Sessions and other routers connect to ``endpoints``
+    (``HOST:PORT``).  The router listens at ``listen``, or at the ports of ``endpoints`` on all its
+    addresses.  ``enclaves`` are names of enclaves, in which ``*`` stands for any characters.
+    ``crossing`` are the topics and services that may pass between this router and others; if empty,
+    ``crossing`` of the network decides.
     """
 
     name: str
@@ -64,24 +65,24 @@ class ZenohRouter:
         return f"{self.name} at {' '.join(self.endpoints)}{served}{passing}"
 
     def listening(self) -> tuple[str, ...]:
-        """Return where it listens."""
+        """Return the addresses at which the router listens, as ``HOST:PORT``."""
         ports = dict.fromkeys(endpoint.rpartition(":")[2] for endpoint in self.endpoints)
         return self.listen or tuple(f"[::]:{port}" for port in ports)
 
 
 @dataclass(frozen=True, slots=True)
 class ZenohNetwork:
-    """The Zenoh network of a keystore's enclaves.
+    """The Zenoh network of the enclaves of a keystore.
 
-    ``router`` is the enclave of the router; The sessions connect to ``endpoints`` (``HOST:PORT``);
-    the router listens there too, or at ``listen``, such as ``[::]:7447``. ``mode`` is the mode of
-    the sessions, client or peer.  ``domains`` are ROS domains; if empty, the domains of the
-    keystore's governance.
+    ``router`` is the enclave of the router.  Sessions connect to ``endpoints`` (``HOST:PORT``), and
+    the router listens at ``listen``, such as ``[::]:7447``, or else at ``endpoints``. ``mode`` is
+    the mode of the sessions, client or peer.  ``domains`` are ROS domains; if empty, the domains of
+    the keystore's governance.
 
-    ``routers`` are further routers.  All routers connect to each other, and an enclave's sessions
-    connect to the first of ``routers`` that names it.  ``crossing`` are the topics and services,
-    perhaps with wildcards, that may pass from one router to another; if empty, the rights of the
-    enclaves alone decide.
+    ``routers`` are further routers.  All routers connect to each other, and the sessions of an
+    enclave connect to the first router in ``routers`` that names the enclave.  ``crossing`` are the
+    topics and services, perhaps with wildcards, that may pass between routers; if empty, only the
+    rights of the enclaves decide.
     """
 
     router: str = "/router"
@@ -93,7 +94,7 @@ class ZenohNetwork:
     crossing: tuple[str, ...] = ()
 
     def listening(self) -> tuple[str, ...]:
-        """Return where the router listens."""
+        """Return the addresses at which the router listens, as ``HOST:PORT``."""
         return self.listen or self.endpoints
 
     def every_router(self) -> tuple[ZenohRouter, ...]:
@@ -112,7 +113,9 @@ class ZenohNetwork:
         return self.every_router()[0]
 
     def connects(self) -> Mapping[str, tuple[str, ...]]:
-        """Map each router to endpoints of others that it connects to; of two routers, one connects.
+        """Map each router to the endpoints of other routers that it connects to.
+
+        Of two routers, only one connects to the other.
 
         Raises:
             UsageError: neither of two routers can reach the other.
@@ -128,7 +131,7 @@ class ZenohNetwork:
             else:
                 raise UsageError(
                     f"the routers {first.name} and {second.name} cannot connect to each other",
-                    "The endpoints of each are on its own host, or it listens only there.",
+                    "The endpoints of each router name its own host, or it listens only there.",
                     "Name an endpoint by which another host reaches one of them.",
                 )
         return connections
@@ -142,7 +145,10 @@ _MICROSECONDS_UNTIL_CLOSED = 60_000_000
 
 
 class SettingsEdition(Enum):
-    """The edition of a file: its settings without effect on security, and how it lists rules."""
+    """The edition of a configuration file that sros wrote.
+
+    Editions differ in settings without effect on security, and in how rules are listed.
+    """
 
     FEW = "few"
     """The few settings of the first files: a session ends instead of waiting for its router."""
@@ -152,7 +158,7 @@ class SettingsEdition(Enum):
     The settings are the same in rmw_zenoh 0.1.9, 0.2.10, 0.6.7 and 0.10.5.
     """
     RULES_ONCE = "rules once"
-    """The settings of `OF_RMW_ZENOH`; a rule that several enclaves have is there once."""
+    """The settings of `OF_RMW_ZENOH`; a rule of several enclaves is written only once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +189,7 @@ class Configuration:
 
 
 class RenderedRights(NamedTuple):
-    """The rules of a remote enclave as a file has them, without ids."""
+    """The rules for one remote enclave as they are written to a file, without ids."""
 
     name: str
     rules: tuple[str, ...]
@@ -233,7 +239,7 @@ def _rest(
     revoked: str,
     settings: SettingsEdition,
 ) -> str:
-    """Return all but the access control, without the brace at the end."""
+    """Return the text of a configuration without access control and without the last brace."""
     document: dict[str, Any] = {
         "mode": mode.value,
         "connect": {"endpoints": list(connect)},
@@ -324,10 +330,12 @@ def _list(texts: Iterable[str]) -> str:
 
 
 def parse_rendered(data: bytes, name: str) -> Configuration:
-    """Return a configuration as `Configuration.render` writes it; ``name`` is for errors.
+    """Return the configuration in a file that `Configuration.render` wrote.
+
+    ``name`` names the file in errors.
 
     Raises:
-        DocumentError: the data is not exactly as sros writes it, so its meaning is not certain.
+        DocumentError: the file is not exactly as sros writes it, so its meaning is uncertain.
     """
     configuration = RenderedReader().read(data)
     if configuration is None:
@@ -346,9 +354,9 @@ _SECTIONS = re.compile(
 
 
 class RenderedReader:
-    """Reader of many configurations as `Configuration.render` writes them.
+    """A reader of many configurations that `Configuration.render` wrote.
 
-    A rule that several of them have in the same words is read once, and so is a file.
+    Equal files, and equal rules of several files, are read only once.
     """
 
     def __init__(self) -> None:
@@ -384,7 +392,7 @@ class RenderedReader:
             return None
 
     def beginning(self, data: bytes) -> Configuration | None:
-        """Return a configuration without the rules, which are not read; None if others wrote it."""
+        """Return a configuration without its rules, or None if sros did not write the file."""
         try:
             text, mark, _ = data.decode().partition(_CONTROL)
             return self._beginning(text) if mark else None
@@ -392,7 +400,11 @@ class RenderedReader:
             return None
 
     def _beginning(self, text: str) -> Configuration:
-        """Return the mode, and where a process listens and connects; raise if others wrote it."""
+        """Return mode and endpoints of a configuration.
+
+        Raises:
+            ValueError, KeyError: sros did not write the file.
+        """
         if text not in self._beginnings:
             document = json.loads(f"{text}\n}}")
             mode = Mode(document["mode"])
@@ -422,7 +434,7 @@ class RenderedReader:
         return rights
 
     def _policy(self, line: str) -> tuple[str, list[str]]:
-        """Return the remote enclave of a policy, and the ids of its rules."""
+        """Return the enclave that a policy is for, and the ids of the policy's rules."""
         if line not in self._policies:
             policy = json.loads(line)
             self._policies[line] = policy["subjects"][0], policy["rules"]
@@ -459,10 +471,10 @@ def is_endpoint(text: str) -> bool:
 
 
 def check_network(network: ZenohNetwork) -> None:
-    """Raise `UsageError` for a network in which nothing can communicate, whatever its processes do.
+    """Raise `UsageError` for a network in which processes cannot communicate.
 
-    A host is known by its name alone: two names may be one host, but only those of the loopback
-    surely are this one.
+    Hosts are compared by name: two names may be one host, but only names such as localhost surely
+    are this host.
     """
     if network.routers:
         _check_routers(network)
@@ -519,7 +531,7 @@ def _check_routers(network: ZenohNetwork) -> None:
 
 
 def _far(router: ZenohRouter) -> tuple[str, ...]:
-    """Return the endpoints at which other hosts reach a router."""
+    """Return the endpoints at which processes of other hosts reach a router."""
     listens = {_place(endpoint)[0] for endpoint in router.listening()}
     far = tuple(endpoint for endpoint in router.endpoints if _place(endpoint)[0] != _LOOPBACK)
     return () if listens == {_LOOPBACK} else far

@@ -1,9 +1,9 @@
-"""Deliveries between Zenoh processes: which messages must pass on each link.
+"""Deliveries between Zenoh processes: which messages have to pass on each link.
 
-On a link, both processes enforce: the sender by its egress rules, the receiver by its ingress
-rules.  A process that denies a message drops it silently.  Which messages a delivery needs, and on
-which links, was measured with 1.10.2: one message after the other was denied.  A test compares the
-result on random rules (``tests/integration/test_zenoh_deliveries.py``).
+On a link, both processes enforce their rules: the sender by egress rules, the receiver by ingress
+rules.  A process drops a denied message without an error.  Which messages a delivery needs, and on
+which links, was measured with zenoh 1.10.2, by denying one message after another.  A test compares
+the result on random rules (``tests/integration/test_zenoh_deliveries.py``).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sros_tool.zenoh.configuration import Mode
 
 @dataclass(frozen=True, slots=True)
 class ZenohProcess:
-    """A Zenoh process on TLS, by the common name of its certificate, and what it enforces."""
+    """A Zenoh process that uses TLS: the common name of its certificate, and what it enforces."""
 
     name: str
     mode: Mode
@@ -66,9 +66,9 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """The checks that a delivery has to pass, in the order of the messages.
+    """The checks that a message has to pass until it arrives, in order.
 
-    ``replies`` are the checks on the reply to a call: the request is executed even if they fail.
+    ``replies`` are the checks on the reply to a call; the call is executed even if they fail.
     """
 
     checks: tuple[Check, ...]
@@ -76,7 +76,7 @@ class Delivery:
 
     @property
     def arrives(self) -> bool:
-        """Whether the message is heard, the request executed, or the token seen."""
+        """Whether the message arrives: a sample, a request or a token."""
         return all(each.allowed for each in self.checks)
 
     @property
@@ -86,19 +86,19 @@ class Delivery:
 
 
 Route = tuple[ZenohProcess, ...]
-"""The two to four processes that a message passes, including the sender and the receiver.
+"""The two to four processes that a message passes, from the sender to the receiver.
 
-A way of only a session and its router is the part that the rights of one enclave decide.
+A route of a session and its router is the part on which the rights of one enclave decide.
 """
 
 
 def route(
     source: ZenohProcess, target: ZenohProcess, router: ZenohProcess, to: ZenohProcess | None = None
 ) -> Route:
-    """Return the way from ``source`` to ``target``; ``to`` is the target's router if it is another.
+    """Return the route from ``source`` to ``target``.
 
-    Peers send to each other directly.  Messages from or to a client go through the router, and then
-    through the target's router.
+    Peers send to each other directly.  Messages from or to a client go through ``router`` and then,
+    if the target has another router, through ``to``.
     """
     if source.mode is Mode.PEER and target.mode is Mode.PEER:
         return source, target
@@ -108,9 +108,10 @@ def route(
 
 
 def publication(way: Route, key: str, subscribed: str = "") -> Delivery:
-    """Return the delivery of a sample, along ``way`` from the publisher to the subscription.
+    """Return the delivery of a published sample along the route ``way``.
 
-    The key may have wildcards.  ``subscribed`` is the key of the subscription, if it differs.
+    ``key`` is the key of the sample, perhaps with wildcards; ``subscribed`` is the key of the
+    subscription ("": the same key).
     """
     back = way[::-1]
     # Nothing is sent that nobody wants to hear, but what has wildcards goes to the router anyway.
@@ -124,9 +125,10 @@ def publication(way: Route, key: str, subscribed: str = "") -> Delivery:
 
 
 def call(way: Route, key: str, served: str = "", replied: str = "") -> Delivery:
-    """Return the delivery of a query, along ``way`` from the asking to the replying process.
+    """Return the delivery of a query along the route ``way``, and of the reply.
 
-    ``served`` is the key of the queryable, and ``replied`` the key of the reply, if they differ.
+    ``key`` is the key of the query; ``served`` is the key of the queryable, and ``replied`` the key
+    of the reply ("": the same key).
     """
     back = way[::-1]
     # Queries go to the router in any case, and to another peer only if it offers to reply.
@@ -143,10 +145,10 @@ def call(way: Route, key: str, served: str = "", replied: str = "") -> Delivery:
 def token(
     way: Route, key: str, asked: str, message: Message = Message.DECLARE_LIVELINESS_SUBSCRIBER
 ) -> Delivery:
-    """Return the delivery of a liveliness token, along ``way`` from its owner to the watcher.
+    """Return the delivery of a liveliness token along the route ``way``, to a watching process.
 
-    ``asked`` is the key that the watcher asks for, with ``message``.  The router answers; peers
-    send each other all tokens unasked.
+    ``asked`` is the key that this process asks for, by a ``message``.  A router answers it; peers
+    send each other all tokens without being asked.
     """
     asking = way[:-3:-1] if way[-2].mode is Mode.ROUTER else ()
     return Delivery(
@@ -158,7 +160,7 @@ def token(
 
 
 def _crossing(way: Sequence[ZenohProcess], message: Message, key: str) -> Iterator[Check]:
-    """Yield the checks on a message that passes the links of ``way``."""
+    """Yield the checks that a message has to pass on all links of a route."""
     for sender, receiver in pairwise(way):
         for enforcer, remote, flow in (
             (sender, receiver.name, Flow.EGRESS),

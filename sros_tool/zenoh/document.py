@@ -76,7 +76,7 @@ _ZID = re.compile(r"[1-9a-f][0-9a-f]{0,31}", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class ZenohEndpoint:
-    """Where a process listens or connects: ``PROTOCOL/ADDRESS?METADATA#KEY=VALUE;...``."""
+    """An address at which a process listens or connects: ``PROTOCOL/ADDRESS?METADATA#OPTIONS``."""
 
     text: str
 
@@ -91,7 +91,7 @@ class ZenohEndpoint:
         return self.text.partition("/")[2].partition("#")[0].partition("?")[0]
 
     def is_encrypted(self) -> bool:
-        """Return whether its protocol encrypts, and has certificates."""
+        """Return whether the protocol encrypts and authenticates by certificates."""
         return self.protocol in ENCRYPTED
 
     @property
@@ -102,7 +102,7 @@ class ZenohEndpoint:
         return {name: value for name, _, value in pairs}
 
     def option(self, name: str, otherwise: bool) -> bool:
-        """Return an option of TLS: of the endpoint, or ``otherwise``."""
+        """Return a yes-or-no option of TLS, or ``otherwise`` if the endpoint does not state it."""
         own = self.options.get(name)
         return otherwise if own is None else own == "true"
 
@@ -152,7 +152,7 @@ class ConfigurationDocument:
     lines: Mapping[str, int] = field(default_factory=dict, compare=False, repr=False)
 
     def open_link(self) -> str:
-        """Return where a process without a certificate gets a connection, as a clause, or ""."""
+        """Return where a process without a certificate can connect, as a clause; "" if nowhere."""
         for endpoint in (*self.listen, *self.connect):
             if self.protocols is not None and endpoint.protocol not in self.protocols:
                 continue  # it is refused
@@ -164,14 +164,14 @@ class ConfigurationDocument:
         return ""
 
     def line_of(self, path: str) -> int:
-        """Return the line of a setting, or else of the nearest one that contains it, or 1."""
+        """Return the line of a setting, else of the smallest section around it, else 1."""
         while path and path not in self.lines:
             path = path.rpartition("/")[0]
         return self.lines.get(path, 1)
 
 
 class UnreadConfigurationError(DocumentError):
-    """A configuration that Zenoh may read, but sros does not, so its rules are not known."""
+    """A configuration that Zenoh may read but sros does not, so that its rules are unknown."""
 
 
 def parse_configuration(
@@ -273,18 +273,21 @@ def _of_yaml(text: str, name: str) -> object:
 
 
 def _not_json5(name: str) -> type[DocumentError]:
-    """Return the error class for text that is not JSON5; Zenoh may read it as YAML by its name."""
+    """Return the error class for text that is not JSON5.
+
+    By some file names, Zenoh reads such text as YAML, so sros does not know its meaning.
+    """
     return UnreadConfigurationError if _has_ending(name) else DocumentError
 
 
 def _no_object(value: object) -> type[DocumentError]:
-    """Return the error class for a value that is no object: Zenoh may read a list instead."""
+    """Return the error class for a value that should be an object; Zenoh accepts some lists."""
     return UnreadConfigurationError if isinstance(value, list) else DocumentError
 
 
 @dataclass(frozen=True, slots=True)
 class _Section:
-    """An object of the file ``name``, at a path that is empty for the whole file."""
+    """An object in the file ``name``, at a path of settings; the path "" is the whole file."""
 
     name: str
     path: str
@@ -518,7 +521,10 @@ def _check_ids(section: _Section, enforcement: Enforcement) -> None:
 
 
 def _check_size(section: _Section, enforcement: Enforcement) -> None:
-    """Refuse a small file that would need many millions of decisions."""
+    """Raise an error if access control would need many millions of decisions.
+
+    Even a small file can state that much.
+    """
     values = {
         subject.id: prod(len(getattr(subject, name) or (None,)) for name in PROPERTIES)
         for subject in enforcement.subjects

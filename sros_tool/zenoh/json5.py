@@ -38,7 +38,7 @@ class Json5Error(ValueError):
 
 
 class Json5Object(dict[str, Any]):
-    """An object, the line on which it begins, and the line of each of its members."""
+    """An object, with the line on which it begins and the line of each member."""
 
     def __init__(self, line: int) -> None:
         super().__init__()
@@ -60,7 +60,7 @@ _TOKEN = re.compile(
     re.VERBOSE | re.DOTALL,
 )
 _NOT_IN_JSON5 = re.compile(r"\\u|[\u2028\u2029]")
-"""What JSON allows in a string, but JSON5 does not: escapes of half a character, and line ends."""
+"""Text in strings that JSON allows and JSON5 does not: half characters, and U+2028, U+2029."""
 _LINE = re.compile(r"\r\n|[\n\r\u2028\u2029]")
 _ESCAPE = re.compile(r"\\(?:u([0-9a-fA-F]{4})|x([0-9a-fA-F]{2})|(\r\n|.))", re.DOTALL)
 _ESCAPED = {"b": "\b", "f": "\f", "n": "\n", "r": "\r", "t": "\t", "v": "\v", "0": "\0"}
@@ -91,10 +91,10 @@ def parse_json5(text: str, *, lines: bool = True) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """Return the value of a JSON text; each object is a `Json5Object` of the first line.
+    """Return the value of a JSON text; each object is a `Json5Object` with line 1.
 
     Raises:
-        Json5Error: it is not JSON, or has more than 100 levels.
+        Json5Error: the text is not JSON, or has more than 100 levels.
     """
     try:
         value = json.loads(text, object_pairs_hook=_without_lines)
@@ -144,7 +144,7 @@ def _tokens(text: str, most: int) -> Iterator[_Token]:
 
 
 class _Reader:
-    """Reads values one after another; ``_now`` is the token that comes next."""
+    """A reader of JSON5 values; ``_now`` is the next token."""
 
     def __init__(self, text: str, most: int) -> None:
         self._tokens = _tokens(text, most)

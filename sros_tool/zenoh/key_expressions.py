@@ -20,14 +20,14 @@ _MANY = 65536
 _LITERAL = re.compile(r"(?<![^/])[^/*]+(?![^/])")
 """A chunk without wildcards."""
 _MOST_COMPARED = 100_000
-"""Maximum number of comparisons to leave out unneeded expressions: less than a second."""
+"""Maximum number of comparisons to find expressions that others include (under a second)."""
 
 
 def canonical(chunks: Iterable[str]) -> str:
-    """Return the key expression of ``chunks`` in the only form that Zenoh accepts.
+    """Return the key expression of some chunks in the only form that Zenoh accepts.
 
-    A chunk that is only ``$*`` becomes ``*``.  In a row of wildcards, each ``*`` is put before one
-    ``**``.  Rules in another form keep a session from opening.
+    A chunk that is only ``$*`` becomes ``*``.  In a row of wildcards, each ``*`` comes before the
+    only ``**``.  With rules in another form, a session does not open.
     """
     chunks = tuple(chunks)
     text = "/".join(chunks)
@@ -89,7 +89,7 @@ class KeyExpressions:
         )
 
     def needed(self) -> list[str]:
-        """Return the sorted expressions that no other one includes; all if there are too many."""
+        """Return the expressions that no other one includes, sorted; all if there are too many."""
         forms = {expression: _form(expression) for expression in self.all}
         if len(set(forms.values())) == 1:
             return sorted(self.all)
@@ -118,7 +118,7 @@ class KeyExpressions:
     def _beginning_as(self, narrow: str) -> list[Mapping[str, list[str]]]:
         """Return the expressions that may include ``narrow``, by their form.
 
-        They have wildcards, begin as ``narrow`` does, and their landmark is a chunk of it.
+        These have wildcards, begin like ``narrow``, and have a landmark that is a chunk of it.
         """
         by_begin, candidates = self._by_begin, []
         chunks = {*_chunks(narrow), ""}
@@ -132,19 +132,22 @@ class KeyExpressions:
 
 @lru_cache(maxsize=_MANY)
 def _form(expression: str) -> str:
-    """Return the wildcards of an expression and their places."""
+    """Return the wildcards of an expression and their positions, as text."""
     return _LITERAL.sub("", expression)
 
 
 @lru_cache(maxsize=_MANY)
 def _landmark(expression: str) -> str:
-    """Return the longest chunk without wildcards behind the first wildcard, or ""."""
+    """Return the longest chunk without wildcards after the first wildcard, or ""."""
     rest = expression[len(_fixed_begin(expression)) :]
     return max((chunk for chunk in rest.split("/") if "*" not in chunk), key=len, default="")
 
 
 def _without_wildcards(expression: str) -> str:
-    """Return the text with which every included key begins; "/**" may stand for nothing."""
+    """Return the text with which every key of an expression begins.
+
+    A slash before ``**`` is not part of it, because "/**" may stand for nothing.
+    """
     begin, wildcard, _ = expression.partition("*")
     return begin.rstrip("$/") if wildcard else expression
 
@@ -181,7 +184,7 @@ def _includes(wide: str, narrow: str) -> bool:
 
 
 def sequence_includes(wide: Sequence[str], narrow: Sequence[str]) -> bool:
-    """Return whether chunks include others: the set of reached places grows chunk by chunk."""
+    """Return whether the chunks ``wide`` include all keys of the chunks ``narrow``."""
     reached = _onward({0}, wide)
     for chunk in narrow:
         following = set()
@@ -197,7 +200,7 @@ def sequence_includes(wide: Sequence[str], narrow: Sequence[str]) -> bool:
 
 
 def _onward(reached: set[int], wide: Sequence[str]) -> set[int]:
-    """Return ``reached``, and the places after each ``**``, which may stand for no chunk."""
+    """Return positions in ``wide``, with the ones after each ``**``: it may stand for nothing."""
     places = set(reached)
     for at in sorted(reached):
         while at < len(wide) and wide[at] == ANY_CHUNKS:
@@ -220,7 +223,7 @@ def _chunk_includes(wide: str, narrow: str) -> bool:
 
 
 def widest(expression: str) -> str:
-    """Return an expression with ``**`` in place of each chunk that does not begin with ``@``."""
+    """Return the expression in which ``**`` replaces all chunks but those that begin with ``@``."""
     chunks = expression.split("/")
     return canonical(chunk if chunk.startswith("@") else ANY_CHUNKS for chunk in chunks)
 
@@ -256,9 +259,9 @@ def chunks_intersect(one: str, other: str) -> bool:
 def _sequences_intersect(
     one: Sequence[str], other: Sequence[str], many: str, meet: Callable[[str, str], bool]
 ) -> bool:
-    """Return whether sequences can be the same where ``many`` stands for any number of members.
+    """Return whether two sequences can be equal; ``many`` stands for any number of members.
 
-    ``meet`` says whether two members can be the same one.
+    ``meet`` returns whether two members can be equal.
     """
     reached = {0}
     for left in (*one, None):
@@ -284,15 +287,15 @@ def _sequences_intersect(
 # ── what two expressions have in common ────────────────────────────────────────────────────
 
 _MOST_COMMON = 4096
-"""Maximum number of key expressions for what two key expressions have in common."""
+"""Maximum number of key expressions that describe what two key expressions share."""
 
 
 class TooManyExpressions(Exception):  # noqa: N818 - the caller makes an error of it
-    """The common part of two expressions takes too many expressions."""
+    """What two key expressions share takes too many key expressions."""
 
 
 def common(one: str, other: str) -> list[str]:
-    """Return expressions that together include the keys that both include, and no others.
+    """Return key expressions for exactly the keys that both expressions include.
 
     Raises:
         TooManyExpressions: there are too many.
@@ -313,7 +316,7 @@ _ANY_LETTERS = "\0"
 
 @lru_cache(maxsize=_MANY)
 def common_chunks(one: str, other: str) -> tuple[str, ...]:
-    """Return chunks that together match what both match; ``**`` matches all of the other chunk."""
+    """Return chunks that together match what both chunks match; ``**`` matches any chunk."""
     if one == other:
         return (one,)
     if ANY_CHUNKS in (one, other):
@@ -343,9 +346,9 @@ def _common(
     many: str,
     meet: Callable[[str, str], tuple[str, ...]],
 ) -> set[tuple[str, ...]]:
-    """Return the common part of two sequences, where ``many`` stands for any number of members.
+    """Return what two sequences share; ``many`` stands for any number of members.
 
-    ``meet`` returns what two members have in common, also of ``many`` and a member.
+    ``meet`` returns what two members share, even if one of them is ``many``.
     """
 
     @cache
@@ -412,9 +415,9 @@ def _automaton(expression: str) -> Automaton | None:
 def _chunk(
     chunk: str, begin: int, number: Iterator[int], edges: list[tuple[int, Letters, int]]
 ) -> int:
-    """Add the edges of a chunk, and return the position at its end.
+    """Add edges for a chunk to ``edges``, and return the position after them.
 
-    With a wildcard in it, no chunk that begins with "@" is included.
+    A chunk with a wildcard includes no chunk that begins with "@".
     """
     parts = chunk.split(ANY_PART)
     at, wild = begin, len(parts) > 1
@@ -450,7 +453,7 @@ def names_of(expressions: Iterable[str]) -> NameSet:
 
 @lru_cache(maxsize=_MANY)
 def expression_problem(text: str) -> str:
-    """Return why Zenoh does not accept a key expression, or "" if it does.
+    """Return why Zenoh does not accept a key expression, as a clause; "" if it does.
 
     Wildcards stand as a chunk of their own or as ``$*``, and only in the canonical form.
     """

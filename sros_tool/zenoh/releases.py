@@ -15,11 +15,11 @@ Version = tuple[int, int, int]
 
 
 class RmwZenohRelease(NamedTuple):
-    """The versions of rmw_zenoh_cpp in one distribution, from ``begin`` to the next distribution.
+    """The versions of rmw_zenoh_cpp in one distribution of ROS 2, from ``begin`` on.
 
-    ``least`` is the first version that has `_LEAST_ZENOH` and reads ZENOH_CONFIG_OVERRIDE.  For
-    subscriptions whose graph tokens it sees, a publisher also sends, or only sends, on
-    ``below_topics``: key expressions below the key of the topic.
+    ``least`` is the first version that has `_LEAST_ZENOH` and reads ZENOH_CONFIG_OVERRIDE.
+    ``below_topics`` are key expressions below the key of a topic, on which a publisher also sends,
+    or only sends, to subscriptions whose graph tokens it sees.
     """
 
     distribution: str
@@ -44,7 +44,7 @@ RELEASES = (
 
 
 def release_of(version: Version) -> RmwZenohRelease:
-    """Return the release of a version: the latest release whose ``begin`` is not after it."""
+    """Return the latest release whose ``begin`` is not later than a version."""
     begun = (each for each in reversed(RELEASES) if each.begin <= version)
     return next(begun, RELEASES[0])
 

@@ -1,4 +1,4 @@
-"""The keys of rules: allowed names minus denied names, and the keys that two rules share."""
+"""The keys of access-control rules: allowed names without denied names, and shared keys."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MANY, _FEW = 65536, 1024
 
 
 class Difference(NamedTuple):
-    """The keys of names that allowed expressions match and denied expressions do not.
+    """The keys of allowed names without the keys of denied names.
 
     A key is the chunk ``begin``, the name, and ``end``: "", or "/" and further chunks.
     """
@@ -32,15 +32,15 @@ class Difference(NamedTuple):
     denied: frozenset[Chunks]
 
     def names(self) -> frozenset[Chunks]:
-        """Return expressions for the names.
+        """Return key expressions for the names that are left.
 
         Raises:
-            CannotSubtract: there are none, or too many: see `subtract_all`.
+            CannotSubtract: no or too many key expressions: see `subtract_all`.
         """
         return subtract_all(self.allowed, self.denied)
 
     def below(self, end: str) -> Difference:
-        """Return the keys that have ``end`` below the keys of this difference."""
+        """Return the keys with ``end`` behind each key of this difference."""
         return self._replace(end=f"{self.end}/{end}")
 
     def include(self, name: str) -> bool:
@@ -48,7 +48,7 @@ class Difference(NamedTuple):
         return _searched(self.allowed).include(name) and not _searched(self.denied).include(name)
 
     def include_all(self, begin: str, name: Chunks, end: str) -> bool:
-        """Return whether the difference has all keys of an expression; only True is certain."""
+        """Return whether the difference has all keys of an expression; False may be wrong."""
         return (
             begin == self.begin
             and _common_end(end, self.end) == end
@@ -57,11 +57,11 @@ class Difference(NamedTuple):
         )
 
     def common(self, other: Difference) -> list[str]:
-        """Return expressions for the keys of both.
+        """Return key expressions for the keys that both differences have.
 
         Raises:
-            CannotSubtract: there are none, or too many: see `subtract_all`.
-            TooManyExpressions: what is allowed by both takes too many.
+            CannotSubtract: no or too many key expressions: see `subtract_all`.
+            TooManyExpressions: the shared allowed names take too many key expressions.
         """
         end = _common_end(self.end, other.end)
         if self.begin != other.begin or end is None:
@@ -71,7 +71,7 @@ class Difference(NamedTuple):
 
 
 def _common_end(one: str, other: str) -> str | None:
-    """Return the common part of what follows the names, where "/**" in one includes the other."""
+    """Return what two endings share, or None; "/**" in one includes the other."""
     end, longer = sorted((one, other), key=len)
     return end if longer in (end, f"{end}/{ANY_CHUNKS}") else None
 
@@ -95,15 +95,15 @@ def _common(some: frozenset[Chunks], others: frozenset[Chunks]) -> frozenset[Chu
 
 
 class RuleKeys:
-    """The keys of a rule: what its expressions include.
+    """The keys that the key expressions of a rule include.
 
-    ``plain`` are keys of one name, with wildcards only in and below the type and its hash.
+    ``plain`` are keys of a single name, with wildcards only in the type, in its hash and behind it.
     ``tokens`` are graph tokens with wildcards; ``differences`` are all other keys.  ``is_plain``
-    says that there are none of these.
+    says that there are only plain keys.
     """
 
     def __init__(self, expressions: frozenset[str], made_of: tuple[Difference, ...]) -> None:
-        """Take the expressions, and the differences from which they were made, if known."""
+        """Keep the key expressions, and the differences from which they were made, if known."""
         wide = [expression for expression in expressions if "*" in _ENDS.sub("", expression)]
         self.plain = expressions.difference(wide)
         self.tokens = KeyExpressions(
@@ -156,12 +156,12 @@ def keys_of(expressions: frozenset[str], made_of: tuple[Difference, ...] = ()) -
 
 
 _TYPE = "/$*::$*/*"
-"""Any type and its hash, which stand behind each name."""
+"""Any type with its hash, which follow the name in a key."""
 _ENDS = re.compile(rf"{re.escape(_TYPE)}(?:/\*\*)?(?:/@adv/\*\*)?\Z")
 
 
 def _parted(expression: str) -> tuple[str, str, str]:
-    """Return what is before a name, the name and what is behind it."""
+    """Return the parts of a key expression before, in and after the name."""
     begin, _, rest = expression.partition("/")
     name, of_type, below = rest.partition(_TYPE)
     return begin, name, of_type + below

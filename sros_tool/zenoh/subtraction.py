@@ -40,13 +40,13 @@ _MOST_CHARACTERS = 1_000_000
 
 
 class CannotSubtract(Exception):  # noqa: N818 - the caller makes an error of it
-    """The difference is not a union of expressions, or has too many; ``denied`` may say why.
+    """The difference cannot be expressed as key expressions, or takes too many of them.
 
     ``denied`` is the expression that cannot be subtracted, or () if there are too many.
     """
 
     def __init__(self, denied: Chunks = ()) -> None:
-        """Record the expression that cannot be subtracted."""
+        """Keep the expression that cannot be subtracted."""
         super().__init__(denied)
         self.denied = denied
 
@@ -68,7 +68,7 @@ def subtract_all(allowed: frozenset[Chunks], denied: frozenset[Chunks]) -> froze
 
 
 def _not_covered(some: frozenset[Chunks]) -> list[Chunks]:
-    """Return the expressions that no other one covers; with many, not all are compared."""
+    """Return the expressions that no other one covers; if there are many, perhaps more."""
     wide: list[Chunks] = []
     left: list[Chunks] = []
     for expression in sorted(
@@ -125,7 +125,7 @@ def _check_number(number: int, most: int = _MOST_STEPS) -> None:
 
 
 def covers(wide: Chunks, narrow: Chunks) -> bool:
-    """Return whether ``wide`` includes all of ``narrow``; False can be wrong, True never is."""
+    """Return whether ``wide`` includes all keys of ``narrow``; only True is certain."""
     if wide.count(ANY_CHUNKS) != 1:
         return sequence_includes(wide, narrow)
     before, after = _around(wide)
@@ -143,7 +143,7 @@ def _begins_as(chunks: Chunks, wide: Chunks) -> bool:
 
 
 def _around(chunks: Chunks) -> tuple[Chunks, Chunks]:
-    """Return the chunks before the first ``**`` and after the last one."""
+    """Return the chunks before the first ``**`` and the chunks after the last ``**``."""
     end = len(chunks) - chunks[::-1].index(ANY_CHUNKS)
     return chunks[: chunks.index(ANY_CHUNKS)], chunks[end:]
 
@@ -154,7 +154,7 @@ def _around(chunks: Chunks) -> tuple[Chunks, Chunks]:
 def _parts(wide: Chunks, denied: Iterable[Chunks]) -> Iterator[Chunks]:
     """Split ``wide`` so that its ``**`` meets no fixed beginning or end of a denied expression.
 
-    So a denied expression can be compared from the start, and then from the end.
+    Then a denied expression can be compared from its start, and after that from its end.
     """
     if ANY_CHUNKS not in wide:
         yield wide
@@ -198,7 +198,10 @@ def _to_last_named(chunks: Chunks) -> int:
 
 @lru_cache(maxsize=_FEW)
 def _less(wide: Chunks, denied: frozenset[Chunks]) -> frozenset[Chunks]:
-    """Return expressions for the keys of ``wide`` without ``denied``; each denied one meets it."""
+    """Return expressions for the keys of ``wide`` without ``denied``.
+
+    Each denied expression shares keys with ``wide``.
+    """
     if not denied:
         return frozenset((wide,))
     if any(covers(expression, wide) for expression in denied):
@@ -214,7 +217,10 @@ def _less(wide: Chunks, denied: frozenset[Chunks]) -> frozenset[Chunks]:
 
 
 def _by_length(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
-    """Return the keys of ``**`` shorter than all denied ones, which consist of wildcards only."""
+    """Return the keys of ``**`` that are shorter than all denied ones.
+
+    The denied expressions consist only of wildcards.
+    """
     named = [expression for expression in denied if {*expression} - {ANY_CHUNK, ANY_CHUNKS}]
     if wide != (ANY_CHUNKS,) or named:
         raise CannotSubtract(min(named or denied))
@@ -224,7 +230,10 @@ def _by_length(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
 
 
 def _by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
-    """Subtract by the first chunk of ``wide``, which is not ``**``."""
+    """Return expressions for the keys of ``wide`` without ``denied``, by the first chunk.
+
+    The first chunk of ``wide`` is not ``**``.
+    """
     first, rest = wide[0], wide[1:]
     tails: dict[str, set[Chunks]] = {}
     for expression in denied:
@@ -293,10 +302,9 @@ def _matches(wide: str, narrow: str) -> bool:
 
 @lru_cache(maxsize=_MANY)
 def _chunks(first: str, some: tuple[str, ...], kinds: frozenset[frozenset[str]]) -> Chunks:
-    """Return few chunks that match all chunks of ``first`` whose kind is in ``kinds``.
+    """Return few chunks that match exactly the names of ``first`` whose kind is in ``kinds``.
 
-    A remainder that is allowed behind a chunk is also allowed behind a chunk that fewer of ``some``
-    match.
+    What is allowed after a chunk is also allowed after a chunk that fewer of ``some`` match.
     """
     every = _kinds(first, some)
 
@@ -344,9 +352,9 @@ def _chunks_less(wide: str, denied: frozenset[str]) -> Chunks:
 
 
 class _Place(NamedTuple):
-    """The chunks that start with ``read``, and whose rest ``wide`` matches and ``denied`` does not.
+    """Names that begin with ``read``, and whose rest ``wide`` matches and ``denied`` does not.
 
-    ``letters`` are the letters that the rest may have: chunks with other letters are already kept.
+    ``letters`` are the letters that the rest may have: names with other letters are already kept.
     """
 
     read: str
@@ -357,9 +365,10 @@ class _Place(NamedTuple):
 
 @dataclass
 class _Letters:
-    """The search, which reads chunks from their start until no denied chunk can match.
+    """The search for chunks that denied chunks do not match.
 
-    If all denied wildcards are stars at the start, a second search reads backwards from the end.
+    It reads names from their start until no denied chunk can match.  If all denied wildcards are
+    stars at the start, a second search reads backwards from the end.
     """
 
     backwards: bool = False
@@ -377,7 +386,7 @@ class _Letters:
                 places += self._following(place)
 
     def _following(self, place: _Place) -> Iterable[_Place]:
-        """Keep the chunks of a place if one expression matches them all; else split the place."""
+        """Keep the names of a place if one expression matches them; else return smaller places."""
         read, wide, denied, _ = place
         self.effort -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
         if self.effort < 0:
@@ -397,7 +406,7 @@ class _Letters:
         return self._by_next_letter(place._replace(denied=denied))
 
     def _by_next_letter(self, place: _Place) -> Iterator[_Place]:
-        """Split the chunks of a place by their next letter; ``wide`` begins with a star."""
+        """Yield the places into which the next letter divides a place; ``wide`` begins with "*"."""
         read, wide, denied, letters = place
         if wide == "*" and not any("*" in chunk for chunk in denied):
             # A chunk with a letter that no denied one has is allowed, whatever its other letters.
@@ -435,7 +444,7 @@ def _overlap(first: str, second: str) -> bool:
 
 
 def _after(letter: str, chunks: Iterable[str]) -> tuple[str, ...]:
-    """Return what remains of the chunks after a letter was read."""
+    """Return the rest of each chunk after a letter was read."""
     rests = []
     for chunk in chunks:
         if chunk.startswith("*"):
@@ -451,7 +460,7 @@ def _after(letter: str, chunks: Iterable[str]) -> tuple[str, ...]:
 
 
 def _joined(expressions: set[Chunks]) -> set[Chunks]:
-    """Return fewer expressions for the same keys, with ``**`` in place of one for each length."""
+    """Return fewer expressions for the same keys: ``**`` replaces an expression for each length."""
     joined = {
         tuple(canonical(expression).split("/")) if expression else expression
         for expression in expressions
@@ -477,7 +486,7 @@ def _joined(expressions: set[Chunks]) -> set[Chunks]:
 
 
 class _Beginnings:
-    """Beginnings of expressions; finds those that match the beginning of an expression."""
+    """An index of beginnings of expressions, to find those with which an expression begins."""
 
     def __init__(self, beginnings: Iterable[Chunks]) -> None:
         self._by_first: dict[Chunks, list[Chunks]] = {}
