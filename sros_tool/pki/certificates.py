@@ -74,12 +74,13 @@ def common_name(text: str) -> x509.Name:
 
 
 def enclave_subject(name: str, *, unique: bool) -> x509.Name:
-    """Return the subject of an enclave's certificate: the CN ``name``; if ``unique``, a random OU.
+    """Return the subject of an enclave's certificate: CN ``name``, and if ``unique`` a random OU.
 
-    The OU keeps other permissions from matching: the permissions of an enclave whose name contains
-    this name (Cyclone DDS compares parts), and the permissions for an earlier certificate.  The RFC
-    4514 text has the CN first.  For the root enclave it has the CN last, because Cyclone DDS takes
-    the slash for the end of a part, and refuses a subject with an empty part before another part.
+    The OU makes the subject different from all others: from subjects of enclaves whose name
+    contains this name (Cyclone DDS compares parts), and from those of earlier certificates.
+    Permissions for these do not fit then.  The RFC 4514 text has the CN first.  For the root
+    enclave it has the CN last, because Cyclone DDS takes the slash for the end of a part, and
+    refuses a subject with an empty part before another part.
     """
     if not unique:
         return common_name(name)
@@ -115,7 +116,7 @@ def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certifi
 
 
 def check_signer(certificate: x509.Certificate) -> None:
-    """Raise `PkiError` if sros cannot sign with a certificate that DDS reads."""
+    """Raise `PkiError` if sros cannot sign with a CA whose certificate breaks rules of X.509."""
     if tolerant.is_tolerated(certificate):
         raise PkiError(
             f"sros cannot sign with the CA {subject_text(certificate.subject)}",
@@ -126,7 +127,7 @@ def check_signer(certificate: x509.Certificate) -> None:
 
 
 class Issuer:
-    """An identity CA that issues certificates to enclaves."""
+    """An identity CA that issues certificates for enclaves."""
 
     def __init__(self, certificate: x509.Certificate, key: PrivateKey) -> None:
         check_signer(certificate)
@@ -137,7 +138,7 @@ class Issuer:
         self._authority_id = authority_identifier(certificate)
 
     def issue(self, subject: x509.Name, public: PublicKey, validity: Window) -> x509.Certificate:
-        """Issue a certificate that is not a CA; it expires with the CA at the latest."""
+        """Return a certificate that is not a CA; it expires no later than the CA."""
         return (
             _builder(subject, self._name, public, validity.within(self._validity))
             .add_extension(_NOT_A_CA, critical=True)
@@ -202,10 +203,11 @@ def load_certificate(
 ) -> x509.Certificate:
     """Return the first certificate of a PEM file; ``name`` names the file in errors.
 
-    Without ``trusted``, pass over blocks ``TRUSTED CERTIFICATE``, as Cyclone DDS does.
+    Without ``trusted``, blocks ``TRUSTED CERTIFICATE`` are ignored, as Cyclone DDS does.
 
     Raises:
-        PkiError: the certificate cannot be read, here or by OpenSSL, or its ``settings`` forbid it.
+        PkiError: sros or OpenSSL cannot read the certificate, or its trust ``settings`` forbid its
+            use.
     """
     return _first_certificate(data, name, trusted, settings)
 
@@ -230,8 +232,8 @@ def load_certificates(
     """Return all certificates of a PEM file, at least one; ``name`` names the file in errors.
 
     Raises:
-        PkiError: the file has no certificate, or a part of it cannot be read, here or by OpenSSL,
-            or the ``settings`` of a ``TRUSTED CERTIFICATE`` forbid it.
+        PkiError: the file has no certificate, sros or OpenSSL cannot read a part of it, or the
+            trust ``settings`` of a ``TRUSTED CERTIFICATE`` forbid its use.
     """
     load_certificate(data, name)
     what = f"the certificates {name} cannot be read"
@@ -318,7 +320,7 @@ def _sentence(clause: str) -> str:
 
 
 def load_der_certificate(data: bytes) -> x509.Certificate:
-    """Return the certificate in DER that a signed document embeds.
+    """Return a certificate, given in DER, that a signed document embeds.
 
     Raises:
         PkiError: the certificate cannot be read.
@@ -346,7 +348,7 @@ _USUAL_BYTES = 16 * 1024
 
 
 def _read_in_full(certificate: x509.Certificate) -> x509.Certificate:
-    """Return ``certificate`` after parsing every part that sros uses."""
+    """Return ``certificate`` after reading all parts that sros uses, to find errors now."""
     certificate.public_key()
     authority_identifier(certificate)
     _ = certificate.signature_hash_algorithm, certificate.serial_number
@@ -426,7 +428,7 @@ def is_for_pss(certificate: x509.Certificate) -> bool:
 
 
 def _normalized(certificate: x509.Certificate, part: bytes) -> bytes:
-    """Return a part of a certificate, converted to DER if the certificate is not in DER."""
+    """Return a part of a certificate, re-encoded in DER if the certificate is not in DER."""
     return der.normalized(part) if tolerant.is_tolerated(certificate) else part
 
 
@@ -452,10 +454,10 @@ def _key_algorithm(certificate: x509.Certificate) -> list[der.Value]:
 
 @lru_cache(maxsize=256)
 def _algorithms(certificate: x509.Certificate) -> tuple[der.Value, der.Value]:
-    """Return the algorithms in the signed part and at the signature (RFC 5280, 4.1.1.2).
+    """Return two signature algorithms: in the signed part, and next to the signature.
 
-    OpenSSL compares them when it verifies the signature, but does not verify the signature of a
-    self-signed CA.
+    OpenSSL compares them when it verifies the signature; it does not verify the signature of a
+    self-signed CA (RFC 5280, 4.1.1.2).
     """
     whole = der.first(
         _normalized(certificate, certificate.public_bytes(serialization.Encoding.DER))
@@ -526,22 +528,23 @@ def digest(certificate: x509.Certificate) -> str:
 def authority_text(certificate: x509.Certificate) -> str:
     """Return the subject of a CA with the first digits of its SHA-256.
 
-    An old and a new CA of a rotation have one name, unless they only issue identities: Fast DDS
-    2.9.1 refuses peers whose permissions CA has another name.
+    In a rotation, the old and the new CA have the same name, because Fast DDS 2.9.1 refuses peers
+    whose permissions CA has another name; only a CA that issues nothing but identities gets a new
+    name.
     """
     return f"{subject_text(certificate.subject)} (SHA-256 {digest(certificate)[:8]})"
 
 
 def other_issuer(certificate: x509.Certificate, authority: x509.Certificate) -> str:
-    """Return a certificate's issuer in words: "another CA named X" if ``authority`` is named X."""
+    """Return a certificate's issuer, as "another CA named X" if ``authority`` has that name."""
     name = subject_text(certificate.issuer)
     return f"another CA named {name}" if certificate.issuer == authority.subject else name
 
 
 def subject_text(name: x509.Name) -> str:
-    """Return a distinguished name as OpenSSL prints it by RFC 2253: the text that vendors compare.
+    """Return a distinguished name as OpenSSL prints it (RFC 2253), which vendors compare.
 
-    RDNs, and the attributes within an RDN, are in reverse order; non-ASCII characters are kept.
+    RDNs, and the attributes in an RDN, are in reverse order; non-ASCII characters are kept.
     """
     if isinstance(name, TolerantName) or all(len(rdn) == 1 for rdn in name.rdns):
         return _name_text(name.public_bytes())
@@ -607,9 +610,9 @@ _FIRST_BIT = 1 << (4 * IDENTITY_DIGITS - 1)
 
 
 def identity_of(subject: bytes) -> str:
-    """Return the first 6 bytes (hex) of a secured participant's GUID, from its subject name (DER).
+    """Return the first 6 bytes (hexadecimal) of a participant's GUID, by its subject name (DER).
 
-    Source: DDS-Security 1.1, 9.3.3.
+    The participant is secured.  Source: DDS-Security 1.1, 9.3.3.
     """
     digest = int(sha256(subject).hexdigest()[:IDENTITY_DIGITS], 16)
     return f"{_FIRST_BIT | digest >> 1:x}"
@@ -644,10 +647,10 @@ _UNUSUAL = re.compile(rb"[^A-Za-z0-9/_]")
 
 
 class CertificateForm(NamedTuple):
-    """The form of a certificate file: all that certificates of the same kind have in common.
+    """What all certificate files of the same kind have in common.
 
-    ``common`` is equal for files that differ in the own parts of their certificates alone.
-    ``validity`` is the period in DER.
+    ``common`` is equal for files that differ only in the values of their own certificate, such as
+    the key.  ``validity`` is the period in DER.
     """
 
     common: tuple[object, ...]
@@ -709,7 +712,7 @@ def _form(certificate: bytes) -> CertificateForm:
 
 
 def _form_of_name(name: bytes) -> tuple[object, ...]:
-    """Return the kinds of the attributes of a name, by RDN, and its unusual characters."""
+    """Return the kinds of a name's attributes, by RDN, and the unusual characters in it."""
     kinds: list[object] = []
     unusual: set[bytes] = set()
     for part in der.children(name):

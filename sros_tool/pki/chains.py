@@ -79,7 +79,7 @@ _WITH_EXTENSIONS = 3
 
 
 class Checks(Flag):
-    """Optional checks of a chain, besides signatures, validities and critical extensions."""
+    """Optional checks of a chain; signatures, dates and critical extensions are always checked."""
 
     NONE = 0
     ROOT_SIGNATURE = auto()
@@ -169,10 +169,10 @@ def build_chain(
     others: Sequence[x509.Certificate],
     at: datetime,
 ) -> tuple[list[x509.Certificate], str]:
-    """Return the chain from ``start`` to a trusted CA, or why there is none (build_chain).
+    """Return the chain from ``start`` to a trusted CA, or why there is none.
 
-    OpenSSL takes the first certificate whose name and identifiers fit, whether or not its key made
-    the signature.
+    OpenSSL (build_chain) takes the first certificate whose name and identifiers fit, even if its
+    key did not make the signature.
     """
     chain = [start]
     only_others = 1  # the certificates at the start of the chain that come from ``others``
@@ -213,7 +213,7 @@ def _issuer(
     at: datetime,
     chain: Sequence[x509.Certificate] = (),
 ) -> x509.Certificate | None:
-    """Return the first possible issuer that is valid at ``at``, else the last to expire."""
+    """Return the first issuer valid at ``at``, else the issuer that expires last, or None."""
     certificates = [
         each for each in among if likely_issued(certificate, each) and each not in chain
     ]
@@ -230,9 +230,9 @@ def _may_sign_certificates(certificate: x509.Certificate) -> bool:
 
 
 def denies_issuing(certificate: x509.Certificate) -> bool:
-    """Return whether a certificate states that it must not issue other certificates.
+    """Return whether a certificate says that it must not issue other certificates.
 
-    One without basicConstraints and keyUsage says nothing: vendors differ about it.
+    A certificate without basicConstraints and keyUsage does not say so: vendors differ about it.
     """
     constraints = extension(certificate, x509.BasicConstraints)
     denied = constraints is not None and not constraints.ca
@@ -263,7 +263,7 @@ def _unread_faults(certificate: x509.Certificate) -> list[str]:
 
 
 def _network_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
-    """Yield why the network extensions make OpenSSL, or sros, refuse a chain (v3_addr.c).
+    """Yield reasons why OpenSSL, or sros, refuses the network extensions of a chain (v3_addr.c).
 
     These extensions restrict nothing if they are inherited from the CA.  But if the first
     certificate has one, the trusted CA must not inherit it from another CA.
@@ -281,7 +281,7 @@ def _network_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
 
 
 class _Authority(Flag):
-    """OpenSSL's answer to whether a certificate is a CA certificate (X509_check_ca)."""
+    """Whether OpenSSL accepts a certificate as a CA certificate (X509_check_ca)."""
 
     NO = 0
     YES = auto()
@@ -512,7 +512,7 @@ def _name_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
 
 
 def _names(certificate: x509.Certificate, *, leaf: bool) -> Iterator[x509.GeneralName | None]:
-    """Yield the names of a certificate that constraints apply to; None for an unreadable one."""
+    """Yield a certificate's names that constraints apply to; None for a name that is unreadable."""
     subject = certificate.subject
     if subject.rdns:
         yield x509.DirectoryName(subject)
@@ -552,7 +552,11 @@ def _is_allowed(name: x509.GeneralName | None, constraints: x509.NameConstraints
 
 
 def _within(name: x509.GeneralName, base: x509.GeneralName) -> bool:
-    """Return whether a name is in the subtree ``base``; raise `ValueError` if undecided."""
+    """Return whether a name is in the subtree ``base``.
+
+    Raises:
+        ValueError: that cannot be decided.
+    """
     if isinstance(name, x509.DirectoryName) and isinstance(base, x509.DirectoryName):
         parts = canonical(base.value)
         return canonical(name.value)[: len(parts)] == parts

@@ -63,7 +63,7 @@ def first(data: bytes) -> Value:
 
 
 def split(data: bytes) -> tuple[bytes, bytes]:
-    """Return the first value in BER ``data``, not re-encoded, and the bytes after it.
+    """Return the first value in ``data`` (BER) with its original bytes, and the bytes after it.
 
     Raises:
         PkiError: the value is truncated, or has a form that this reader does not support.
@@ -73,7 +73,11 @@ def split(data: bytes) -> tuple[bytes, bytes]:
 
 
 def split_all(data: bytes) -> list[bytes]:
-    """Return all values in BER ``data``, not re-encoded; raise as `split`."""
+    """Return all values in ``data`` (BER), with their original bytes.
+
+    Raises:
+        PkiError: a value is truncated, or has a form that this reader does not support.
+    """
     values = []
     while data:
         value, data = split(data)
@@ -93,9 +97,12 @@ def normalized(data: bytes) -> bytes:
 
 
 def first_part(data: bytes) -> bytes:
-    """Return the first value inside a constructed BER value, not re-encoded; raise as `split`.
+    """Return the first value inside a constructed value (BER), with its original bytes.
 
-    That is what a signature covers.
+    These are the bytes that a signature covers.
+
+    Raises:
+        PkiError: a value is truncated, or has a form that this reader does not support.
     """
     begin = _header(data, 0)[1]
     return data[begin : _normalized(data, begin, 1)[1]]

@@ -36,18 +36,18 @@ def same_name(one: x509.Name, other: x509.Name) -> bool:
 
 @lru_cache(maxsize=64)  # all documents of a keystore have the same signer
 def canonical_issuer(certificate: x509.Certificate) -> tuple[bytes, ...]:
-    """Return the `canonical` parts of a certificate's issuer name."""
+    """Return the issuer name of a certificate in the form of `canonical`."""
     return canonical(certificate.issuer)
 
 
 def canonical(name: x509.Name) -> tuple[bytes, ...]:
-    """Return the parts (RDNs) of a name in a form that is equal for equal names."""
+    """Return the parts (RDNs) of a name in a form in which equal names are equal."""
     return canonical_der(name.public_bytes())
 
 
 @lru_cache(maxsize=256)  # a few CAs are compared with many certificates
 def canonical_der(name: bytes) -> tuple[bytes, ...]:
-    """Return the `canonical` parts of a name given in DER."""
+    """Return a name, given in DER, in the form of `canonical`."""
     parts = der.children(der.first(name).content)
     return tuple(
         b"".join(sorted(_attribute(attribute) for attribute in der.children(part.content)))
@@ -86,10 +86,10 @@ _IN_NAMES = (0x03, 0x0C, 0x12, 0x13, 0x14, 0x16, 0x1C, _BMP_STRING)
 
 @contextmanager
 def reading(what: str, why: str, remedy: str = "") -> Iterator[None]:
-    """Raise `PkiError` with these texts for any error of `cryptography` in the ``with`` block.
+    """Turn all errors of `cryptography` in the ``with`` block into a `PkiError` with these texts.
 
-    For a damaged or hostile document it raises errors of more than ten classes, most of them at
-    the first use of a part (``subject``, ``extensions``, ``public_key()``).  So the block also uses
+    For a damaged or hostile document it raises errors of more than ten classes, most of them at the
+    first use of a part (``subject``, ``extensions``, ``public_key()``).  So the block also uses
     each part that is used later.
     """
     try:

@@ -49,10 +49,10 @@ _AES_256_CBC = "2.16.840.1.101.3.4.1.42"
 
 
 def _encrypted(key: bytes, passphrase: str) -> bytes:
-    """Return a PKCS#8 key (DER) as encrypted PEM: PBES2 with scrypt and AES-256-CBC.
+    """Return a PKCS#8 key, given in DER, as encrypted PEM (PBES2 with scrypt and AES-256-CBC).
 
-    `cryptography` reads this form, but writes PBKDF2 with 2048 rounds, which are soon guessed.
-    Source: RFC 5958, 3; RFC 8018, 6.2 and A.4; RFC 7914, 7.
+    `cryptography` can read this form, but writes keys with 2048 rounds of PBKDF2, whose passphrases
+    are quickly guessed.  Source: RFC 5958, 3; RFC 8018, 6.2 and A.4; RFC 7914, 7.
     """
     import textwrap  # no key is written by most verbs
 
@@ -88,13 +88,14 @@ def holds_private_key(data: bytes) -> bool:
 
 
 def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None) -> PrivateKey:
-    """Return the EC or RSA key of a PEM file; ``name`` names the file in errors.
+    """Return the EC or RSA key in a PEM file; ``name`` names the file in errors.
 
     ``passphrase`` is called if the key is encrypted.
 
     Raises:
-        PkiError: the key cannot be read, is encrypted and ``passphrase`` is None or wrong, is
-            neither an EC nor an RSA key, or would take OpenSSL long, which no signal ends.
+        PkiError: the key cannot be read; it is encrypted, and ``passphrase`` is None or wrong; it
+            is neither an EC nor an RSA key; or OpenSSL would take so long that no signal could end
+            it.
     """
     key = load_any_key(pem, name, passphrase)
     if not isinstance(key, (ec.EllipticCurvePrivateKey, rsa.RSAPrivateKey)):
@@ -109,10 +110,10 @@ def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None)
 def load_any_key(
     pem: bytes, name: str, passphrase: Callable[[], str] | None = None
 ) -> PrivateKeyTypes:
-    """Return the private key of a PEM file, also of a kind that DDS Security does not allow.
+    """Return the private key in a PEM file, even of a kind that DDS Security does not allow.
 
     Raises:
-        PkiError: as `load_key`, but for the kind of the key.
+        PkiError: as `load_key`, except for the kind of the key.
     """
     pem = _key_block(pem, name)
     if _TRADITIONAL in pem or _ENCRYPTED.match(pem):
@@ -145,7 +146,7 @@ _PSS = der.encode_oid("1.2.840.113549.1.1.10")
 
 
 def check_key(content: bytes, label: str = "") -> None:
-    """Check that DER ``content`` is a private key of the PEM ``label``; raise any error if not."""
+    """Raise an error unless ``content`` (DER) is a private key with the PEM ``label``."""
     if len(content) > _MAX_BYTES:
         raise ValueError("too large")
     data, _ = der.split(content)
@@ -237,7 +238,7 @@ _HEX_DIGITS = {b"DES-CBC": 16, b"DES-EDE3-CBC": 16}
 
 
 def _check_derivation(pem: bytes, name: str) -> None:
-    """Refuse an encrypted key whose file demands hours or gigabytes to try a passphrase.
+    """Refuse an encrypted key for which trying a passphrase takes hours or gigabytes.
 
     Source: RFC 5958, 3; RFC 8018, A; RFC 7914, 7.
     """
@@ -281,7 +282,7 @@ _LEAST_SCRYPT_WORK = 2**17  # N * r * p of `openssl pkcs8 -scrypt`
 
 
 def few_rounds(pem: bytes) -> str:
-    """Return why an encrypted key's passphrase is fast to guess, as a clause; "" if it is not.
+    """Return why the passphrase of an encrypted key is quick to guess, as a clause, or "".
 
     Source: RFC 8018, 4.2; OpenSSL 3.0, openssl-pkcs8 (2048 rounds) and PEM_write_bio_PrivateKey
     (one round of MD5).
@@ -320,7 +321,7 @@ def _decrypted(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
 
 
 def _as_bytes(passphrase: str) -> bytes:
-    """Return the bytes of a passphrase; in the environment they need not be valid UTF-8."""
+    """Return the bytes of a passphrase, which may be invalid UTF-8 in an environment variable."""
     secret = passphrase.encode("utf-8", "surrogateescape")
     if len(secret) > LONGEST_PASSPHRASE:
         raise PkiError(
@@ -332,7 +333,7 @@ def _as_bytes(passphrase: str) -> bytes:
 
 
 def is_weak(key: object) -> bool:
-    """Return whether a key is weak: an RSA key under 2048 bits, an EC key under 256 bits.
+    """Return whether a key is weak: an RSA key below 2048 bits, an EC key below 256 bits.
 
     Source: NIST SP 800-57 part 1, 5.6; DDS-Security 1.1, 9.3.1.
     """

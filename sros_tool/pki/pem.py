@@ -84,7 +84,7 @@ def read_as_text(data: bytes) -> bytes:
 
 
 def missing(data: bytes, label: str) -> str:
-    """Return why OpenSSL finds no block with this label in a PEM file, as a clause."""
+    """Return why OpenSSL finds no block with a label in a PEM file, as a clause."""
     if _NOT_AT_START.search(data):
         return (
             "'-----BEGIN' is not at the start of its line, where OpenSSL looks for it: "

@@ -187,7 +187,7 @@ _CAPABILITIES = _attribute(_SMIME_CAPABILITIES, der.encode(der.SEQUENCE, *_AES_C
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Signature:
-    """A signature in a message; ``digest`` is its hash algorithm."""
+    """A signature in a signed message; ``digest`` is its hash algorithm."""
 
     digest: hashes.HashAlgorithm
     _signed_attributes: bytes
@@ -221,10 +221,10 @@ class Signature:
         return known
 
     def _verify(self, content: bytes, signer: x509.Certificate) -> bool:
-        """Verify the signature without the cache of `is_intact`; return the same.
+        """Return whether the signature verifies, without using the cache of `is_intact`.
 
         The kind of the key decides how.  OpenSSL ignores the algorithm that the message names, so
-        it accepts RSA-PSS only from keys for RSA-PSS alone, and never Ed25519 (pk7_doit.c,
+        it accepts RSA-PSS only from keys that are only for RSA-PSS, and never Ed25519 (pk7_doit.c,
         PKCS7_signatureVerify).
         """
         if self._signed_attributes and not self.digest_matches(content):
@@ -244,7 +244,7 @@ class Signature:
 
 
 class SignedDocument(NamedTuple):
-    """A parsed ``.p7s``; do not trust its content before `verify`.
+    """A ``.p7s`` that was read; its content is not to be trusted before `verify`.
 
     ``content`` is the signed part, with CRLF line ends and the MIME header; ``document`` is the
     same without the header.  ``certificates`` are the embedded certificates.  OpenSSL, and with it
@@ -351,7 +351,7 @@ def parse(message: bytes) -> SignedDocument:
 
 
 def parse_new(message: bytes) -> SignedDocument:
-    """Parse a message that was just signed, as `parse` but without its cache."""
+    """Return a message that was just signed, read as by `parse` but without its cache."""
     content, signature = _split(message)
     try:
         return _parse_cms(signature, content)
@@ -556,7 +556,7 @@ def _issuer_and_serial(identifier: der.Value) -> tuple[tuple[bytes, ...], int]:
 
 
 def _check_values(*values: der.Value) -> None:
-    """Raise `ValueError` for a value that OpenSSL might read differently, or refuse."""
+    """Raise `ValueError` if OpenSSL might read one of the values differently, or refuse it."""
     for value in values:
         if (
             value.tag not in _ANY_VALUES

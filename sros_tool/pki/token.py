@@ -1,4 +1,4 @@
-"""Keys on PKCS#11 tokens, named by URI; the token signs, and keys never leave it."""
+"""Keys on PKCS#11 tokens, which are named by a URI; the token signs, and keys never leave it."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from sros_tool.xml import read_bytes
 MODULE_VARIABLE = "PKCS11_MODULE_PATH"
 """The variable that names the PKCS#11 module, for sros and for the engine of libp11."""
 Secrets = Callable[[str], str]
-"""A callback that gets a prompt, such as "the PIN of the token X", and returns the secret."""
+"""Function that returns a secret, such as a PIN, for a prompt such as "the PIN of the token X"."""
 
 
 def _module_of(parsed: TokenUri, *, named: bool) -> str:
     """Return the path of the PKCS#11 library to load; ``named``: the user gave the URI.
 
-    A library named by anybody else, as in the settings of a keystore that was received, is
-    loaded only if it is root's: loading runs its code.
+    If somebody else named the library, for instance in the settings of a received keystore, it is
+    loaded only if it belongs to root, because loading runs its code.
 
     Raises:
-        UsageError: no library is named, or it is not one to be loaded.
+        UsageError: no library is named, or it must not be loaded.
     """
     own = os.environ.get(MODULE_VARIABLE, "")
     path = Path(parsed.module)
@@ -62,9 +62,9 @@ def _module_of(parsed: TokenUri, *, named: bool) -> str:
 
 
 def _proxy() -> str:
-    """Return the path of p11-kit's module, which loads all registered modules; "" if missing.
+    """Return the path of the library of p11-kit, which loads all registered ones; "" if missing.
 
-    libp11 loads it, too, where no other is named (Debian and Ubuntu, libengine-pkcs11-openssl).
+    libp11 also loads it if no other library is named (Debian and Ubuntu, libengine-pkcs11-openssl).
     """
     paths = sorted(path for folder in _PROXIES for path in Path("/").glob(folder))
     return next((str(real) for path in paths if (real := file_of_root(path))), "")
@@ -74,10 +74,10 @@ _PROXIES = ("usr/lib/*/p11-kit-proxy.so", "usr/lib64/p11-kit-proxy.so", "usr/lib
 
 
 class TokenKey(ec.EllipticCurvePrivateKey):
-    """A private key on the curve prime256v1, stored on a token.
+    """A private key on a token, of the curve prime256v1.
 
     `cryptography` signs certificates, documents and revocation lists with it as with other keys.
-    ``place`` names the key.  One that is only planned has no ``private`` part, and cannot sign.
+    ``place`` names the key.  If the key is only planned, ``private`` is None and it cannot sign.
     """
 
     def __init__(self, private: Any, public: ec.EllipticCurvePublicKey, place: TokenUri) -> None:
@@ -142,7 +142,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         )
 
     def signs_for(self, public: object) -> bool:
-        """Return whether the token signs what ``public``, the key of a certificate, verifies."""
+        """Return whether a signature by the token verifies with ``public``, a certificate's key."""
         if not isinstance(public, ec.EllipticCurvePublicKey):
             return False
         message, algorithm = random.token_bytes(32), ec.ECDSA(hashes.SHA256())
@@ -176,12 +176,13 @@ def holds_token_key(uri: str, secrets: Secrets, *, named: bool) -> bool:
 
     Args:
         uri: the URI of the key.
-        secrets: called for the PIN.
-        named: whether the user of this process gave the URI, who may name any module; the module
-            of another URI, as of a keystore's settings, is loaded only if it is root's.
+        secrets: returns the PIN.
+        named: whether the user of this process gave the URI, who may name any library; otherwise,
+            such as for a URI in a keystore's settings, the library is only loaded if it belongs to
+            root.
 
     Raises:
-        UsageError: the URI is not valid, or its module is not one to be loaded.
+        UsageError: the URI is not valid, or its library must not be loaded.
         PkiError: the token cannot be used.
     """
     return _holds(_usable_uri(uri, named=named), secrets)
@@ -198,20 +199,27 @@ def _holds(parsed: TokenUri, secrets: Secrets) -> bool:
 
 
 def open_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
-    """Return the key that ``uri`` names; arguments and errors as of `holds_token_key`."""
+    """Return the key that ``uri`` names.
+
+    Arguments and errors are those of `holds_token_key`.
+    """
     return _open(_usable_uri(uri, named=named), secrets, create=False)
 
 
 def create_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
-    """Generate a key pair on the token; raise `PkiError` if the token has one of this label."""
+    """Generate a key on the token, and return it.
+
+    Raises:
+        PkiError: the token has a key with this label, or cannot be used.
+    """
     return _open(_usable_uri(uri, named=named), secrets, create=True)
 
 
 def make_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
-    """Return the key at a place that the user named; it is generated if the token lacks it.
+    """Return the key that the user named; generate the key if the token does not have it.
 
     Raises:
-        UsageError: no module is named.
+        UsageError: no library is named.
         PkiError: the token cannot be used.
     """
     usable = _usable(place, named=True)
@@ -219,7 +227,12 @@ def make_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
 
 
 def open_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
-    """Return the key at a place that a ``key.p11`` names; errors as of `make_enclave_key`."""
+    """Return the key that a ``key.p11`` names.
+
+    Raises:
+        UsageError: no library is named.
+        PkiError: the token cannot be used.
+    """
     return _open(_usable(place, named=False), secrets, create=False)
 
 
@@ -233,7 +246,11 @@ def _usable_uri(uri: str, *, named: bool) -> TokenUri:
 
 
 def _usable(parsed: TokenUri, *, named: bool) -> TokenUri:
-    """Return the URI with its module filled in; raise if tokens cannot be used here."""
+    """Return the URI with the path of its library.
+
+    Raises:
+        UsageError, UnavailableError: tokens cannot be used on this machine.
+    """
     parsed = parsed._replace(module=_module_of(parsed, named=named))
     if importlib.util.find_spec("pkcs11") is None:
         raise UnavailableError(
@@ -370,9 +387,9 @@ def is_token_uri(place: str) -> bool:
 
 
 def refuse_pin(place: str) -> None:
-    """Raise `UsageError` if the place of a key contains a PIN: places are written into files.
+    """Raise `UsageError` if a URI contains a PIN, because URIs are written into files.
 
-    The attribute ``pin-value`` is found in every part of a URI, and percent-encoded, too.
+    The attribute ``pin-value`` is found in every part of a URI, even percent-encoded.
     """
     plain = place
     while (decoded := unquote(plain)) != plain:

@@ -1,4 +1,4 @@
-"""Certificates and revocation lists that OpenSSL 3.0 reads, and `cryptography` does not.
+"""Read certificates and revocation lists that OpenSSL 3.0 reads, and `cryptography` does not.
 
 OpenSSL reads BER, invalid versions, unknown keys and signatures, and odd strings and dates; it
 checks most of them only when it verifies a chain.  It decodes an extension by its ASN.1 template
@@ -257,7 +257,7 @@ class _TolerantList(_Signed):
 
 
 def read_certificate(data: bytes) -> x509.Certificate:
-    """Return a certificate that `cryptography` does not read; ``data`` is in BER.
+    """Return a certificate, given in BER, that `cryptography` refuses to read.
 
     Raises:
         PkiError, ValueError: OpenSSL does not read it either.
@@ -266,7 +266,11 @@ def read_certificate(data: bytes) -> x509.Certificate:
 
 
 def read_list(data: bytes) -> x509.CertificateRevocationList:
-    """Parse a revocation list that `cryptography` refuses; raise as `read_certificate`."""
+    """Return a revocation list, given in BER, that `cryptography` refuses to read.
+
+    Raises:
+        PkiError, ValueError: OpenSSL does not read it either.
+    """
     return cast(x509.CertificateRevocationList, _TolerantList(data))
 
 
@@ -318,7 +322,7 @@ def unread_date(certificate: x509.Certificate) -> str:
 def date(
     of: x509.Certificate | x509.CertificateRevocationList | x509.RevokedCertificate, name: str
 ) -> Any:
-    """Return the date in the attribute ``name``, in UTC; None if a list does not have it.
+    """Return the date in the attribute ``name``, in UTC; None if a revocation list lacks it.
 
     `cryptography` 41 has the dates without a time zone.
     """
@@ -330,7 +334,7 @@ def date(
 
 
 def _name(data: bytes) -> x509.Name:
-    """Parse a distinguished name in DER, also with values that their types do not allow.
+    """Return a distinguished name, given in DER, even with values that its types do not allow.
 
     Raises:
         PkiError, ValueError: OpenSSL does not read it either.
@@ -344,9 +348,10 @@ def _name(data: bytes) -> x509.Name:
 
 
 def _entries(values: list[der.Value]) -> Iterator[_TolerantEntry]:
-    """Yield the entries of a list; OpenSSL decodes extensions up to the first one that is damaged.
+    """Yield the entries of a revocation list.
 
-    Source: x_crl.c (crl_set_issuers).
+    Extensions of an entry are decoded up to the first damaged one, as in OpenSSL (x_crl.c,
+    crl_set_issuers).
     """
     damaged = False
     for value in values:
