@@ -62,7 +62,7 @@ from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import validity_of
 from sros_tool.pki.token import Secrets
-from sros_tool.runtime.processes import RunningProcesses
+from sros_tool.runtime.processes import RunningProcesses, boot_id
 from sros_tool.validity import elapsed, iso
 
 _TOLERANCE = timedelta(minutes=2)
@@ -101,6 +101,9 @@ class Machine:
     systemd: Systemd | None = None
     fetch: Callable[..., Release | None] = fetch_release
     clock: Callable[[], RobotClock] = kernel_clock
+    boot: Callable[[], str] = boot_id
+    restarted: bool = False
+    """Whether somebody says that all processes were restarted since the last round."""
 
 
 def run_round(folder: Path, settings: AgentSettings, machine: Machine) -> Round:
@@ -125,6 +128,10 @@ class _Round:
     def run(self) -> Round:
         now, before = self._machine.now, self._state
         self._attempt(lambda: tidy(self._folder))
+        boot = self._machine.boot()
+        if self._machine.restarted or before.boot != boot:
+            # After a start of the machine no process has files of before; what is seen counts.
+            self._state = replace(before, due=(), boot=boot)
         clock = self._clock()
         # Documents that were verified prove that this moment has passed, whatever the clock shows.
         certain = max(now, before.latest) if before.latest else now

@@ -40,8 +40,8 @@ class AgentState:
     ``accepted`` the highest number that was verified: an older release is refused.  ``sequence`` is
     that of the last message.  ``latest`` is the latest moment that has certainly passed: verified
     documents begin to be valid then.  ``due`` are the enclaves whose processes were not yet seen
-    with the installed files.  ``fetched`` and ``sent`` tell when the source and the inbox were last
-    reached.
+    with the installed files, since the start ``boot`` of the machine (see `boot_id`).  ``fetched``
+    and ``sent`` tell when the source and the inbox were last reached.
     """
 
     release: int = 0
@@ -49,6 +49,7 @@ class AgentState:
     sequence: int = 0
     latest: datetime | None = None
     due: tuple[str, ...] = ()
+    boot: str = ""
     fetched: datetime | None = None
     sent: datetime | None = None
     problems: tuple[str, ...] = ()
@@ -88,6 +89,8 @@ def _state_from(value: Any) -> AgentState:
             raise ValueError(number)
     for moment in ("latest", "fetched", "sent"):
         value[moment] = parse_iso(value[moment]) if value[moment] is not None else None
+    if not isinstance(value["boot"], str):
+        raise TypeError("boot")
     value["due"] = tuple(map(check_enclave_name, value["due"]))
     value["problems"] = tuple(text for text in value["problems"] if isinstance(text, str))
     return AgentState(**value)

@@ -219,8 +219,13 @@ def _unit(text: str) -> Unit:
     "--interval", metavar="DURATION", default=_INTERVAL, show_default=True,
     help="The time between two rounds.",
 )  # fmt: skip
+@click.option(
+    "--restarted", is_flag=True,
+    help="With --once: all processes were restarted since the last round, also those that the "
+    "agent cannot see.",
+)  # fmt: skip
 @json_option
-def _run(folder: Path, once: bool, interval: str, as_json: bool) -> int:
+def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool) -> int:
     """Keep the enclaves in FOLDER as home publishes them, and confirm what is there and runs.
 
     A round fetches the robot's release, verifies it, installs it whole or not at all, restarts
@@ -242,9 +247,11 @@ def _run(folder: Path, once: bool, interval: str, as_json: bool) -> int:
     from sros_tool.validity import parse_duration
 
     pause = parse_duration(interval)
+    if restarted and not once:
+        raise UsageError("--restarted is for --once only")
     if once:
         with only_agent(folder):
-            done = _round(folder, read_settings(folder))
+            done = _round(folder, read_settings(folder), restarted=restarted)
         _show(done, as_json=as_json)
         return int(bool(done.problems))
     while True:
@@ -259,13 +266,14 @@ def _run(folder: Path, once: bool, interval: str, as_json: bool) -> int:
         time.sleep(pause.total_seconds())
 
 
-def _round(folder: Path, settings: AgentSettings) -> Round:
+def _round(folder: Path, settings: AgentSettings, *, restarted: bool = False) -> Round:
     import os
 
     from sros_tool.agent.agent import Machine, run_round
 
     moment = now()
-    return run_round(folder, settings, Machine(moment, local_zone(os.environ), secrets()))
+    machine = Machine(moment, local_zone(os.environ), secrets(), restarted=restarted)
+    return run_round(folder, settings, machine)
 
 
 def _show(done: Round, *, as_json: bool) -> None:

@@ -194,6 +194,14 @@ class RunningProcesses:
     container: bool = False
 
 
+def boot_id(proc: Path = Path("/proc")) -> str:
+    """Return the random name of this start of the machine; "" if the system does not tell it."""
+    try:
+        return (proc / "sys/kernel/random/boot_id").read_text(errors="replace").strip()[:_LONGEST]
+    except OSError:
+        return ""
+
+
 def plain(text: str, longest: int = _LONGEST) -> str:
     """Return a text that a process chose, shortened and escaped for a message."""
     return re.sub(r"[^\w.+/ -]", "?", text[:longest])

@@ -61,6 +61,8 @@ class Robot:
     """When the process of an enclave started; it has none if it is not here."""
     unseen: bool = False
     clock: RobotClock = RobotClock.SYNCHRONIZED
+    boot: str = "first"
+    restarted: bool = False
     settings: AgentSettings = field(init=False)
     asked: list[int] = field(default_factory=list)
     """The number of the installed release in each question to the source."""
@@ -85,6 +87,8 @@ class Robot:
             systemd=FakeSystemd(self),
             fetch=self.fetch,
             clock=lambda: self.clock,
+            boot=lambda: self.boot,
+            restarted=self.restarted,
         )
         return run_round(self.folder, self.settings, machine)
 
@@ -326,6 +330,30 @@ def test_a_restart_is_due_until_the_processes_were_seen_with_the_new_files(
     assert r1.round().restart == ("/r1/b",), "what is seen is known without the state"
     r1.started["/r1/b"] = later
     assert r1.round().restart == ()
+
+
+@pytest.mark.parametrize("how", ["restart of the machine", "somebody says so"])
+def test_a_restart_of_all_ends_what_cannot_be_seen(how: str, home: Home, r1: Robot) -> None:
+    r1.round()
+    r1.unseen = True
+    r1.started = {"/r1/a": moment() - timedelta(hours=1)}
+    r1.release = home.revoked
+    assert r1.round().restart == NAMES == r1.round().restart
+    if how == "restart of the machine":
+        r1.boot = "second"
+    else:
+        r1.restarted = True
+    assert r1.round().restart == ("/r1/a",), "what is seen counts more"
+    r1.release = home.release({**home.revoked.files, **governance_again(home)}, 4)
+    r1.restarted = False
+    assert r1.round().restart == ("/r1/a", "/r1/b")
+
+
+def governance_again(home: Home) -> dict[str, bytes]:
+    """Return the governance of /r1/b, signed again."""
+    path = "enclaves/r1/b/governance.p7s"
+    document = smime.parse(home.revoked.files[path]).document
+    return {path: home.authority.sign(document, "the governance")}
 
 
 def test_units_restart_in_their_order(home: Home, r1: Robot) -> None:
