@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from sros_tool.agent.settings import agent_folder
-from sros_tool.errors import InvalidNameError, KeystoreError, SrosError
+from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.release import sealed_robot
@@ -65,7 +65,7 @@ class AgentState:
 def read_state(folder: Path) -> AgentState:
     """Return what the agent of ``folder`` remembers; if the file is damaged, what can be known."""
     state = AgentState()
-    with suppress(SrosError, OSError, ValueError, TypeError, InvalidNameError):
+    with suppress(SrosError, OSError, ValueError, TypeError, KeyError):
         path = agent_folder(folder) / _STATE
         state = _state_from(parse_json(read_bytes(path, "agent's state")))
     seal = read_seal(folder)
@@ -80,20 +80,26 @@ def _state_from(value: Any) -> AgentState:
     """Return the state in a JSON value.
 
     Raises:
-        ValueError, TypeError, InvalidNameError: it is not of that form.
+        ValueError, TypeError, KeyError, InvalidNameError: it is not of that form.
     """
     if not isinstance(value, dict) or value.pop("format", None) != _FORMAT:
         raise ValueError("another format")
     for number in ("release", "accepted", "sequence"):
-        if type(value.get(number)) is not int or value[number] < 0:
+        if type(value[number]) is not int or value[number] < 0:
             raise ValueError(number)
     for moment in ("latest", "fetched", "sent"):
-        value[moment] = parse_iso(value[moment]) if value[moment] is not None else None
-    if not isinstance(value["boot"], str):
-        raise TypeError("boot")
-    value["due"] = tuple(map(check_enclave_name, value["due"]))
-    value["problems"] = tuple(text for text in value["problems"] if isinstance(text, str))
+        if value[moment] is not None:
+            value[moment] = parse_iso(_text(value[moment]))
+    value["boot"] = _text(value["boot"])
+    value["due"] = tuple(check_enclave_name(_text(name)) for name in value["due"])
+    value["problems"] = tuple(map(_text, value["problems"]))
     return AgentState(**value)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is no text")
+    return value
 
 
 def write_state(folder: Path, state: AgentState) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -244,7 +245,15 @@ def test_two_releases_with_one_number_are_refused(home: Home, r1: Robot) -> None
 def test_an_older_release_is_refused_also_without_a_state(home: Home, r1: Robot) -> None:
     r1.release = home.renewed
     r1.round()
-    (r1.folder / ".agent/state.json").write_text("damaged")
+    path = r1.folder / ".agent/state.json"
+    whole = json.loads(path.read_text())
+    damaged: list[object] = [[], None, {**whole, "due": ["x"]}, {**whole, "more": 1}]
+    damaged += [{key: whole[key] for key in whole if key != left_out} for left_out in whole]
+    damaged += [{**whole, key: wrong} for key in whole for wrong in ({}, True)]
+    for value in damaged:
+        path.write_text(json.dumps(value))
+        assert read_state(r1.folder).accepted == 2, value
+    path.write_text("damaged")
     assert read_state(r1.folder).accepted == 2
     r1.release = home.first
     done = r1.round()
