@@ -41,6 +41,12 @@ def shell(script: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     return run(["bash", "-c", f"set -o pipefail; {script}"], cwd=cwd, status=None)
 
 
+def written_to(path: Path, *words: str) -> Ended:
+    """Run the program where ``path`` lies, with its standard output in this new file."""
+    path.touch()
+    return Running(*words, cwd=path.parent, write_to=path).end()
+
+
 def signed_and_imported(
     request: Path, folder: Path, *, signing: str = "", importing: str = ""
 ) -> tuple[Ended, Ended]:
@@ -97,19 +103,21 @@ def test_through_a_pipe_with_the_modes_of_keys(keystore: Path, tmp_path: Path) -
     assert stat.S_IMODE((tmp_path / "robot/enclaves/a").stat().st_mode) == 0o700
     assert sros("verify", tmp_path / "robot").ok().out.count("loadable in domain 0") == 2
     sros("distribute_key", keystore, "--all", tmp_path / "file.tgz").ok()
-    ended = shell("sros distribute_key ks /a /b - | cmp - file.tgz", tmp_path)
-    assert ended.returncode == 0, ended
+    written_to(tmp_path / "out", "distribute_key", "ks", "/a", "/b", "-").ok()
+    assert (tmp_path / "out").read_bytes() == (tmp_path / "file.tgz").read_bytes()
 
 
 def test_broken_and_empty_pipes(keystore: Path, tmp_path: Path) -> None:
     assert shell("sros distribute_key ks --all - | true", tmp_path).stderr.count("Traceback") == 0
-    ended = shell("sros distribute_key ks /none - > out", tmp_path)
-    assert ended.returncode == 2
+    refused = written_to(tmp_path / "out", "distribute_key", "ks", "/none", "-")
+    assert refused.status == 2
     assert (tmp_path / "out").read_bytes() == b""
-    ended = shell("sros distribute_key ks /a - >/dev/full", tmp_path)
-    assert (ended.returncode, ended.stderr.count("\n")) == (2, 1), ended
-    assert "exported" not in ended.stderr
-    assert "Nothing was changed" not in ended.stderr
+    ended = Running(
+        "distribute_key", "ks", "/a", "-", cwd=tmp_path, write_to=Path("/dev/full")
+    ).end()
+    assert (ended.status, ended.err.count("\n")) == (2, 1), ended
+    assert "exported" not in ended.err
+    assert "Nothing was changed" not in ended.err
 
 
 @pytest.mark.parametrize(
@@ -121,18 +129,11 @@ def test_no_archive_is_written_to_a_terminal(
     shutil.copy(asked(tmp_path), tmp_path / "r.pem")
     before = snapshot(tmp_path)
     leader, follower = pty.openpty()
-    ended = subprocess.run(
-        [sys.executable, "-m", "sros_tool", *words],
-        cwd=tmp_path,
-        stdout=follower,
-        stderr=subprocess.PIPE,
-        text=True,
-        check=False,
-    )
+    ended = Running(*words, cwd=tmp_path, write_to=Path(os.ttyname(follower))).end()
     os.close(follower)
     os.close(leader)
-    assert ended.returncode == 2
-    assert "terminal" in ended.stderr
+    assert ended.status == 2
+    assert "terminal" in ended.err
     assert snapshot(tmp_path) == before
 
 
