@@ -28,6 +28,7 @@ from sros_tool.runtime.variables import DOMAIN
 from sros_tool.validity import Window
 from tests.support.children import finish, run, wait_for
 from tests.support.harness import (
+    Running,
     check_whole,
     forked,
     policy_text,
@@ -200,8 +201,11 @@ def test_root_with_any_name(name: str, tmp_path: Path) -> None:
     check_whole(tmp_path / root)
     assert not remains(tmp_path)
     # What the shell is told is what the file system knows.
-    script = 'eval "$("$@")"; test -f "$ROS_SECURITY_KEYSTORE/enclaves/robot/arm/key.pem"'
-    run(["sh", "-c", script, "sh", *PROGRAM, "env", root, "/robot/arm"], cwd=tmp_path)
+    told = tmp_path / "told"
+    told.touch()
+    Running("env", root, "/robot/arm", cwd=tmp_path, write_to=told).end().ok()
+    script = 'eval "$(cat told)"; test -f "$ROS_SECURITY_KEYSTORE/enclaves/robot/arm/key.pem"'
+    run(["sh", "-c", script], cwd=tmp_path)
 
 
 @pytest.mark.parametrize("shell", ["sh", "bash", "zsh", "fish"])
