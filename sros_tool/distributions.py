@@ -1,4 +1,4 @@
-"""The distributions of ROS 2: the DDS and Zenoh that each one ships, and which sros decides for.
+"""The distributions of ROS 2: the DDS and Zenoh that they ship, and by whose rules sros decides.
 
 Source: ``ros2.repos`` of the branches of ros2/ros2 and their release tags, November 2026; REP-2000.
 """
@@ -53,8 +53,8 @@ class Shipped(NamedTuple):
 class Distribution(NamedTuple):
     """A distribution of ROS 2.
 
-    ``until`` is the month in which its support ends.  ``stands_for`` says of which distribution
-    that is not supported this one has the rules, or is "".
+    ``until`` is the month in which its support ends.  ``stands_for`` is an unsupported distribution
+    in whose place this one is used, or "".
     """
 
     name: str
@@ -65,7 +65,7 @@ class Distribution(NamedTuple):
 
     @property
     def named(self) -> str:
-        """The name as users write it."""
+        """The name as the user wrote it."""
         return self.stands_for or self.name
 
     @property
@@ -94,14 +94,14 @@ class Distribution(NamedTuple):
 
     @property
     def assumption(self) -> str:
-        """A sentence on what is assumed of a distribution that is not supported, or ""."""
+        """A sentence on the rules that an unsupported distribution is assumed to have, or ""."""
         if not self.stands_for:
             return ""
         why = "has no releases" if self.stands_for == _ROLLING else "is not supported any more"
         return f"ROS 2 {self.title} {why}: taken to decide as {self.name.capitalize()}."
 
     def why(self, vendor: Vendor) -> str:
-        """Return why a vendor decides for its nodes: ``as in ROS 2 Jazzy``, and what is assumed."""
+        """Return why a vendor decides: ``as in ROS 2 Jazzy``, with what is assumed."""
         parts = [f"as in ROS 2 {self.title}"]
         if self.stands_for:
             parts.append(f"which is taken to be like {self.name.capitalize()}")
@@ -113,14 +113,14 @@ class Distribution(NamedTuple):
         return ", ".join(parts)
 
     def of_product(self, product: str) -> Shipped | None:
-        """Return what it ships of a product, or None."""
+        """Return the release of a product that this distribution ships, or None."""
         return next((shipped for shipped in self.shipped if shipped.product == product), None)
 
     def of_vendor(self, vendor: Vendor) -> Shipped:
-        """Return what it ships of the product of a vendor, such as Cyclone DDS of ``cyclonedds``.
+        """Return the release that it ships of a vendor's product, such as of ``cyclonedds``.
 
         Raises:
-            UsageError: it ships another release than the vendor's name says, or sros knows none.
+            UsageError: it ships another release than the vendor names, or sros knows no release.
         """
         shipped = self.of_product(vendor.traits.product)
         if shipped and (shipped.vendor is vendor or "-" not in vendor.value):
@@ -177,9 +177,9 @@ def shipped_title(vendor: Vendor, distributions: Sequence[Distribution]) -> str:
 
 
 def selected_vendors(vendor: str, distributions: Sequence[Distribution]) -> tuple[str, ...]:
-    """Return the vendor with a name, or those of distributions; () if neither is given.
+    """Return the vendor of this name, or the vendors of distributions; () if neither is given.
 
-    Of a vendor and distributions, the vendor is in the releases that they ship.
+    If both are given, the releases of the vendor that the distributions ship.
 
     Raises:
         UsageError: a distribution does not ship the vendor.
@@ -217,7 +217,7 @@ def _decided_as(product: str, version: str) -> Vendor:
 
 
 def _minor(version: str) -> str:
-    """Return the first two numbers of a version: releases differ by them, patches do not."""
+    """Return the first two numbers of a version, by which releases differ."""
     return ".".join(version.split(".")[:2])
 
 

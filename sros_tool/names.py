@@ -37,7 +37,7 @@ _NODE_SERVICE = re.compile(rf"(?P<node>/.+)/(?:{'|'.join(NODE_SERVICES)})\Z")
 
 
 def node_of_service(service: str) -> str:
-    """Return the full name of the node that offers one of `NODE_SERVICES`, or "" for others."""
+    """Return the full name of the node that offers a service of `NODE_SERVICES`; "" for others."""
     own = _NODE_SERVICE.match(service)
     return own["node"] if own else ""
 
@@ -220,10 +220,9 @@ def expand(name: str, ns: str, node: str) -> str:
 
 
 def has_parts(text: str, parts: Sequence[str]) -> bool:
-    """Return whether ``text`` matches ``parts`` joined by ``*``: the first at its start, and so on.
+    """Return whether ``text`` matches the expression with ``parts`` separated by ``*``.
 
-    There are at least two parts, the texts between the ``*`` of an expression.  The matches of
-    parts do not overlap.
+    There are at least two parts.
     """
     first, *middle, last = parts
     at, end = len(first), len(text) - len(last)
@@ -238,9 +237,9 @@ def has_parts(text: str, parts: Sequence[str]) -> bool:
 
 
 def action_part(name: str) -> tuple[str, str]:
-    """Split the name of an action's service or topic into the action and a part (``send_goal``).
+    """Return the action that a service or topic belongs to, and which part it is.
 
-    Both are "" if ``name`` does not belong to an action.
+    The part is a name such as ``send_goal``.  Both are "" if ``name`` belongs to no action.
     """
     action, _, part = name.rpartition(ACTION_SEPARATOR)
     return (action, part) if part in (*ACTION_SERVICES, *ACTION_TOPICS) else ("", "")
@@ -330,9 +329,9 @@ _RIGHTS_TO_USE = {
 
 
 def right_to_use(topic: str, *, writes: bool) -> tuple[str, str]:
-    """Return the ROS right to write or read a DDS topic, and its ROS name.
+    """Return the ROS right to write (or read) a DDS topic, and its ROS name.
 
-    Returns "" and the topic if it belongs to no ROS name.
+    For a topic that belongs to no ROS name, the right is "", and the name is the topic.
     """
     service, begin = service_of(topic)
     name = service or (topic[2:] if topic.startswith("rt/") else "")

@@ -19,7 +19,7 @@ _MOST_LINKS = 40
 
 
 def other_writers(state: os.stat_result, trusted: frozenset[int]) -> str:
-    """Return why users besides ``trusted`` (user ids) can change a file or folder, or "".
+    """Return why other users than ``trusted`` (user ids) can change a file or folder, or "".
 
     The group counts unless it is the private group of a trusted user, which Debian and others give
     to each user and write with (umask 002).
@@ -49,7 +49,7 @@ def replaceable_on_the_way(path: Path, trusted: frozenset[int]) -> Iterator[tupl
 
 
 def file_of_root(path: Path) -> Path | None:
-    """Return the real path of a regular file if only root can change or replace it, else None."""
+    """Return the real path of a regular file that only root can change or replace, else None."""
     try:
         real = path.resolve(strict=True)
         state = real.lstat()
@@ -61,9 +61,9 @@ def file_of_root(path: Path) -> Path | None:
 
 
 def _way(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
-    """Yield the folders and links that resolving ``path`` passes, with their lstat(2).
+    """Yield the folders and links on the way to ``path``, each with its lstat(2).
 
-    ``path`` itself is not among them, unless it is a link.
+    ``path`` itself is included only if it is a link.
     """
     here, rest, links = Path("/"), list(reversed(path.absolute().parts[1:])), 0
     yield here, here.lstat()

@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Unguarded:
-    """DDS topics without access control in one direction (publish or subscribe).
+    """DDS topics that need no right in one direction (publish or subscribe).
 
-    ``topic`` is an expression; ``without`` are the expressions of earlier rules that protect a
-    part of it.
+    ``topic`` is an expression; ``without`` are expressions of earlier rules that protect a part of
+    these topics.
     """
 
     direction: str
@@ -45,9 +45,9 @@ class Unguarded:
 
 
 def unguarded(governance: Governance) -> Iterator[Unguarded]:
-    """Yield the topics without access control in any domain; the first matching rule applies.
+    """Yield the topics without access control in some domain; the first matching rule counts.
 
-    DDS-Security 1.1, 9.4.1.2.6 (topic rules, and enable_read/write_access_control).
+    Source: DDS-Security 1.1, 9.4.1.2.6 (topic rules, and enable_read/write_access_control).
     """
     for domain in governance.domain_access_rules:
         guarded: dict[str, list[str]] = {"publish": [], "subscribe": []}
@@ -263,9 +263,9 @@ class Network:
     def _steps(
         self, enclave: str, forward: bool, used: _Used, known: Container[str]
     ) -> Iterator[Hop]:
-        """Yield the hops from (``forward``) or to an enclave, except those with ``known`` enclaves.
+        """Yield the hops from an enclave (``forward``) or to it, except with ``known`` enclaves.
 
-        Topics that were ``used`` before cannot reach other enclaves, and are left out.
+        Topics that were ``used`` before cannot lead to other enclaves, and are left out, too.
         """
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
         own, others = (self._sides[direction] for direction in directions)
@@ -282,7 +282,7 @@ class Network:
                     yield _hop(writer, reader, name)
 
     def _carrying(self, writer: _Access, reader: _Access) -> str:
-        """Return a DDS topic that gets from a writer to a reader, or ""."""
+        """Return a DDS topic that a writer may write and a reader gets, or ""."""
         sending, receiving = (self._router_of.get(end.enclave, "") for end in (writer, reader))
         if sending == receiving:
             return _shared(writer, reader)
@@ -292,7 +292,10 @@ class Network:
 
 
 def _ends(rights: Iterable[Right], ignored: Collection[str]) -> dict[str, list[_Access]]:
-    """Return who may write (publish) and read (subscribe) which topics, without ignored topics."""
+    """Return which enclaves may write (publish) and read (subscribe) which topics.
+
+    Topics in ``ignored`` are left out.
+    """
     ends: dict[str, list[_Access]] = {"publish": [], "subscribe": []}
     denied: dict[tuple[str, str], set[str]] = defaultdict(set)
     allowed: dict[tuple[str, str], set[str]] = defaultdict(set)

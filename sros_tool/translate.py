@@ -139,8 +139,8 @@ def governance_for(protection: DomainProtection, domains: DomainSet) -> Governan
 def hidden_protections(protection: DomainProtection) -> list[tuple[str, str]]:
     """Return pairs of protected names ("topic /camera/*") where the second hides the first.
 
-    A hidden protection never applies: for each of its DDS topics, a rule before decides.  As narrow
-    rules stand first, that is a rule for the same topics.
+    The protection of the first name never applies, because another rule decides on each of its DDS
+    topics.  Narrow rules come first, so this is a rule for the same topics.
     """
     found = []
     earlier: list[tuple[str, str]] = []
@@ -242,7 +242,7 @@ def protection_for(governance: Governance) -> DomainProtection | None:
 
 
 def _terms(rule: DomainRule | TopicRule) -> dict[str, Any]:
-    """Map the fields of a protection to the values of a rule, as `_values` does backwards."""
+    """Map the fields of a protection to the values of a rule: the reverse of `_values`."""
     from sros_tool.policy.model import Level
 
     chosen = {attribute: getattr(rule, attribute.name) for attribute in attributes(type(rule))}

@@ -44,11 +44,11 @@ _YAML_WORDS = frozenset(("y", "n", "yes", "no", "on", "off", "true", "false", "n
 def yaml_text(value: object) -> str:
     """Return dictionaries, lists, strings, integers and booleans as a YAML document.
 
-    Every string that could be anything else is a JSON string, which is one of YAML, too: readers
-    of YAML 1.1 and 1.2 find the same.
+    A string that YAML 1.1 or 1.2 could read as something else is written as a JSON string, which is
+    also valid in YAML.
 
     Raises:
-        TypeError: a part of ``value`` is of another type.
+        TypeError: a part of ``value`` has another type.
     """
     return "".join(f"{line}\n" for line in _yaml_lines(value))
 
@@ -137,7 +137,7 @@ def shows(
     null_if_empty: tuple[str, ...] = (),
     spread: tuple[str, ...] = (),
 ) -> Callable[[type[_Value]], type[_Value]]:
-    """Return a class decorator that chooses the keys of the JSON object that `as_plain` makes.
+    """Return a class decorator that chooses the keys of an object's JSON, as `as_plain` makes it.
 
     Args:
         names: the attributes that become keys; without any, the public fields of the class.

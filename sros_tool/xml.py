@@ -35,11 +35,11 @@ def _parser(instructions: bool) -> etree.XMLParser:
 
 
 def read_bytes(path: Path, what: str, *, owner: int | None = None, most: int = MAX_BYTES) -> bytes:
-    """Return the content of a regular file of at most ``most`` bytes (16 MiB).
+    """Return the content of a regular file of at most ``most`` bytes (default: 16 MiB).
 
-    ``what`` describes the file in errors, such as "policy".  A file without a size is empty, also
-    one of the kernel (proc(5)), which may have no end, or wait for its next line.  With ``owner``,
-    a user id, the file has to belong to that user.
+    ``what`` describes the file in errors, such as "policy".  A file whose size is 0 counts as
+    empty, also a file of the kernel (proc(5)), which may have no end.  With ``owner``, a user id,
+    the file has to belong to that user.
 
     Raises:
         DocumentError: the file does not exist, cannot be read, is too large or not a regular file.
@@ -99,7 +99,7 @@ def _read_open(path: Path, most: int) -> tuple[os.stat_result, bytes]:
 
 
 def open_at_once(path: Path) -> BinaryIO:
-    """Open a file for reading without waiting: opening a pipe does not block for its writer."""
+    """Open a file for reading without waiting, even a pipe without a writer."""
     return open(_handle_at_once(path), "rb")
 
 

@@ -59,10 +59,10 @@ NOTE, WARNING, ERROR = Severity.NOTE, Severity.WARNING, Severity.ERROR
 class FindingKind(NamedTuple):
     """A kind of finding.
 
-    ``id`` is stable and has the form ``family.name``.  ``title`` is a clause; ``why``, ``source``
-    and ``remedy`` are sentences.  ``source`` is a section of a specification, a vendor and version,
-    or ROS.  ``group`` is an id that several kinds share.  A ``prominent`` note is shown among the
-    warnings, but counts as a note.
+    ``id`` never changes and has the form ``family.name``.  ``title`` is a clause; ``why``,
+    ``source`` and ``remedy`` are sentences.  ``source`` is a section of a specification, a vendor
+    and version, or ROS.  ``group`` is an id that several kinds share.  A ``prominent`` note is
+    shown among the warnings, but counts as a note.
     """
 
     id: str
@@ -188,7 +188,7 @@ class Finding(NamedTuple):
 
 
 def by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:
-    """Yield groups of findings in order: a cause with all its findings, any other finding alone."""
+    """Yield groups of findings: all that share a cause, or a single one without a cause."""
     groups: dict[Cause, list[Finding]] = {}
     for finding in findings:
         if finding.cause:

@@ -294,7 +294,7 @@ def _is_of_a_node(name: str) -> bool:
 
 
 def _misspelt(each: _Statement, other: str, statements: Sequence[_Statement]) -> Finding:
-    """Return the finding that a statement has no counterpart, with similar names as suggestions."""
+    """Return the finding on a name without counterpart, which suggests similar names."""
     shown = " or ".join(
         f"{statement.name} ({statement.right.right})" for statement in statements[:_NAMES_SHOWN]
     )
@@ -695,7 +695,7 @@ def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _at_denial(found: Finding, checked: _CheckedPolicy) -> Finding:
-    """Return the finding with the place of the first denial of its enclave."""
+    """Return the finding with the file and line of the first denial in its enclave."""
     denials = (s for s in checked.statements if s.right.enclave == found.subject and not s.allows)
     source = next(denials).source
     return found._replace(file=source.file, line=source.line)
@@ -900,7 +900,7 @@ def policy_file_findings(
 
 
 def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
-    """Yield a clause for each namespace that several robots on one ROS domain have, or are in."""
+    """Yield a clause for each namespace that several robots on one ROS domain share."""
     robots = {
         namespace: [fleet.robots[name] for name in names]
         for namespace, names in fleet.by_namespace.items()
@@ -918,7 +918,10 @@ def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
 def _on_one_domain(
     robots: Sequence[Robot], others: Sequence[Robot] | None = None
 ) -> tuple[Robot, Robot] | None:
-    """Return one of ``others``, or of ``robots``, and one of ``robots`` that can share a domain."""
+    """Return two robots that may be in the same ROS domain, or None.
+
+    The first is one of ``others`` (without them, of ``robots``), the second one of ``robots``.
+    """
     seen = {robot.domain: robot for robot in others or ()}
     for robot in robots:
         same = (seen.get(robot.domain), seen.get(None))
@@ -1082,7 +1085,7 @@ def _is_near(one: str, other: str) -> bool:
 
 
 def _one_edit(a: str, b: str) -> bool:
-    """Return whether ``b``, which is not shorter, is ``a`` with one letter typed wrong."""
+    """Return whether ``b`` is ``a`` with one letter typed wrong; ``b`` is at least as long."""
     at = next((index for index, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), len(a))
     if len(a) < len(b):
         return a[at:] == b[at + 1 :]

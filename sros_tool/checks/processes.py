@@ -569,7 +569,7 @@ def process_findings(
 
 
 def _place(process: Process) -> tuple[str, str]:
-    """Return the network and the domain of a process; processes with equal ones are neighbours."""
+    """Return the network and the domain of a process; equal results mean neighbours."""
     return process.network, process.environment.get(DOMAIN) or "0"
 
 
@@ -753,7 +753,7 @@ def _keystore(process: Process) -> str:
 
 
 _Keys = frozenset[bytes]
-"""The public keys of identity CAs."""
+"""Public keys of identity CAs, as bytes in DER."""
 
 
 def _by_authorities(processes: Iterable[Process]) -> list[tuple[_Keys, list[Process]]]:
@@ -800,7 +800,7 @@ def _elsewhere(nodes: Sequence[Process], security: Mapping[int, Security]) -> It
 
 
 def _not_seen(running: RunningProcesses) -> Iterator[Finding]:
-    """Yield findings about unreadable processes: each known node, and a count of the others."""
+    """Yield a finding for each node that could not be examined, and one with their number."""
     for process in running.unseen:
         if process.speaks:
             text = f"it speaks ROS 2, and cannot be looked at: {process.why}"

@@ -141,7 +141,7 @@ class FindingChange:
 
 
 class FindingNews:
-    """The findings of the last check, to compare with the findings of the next check."""
+    """The findings of the last check, for comparison with those of the next check."""
 
     def __init__(self) -> None:
         self._before: dict[tuple[str, str], Finding] = {}

@@ -1,6 +1,6 @@
-"""Kinds of findings about the update to another distribution of ROS 2; `sros_tool.proof` decides.
+"""Kinds of findings about an update to another distribution of ROS 2; `sros_tool.proof` decides.
 
-They also report where the distributions differ that a keystore is for.
+They are also used for keystores that are for several distributions, if these decide differently.
 """
 
 from __future__ import annotations

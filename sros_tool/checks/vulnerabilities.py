@@ -121,9 +121,9 @@ _SEEN = {Seen.PROCESS: "loaded by processes of", Seen.INSTALLED: "installed, but
 
 
 def is_mended_later(library: RobotLibrary, advisories: Sequence[Advisory] | None = None) -> bool:
-    """Return whether a later release of the same major version mends a known vulnerability.
+    """Return whether a later release of the same major version fixes a known vulnerability.
 
-    False for packages of Debian and Ubuntu, whose version does not tell.
+    False for packages of Debian and Ubuntu, whose version does not tell which fixes they have.
     """
     known = known_vulnerabilities(library.product, library.version, advisories)
     numbers = version_numbers(library.version)
@@ -201,7 +201,7 @@ def vulnerability_metrics(
 def _users(
     running: RunningProcesses, libraries: Iterable[MappedLibrary] = ()
 ) -> Mapping[MappedLibrary, list[str]]:
-    """Map libraries to the labels of the processes that have mapped them."""
+    """Map libraries to the names of the processes that have mapped them."""
     users: dict[MappedLibrary, list[str]] = {library: [] for library in libraries}
     for process in running.processes:
         for library in process.dds:
@@ -231,7 +231,10 @@ def _unclear(advisories: Sequence[Advisory]) -> str:
 
 
 def _remedy(kind: FindingKind, library: MappedLibrary) -> str:
-    """Return what to upgrade, with the package's name where the path shows it; "": as the kind."""
+    """Return what to upgrade, with the package's name if the path shows it.
+
+    "" stands for the remedy of the kind.
+    """
     if kind is PACKAGE_VULNERABILITIES or not library.path.startswith(_ROS_PACKAGES):
         return ""
     distribution = library.path.removeprefix(_ROS_PACKAGES).partition("/")[0]

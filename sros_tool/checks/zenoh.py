@@ -231,7 +231,7 @@ _FEW = 3
 _MOST_PAIRS = 1000
 """Maximum number of pairs of subjects that are counted."""
 _COMPARISON = 20
-"""Cost of the comparison of two subjects, in characters."""
+"""Cost of comparing two subjects, in the unit of `ComparisonLimit` (characters)."""
 
 
 def configuration_findings(path: Path) -> Iterator[Finding]:
@@ -303,7 +303,7 @@ def _links(document: ConfigurationDocument) -> Iterator[Finding]:
 
 
 def _names(document: ConfigurationDocument) -> Iterator[Finding]:
-    """Yield a finding if whoever has any accepted certificate can play the router."""
+    """Yield a finding if anybody with an accepted certificate can act as the router."""
     unverified = [
         endpoint
         for endpoint in document.connect
@@ -410,7 +410,7 @@ def _described(subject: AclSubject) -> str:
 
 
 def _denials(document: ConfigurationDocument) -> Iterator[Finding]:
-    """Yield a finding for each denial that messages can bypass."""
+    """Yield a finding for each denial that some messages can circumvent."""
     access, limit = document.access, ComparisonLimit()
     reported: set[tuple[str, str]] = set()
     for subject in access.subjects:
@@ -432,7 +432,7 @@ def _denials(document: ConfigurationDocument) -> Iterator[Finding]:
 def _wildcard_past(
     rule: AclRule, subject: AclSubject, access: Enforcement, limit: ComparisonLimit
 ) -> str:
-    """Return how a message with a wildcard passes a rule that denies, or "" if none does."""
+    """Return how a message with a wildcard circumvents a denial, or "" if none can."""
     rules = access.rules_of(subject.id)
     for flow, message in product(rule.flows, rule.messages):
         if message not in _WITH_WILDCARDS:

@@ -56,7 +56,7 @@ _PYTHON = (sys.executable, "-P")  # never import modules from the current folder
 _LEAN_PYTHON = (*_PYTHON, "-S")
 """Python without site packages: their start-up files can take longer than a node."""
 _ON_THE_WIRE = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-"""The environment variable that keeps Fast DDS from using shared memory."""
+"""Environment variable that keeps Fast DDS from using shared memory, so packets can be seen."""
 
 
 @cache
@@ -109,8 +109,8 @@ class Backend:
     def seconds_until_forgotten(self) -> float:
         """The seconds for which peers still know a secured node that has ended.
 
-        Cyclone DDS 11 says only in clear that a participant leaves, which its peers do not believe:
-        they keep it until its lease expires (measured).
+        Cyclone DDS 11 announces its end only unencrypted, which peers do not believe: they keep the
+        participant until its lease expires (measured).
         """
         return 10.0 if self.dds.startswith("Cyclone DDS 11.") else 0.0
 
@@ -120,7 +120,7 @@ class Backend:
 
     @property
     def vendor(self) -> Condition | None:
-        """The DDS vendor as a condition for expected statuses; None for other vendors."""
+        """The DDS vendor, as a condition for expected results; None for other vendors."""
         if self.dds.startswith("Cyclone DDS"):
             return Condition.CYCLONE
         return Condition.FAST if self.dds.startswith("Fast DDS") else None

@@ -1,9 +1,9 @@
-"""Choose enclaves for the parts of a scenario, by their signed permissions.
+"""Choose enclaves of a keystore for the parts of a scenario, by their signed permissions.
 
-The choice depends on the files of all enclaves.  An enclave with only the rights that a part needs
-is preferred, because it shows best whether more is denied.  The enclave with the widest permissions
-gets a part of its own, so that one such enclave among many narrow ones is tried, too.  Enclaves
-with faulty or revoked files play no part, and get a row of their own.
+The files of all enclaves decide.  An enclave that has only the rights of a part is preferred,
+because it shows best whether more is denied.  The enclave with the widest permissions gets a part
+of its own, so that it is tried even among many enclaves with few rights.  Enclaves with faulty or
+revoked files play no part, and get a row of their own.
 """
 
 from __future__ import annotations
@@ -93,10 +93,10 @@ class UserKeystore(NamedTuple):
     """A user's keystore to attack, with its template, domains, and cast.
 
     ``topic`` is the attacked ROS topic, ``service`` the attacked ROS service ("": none). ``grants``
-    has the grant of each enclave of the cast, ``why`` the reason for the choice of some parts.
-    ``rows`` are for the widest enclaves, and for those whose faulty or revoked files allow them no
-    part.  ``enclaves`` is the number of all enclaves, of which ``elsewhere`` have their key
-    elsewhere; ``not_tried`` lists tests that a proof needs and that cannot run.
+    has the grant of each enclave of the cast, ``why`` the reasons for the choice of some parts.
+    ``rows`` are for the enclaves with the widest permissions, and for those with faulty or revoked
+    files.  ``enclaves`` is the number of all enclaves; the key of ``elsewhere`` of them is not in
+    the keystore.  ``not_tried`` lists tests that a proof needs and that cannot run.
     """
 
     root: Path
@@ -131,7 +131,7 @@ class UserKeystore(NamedTuple):
         return (self.service or SERVICE) if name == SERVICE else name
 
     def rightful(self, row: Row) -> str:
-        """Return the enclave if attacker and permitted party of a row are the same, else ""."""
+        """Return the enclave that plays attacker and permitted party of a row, else ""."""
         attackers, others = (
             {
                 (party.role, self.cast.get(party.identity.enclave, ""))
@@ -143,9 +143,9 @@ class UserKeystore(NamedTuple):
         return next((enclave for _, enclave in attackers & others), "")
 
     def opened(self, row: Row, topic: str) -> Row:
-        """Return a row that expects success if the attacker's permissions allow the attack.
+        """Return a row that expects success, if the attacker's permissions allow the attack.
 
-        ``topic`` is the attacked ROS topic.  Then no other party takes part: success needs no
+        ``topic`` is the attacked ROS topic.  The new row has no other party: success needs no
         control, and another server could answer in place of the attacker.
         """
         attacker = next((party for party in row.parties if party.intruder), None)
@@ -329,7 +329,7 @@ def _content(path: Path) -> bytes:
 
 
 def _strange_authority(keystore: Keystore, state: OpenedEnclave) -> str:
-    """Return the name of an enclave's CA file that has no CA of the keystore, or ""."""
+    """Return the name of an enclave's CA file whose CA is none of the keystore's, or ""."""
     for file, role in ((IDENTITY_CA_FILE, IDENTITY), (PERMISSIONS_CA_FILE, PERMISSIONS)):
         known = {digest(certificate) for certificate in keystore.authority(role)}
         if fingerprints(state.files[file]).isdisjoint(known):
@@ -340,10 +340,10 @@ def _strange_authority(keystore: Keystore, state: OpenedEnclave) -> str:
 def _best_cast(
     rights: Mapping[str, Grant], wanted: str, without_list: frozenset[str]
 ) -> tuple[dict[str, str], str]:
-    """Return the most useful cast (talker, listener, guest) and its DDS topic.
+    """Return the best enclaves for talker, listener and guest, and their DDS topic.
 
-    An enclave that may only publish, or only subscribe, is more useful than one that may do both;
-    most useful as listener is one ``without_list``, which may not know who was revoked.
+    An enclave that may only publish, or only subscribe, is better than one that may do both.  The
+    best listener is one of ``without_list``, which may not know who was revoked.
     """
     best: tuple[int, dict[str, str], str] = (-1, {}, "")
     serving = _serving(rights)
@@ -388,9 +388,11 @@ def _best_cast(
 def _best_first(
     rights: Mapping[str, Grant], right: str, chosen: set[str], others: set[str], topic: str
 ) -> list[str]:
-    """Return ``chosen`` sorted: first enclaves not in ``others``, then enclaves naming the topic.
+    """Return ``chosen`` sorted by how well an enclave shows the ``right`` to ``topic``.
 
-    Last are those that a rule denies the other direction: Cyclone DDS 0.10 denies them both.
+    Enclaves that are not in ``others`` come first, then those whose permissions name the topic.
+    Last are enclaves with a rule that denies the other direction: Cyclone DDS 0.10 denies them
+    both.
     """
     return sorted(
         (name for name in rights if name in chosen),
@@ -470,7 +472,7 @@ def _widest(
 
 
 def _width(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
-    """Return how wide a grant is, as a sort key: the widest grant has the greatest key."""
+    """Return a sort key by which wider grants have greater keys."""
     size = sum(
         len(criteria.topics)
         for rule in grant.rules
@@ -534,10 +536,10 @@ def allows(grant: Grant, verb: str, topic: str) -> bool:
 
 
 def _allowing(grant: Grant, verb: str, topic: str) -> str:
-    """Return the expression by which a grant allows ``verb`` on a DDS topic; "" if denied.
+    """Return the expression by which a grant allows ``verb`` on a DDS topic; "" if it denies.
 
-    The first rule that names the topic decides, as with the vendors; of its expressions the topic's
-    own name comes first.  A topic that no rule names is denied.
+    As with the vendors, the first rule that names the topic decides; of several expressions in it,
+    the exact name is returned.  A topic that no rule names is denied.
     """
     for rule in grant.rules:
         fitting = [
@@ -576,7 +578,7 @@ def _may(grant: Grant, right: str, name: str, *, named: bool = False) -> bool:
 
 
 def _is_wild(expression: str) -> bool:
-    """Return whether an expression has wildcards."""
+    """Return whether a topic expression has wildcards."""
     return bool(set(expression) & _WILD)
 
 

@@ -201,7 +201,7 @@ def _same_template(template: Template) -> Template:
 
 
 class Undefended(NamedTuple):
-    """A new keystore without a defence: made from a changed template, then forged."""
+    """A forgery in a new keystore that lacks a defence: its template is changed first."""
 
     forge: Forge = _unchanged
     template: Callable[[Template], Template] = _same_template
@@ -231,7 +231,7 @@ def _widened(criteria: tuple[Criteria, ...], topics: Sequence[str]) -> tuple[Cri
 
 
 def _weak_governance(copy: KeystoreCopy) -> bytes:
-    """Return the governance as XML, changed to admit every participant and protect nothing."""
+    """Return a governance, as XML, that admits every participant and protects nothing."""
     governance = parse_governance(copy.governance())
     return render_governance(
         Governance(

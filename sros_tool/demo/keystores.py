@@ -48,7 +48,7 @@ from sros_tool.zenoh.configuration import Mode
 
 @dataclass(frozen=True)
 class KeystoreSpec:
-    """The input for creating keystores: absolute ROS topic, domains, template, and time.
+    """What is needed to create keystores: ROS topic (absolute), domains, template, and time.
 
     ``endpoint`` is where a Zenoh router listens.
     """
@@ -64,10 +64,10 @@ class KeystoreSpec:
 class KeystoreSet:
     """The keystores of a scenario, unforged and forged, and the enclave of each part.
 
-    ``missing`` has the error for each keystore that could not be made.  The scenario's own
-    keystore is a copy of the ``user`` keystore, if given: that copy and its forgeries have the
-    cast of ``user``, the other keystores have ``cast``.  With a ``router``, the name of an
-    enclave, the processes run on Zenoh.  ``copies`` has the forged keystores.
+    ``missing`` has the error for each keystore that could not be made.  If there is a ``user``
+    keystore, the scenario's own keystore is a copy of it: the copy and its forgeries have the cast
+    of ``user``, the other keystores have ``cast``.  With a ``router``, the name of an enclave, the
+    processes run on Zenoh.  ``copies`` has the forged keystores.
     """
 
     keystores: Mapping[KeystoreChoice, Path]
@@ -110,10 +110,10 @@ class KeystoreSet:
         return self.enclave(party.identity) if party.identity.keystore is not None else ""
 
     def shorten(self, identity: Identity, lifetime: int, elapsed: float) -> float:
-        """Issue a certificate for an identity's enclave that expires in ``lifetime`` seconds.
+        """Issue a certificate for an identity's enclave that expires soon; return the seconds left.
 
-        ``elapsed`` is the time since the keystores were made.  Returns in how many seconds the
-        certificate expires: a certificate has whole seconds.
+        ``lifetime`` is its validity in seconds, and ``elapsed`` the time since the keystores were
+        made. The result can differ from ``lifetime``, because certificates have whole seconds.
         """
         assert identity.keystore is not None
         copy = self.copies[identity.keystore]

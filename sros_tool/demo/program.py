@@ -195,7 +195,7 @@ def _result_of(
 
 
 def _parted(scenarios: Sequence[Scenario], rows: Sequence[RowResult]) -> Iterator[ScenarioResult]:
-    """Split results of rows that ran together by scenario; yield the scenarios in order."""
+    """Yield the result of each scenario in order; the rows of several scenarios ran together."""
     left = iter(rows)
     for scenario in scenarios:
         own = itertools.islice(left, len(scenario.rows))
@@ -203,12 +203,12 @@ def _parted(scenarios: Sequence[Scenario], rows: Sequence[RowResult]) -> Iterato
 
 
 def _expected(row: Row, backend: Backend, template: Template, topic: str) -> Row:
-    """Return the row with the status that a keystore from a template should give."""
+    """Return the row with the outcome that a keystore from this template should give."""
     return row.under(conditions(backend, template, _dds_topic(row, topic)))
 
 
 def _gated(row: Row, strong: Row, options: DemoOptions) -> Row:
-    """Return the row, marked if it is accepted, or open despite the default template."""
+    """Return the row, marked as accepted, or as open although the default template prevents it."""
     opened = bool(row.open_because) and not strong.open_because
     accepted = row.name in options.accept_open
     return replace(row, accepted=accepted, unaccepted=opened and not accepted)
@@ -360,7 +360,7 @@ def _folder(keep: Path | None) -> Iterator[Path]:
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """Clean up on SIGTERM and SIGHUP as on Ctrl-C: the folder contains private keys."""
+    """Clean up after SIGTERM and SIGHUP as after Ctrl-C: the folder has private keys."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

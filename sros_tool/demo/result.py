@@ -44,11 +44,11 @@ from sros_tool.wording import counted, first_few
 
 @dataclass(frozen=True)
 class PartyRecord:
-    """The record of a process that has ended.
+    """What was recorded of a process that has ended.
 
-    ``text`` marks the messages of a talker; ``topic`` is its ROS topic; ``through`` names the
-    library it used; ``output`` is what it printed; ``status`` is its exit status (negative for a
-    signal) if it ended before it was stopped.
+    ``text`` marks the messages of a talker; ``topic`` is its ROS topic; ``through`` is the name of
+    the library that it used; ``output`` is what it printed; ``status`` is its exit status (negative
+    for a signal) if it ended by itself.
     """
 
     text: str = ""
@@ -61,14 +61,15 @@ class PartyRecord:
 
 @dataclass(frozen=True)
 class RowRecord:
-    """The record of a row that has ended.
+    """What was recorded of a row that has ended.
 
-    ``window`` has start and end of the observation (CLOCK_MONOTONIC, s), or None if a party was not
-    ready in time.  ``injected`` counts the packets that were sent again or changed; ``skipped`` is
-    why the row was not run, or "".  ``expiry`` is when the certificate of a short-lived talker
-    expires (CLOCK_MONOTONIC, s); ``memory`` counts the segments of shared memory with the text of
-    each party.  Without ``applies``, the keystore has nobody for a part of the row.  ``libraries``
-    are those of DDS that the parties had mapped at the end of the observation.
+    ``window`` is the start and end of the observation (seconds of CLOCK_MONOTONIC), or None if a
+    party was not ready in time.  ``injected`` counts packets that were sent again or changed;
+    ``skipped`` is the reason why the row was not run, or "".  ``expiry`` is the time at which the
+    certificate of a short-lived talker expires (CLOCK_MONOTONIC, s); ``memory`` counts, for each
+    party, the segments of shared memory that contain its text.  If ``applies`` is False, the
+    keystore has no enclave for a part of the row.  ``libraries`` are the DDS libraries that the
+    parties had mapped at the end.
     """
 
     row: Row
@@ -164,7 +165,7 @@ class RowResult:
 
 
 class _Finding(NamedTuple):
-    """The observed status of a claim, with the evidence."""
+    """The observed outcome for a claim, with the evidence."""
 
     status: RowStatus
     detail: str
@@ -235,7 +236,7 @@ def _lost_import(party: Party, record: PartyRecord) -> str:
 
 
 class _Case:
-    """A claim with the records of its row and of its two parties."""
+    """A claim, with the records of its row and of its two parties."""
 
     def __init__(self, claim: Claim, record: RowRecord) -> None:
         self.claim, self.record = claim, record

@@ -67,7 +67,7 @@ _GRACE = 0.3
 
 
 class _Patience(NamedTuple):
-    """Time limits in seconds for slow machines; an undecided row is tried again with more.
+    """Time limits in seconds, which are longer when an undecided row is tried again.
 
     ``lifetime`` is the lifetime of a short-lived certificate.  A process that should be refused
     tries to connect for ``connect`` seconds.
@@ -372,7 +372,7 @@ class _Runner:
         return start, now
 
     def _is_met(self, claim: Claim, processes: Mapping[str, _PartyProcess]) -> bool:
-        """Return whether an event that a claim expects was observed often enough."""
+        """Return whether the events that a claim expects were observed often enough."""
         events = processes[claim.subject].look()
         if claim.relation in (Relation.HEARS, Relation.IS_ANSWERED, Relation.EXECUTES):
             mark = f"{processes[claim.talker].text}: "
@@ -387,13 +387,13 @@ class _Runner:
 
 
 def _is_hopeless(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
-    """Return whether a claim cannot be met any more: its intruder was refused, or has ended."""
+    """Return whether a claim can no longer hold: its intruder was refused, or has ended."""
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
     return not all(processes[name].running for name in names)
 
 
 def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
-    """Return whether a claim expects silence that could still end, so needs the whole window."""
+    """Return whether a claim expects silence that could still end, so needs the full time."""
     if claim.holds or claim.relation in (Relation.HEARS_AGAIN, Relation.BELIEVES):
         return False
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
@@ -401,7 +401,7 @@ def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProces
 
 
 def worlds(rows: Sequence[Row]) -> list[list[int]]:
-    """Group rows that can share processes; return the indexes of the rows."""
+    """Return groups of rows that can share processes, as indexes of rows."""
     groups: dict[object, list[int]] = {}
     for index, row in enumerate(rows):
         groups.setdefault(row.world or index, []).append(index)
@@ -518,7 +518,7 @@ _VARIABLES_LEFT_OUT = frozenset(
 
 
 def base_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return ``environment`` without the variables that change DDS discovery or security."""
+    """Return ``environment`` without variables that change discovery or security of DDS."""
     return {
         name: value
         for name, value in environment.items()

@@ -1,4 +1,4 @@
-"""Comparison of two governances or two keystore settings: what becomes looser, what tighter."""
+"""Compare two governances, or two settings of keystores: what permits more, what permits less."""
 
 from __future__ import annotations
 
@@ -171,10 +171,7 @@ def _topic_pairs(
 
 
 def _deciding(domain: DomainRule) -> Callable[[str], TopicRule | None]:
-    """Return a function from a topic expression to the first rule in ``domain`` that covers it.
-
-    The function returns None if no rule covers the expression.
-    """
+    """Return a function that returns the first rule that covers a topic expression, or None."""
     numbered = list(enumerate(domain.topic_access_rules))
     own = {rule.topic_expression: (number, rule) for number, rule in reversed(numbered)}
     wide = [(number, rule) for number, rule in numbered if is_expression(rule.topic_expression)]
@@ -279,7 +276,7 @@ _DISTURBING = {
 
 
 def mismatch(old: Governance, new: Governance) -> Mismatch:
-    """Return the communication that fails between processes with ``old`` and with ``new``."""
+    """Return which communication fails between processes with ``old`` and with ``new``."""
     domains = [domain for domain in old.domains().closed() if domain in new.domains().closed()]
     names: dict[str, None] = {}
     pairs = dict.fromkeys((_rule_of(old, d), _rule_of(new, d)) for d in domains)

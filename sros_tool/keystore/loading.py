@@ -163,7 +163,7 @@ def _is_of_list(problem: Problem) -> bool:
 
 
 def _is_specific(problem: Problem, state: OpenedEnclave) -> bool:
-    """Return whether only some vendors refuse an enclave for a problem."""
+    """Return whether a problem is one for which only some vendors refuse an enclave."""
     later = problem.file == IDENTITY_CA_FILE and state.identity_ca is not None
     return problem.fault in _VENDOR_SPECIFIC or (
         problem.fault is Fault.CERTIFICATE_MALFORMED and later
@@ -343,7 +343,7 @@ def refusals_text(refusals: Mapping[Vendor, str]) -> str:
 def _signer_fault(
     traits: VendorTraits, signed: smime.SignedDocument, certificates: Certificates, at: datetime
 ) -> str:
-    """Return a clause on why the vendor refuses the signature of a document; "" if it accepts it.
+    """Return a clause on why the vendor refuses a document's signature; "" if it accepts it.
 
     ``certificates`` are all certificates of the permissions CA's file, in order.
     """

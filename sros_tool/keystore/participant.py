@@ -69,7 +69,7 @@ _LEFT_TO_THE_VENDOR = frozenset(
         Fault.PERMISSIONS_SUBJECT,
     }
 )
-"""Faults of documents that each vendor judges by its own rules."""
+"""Faults of documents on which each vendor decides by its own rules."""
 _NO_KEY = (Fault.FILE_MISSING, KEY_FILE)
 
 _PLANNED = timedelta(days=365)
@@ -279,7 +279,7 @@ _OF_GOVERNANCE = {
 
 
 def _crashes_before(problem: Problem, governed: GovernedDomain | Refusal) -> bool:
-    """Return whether a process crashes on its governance before it meets a problem."""
+    """Return whether a process crashes because of its governance before it finds a problem."""
     return (
         isinstance(governed, Refusal)
         and governed.outcome is Outcome.CRASHES
@@ -370,7 +370,7 @@ class VendorParticipant:
 
 
 class EvaluatedEnclave(NamedTuple):
-    """An enclave as given vendors load it, and their participants in it."""
+    """An enclave as some vendors load it, with the participants of these vendors."""
 
     state: OpenedEnclave
     participants: tuple[VendorParticipant, ...]

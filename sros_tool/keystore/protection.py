@@ -56,7 +56,7 @@ def contradictions(
 def with_stated(
     protection: DomainProtection, stated: Sequence[StatedProtection]
 ) -> DomainProtection:
-    """Return ``protection``, raised where policies state more; never lowered.
+    """Return ``protection``, raised where policies state a stronger one, and never lowered.
 
     Raises:
         PolicyError: statements contradict each other, or a wildcard in the settings matches only a
@@ -90,7 +90,7 @@ def governance_for_all(protection: DomainProtection) -> Governance:
 
 
 class _Raising:
-    """The protection of a keystore while statements raise it."""
+    """The protection of a keystore, while the statements of policies raise it."""
 
     def __init__(self, protection: DomainProtection) -> None:
         self._protection = protection

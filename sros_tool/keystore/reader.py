@@ -213,7 +213,7 @@ class Keystore:
         return f"Keystore({str(self.root)!r})"
 
     def forget(self) -> None:
-        """Forget everything that was read, after a change of the keystore."""
+        """Forget all parts that were read, so that a change of the keystore is seen."""
         self.files = FilesReadOnce()
         """Cache of the files that were read, in the keystore and next to it."""
         self._parts: dict[Hashable, object] = {}
@@ -612,7 +612,7 @@ class Problem(NamedTuple):
 
 @dataclass(frozen=True)
 class OpenedEnclave:
-    """The readable content of an enclave's files, and their problems.
+    """The content of an enclave's files that could be read, and their problems.
 
     ``permissions_bytes`` is the size of ``permissions.p7s``.
     """
@@ -1079,7 +1079,7 @@ Opened = TypeVar("Opened", Path, Keystore)
 def of_one_state(
     read: Callable[Concatenate[Opened, Arguments], Result],
 ) -> Callable[Concatenate[Opened, Arguments], Result]:
-    """Decorate a function of a keystore so that it reads again if the keystore changes meanwhile.
+    """Decorate a function so that it is called again if the keystore changes meanwhile.
 
     It is called at most five times; then its last result or exception counts.
     """
@@ -1105,7 +1105,10 @@ def of_one_state(
 
 
 def _state(root: Path) -> object:
-    """Return a value that differs after each change of a keystore: the ledger file's identity."""
+    """Return a value that is different after each change of a keystore.
+
+    It identifies the file of the ledger.
+    """
     found: list[tuple[int, int, int] | None] = []
     for name in (LEDGER, SETTINGS):
         try:

@@ -211,9 +211,10 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
 def _links(
     sources: Mapping[Path, RightsSource], files: Mapping[str, Path], routers: Sequence[str]
 ) -> RouterLinks | None:
-    """Return the messages that pass between routers, and the router with rules for each enclave.
+    """Return which messages pass between routers, and for each enclave the router with its rules.
 
-    ``files`` are the folders of the enclaves, and ``sources`` what the configurations in them give.
+    ``files`` are the folders of the enclaves, and ``sources`` the rights in the configurations
+    there.
     """
     from sros_tool.translate_zenoh.rights import RouterLinks
 
@@ -542,14 +543,14 @@ class SignedRights(NamedTuple):
 
 
 _MOST_LOOKUPS = 200
-"""Enclaves that are looked up one by one; for more, all permissions in the ledger are read."""
+"""Number of enclaves up to which each is searched in the ledger; for more, all of it is read."""
 
 
 class _OfLedger:
-    """The permissions in a ledger, or in the part of it that is about some enclaves.
+    """The permissions in the ledger, or in the part of the ledger about some enclaves.
 
-    ``last`` maps enclaves to their last permissions; those in ``chained`` have some after the lines
-    without a chain, those in ``certain`` after the last gap.
+    ``last`` maps enclaves to their last permissions.  ``chained`` are enclaves with permissions
+    after the lines without a hash chain, ``certain`` those with permissions after the last gap.
     """
 
     def __init__(self, ledger: Ledger, keystore: Keystore) -> None:
@@ -585,7 +586,7 @@ class RecordedRights:
         )
 
     def _of(self, name: str) -> _OfLedger:
-        """Return what the ledger has of an enclave, and perhaps of others."""
+        """Return the part of the ledger about an enclave, and perhaps about others."""
         is_first = len(self._looked_up) < _MOST_LOOKUPS and "_of_all" not in self.__dict__
         if self._whole or not is_first or not self._keystore.ledger_file.is_indexed:
             return self._of_all
@@ -595,14 +596,14 @@ class RecordedRights:
         return self._looked_up[name]
 
     def of(self, name: str, digest: str, grant: Grant) -> SignedRights:
-        """Return the rights in the permissions of an enclave, to sign them again.
+        """Return the rights in an enclave's permissions, in order to sign them again.
 
-        ``grant`` are the rights; otherwise as `policy`.
+        ``grant`` has the rights; ``name``, ``digest`` and errors are as for `policy`.
         """
         return SignedRights(grant, self.policy(name, digest), self.nodes(name))
 
     def nodes(self, name: str) -> str:
-        """Return the nodes of the last permissions of an enclave, as the ledger has them."""
+        """Return the nodes of an enclave's last permissions, as text from the ledger."""
         last = self._of(name).last
         return last[name].nodes if name in last else ""
 
@@ -617,7 +618,7 @@ class RecordedRights:
         return None
 
     def unproven(self) -> dict[str, Entry]:
-        """Map enclaves to their last entries, if these are on lines from before the chain."""
+        """Map enclaves to their last entries, if these are from before the hash chain."""
         of_all = self._of_all
         if not of_all.unchained:
             return {}

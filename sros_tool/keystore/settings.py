@@ -59,11 +59,11 @@ def _recorded_settings(ledger: Ledger) -> Template | None:
 
 @dataclass(frozen=True, slots=True)
 class HandEdits:
-    """Edits by hand in a keystore that sros has not applied.
+    """Edits by hand in a keystore that sros has not applied yet.
 
-    ``settings`` are clauses about keys of ``sros.toml``; ``governance`` is a clause about
-    ``governance.xml``, or "".  ``unsigned`` are clauses about protection that ``sros.toml`` states
-    and the signed governance does not have.
+    ``settings`` are clauses on keys of ``sros.toml``; ``governance`` is a clause on
+    ``governance.xml``, or "".  ``unsigned`` are clauses on protection that ``sros.toml`` states and
+    the signed governance lacks.
     """
 
     settings: tuple[str, ...] = ()
@@ -101,7 +101,7 @@ class PresentSettings(NamedTuple):
         return self.governance.domains().closed()
 
     def undone(self) -> Template:
-        """Return the settings without the edits: from the ledger, or else as `base`.
+        """Return the settings without edits: those in the ledger, or else `base`.
 
         Raises:
             KeystoreError: as `base`.
@@ -109,7 +109,7 @@ class PresentSettings(NamedTuple):
         return self.recorded or self.base()
 
     def base(self) -> Template:
-        """Return the settings that single changes start from.
+        """Return the settings to which a single change is applied.
 
         Raises:
             KeystoreError: no settings can state the governance, so a change would replace it.
@@ -179,7 +179,7 @@ def edit_notes(keystore: Keystore, governance: Governance) -> tuple[Note, ...]:
 
 
 def found_edits(keystore: Keystore, governance: Governance | None) -> HandEdits:
-    """Return the edits by hand; ``governance`` is the signed one, None if unreadable."""
+    """Return the edits by hand; ``governance`` is the signed governance, None if unreadable."""
     ledger = keystore.ledger_with("what", "settings")
     return hand_edits(keystore, ledger, keystore.settings, governance)
 
@@ -237,7 +237,7 @@ def _differences(old: Template, new: Template, origin: str) -> Iterator[str]:
 
 
 def _governance_edit(keystore: Keystore) -> str:
-    """Return a clause if ``governance.xml`` differs from the signed governance, else ""."""
+    """Return a clause if ``governance.xml`` differs from the signed governance; else ""."""
     if not all((keystore.root / file).is_file() for file in (GOVERNANCE_XML, GOVERNANCE_P7S)):
         return ""
     try:

@@ -1,4 +1,4 @@
-"""The Zenoh configurations of a keystore: those that it has, their faults, and those it needs.
+"""The Zenoh configurations of a keystore: those that exist, their faults, and those it needs.
 
 Zenoh itself verifies nothing: each configuration has to be the document that the permissions CA
 signed next to it, and to state the rights of the enclave's signed permissions.
@@ -376,7 +376,8 @@ def drifted(
 def _without(document: bytes, names: Collection[str], reader: RenderedReader) -> bytes | None:
     """Return a configuration without the rules for the enclaves ``names``.
 
-    Return None if ``names`` is not empty and this version of sros would write the file differently.
+    Returns None if ``names`` is not empty and this version of sros would write the file
+    differently.
     """
     if not names:
         return document
@@ -437,12 +438,18 @@ def zenoh_documents(
     only: Collection[str] = (),
     among: Collection[str] = (),
 ) -> ZenohDocuments:
-    """Return the configurations that the enclaves of a keystore need; arguments as `keep_zenoh`.
+    """Return the configurations that the enclaves of a keystore need.
 
-    Without ``now``, permissions that have expired count, too.  ``existing`` are the enclaves of the
-    keystore; None searches for them.  ``only`` are the enclaves whose configurations are made, and
-    that count as existing, ``among`` the enclaves whose rights these configurations have; empty for
-    all.
+    Args:
+        keystore: the keystore.
+        network: the Zenoh network of its settings.
+        domains: the ROS domains of its governance.
+        authority: the permissions CA.
+        now: the current time; with None, permissions that have expired count, too.
+        change: what a transaction changes.
+        existing: the enclaves of the keystore; None searches for them.
+        only: the enclaves whose configurations are made, and that count as existing; () for all.
+        among: the enclaves whose rights these configurations have; () for all.
     """
     root = keystore.root
     of_network = _domains(network, domains, root)
@@ -528,7 +535,7 @@ def zenoh_documents(
 
 
 def _last_revocation(entries: Iterable[Entry] = (), lists: Iterable[RevocationList] = ()) -> str:
-    """Return when an enclave was revoked last, by entries of the ledger and by lists; "" if never.
+    """Return when an enclave was last revoked, by the ledger and by revocation lists; "" if never.
 
     Certificates that were replaced by others of the same enclave do not count: their reason is
     `SUPERSEDED`.
@@ -546,7 +553,7 @@ def _last_revocation(entries: Iterable[Entry] = (), lists: Iterable[RevocationLi
 
 
 def _peers(name: str, router: RenderedRights, between: RightsBetween) -> list[RenderedRights]:
-    """Return the rights that a session gives to the router and to all other sessions, in order.
+    """Return the rights that a session gives to the router and to each other session, in order.
 
     Raises:
         PolicyError: the common rights of two enclaves take too many key expressions.
@@ -575,9 +582,10 @@ def _router_files(
     rules: Mapping[str, _RulesOfEnclave],
     revoked: str,
 ) -> dict[str, bytes]:
-    """Return the configurations of all routers, by their paths; ``revoked`` is as in the files.
+    """Return the configurations of all routers, by their paths.
 
-    A router gives another router the rights that the enclaves at both ends have.
+    ``revoked`` is the time of the last revocation, which is written into the files.  A router gives
+    another router the rights that the enclaves at both ends have.
 
     Raises:
         TooManyExpressions: these rights take too many key expressions.
@@ -634,7 +642,7 @@ def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int
 
 
 _UNCERTAIN = re.compile(rb"[\x00\x80-\xff*?\[&]|<!|ALLOW")
-"""Text in permissions that may give a right to a name that they do not contain.
+"""Matches text in permissions that may give a right to a name that they do not contain.
 
 It may be a wildcard, markup that splits or encodes a name, or a default that allows.
 """
@@ -678,10 +686,10 @@ class _RulesOfEnclave(NamedTuple):
 
 
 class _RightsReader:
-    """Reader of the enclaves' rights, as what other processes allow to them.
+    """A reader of enclaves' rights, as rules of other processes.
 
-    Only the last permissions that the permissions CA signed count, until they expire: whoever puts
-    older ones, or others, into a folder gets no rules for them.
+    Only the last permissions that the permissions CA signed count, until they expire: an enclave
+    whose files are older or other permissions gets no rules.
     """
 
     def __init__(
@@ -717,7 +725,7 @@ class _RightsReader:
         return rules
 
     def _read_some(self, names: Sequence[str]) -> dict[str, _RulesOfEnclave | str]:
-        """Do what `read` does, each step for all of the enclaves before the next step."""
+        """Return what `read` does, doing each step for all enclaves before the next step."""
         left_out: dict[str, str] = {}
 
         def for_each(some: Iterable[str], step: Callable[[str], Result]) -> dict[str, Result]:
@@ -826,7 +834,7 @@ _PROOF = {
     "request": (Flow.INGRESS, Message.QUERY),
     "reply": (Flow.EGRESS, Message.QUERY),
 }
-"""Right → the message that uses it; not from the translation, so that its errors show."""
+"""The message of each right; written here again, so that errors of the translation show."""
 _ANNOUNCED = {"NN": "", "MP": "publish", "MS": "subscribe", "SC": "request", "SS": "reply"}
 """What each kind of graph token announces: a node, or the use of a right to a name."""
 _TOKEN = re.compile(r"@ros2_lv/([0-9]+)/\*/\*/\*/(..)/([^/]+)/[^/]+/[^/]+(?:/([^/]+)/\*\*)?")
@@ -835,7 +843,7 @@ _TOKEN = re.compile(r"@ros2_lv/([0-9]+)/\*/\*/\*/(..)/([^/]+)/[^/]+/[^/]+(?:/([^
 def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[StatedRight]]) -> None:
     """Raise `PkiError` if rules and rights decide differently on a name in the rights.
 
-    For a name with wildcards, example names that it matches are tried.
+    For a name with wildcards, examples are tried.
     """
     control = AccessControl((remote,))
     passing = {right: control.passing(enclave, *use) for right, use in _PROOF.items()}
@@ -877,7 +885,7 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
 def _are_exactly(
     passing: Mapping[str, KeyExpressions], stated: Mapping[int, Sequence[StatedRight]]
 ) -> bool:
-    """Return whether rights have no wildcards, and rules have exactly the keys of the rights.
+    """Return whether the rights have no wildcards, and the rules have exactly their keys.
 
     A key below a topic with history is not the key of a name.
     """
@@ -901,9 +909,9 @@ def _are_exactly(
 
 
 def _announced(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str, str]] | None:
-    """Return what graph tokens announce: domain, right and name, which are "" for a node.
+    """Return what graph tokens announce, as triples of domain, right and name.
 
-    Return None if they are not all in the enclave's own name.
+    Right and name are "" for a node.  Returns None if a token is for another enclave.
     """
     announced = set()
     for key in tokens.all:
@@ -916,7 +924,7 @@ def _announced(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str, str]
 
 
 def _to_announce(stated: Mapping[int, Sequence[StatedRight]]) -> set[tuple[str, str, str]]:
-    """Return what rights to names without wildcards let an enclave announce, as `_announced`."""
+    """Return what an enclave may announce by its rights without wildcards, as `_announced` does."""
     return {(str(domain), "", "") for domain in stated} | {
         (str(domain), right, name)
         for domain, rights in stated.items()
@@ -925,9 +933,9 @@ def _to_announce(stated: Mapping[int, Sequence[StatedRight]]) -> set[tuple[str, 
 
 
 def _some_nodes(enclave: str, control: AccessControl) -> set[tuple[str, ...]]:
-    """Return the nodes, as in tokens, that rules let an enclave announce; one per wildcard.
+    """Return nodes, as tokens name them, that rules let an enclave announce: one for each wildcard.
 
-    The result is empty if the rights of the enclave deny all of its nodes.
+    The result is empty if the rights of the enclave deny all its nodes.
     """
     announcing = (enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN)
     nodes = [
@@ -964,9 +972,9 @@ def _present(keystore: Keystore, path: str) -> bytes | None:
 
 
 def stale_files(root: Path, wanted: Collection[str], names: Iterable[str]) -> Iterable[Drifted]:
-    """Yield the configurations that the enclaves ``names`` should not have.
+    """Yield the configurations in enclaves ``names`` that should not be there.
 
-    A file without a signed document is left out, because it may be a user's own file.
+    A file without a signed document is left out, because it may be the user's own file.
     """
     for name in names:
         for path in (_router_path(name), _session_path(name)):

@@ -1,9 +1,9 @@
-"""The ROS rights in signed permissions, whoever wrote them: as all vendors of DDS decide, or none.
+"""The ROS rights in signed permissions, for Zenoh, if all vendors of DDS decide alike.
 
-Zenoh has no partitions, and its rules have no order.  A node of ROS opens its topics in the default
-partition.  What an earlier rule decides is taken out of the later ones, and the result is compared
-with the decisions of each vendor: where two of them differ, or where the order cannot be said in
-another way, the permissions are refused.
+Anybody may have written the permissions.  Zenoh has no partitions, and its rules have no order.  A
+ROS node opens its topics in the default partition.  What an earlier rule decides is subtracted from
+later rules, and the result is compared with the decisions of each vendor: if two vendors differ, or
+if the order of the rules cannot be expressed, the permissions are refused.
 
 One difference between vendors is left out: on Cyclone DDS 0.10, a denial of one direction also
 keeps an enclave from the other direction of the topic (``portable.deny-blocks-topic``).
@@ -43,12 +43,12 @@ _PREFIXES = (_TOPICS, "rq", "rr")
 
 
 def grant_for_all(document: bytes, name: str, subject: str) -> Grant | None:
-    """Return the grant that every vendor takes from signed permissions; None if it is not there.
+    """Return the grant in signed permissions on which all vendors agree; None if there is none.
 
-    ``name`` is that of the document in errors, ``subject`` the subject of the certificate.
+    ``name`` is the name of the document in errors, ``subject`` the subject of the certificate.
 
     Raises:
-        DocumentError: a vendor refuses the document, or takes other rules from it.
+        DocumentError: a vendor refuses the document, or reads other rules in it.
     """
     permissions = parse_permissions(document, name)
     grant = permissions.grant_of(subject)
@@ -75,7 +75,7 @@ def grant_for_all(document: bytes, name: str, subject: str) -> Grant | None:
 def _grant_for(
     vendor: Vendor, permissions: Permissions | Refusal, subject: str, at: datetime
 ) -> Grant | Refusal:
-    """Return the grant that a vendor takes at a moment, or why it takes none."""
+    """Return the grant that a vendor applies at a time, or why it applies none."""
     if isinstance(permissions, Refusal):
         return permissions
     index = choose_grant(vendor.traits, permissions, subject, at=at, zone=UTC)
@@ -83,7 +83,7 @@ def _grant_for(
 
 
 def joined_domains(grant: Grant, domains: Iterable[int]) -> tuple[int, ...]:
-    """Return those of the ROS domains that signed permissions let an enclave join."""
+    """Return the ROS domains, out of ``domains``, that an enclave may join by its permissions."""
     allowed = grant.domains()
     return tuple(domain for domain in domains if domain in allowed)
 
@@ -135,7 +135,7 @@ def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
 
 
 def _meets_ros_names(topic: str) -> bool:
-    """Return whether a wildcard of DDS also matches topics of ROS names."""
+    """Return whether a DDS topic with wildcards also matches topics of ROS names."""
     return is_expression(topic) and any(overlap(topic, f"{prefix}/*") for prefix in _PREFIXES)
 
 
@@ -143,7 +143,10 @@ def _meets_ros_names(topic: str) -> bool:
 
 
 def _is_plain(grant: Grant) -> bool:
-    """Return whether all vendors decide alike, and denials come first: as sros writes it."""
+    """Return whether a grant has the form that sros writes: denials come first.
+
+    All vendors decide alike on such a grant.
+    """
     kinds = [rule.allow for rule in grant.rules]
     return (
         not (grant.default_first or grant.default_empty)
@@ -171,16 +174,16 @@ def _is_plain_topic(topic: str) -> bool:
 
 
 class _Ordered(NamedTuple):
-    """Topics that rules allow and deny, with the position of each in the rules."""
+    """The topics that rules allow and deny, each with its position in the rules."""
 
     allowed: list[tuple[int, str]]
     denied: list[tuple[int, str]]
 
 
 def _without_order(rules: Sequence[Rule]) -> list[Rule]:
-    """Return rules of the default partition whose denials come first and mean the same, if any do.
+    """Return rules with the same meaning whose denials come first, for the default partition.
 
-    A right that an earlier rule denies as a whole is left out, and so is a denial behind all rights
+    A right that an earlier rule denies completely is left out, and so is a denial after all rights
     that it is about.
     """
     allowed: dict[AccessVerb, tuple[str, ...]] = {}
@@ -223,7 +226,7 @@ def _criteria(topics: tuple[str, ...]) -> tuple[Criteria, ...]:
 
 
 def _joined(rules: Iterable[Rule]) -> tuple[Rule, ...]:
-    """Return one rule with all denials and one with all rights, of rules that have no order."""
+    """Return one rule with all denials and one with all rights, if the order does not matter."""
     joined = []
     for allow in (False, True):
         of = [rule for rule in rules if rule.allow is allow]
@@ -242,7 +245,7 @@ def _topics(all_criteria: Iterable[Criteria]) -> Iterator[str]:
 
 
 def _check_vendors(source: Source, grant: Grant, domain: int, rules: Sequence[Rule]) -> None:
-    """Raise `PolicyError` unless every vendor decides as ``rules``, of which denials win."""
+    """Raise `PolicyError` unless every vendor decides as ``rules``, in which denials win."""
     decisions = {vendor: GrantedAccess(vendor.traits, grant, domain) for vendor in _VENDORS}
     for verb in _VERBS:
         denied, allowed = (

@@ -567,7 +567,10 @@ class _Review:
         return sorted(e for e in users if e not in files and is_whole_policy(there[e]))
 
     def _unseen(self, path: str, entry: TreeEntry) -> str:
-        """Name the link or submodule at a path of HEAD that may hide policies, or return ""."""
+        """Return a clause on a link or submodule at a path that may hide policies, or "".
+
+        ``path`` is a path in HEAD.
+        """
         apart = (*self.request.left_out, *self.request.keystores)
         if entry.mode not in (LINK, SUBMODULE) or _is_below(path, apart):
             return ""

@@ -1,8 +1,8 @@
 """Cyclone DDS from Python: participants, writers and readers of strings, with DDS Security.
 
-A refusal by DDS Security raises a `SecurityRefusedError`; every other failure raises a `DdsError`,
-so that a crash is never mistaken for a refusal.  One process must not have two participants with
-different enclaves in one domain: in Cyclone 0.10 the second one gets the permissions of the first.
+A refusal by DDS Security raises a `SecurityRefusedError`, every other failure a `DdsError`, so that
+a crash is never mistaken for a refusal.  A process must not have two participants with different
+enclaves in one domain: in Cyclone DDS 0.10 the second one gets the permissions of the first.
 
 libddsc is not loaded at import: `load_cyclone` finds and loads it on the first call.  The functions
 that sros calls are declared here as in ``dds/dds.h`` of Cyclone DDS 0.10 and 11.0, which agree.
@@ -367,7 +367,10 @@ class CycloneLog:
     """
 
     def __init__(self) -> None:
-        """Redirect the stream.  libddsc keeps the stream that it sees at its first participant."""
+        """Redirect the stream ``stderr`` of the C library to a file in memory.
+
+        libddsc keeps the stream that exists when it creates its first participant.
+        """
         self._file = _memory_file()
         self._made = os.fstat(self._file)
         libc = ctypes.CDLL(None)
@@ -378,8 +381,8 @@ class CycloneLog:
     def _leave_parent(self) -> None:
         """Write to a new file if this process was forked from the process that opened the log.
 
-        If the parent closed the log's file, its descriptor may belong to another file, and is left
-        alone.
+        The parent's descriptor is not closed: if the parent closed the file, the descriptor may
+        belong to another file.
         """
         with suppress(OSError):
             if os.path.samestat(os.fstat(self._file), self._made):
@@ -485,9 +488,9 @@ def _library_files(folder: Path) -> list[Path]:
 
 
 def _load_all(files: Iterable[Path]) -> None:
-    """Load libraries that depend on each other; ignore libraries that cannot be loaded.
+    """Load libraries that depend on each other; ignore those that cannot be loaded.
 
-    After that, libddsc finds them by name, without LD_LIBRARY_PATH.  Loads dependencies first:
+    After that, libddsc finds them by name, without LD_LIBRARY_PATH.  Dependencies are loaded first,
     otherwise the dynamic loader might load the system's copies of them.
     """
     waiting = sorted(files, key=_load_order)
@@ -516,9 +519,10 @@ def loaded_libraries(prefix: str) -> tuple[Path, ...]:
 
 
 def version_of(path: Path) -> str:
-    """Return the version in the name of a shared library: "0.10.2" of libddsc.so.0.10.2.
+    """Return the version in a shared library's name: "0.10.2" of libddsc.so.0.10.2.
 
-    Wheels contain copies instead of links, so the loaded file may have the shortest name.
+    Wheels contain copies instead of links, so the loaded file may have the shortest name: then the
+    names next to it count.
     """
     copies = [copy for copy in path.parent.glob(f"{path.name}.*") if _same_size(copy, path)]
     name = max([path.name, *(copy.name for copy in copies)], key=len)

@@ -72,13 +72,16 @@ class PrintedEnvironment(NamedTuple):
 
 
 def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
-    """Return the domain for a process that uses the keystore at ``root``, which is for ``domains``.
+    """Return the ROS domain for a process that uses a keystore.
 
-    This is ``wanted`` (from an option or ROS_DOMAIN_ID) unless it is None; else 0, the default of
-    ROS, if the keystore is for it; else the first domain of the keystore.
+    Args:
+        domains: the domains that the keystore is for.
+        wanted: the domain from an option or ROS_DOMAIN_ID; None if there is none: then the result
+            is 0, the default of ROS, if the keystore is for it, else the keystore's first domain.
+        root: the keystore, for errors.
 
     Raises:
-        KeystoreError: The keystore is not for the ``wanted`` domain.
+        KeystoreError: the keystore is not for the ``wanted`` domain.
     """
     if wanted is not None:
         if wanted not in domains:
@@ -94,7 +97,7 @@ def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
 
 
 def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
-    """Return the variables that make a process run secured in enclave ``name``, or not start."""
+    """Return the variables with which a process runs secured in an enclave, or does not start."""
     return {
         KEYSTORE: str(root.absolute()),
         ENABLE: "true",
@@ -114,12 +117,12 @@ REFUSING: Mapping[str, str] = {
 
 
 def render_refusal(form: str) -> str:
-    """Return text in the format ``form`` that keeps a node from starting, after an error.
+    """Return text in the format ``form`` that keeps nodes from starting, after an error.
 
-    Empty output would start nodes unsecured, for example through a shell or jq: see `REFUSING`.  In
-    a shell, the text also fails as a command, also where ``eval $(...)`` without quotes makes it a
+    Empty output would let nodes start unsecured, for example through a shell or jq: see `REFUSING`.
+    In a shell, the text also fails as a command, even if ``eval $(...)`` without quotes makes it a
     single line; in a unit, it keeps systemd from starting the service.  Compose and Kubernetes
-    refuse it as it is.
+    refuse the text.
     """
     if form in CONTAINER_FORMS:
         return yaml_text({"refused-by-sros": "the enclave cannot be used"})
@@ -130,12 +133,12 @@ def render_refusal(form: str) -> str:
 
 
 def render_environment(variables: Mapping[str, str], form: str) -> str:
-    """Return the variables as text in the format ``form``: sh, fish, json, systemd or docker.
+    """Return variables as text in the format ``form``: sh, fish, json, systemd or docker.
 
     ``docker`` is an env-file, ``systemd`` the lines of a unit.
 
     Raises:
-        UsageError: The format cannot express a value so that all its readers get the same value.
+        UsageError: in this format, not all programs would read the same value.
     """
     for name, value in variables.items():
         if form in _UNREADABLE and _UNREADABLE[form](value):
@@ -202,7 +205,7 @@ _PYTHON = re.compile(r"python[\d.]*\Z")
 
 
 def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
-    """Return the command with ``--ros-args --enclave`` added, if it certainly starts a ROS node.
+    """Return a command with ``--ros-args --enclave``, if it certainly starts a ROS node.
 
     It does if it is ``ros2 run``, runs an executable or Python script of a ROS package
     (``lib/PACKAGE/NAME``), or has ``--ros-args``.  Other commands, the router of rmw_zenoh_cpp, and
@@ -297,10 +300,14 @@ def _is_of_package(command: Sequence[str]) -> bool:
 def zenoh_environment(
     configurations: Mapping[str, str], authority: Path, certificate: Path, key: Path
 ) -> dict[str, str]:
-    """Return the variables that make processes of rmw_zenoh_cpp run in an enclave, or not start.
+    """Return the variables with which rmw_zenoh_cpp runs in an enclave, or does not start.
 
-    ``configurations`` maps `SESSION_URI` and `ROUTER_URI` to the absolute paths of the files; a
-    process whose kind is left out does not start.  The other paths are absolute, too.
+    Args:
+        configurations: maps `SESSION_URI` and `ROUTER_URI` to absolute paths of files; processes of
+            a kind that is left out do not start.
+        authority: the absolute path of the CA file.
+        certificate: the absolute path of the certificate.
+        key: the absolute path of the key.
 
     Raises:
         KeystoreError: a path is not UTF-8, or has a ";" or "?", so that Zenoh would read another
@@ -334,7 +341,7 @@ def _text(path: Path) -> str:
 
 
 def override_pairs(text: str) -> Iterator[tuple[str, str]]:
-    """Yield the (key, value) pairs of ZENOH_CONFIG_OVERRIDE, divided as by rmw_zenoh_cpp.
+    """Yield key and value of each entry of ZENOH_CONFIG_OVERRIDE, as rmw_zenoh_cpp splits it.
 
     A value ends at a line end; an entry without key or value is skipped.
     """
@@ -346,9 +353,10 @@ def override_pairs(text: str) -> Iterator[tuple[str, str]]:
 
 
 def replaced_notes(environment: Mapping[str, str], variables: Mapping[str, str]) -> Iterator[Note]:
-    """Yield a note for each Zenoh variable of ``environment`` that ``variables`` replace.
+    """Yield a note for each Zenoh variable of ``environment`` that ``variables`` replaces.
 
-    Another value of ZENOH_CONFIG_OVERRIDE could switch access control off, so its keys are named.
+    For ZENOH_CONFIG_OVERRIDE the note names the keys, because its old value could switch access
+    control off.
     """
     for name in _VARIABLES:
         before = environment.get(name)
@@ -397,9 +405,9 @@ _LONGEST_PLAIN = 40
 class Container:
     """A container whose process runs in an enclave.
 
-    ``folder`` is the absolute path of the enclave's files, in the container and, for Compose, on
-    the machine that runs it.  Without ``image`` the result has to be merged with a definition that
-    has an image.
+    ``folder`` is the absolute path of the enclave's files, in the container and, for Compose, also
+    on the machine that runs it.  Without ``image``, the result has to be merged with a definition
+    that has an image.
     """
 
     enclave: str
@@ -410,10 +418,10 @@ class Container:
 
 
 def object_name(enclave: str) -> str:
-    """Return a name for an enclave that no other enclave has, of at most 58 characters (RFC 1123).
+    """Return a name of at most 58 characters (RFC 1123) that only this enclave has.
 
-    Names of enclaves distinguish capitals and have "_" and "/".  Where that is lost, the first 64
-    bits of the enclave's SHA-256 follow after "--", so that the name is unique.
+    Names of enclaves distinguish capitals and have "_" and "/".  If the new name loses that, "--"
+    and the first 64 bits of the enclave's SHA-256 follow, so that it is unique.
     """
     words = "-".join(re.findall(r"[a-z0-9]+", enclave.lower()))
     if _PLAIN.match(enclave) and len(words) <= _LONGEST_PLAIN:
@@ -428,7 +436,7 @@ def secret_name(enclave: str) -> str:
 
 
 def check_name(name: str, form: str) -> str:
-    """Return the name of a service or an object, after checking it for the format ``form``.
+    """Return the name of a service or object if it is valid in the format ``form``.
 
     Raises:
         UsageError: the name is not valid.

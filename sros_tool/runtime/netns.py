@@ -1,4 +1,4 @@
-"""Separate networks, so that demo and host do not interfere: for a process, and for each row.
+"""Networks for the demo: one for the process, and one for each row, apart from the host's.
 
 The network namespace has only a loopback interface, and disappears with the last process in it.
 Creating it needs CAP_SYS_ADMIN or a user namespace, which also grants the right to capture packets
@@ -67,7 +67,7 @@ class _RouteEntry(ctypes.Structure):
 
 
 class Isolation(NamedTuple):
-    """Whether a process can get a separate network, with the reason if it cannot."""
+    """Whether a process can get a network of its own, and the reason if it cannot."""
 
     isolated: bool
     reason: str = ""
@@ -134,7 +134,10 @@ def _unshare(flags: int) -> None:
 
 
 def _bring_up_loopback() -> None:
-    """Do ``ip link set lo up multicast on; ip route add 224.0.0.0/4 dev lo`` without iproute2."""
+    """Switch on the loopback interface, with multicast, without the program ip.
+
+    This is what ``ip link set lo up multicast on; ip route add 224.0.0.0/4 dev lo`` does.
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
         request = struct.pack("16sH14x", b"lo", 0)
         answer = fcntl.ioctl(control, _SIOCGIFFLAGS, request)
@@ -167,7 +170,7 @@ def _keep_off_ports_of_dds() -> None:
 
 
 def _internet_address(text: str) -> bytes:
-    """Return the address as a ``struct sockaddr_in`` with port 0."""
+    """Return an IPv4 address as a C ``struct sockaddr_in`` with port 0."""
     return struct.pack("=HH4s8x", socket.AF_INET, 0, socket.inet_aton(text))
 
 
@@ -175,7 +178,10 @@ _HERE = "/proc/thread-self/ns/net"
 
 
 class RowNetwork:
-    """The network of a row's processes and capture; the machine's network if ``own`` is false."""
+    """The network of a demo row's processes and capture.
+
+    With ``own`` False it is the network of the machine.
+    """
 
     def __init__(self, *, own: bool) -> None:
         self.own = own
@@ -191,7 +197,7 @@ class RowNetwork:
 
     @contextmanager
     def entered(self) -> Iterator[None]:
-        """Enter the network of the row, and leave it at the end of the context."""
+        """Move this thread into the network of the row, until the end of the context."""
         if not self.own:
             yield
             return
@@ -227,7 +233,10 @@ _SECONDS_TO_END = 8.0
 
 
 def end_with_starter() -> Callable[[], None]:
-    """Return a function for a child to call first: the kernel then kills it with this process."""
+    """Return a function for a child process to call first.
+
+    By the function, the kernel kills the child when this process ends.
+    """
     starter = os.getpid()
 
     def follow() -> None:

@@ -50,7 +50,7 @@ _DDS_LIBRARIES = re.compile(
     rb"(?:\.abi3|\.cpython-[\w-]+)?\.so[^/\n]*?)( \(deleted\))?$",
     re.MULTILINE,
 )
-"""Tried once for each line: a process may map thousands of files with long paths."""
+"""Matches a mapped library of DDS, only at a line's start: a process may map thousands of files."""
 _PRODUCTS = {b"fastrtps": "Fast DDS", b"fastdds": "Fast DDS", b"ddsc": "Cyclone DDS"}
 _THREE_NUMBERS = re.compile(r"\.so\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
 _MOST_ENTRIES = 10_000
@@ -72,10 +72,10 @@ _LONGEST = 40
 
 
 class MappedLibrary(NamedTuple):
-    """A library of DDS that a process has mapped.
+    """A DDS library that a process has mapped.
 
-    ``version`` has three numbers, or is "" if the name of the file does not show it.  ``path`` is
-    what the process sees; ``replaced`` says that another file is there now, or none.
+    ``version`` has three numbers, or is "" if the file's name does not show it.  ``path`` is the
+    path as the process sees it.  ``replaced`` says that the path now has another file or none.
     """
 
     product: str
@@ -85,7 +85,7 @@ class MappedLibrary(NamedTuple):
 
     @property
     def packaged(self) -> bool:
-        """Whether a package of Debian or Ubuntu has it, which can carry mends of later releases."""
+        """Whether a Debian or Ubuntu package has it, which can have fixes of later releases."""
         return self.path.startswith(("/usr/lib/", "/lib/"))
 
 
@@ -113,7 +113,7 @@ class Process:
 
     @property
     def label(self) -> str:
-        """Its name in messages, such as "process 4711 (talker)"."""
+        """The name of the process in messages, such as "process 4711 (talker)"."""
         return f"process {self.pid} ({_program(self.command)})"
 
     @property
@@ -163,9 +163,9 @@ _RMW_OF = {
 
 
 class UnseenProcess(NamedTuple):
-    """A process that could not be examined, and ``why``, as a clause.
+    """A process that could not be examined; ``why`` is a clause.
 
-    ``speaks`` says whether its command shows that it uses ROS 2; if not, that is not known.
+    ``speaks`` says whether its command shows that it uses ROS 2; if not, that is unknown.
     """
 
     pid: int
@@ -175,7 +175,7 @@ class UnseenProcess(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Its name in messages, such as "process 4711 (talker)"."""
+        """The name of the process in messages, such as "process 4711 (talker)"."""
         return f"process {self.pid} ({_program(self.command)})"
 
 
@@ -203,12 +203,12 @@ def boot_id(proc: Path = Path("/proc")) -> str:
 
 
 def plain(text: str, longest: int = _LONGEST) -> str:
-    """Return a text that a process chose, shortened and escaped for a message."""
+    """Return a text, which a process chose, in a short and escaped form for messages."""
     return re.sub(r"[^\w.+/ -]", "?", text[:longest])
 
 
 def _program(command: tuple[str, ...]) -> str:
-    """Return the name of a program, or of the script or module that an interpreter runs."""
+    """Return the name of a command's program, or of the script or module that it interprets."""
     name = Path(command[0]).name if command else ""
     if len(command) > 1 and _INTERPRETER.match(name):
         if command[1] == "-m" and len(command) > 2:
@@ -229,7 +229,7 @@ class _Stat(NamedTuple):
 
 
 class _Looked(NamedTuple):
-    """The values that were read of a process, valid as long as ``stat`` is the same."""
+    """The data that was read of a process; it is valid as long as ``stat`` does not change."""
 
     stat: _Stat
     process: Process | None
@@ -237,7 +237,7 @@ class _Looked(NamedTuple):
 
 
 class ProcessTable:
-    """Reader of the processes in /proc, which reads only changed processes again."""
+    """A reader of the processes in /proc; it reads a process again only if it changed."""
 
     def __init__(self, proc: Path = Path("/proc")) -> None:
         self._proc = proc
@@ -293,9 +293,9 @@ class ProcessTable:
     def _look(
         self, pid: int, folder: int, before: _Looked | None, begin: datetime
     ) -> _Looked | None:
-        """Return the values read of a process; None if it has ended or runs no program.
+        """Return the data of a process; None if it has ended or runs no program.
 
-        ``begin`` is the moment from which the starts of processes count.
+        ``begin`` is the time from which the kernel counts the start times of processes.
         """
         for _ in range(_MOST_TRIES):
             stat = _stat(folder)
@@ -394,13 +394,13 @@ def _with_versions(
 
 
 def _with_version(library: MappedLibrary, root: ProcessRoot) -> MappedLibrary:
-    """Return a library with the version in the name of its only copy: wheels have no links."""
+    """Return a library with the version in the name of its only copy, as wheels have no links."""
     versions = {_version(name) for name in root.copies(library.path)} - {""}
     return library._replace(version=versions.pop()) if len(versions) == 1 else library
 
 
 class _TooLongError(OSError):
-    """A text of /proc that is longer than sros reads."""
+    """A file of /proc is longer than sros reads."""
 
 
 def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime) -> Process | None:
@@ -447,7 +447,7 @@ def _mapped_dds(maps: bytes) -> tuple[MappedLibrary, ...]:
 def installed_dds(top: Path = Path("/")) -> tuple[MappedLibrary, ...]:
     """Return the libraries of DDS in the folders of ROS and of packages below ``top``.
 
-    No environment is asked for: that of a login by ssh does not name the folder of ROS.
+    Environment variables are not used: in a login by ssh they do not name the folder of ROS.
     """
     files = {
         (file.resolve(), product)
@@ -474,11 +474,11 @@ def _version(name: str) -> str:
 
 
 _FIRST_PID_NAMESPACE = "pid:[4026531836]"
-"""The name of the namespace of all processes (PROC_PID_INIT_INO of <linux/proc_ns.h>)."""
+"""The name of the namespace that has all processes (PROC_PID_INIT_INO of <linux/proc_ns.h>)."""
 
 
 def _may_speak(command: tuple[str, ...]) -> bool:
-    """Return whether a command shows that its process uses ROS 2 or Zenoh."""
+    """Return whether the command of a process shows that it uses ROS 2 or Zenoh."""
     return ROS_ARGS in command or any(
         Path(word).name in (*_ROUTERS, *_BRIDGES) or any(mark in word for mark in _DAEMON)
         for word in command[:3]
@@ -486,15 +486,15 @@ def _may_speak(command: tuple[str, ...]) -> bool:
 
 
 def _is_sros_run(command: tuple[str, ...]) -> bool:
-    """Return whether a command is ``sros run``, before it becomes the command of the node."""
+    """Return whether a command is ``sros run``, which later becomes the command of the node."""
     names = [Path(word).name for word in command[:4]]
     return "run" in names and any(each in names for each in _SCRIPTS_OF_SROS)
 
 
 def _configuration_of(process: Process) -> LoadedFile | None:
-    """Return the configuration file of a Zenoh process, not read yet; None for other processes.
+    """Return the configuration file of a Zenoh process, not read yet; None for others.
 
-    If the file is not known, the `problem` of the result says why.
+    If the file is unknown, the ``problem`` of the result says why.
     """
     if not process.is_zenoh:
         return None
@@ -649,7 +649,7 @@ class FileReader:
         return self._read[key]
 
     def begin(self) -> None:
-        """Forget the files that were not read since the last call."""
+        """Forget files that were not read since the last call of this method."""
         self._left = _MOST_BYTES_OF_FILES
         self._before, self._read = self._read, {}
 
@@ -676,9 +676,9 @@ class ProcessRoot:
         return LoadedFile(name, _moment(changed), data)
 
     def copies(self, path: str) -> list[str]:
-        """Return names in the folder of a file that continue its name, of files of its size.
+        """Return files next to a library that have its size, and a name that begins with its name.
 
-        An empty list if the folder cannot be examined, or has too many entries.
+        The result is empty if the folder cannot be examined, or has too many entries.
         """
         above, _, name = path.rpartition("/")
         try:
@@ -822,14 +822,14 @@ def _loaded_enclave(
 
 
 def _reason(error: OSError) -> str:
-    """Return why a folder could not be examined; "" if it does not exist."""
+    """Return why a folder could not be examined, as a clause; "" if it does not exist."""
     if error.errno in (errno.ENOENT, errno.ENOTDIR):
         return ""
     return error.strerror or str(error)
 
 
 def _writable(folders: list[tuple[str, os.stat_result]], user: int) -> str:
-    """Return a clause on a folder that users other than root, ``user`` and the owner can change."""
+    """Return a clause on a folder that other users can change than root, ``user`` and the owner."""
     trusted = frozenset({0, user, folders[0][1].st_uid})
     for path, state in folders:
         if why := other_writers(state, trusted):

@@ -37,9 +37,9 @@ def cyclone_explains(stream: str) -> dict[str, str]:
 class Middleware:
     """A middleware that ROS 2 can use, and how to recognise it.
 
-    ``rmw`` is part of the names of its RMWs, and the names of its shared libraries start with one
-    of ``libraries``.  ``vendor`` is its DDS vendor, None if it is not DDS; ``explains`` are
-    variables that make it log why it denies a topic.
+    ``rmw`` is a part of the names of its RMWs, and the names of its shared libraries begin with one
+    of ``libraries``.  ``vendor`` is its DDS vendor, or None if it is not a DDS; ``explains`` are
+    environment variables with which it logs why it denies a topic.
     """
 
     name: str
@@ -114,10 +114,10 @@ _VERSION = re.compile(r"(\d{1,9})\.(\d{1,9})\.(\d{1,9})", re.ASCII)
 
 
 def chosen_rmw(named: str | None, environment: Mapping[str, str]) -> str:
-    """Return the RMW that a process would use, as far as it is certain, or "".
+    """Return the RMW that a process will use; "" if that is uncertain.
 
-    ``named`` is what the user chose; without it, that is $RMW_IMPLEMENTATION, or the only
-    installed RMW, which rmw_implementation then loads.
+    ``named`` is the RMW that the user chose.  Without it, the result is $RMW_IMPLEMENTATION, or the
+    only installed RMW, which rmw_implementation then loads.
     """
     if named or environment.get(RMW):
         return named or environment[RMW]

@@ -1,4 +1,4 @@
-"""Find out which installed DDS stacks enforce security, by trying each with an enclave of sros.
+"""Find out which installed DDS stacks enforce security, by trying each with an enclave.
 
 The name or version of a library does not show how it was built, so each stack is tried in a
 separate process.  Only two results mean "does not enforce": the stack reports that security is not
@@ -79,8 +79,8 @@ _EXIT_SECONDS = 5.0
 class ProbeEnclave(NamedTuple):
     """The secured environment of a probe, with one allowed and one denied ROS topic.
 
-    ``environment`` holds the ROS_SECURITY_* variables and ROS_DOMAIN_ID of an enclave that may
-    publish ``allowed`` and neither publish nor subscribe ``denied``.
+    ``environment`` has the ROS_SECURITY_* variables and ROS_DOMAIN_ID of an enclave that may
+    publish ``allowed``, and neither publish nor subscribe to ``denied``.
     """
 
     environment: Mapping[str, str]
@@ -174,7 +174,7 @@ def _probe_rmw(probe: ProbeEnclave, rmw: str) -> Stack:
 
 
 def _with_release(stack: Stack) -> Stack:
-    """Return an RMW on Zenoh with the release that is installed, and what enforces security."""
+    """Return an RMW on Zenoh with its installed release, and a note on what enforces security."""
     version = package_version(stack.rmw, os.environ)
     if version is None:
         return stack._replace(advice=_ZENOH_ADVICE)

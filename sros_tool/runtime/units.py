@@ -96,7 +96,7 @@ def unit_instance(enclave: str) -> str:
 
 
 def _check_path(path: str, what: str) -> str:
-    """Return ``path``, after checking that every directive of a unit reads it alike.
+    """Return ``path`` if all directives of a unit read it in the same way.
 
     Raises:
         UsageError: the path is not absolute, or has characters with a meaning in some directives.
@@ -112,7 +112,7 @@ def _check_path(path: str, what: str) -> str:
 
 
 def _check_user(name: str) -> str:
-    """Return ``name``, after checking that it is a valid user name.
+    """Return ``name`` if it is a valid user name.
 
     Raises:
         UsageError: it is not a valid user name.

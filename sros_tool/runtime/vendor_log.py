@@ -29,7 +29,7 @@ from sros_tool.faults import Fault
 
 
 class Refused(Enum):
-    """The entity that a log message reports as refused."""
+    """What a log message says that DDS Security refused."""
 
     ALL_SECURITY = auto()
     """Every secured participant: DDS Security is not built in."""
@@ -40,17 +40,16 @@ class Refused(Enum):
 
 
 _ROS = None
-"""The vendor of texts that rcl or an RMW prints with every DDS."""
+"""The vendor of texts that rcl or an RMW prints, whichever DDS is used."""
 
 
 class LogText(NamedTuple):
-    """A text of a log and its meaning.
+    """A text in logs, and its meaning.
 
     ``pattern`` is searched in a line without colours; its groups are fields such as ``path``,
     ``domain`` and ``topic``.  ``cause`` and ``remedy`` may use these fields in braces; ``cause`` is
-    "" if the text alone does not show a cause.  Many texts have several possible causes: ``faults``
-    are the faults of an enclave that can cause the text, to look for in the enclave; ``unseen`` is
-    the remedy if the enclave has none of them.
+    "" if the text alone does not show a cause.  ``faults`` are faults of an enclave that can cause
+    the text, to look for in the enclave; ``unseen`` is the remedy if the enclave has none of them.
 
     ``weak`` is 0 for a text that names a cause, and higher for less specific texts: of all texts of
     a process, only those with the lowest value count.  ``refuses`` is None if the text alone does
@@ -674,7 +673,10 @@ _STYLES = (
 
 
 def style_of(line: str) -> Vendor | None:
-    """Return the vendor whose log has lines of this form, or None; ``line`` has no label."""
+    """Return the vendor whose log has lines of this form, or None.
+
+    ``line`` has no label of its process any more.
+    """
     return next((vendor for vendor, style in _STYLES if style.search(line)), None)
 
 
@@ -719,16 +721,19 @@ DIRECTIONS: Mapping[str, re.Pattern[str]] = {
 
 
 def log_lines(text: str) -> list[str]:
-    r"""Return the lines of a log, which only ``\n`` ends.
+    r"""Return the lines of a log, which end only with ``\n``.
 
-    A process can print every other separator of lines, such as ``\r``, in the middle of a line,
-    with the label of another process behind it.
+    A process can print any other line separator, such as ``\r``, in the middle of a line, and
+    behind it a label that makes the text look like that of another process.
     """
     return [line.removesuffix("\r") for line in text.split("\n")]
 
 
 def labelled_line(line: str) -> tuple[str, str]:
-    """Return the process in the label of a line, and the line after it; ("", line) without one."""
+    """Return the process that the label of a line names, and the text after it.
+
+    A line without a label gives ("", line).
+    """
     label = _PROCESS_LABEL.match(line)
     return (label[label.lastgroup or 0], line[label.end() :]) if label else ("", line)
 

@@ -1,4 +1,4 @@
-"""Check the enclaves on a robot: whether a process can run in them, until when, and findings."""
+"""Check the enclaves in a folder on a robot: whether and until when processes can run in them."""
 
 from __future__ import annotations
 
@@ -76,10 +76,10 @@ class VerifiedFolder(NamedTuple):
 )
 @dataclass(frozen=True, slots=True)
 class ArrivedEnclave:
-    """An enclave on a robot: whether a process can run in it, in which domains, and until when.
+    """An enclave on a robot: whether a process can run in it, in which domains, until when.
 
-    One vendor that accepts the enclave is enough; a refusal by another vendor is a finding.
-    ``place`` is the PKCS #11 URI of a key on a token.
+    It is enough if one vendor accepts the enclave; a refusal by another vendor is a finding.
+    ``place`` is the PKCS#11 URI of a key on a token.
     """
 
     name: str
@@ -230,7 +230,7 @@ TOKEN_KEY = FindingKind(
 def _token_findings(
     keystore: Keystore, name: str, now: datetime, secrets: Secrets
 ) -> Iterator[Finding]:
-    """Yield a finding unless the token signs for an enclave's certificate."""
+    """Yield a finding unless the token has the key of an enclave's certificate."""
     state = keystore.enclave(name, now=now)
     if not state.token:
         return

@@ -358,7 +358,7 @@ def _order(grant: Grant, name: str, file: str) -> Iterator[Finding]:
 def _hidden(
     stated: Mapping[tuple[str, bool], _Topics], rule: Rule, index: int, name: str, file: str
 ) -> Iterator[Finding]:
-    """Yield a finding if earlier deny rules hide topics that a rule allows."""
+    """Yield a finding if earlier deny rules deny topics that a rule allows."""
     hidden: dict[str, dict[str, list[str]]] = {}
     left = 0
     for direction in _DIRECTIONS:
@@ -601,10 +601,10 @@ _NONE = (ProtectionKind.NONE,)
 def check_governance(
     enclave: CheckedEnclave, common: bytes, asked: Sequence[Vendor]
 ) -> Iterator[Finding]:
-    """Yield findings if an enclave has another governance than the signed document ``common``.
+    """Yield findings if an enclave has another governance than the document ``common``.
 
-    ``common`` is the governance of the keystore, or of the first enclave of an export.  ``asked``
-    are the vendors that the enclave's nodes may use.
+    ``common`` is the signed governance of the keystore, or of the first enclave of an export.
+    ``asked`` are the vendors that the enclave's nodes may use.
     """
     governance = enclave.state.governance
     if governance is None:
@@ -619,7 +619,7 @@ def check_governance(
 
 @dataclass(frozen=True, slots=True)
 class _Chosen:
-    """A test whether a template's settings lead to a governance with the same finding."""
+    """Tells whether a template's settings lead to a governance with the same finding."""
 
     kind: FindingKind
     text: str
@@ -663,7 +663,7 @@ def governance_findings(
 
 
 def _unauthenticated(rule: DomainRule, asked: Sequence[Vendor]) -> tuple[FindingKind, str]:
-    """Return kind and text of the finding about participants without an identity."""
+    """Return the kind and the text of the finding about participants without a certificate."""
     kind = UNAUTHENTICATED_KEPT_OUT
     clauses: dict[str, list[str]] = {}
     for vendor in asked or MEASURED:
@@ -685,9 +685,9 @@ def _unauthenticated(rule: DomainRule, asked: Sequence[Vendor]) -> tuple[Finding
 
 
 def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:
-    """Return a clause on the topics that participants without an identity can use on a vendor.
+    """Return a clause on the topics that participants without a certificate can use on a vendor.
 
-    Cyclone DDS 0.10.2 does not check the rights of these participants, but hides from them all
+    Cyclone DDS 0.10.2 does not check the rights of these participants, but it hides from them all
     topics with enable_discovery_protection, whatever discovery_protection_kind is.
     """
     on_cyclone = vendor in CYCLONE_DDS

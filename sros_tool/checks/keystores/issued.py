@@ -151,7 +151,7 @@ _AUTHORITY_FILES = (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
 
 class EnclaveSummary(NamedTuple):
-    """Digests and names of an enclave, to compare enclaves that several processes checked."""
+    """The digests and names by which an enclave is compared with other enclaves."""
 
     name: str
     serial: int
@@ -226,7 +226,7 @@ def _trusted(data: bytes) -> frozenset[str]:
 def check_issued(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
-    """Yield findings that compare enclaves with each other, the ledger and the policies."""
+    """Yield findings from comparing enclaves with each other, the ledger and the policies."""
     for (_, serial), names in _twice(((t.issuer, t.serial), t.name) for t in summaries):
         yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial:x}")
     for _, names in _twice((summary.key, summary.name) for summary in summaries):

@@ -215,7 +215,7 @@ def _enclave_findings(
 
 
 def joined(findings: Sequence[Finding]) -> list[Finding]:
-    """Join findings that several enclaves have because of a shared file or a keystore setting."""
+    """Return findings; those that a shared file or a keystore setting causes are joined."""
     together: dict[tuple[object, ...], list[Finding]] = {}
     for finding in findings:
         one = finding.accepted or finding.id in _OF_THE_KEYSTORE
@@ -226,9 +226,9 @@ def joined(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, bytes]:
-    """Return the first enclave with the keystore's signed governance, and this governance.
+    """Return the first enclave that has the keystore's signed governance, and this governance.
 
-    In an export, the governance of the first enclave is returned.
+    For an export, it is the first enclave.
     """
     common = keystore.governance
     for name in names:
@@ -348,7 +348,7 @@ def _with(
     text: str,
     remedy: str,
 ) -> list[Finding]:
-    """Return the findings, where the errors and warnings among ``chosen`` get a common cause."""
+    """Return findings in which the errors and warnings of ``chosen`` get a common cause."""
     together = {id(finding) for finding in chosen if finding.severity >= WARNING}
     if len(together) < 2:
         return list(findings)

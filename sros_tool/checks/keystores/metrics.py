@@ -115,7 +115,7 @@ def keystore_metrics(
 
 
 def _shared(keystore: Keystore) -> Iterator[Expiry]:
-    """Yield the expiry of the files that all enclaves share; skip unreadable files."""
+    """Yield the expiry of the files that all enclaves share; unreadable files are left out."""
     for role in ROLES:
         with suppress(SrosError):
             for certificate in keystore.authority(role)[:1]:

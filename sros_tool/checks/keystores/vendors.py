@@ -124,7 +124,10 @@ _REFUSES = ("refuse it", "refuses it")
 
 
 def asked_vendors(words: Sequence[str]) -> tuple[Vendor, ...]:
-    """Return the measured DDS vendors among some words; all without any, none for ``zenoh``."""
+    """Return the measured DDS vendors that the words name; all if there are no words.
+
+    The word ``zenoh`` names none.
+    """
     return tuple(vendor for vendor in MEASURED if not words or vendor.value in words)
 
 

@@ -93,7 +93,7 @@ _MOST_BROKEN = 20
 
 Files = dict[str, bytes]
 _Kind = tuple[tuple[str, ...], frozenset[str], tuple[object, ...]]
-"""The paths of an enclave's files, the files that change, and the content that vendors look at."""
+"""The paths of an enclave's files, the changed files, and the content on which vendors decide."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +198,8 @@ def _stopped_enclaves(
 def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
     """Map each measured vendor that refuses an enclave with these files to the reason.
 
-    The private key is assumed to belong to the certificate.
+    ``files`` has the content of the files by name.  The private key is assumed to belong to the
+    certificate.
     """
     import tempfile
 
@@ -243,7 +244,7 @@ _READ_SEVERAL = tuple(vendor for vendor in MEASURED if not vendor.traits.reads_f
 def _authority_without_list(files: _FilesOfChange) -> x509.Certificate | None:
     """Return an earlier CA that may not sign revocation lists, if the change adds the first list.
 
-    As soon as there is a list, OpenSSL demands a list of the CA of every certificate.
+    Once there is a list, OpenSSL demands a list of the CA of every certificate.
     """
     if not files.content_after(CRL) or files.content(CRL):
         return None
@@ -397,9 +398,9 @@ class _FilesOfChange:
 
     @cached_property
     def _revoked_serials(self) -> frozenset[int]:
-        """The serial numbers that ledger or revocation list had before the transaction.
+        """Serial numbers that the ledger or the revocation list had before the transaction.
 
-        Only the list has them where it comes from a robot, and the keystore from a backup.
+        If the list is from a robot and the keystore from a backup, only the list has some of them.
         """
         entries = self._keystore.ledger_with("what", "revocation").entries
         of_ledger = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
@@ -407,10 +408,11 @@ class _FilesOfChange:
         return _listed(self._keystore.read(CRL, "revocation list") if has_list else b"") | of_ledger
 
     def with_a_newer_list(self) -> set[str] | None:
-        """Return enclaves that show whether vendors take a list as they take the present one.
+        """Return the enclaves to evaluate if a newer revocation list is the only change.
 
-        These are one that stays, and all whose certificates only the new list has.  Return None if
-        the lists differ in more than entries, number and dates, or no index finds those enclaves.
+        They are one enclave that stays, and all whose certificates only the new list has.  Returns
+        None if the lists differ in more than entries, number and dates, or no index finds these
+        enclaves.
         """
         before, after = self.content(CRL), self.content_after(CRL)
         ledger = self._keystore.ledger_file
@@ -425,7 +427,7 @@ class _FilesOfChange:
         return listed | ({kept} if kept else set())
 
     def was_revoked(self, name: str) -> bool:
-        """Return whether the enclave's certificate, before and after, was revoked before."""
+        """Return whether the enclave's old and new certificate were both revoked before."""
         path = f"{enclave_folder(name)}/{CERTIFICATE_FILE}"
         if not self._revoked_serials or self.transaction.is_staged(path):
             return False
@@ -526,7 +528,7 @@ def _complete(files: Mapping[str, bytes | None]) -> Files:
 
 
 def _certificate_kind(data: bytes, listed: frozenset[int], now: datetime) -> tuple[object, ...]:
-    """Return the parts of a certificate, but name and key, that vendors could treat differently."""
+    """Return all that vendors could treat differently in a certificate, except name and key."""
     form = read_form(data)
     if form is None:
         return (data,)

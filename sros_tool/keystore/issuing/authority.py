@@ -85,10 +85,10 @@ class Authority:
         return self.sign_all((document,), what)[0]
 
     def sign_all(self, documents: Sequence[bytes], what: str) -> list[bytes]:
-        """Return ``documents`` as signed S/MIME messages, in order, as `sign` does.
+        """Return ``documents`` as signed S/MIME messages, in order, as by `sign`.
 
-        Small documents take less time than with `sign`, because each step is done for several in a
-        row.
+        For small documents this is faster than `sign`, because each step is done for several
+        documents in a row.
         """
         messages: list[bytes] = []
         for batch in _batches(documents):
@@ -232,10 +232,10 @@ def write_bundle(
     bundle: bytes,
     names: Sequence[str],
 ) -> None:
-    """Stage ``bundle`` (PEM) as the CA file named ``file``, and update its copies in enclaves.
+    """Stage ``bundle`` (PEM) as a CA file, and replace copies of the file in enclaves.
 
-    ``file`` lacks the suffix ``.cert.pem``; ``roles`` are the roles of the CA, ``names`` the
-    enclaves of the keystore.
+    ``file`` is its name without the suffix ``.cert.pem``; ``roles`` are the roles of the CA,
+    ``names`` the enclaves of the keystore.
     """
     transaction.write(f"{PUBLIC}/{file}.cert.pem", bundle)
     for role in roles:
@@ -243,7 +243,7 @@ def write_bundle(
 
 
 def write_copies(transaction: Transaction, names: Sequence[str], name: str, data: bytes) -> None:
-    """Stage ``data`` as file ``name`` in each enclave that has its own copy instead of a link."""
+    """Stage ``data`` as the file ``name`` in all enclaves that have a copy of it, not a link."""
     for enclave in names:
         path = f"{enclave_folder(enclave)}/{name}"
         if (transaction.root / path).is_file() and not (transaction.root / path).is_symlink():

@@ -233,7 +233,7 @@ class EnclaveWriter:
     def would_only_date(
         self, rights: StatedRights, certificate: x509.Certificate, validity: Window, text: bytes
     ) -> bool:
-        """Return whether `write` would only change dates that are still far enough away.
+        """Return whether `write` would only change dates, and the present ones are far enough away.
 
         ``text`` is the present document, with LF line ends.  Its ``validity`` is long enough until
         two thirds of a new validity are over (`Window.lasts`).
@@ -340,7 +340,7 @@ def _permissions(
 def _early_expiry(
     what: str, wanted: Window, authority: x509.Certificate, root: Path
 ) -> Note | None:
-    """Note when the CA's expiry shortens the chosen validity by more than 1 %."""
+    """Return a note if the CA's expiry shortens the chosen validity by more than 1 %."""
     end = validity_of(authority).not_after
     lost = wanted.not_after - end
     if lost <= max((wanted.not_after - wanted.not_before) * _NOTED_LOSS, timedelta(0)):

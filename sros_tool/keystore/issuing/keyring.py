@@ -35,11 +35,11 @@ _SHORTEST_PASSPHRASE = 12  # characters; OWASP ASVS 4.0.3, 2.1.1
 _LOG = logging.getLogger(__name__)
 
 Secrets = Callable[[str], str]
-"""A secrets handler: returns the passphrase or PIN that its argument describes."""
+"""Function that returns a secret, such as a passphrase or PIN, for a description of it."""
 
 
 def no_secrets(what: str) -> str:
-    """Raise `PkiError`: the default secrets handler of a keyring, which cannot ask the user."""
+    """Raise `PkiError`: without another function, a keyring cannot ask the user for secrets."""
     raise PkiError(
         f"{what} is needed",
         "The keyring has no secrets handler to ask for it.",
@@ -49,7 +49,7 @@ def no_secrets(what: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Keyring:
-    """The places of the CA keys, and the secrets handler that opens them.
+    """Where the CA keys are, and the function that returns the secrets to open them.
 
     ``places`` maps a role ("identity", "permissions") to the URI of its key, ``file:PATH`` or
     ``pkcs11:...``, as the user named it.  For a role without an entry, the keystore's settings name
@@ -192,7 +192,7 @@ class Keyring:
             ) from error
 
     def _is_from_user(self, role: str) -> bool:
-        """Return whether the key location came from the user rather than from keystore settings."""
+        """Return whether the user named the place of a key, rather than the keystore's settings."""
         return bool(self.places.get(role))
 
     def _new_passphrase(self, role: str) -> str:

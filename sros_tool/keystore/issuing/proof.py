@@ -97,10 +97,9 @@ class ExpressionSets:
         )
 
     def says(self, stated: ExpressionSets) -> bool:
-        """Return whether these sets match the same names as ``stated``.
+        """Return whether these sets match the same names as the sets ``stated``.
 
-        They have to be subsets of ``stated``, and may lack only names that a wildcard matches
-        anyway.
+        They have to be subsets of ``stated``, and may lack only names that a wildcard also matches.
         """
         return all(
             own <= theirs and _matched_anyway(theirs - own, own)
@@ -108,7 +107,7 @@ class ExpressionSets:
         )
 
     def beside(self, other: ExpressionSets) -> Iterator[tuple[set[str], set[str]]]:
-        """Yield pairs of a set here and the set of ``other`` for the same side and direction."""
+        """Yield pairs of sets for the same side and direction: from here, and from ``other``."""
         for own, theirs in ((self.allowed, other.allowed), (self.denied, other.denied)):
             for verb in (_OUT, _IN):
                 yield own[verb], theirs[verb]
@@ -163,7 +162,7 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
 
 
 def _matched_anyway(left_out: set[str], present: set[str]) -> bool:
-    """Return whether wildcards in ``present`` match all of ``left_out``, which are plain names."""
+    """Return whether each name in ``left_out`` (no wildcards) matches a wildcard in ``present``."""
     if not left_out:
         return True
     wildcards = list(filter(is_expression, present))
@@ -177,7 +176,7 @@ def _matched_anyway(left_out: set[str], present: set[str]) -> bool:
 
 @lru_cache(maxsize=4096)
 def matched_as_meant(expression: str) -> bool:
-    """Return whether vendors and policies match an expression with the same example names."""
+    """Return whether vendors and policies agree on example names for an expression."""
     return all(
         dds_matches(vendor.traits.style, expression, name) == matches(expression, name)
         for name in example_topics([expression])
@@ -290,7 +289,7 @@ def _matched(expression: str) -> str | None:
 
 
 def _only(expression: str, known: list[str]) -> str | None:
-    """Return a name that only ``expression`` matches; None if no simple name is like that."""
+    """Return a name that only ``expression`` matches, or None if no simple name is such."""
     for letter in ("never_mentioned", "n", "0", ""):
         name = _SET.sub(_member, expression).replace("*", letter).replace("?", "n")
         if matches(expression, name) and not any(

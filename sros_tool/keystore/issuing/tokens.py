@@ -65,7 +65,7 @@ def place_in(path: Path) -> TokenUri:
 
 @dataclass(frozen=True, slots=True)
 class EnclaveTokens:
-    """The ``places`` of new keys on tokens, by enclave, and the keys they must differ from."""
+    """The ``places`` of new keys on tokens, by enclave, and keys that must not be used again."""
 
     places: Mapping[str, TokenUri]
     secrets: Secrets

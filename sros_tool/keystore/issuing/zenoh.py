@@ -1,4 +1,4 @@
-"""The Zenoh configurations of a keystore: made from its signed permissions, kept in step with them.
+"""Update the Zenoh configurations of a keystore whenever its signed permissions change.
 
 Every change of a keystore that has a Zenoh network calls `keep_zenoh` in its transaction, so DDS
 and Zenoh enforce the same rights at any moment.
@@ -43,7 +43,7 @@ def keep_zenoh(
     now: datetime,
     change: ZenohChange = NO_CHANGE,
 ) -> KeptZenoh:
-    """Stage the configurations as the keystore will need them.
+    """Stage the Zenoh configurations that the keystore needs after a change.
 
     Args:
         transaction: the transaction, before its commit.
@@ -138,7 +138,7 @@ def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
 def _revoked_names(
     ledger: Ledger, names: Sequence[str], now: datetime, replaced: Collection[str]
 ) -> Iterable[Note]:
-    """Yield a note on names that revoked certificates have, too, until they expire."""
+    """Yield a note on enclave names that revoked certificates also have, until these expire."""
     entries = ledger.entries
     revoked = {entry.serial for entry in entries if entry.what == "revocation"}
     again = sorted(
