@@ -32,7 +32,7 @@ from sros_tool.folders import Folder
 _BLOCK = 1 << 16
 _SILENCE = 30.0
 """Longest wait for the next byte of a server, in seconds."""
-MOST_SECONDS = 300.0
+_MOST_SECONDS = 300.0
 """Longest time in seconds that all files of one visit may take together."""
 
 
@@ -80,7 +80,7 @@ class FolderTransport(FetcherInterface):
 class HttpTransport(FetcherInterface):
     """Gets the files of a publishing folder from a web server, over one connection.
 
-    A context manager: when `MOST_SECONDS` are over, what still goes on is cut off.
+    A context manager: when `_MOST_SECONDS` are over, what still goes on is cut off.
     """
 
     def __init__(
@@ -89,7 +89,6 @@ class HttpTransport(FetcherInterface):
         *,
         certificate: tuple[Path, Path] | None = None,
         tls_ca: Path | None = None,
-        seconds: float = MOST_SECONDS,
     ) -> None:
         """Prepare to get files below ``url``, without connecting.
 
@@ -97,7 +96,6 @@ class HttpTransport(FetcherInterface):
             url: ``http://HOST[:PORT][/PATH]`` or ``https://…``.
             certificate: files (PEM) of the client's certificate and its key.
             tls_ca: file (PEM) of the server's CAs; None: those of the system.
-            seconds: longest time for all files together.
 
         Raises:
             UsageError: ``url`` has another form.
@@ -129,7 +127,7 @@ class HttpTransport(FetcherInterface):
         if context and certificate:
             context.load_cert_chain(*certificate)
         self._connection = _GuardedConnection(parts.hostname, port, context)
-        self._timer = threading.Timer(seconds, self._connection.cut_off)
+        self._timer = threading.Timer(_MOST_SECONDS, self._connection.cut_off)
         self._timer.daemon = True
 
     def __enter__(self) -> Self:
@@ -143,7 +141,7 @@ class HttpTransport(FetcherInterface):
         trace: TracebackType | None,
     ) -> None:
         self._timer.cancel()
-        self._connection.close()
+        self._connection.end()
 
     def _fetch(self, url: str) -> Iterator[bytes]:
         path = f"{self._path}{url.removeprefix(self.base)}"
@@ -161,7 +159,7 @@ class HttpTransport(FetcherInterface):
             raise DownloadError(_clause(error)) from error
         finally:
             if response is None or not response.isclosed():
-                self._connection.close()
+                self._connection.end()
         if self._connection.is_cut_off:  # the end may be that of the connection alone
             raise SlowRetrievalError(f"{path} takes too long")
 
@@ -191,16 +189,21 @@ class _GuardedConnection(http.client.HTTPConnection):
         self.is_cut_off = False
 
     def connect(self) -> None:
-        if self.is_cut_off:
-            raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
+        self._end_guard()
         plain = socket.create_connection((self.host, self.port), _SILENCE)
         self._guard = plain.dup()
         self.sock = plain
+        if self.is_cut_off:  # before there was a guard
+            raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
         if self._context:
             self.sock = self._context.wrap_socket(plain, server_hostname=self.host)
 
-    def close(self) -> None:
-        super().close()
+    def end(self) -> None:
+        """Close everything; `close` leaves an answer open that ends with the connection."""
+        self.close()
+        self._end_guard()
+
+    def _end_guard(self) -> None:
         if self._guard:
             self._guard.close()
             self._guard = None
