@@ -30,7 +30,7 @@ def made_publisher(tmp_path_factory: pytest.TempPathFactory) -> published.Home:
     home = published.Home(tmp_path_factory.mktemp("publisher"), datetime.now(UTC))
     (home.folder / "fleet.toml").write_text("[robots.r1]\n[robots.r2]\n[robots.r5]\n")
     (home.folder / "policy.xml").write_text(policy_text({"/{robot}/base": publish("x")}))
-    home.run("create_keystore", "ks")
+    home.run("create_keystore", "ks", "--template", "production")
     home.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
     assert home.publish().names("published") == ["r1", "r2", "r5"]
     return home

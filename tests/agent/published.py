@@ -16,6 +16,10 @@ from sros_tool.agent.fetch import FetchError, FetchProblem, fetch_release, pin_r
 from sros_tool.keystore.delivery.publish import PublishedFleet, publish
 from sros_tool.keystore.delivery.release import Release, release_target
 from sros_tool.keystore.delivery.repository import load_signer
+from sros_tool.keystore.issuing.authority import Authority, load_authority
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
+from sros_tool.keystore.layout import PERMISSIONS
+from sros_tool.keystore.reader import Keystore
 from tests.support.harness import Ended, sros
 
 DAY = timedelta(days=1)
@@ -50,12 +54,18 @@ class Home:
         self.now += after
         return publish(self.root, self.pub, now=self.now, **more)
 
-    def robot(self, name: str = "r1") -> Robot:
+    def robot(self, name: str = "r1", pinned_at: datetime | None = None) -> Robot:
         """Return a robot that has pinned the first root, and fetched nothing yet."""
         state = self.folder / f"agent{len([*self.folder.glob('agent*')])}"
         state.mkdir()
-        pin_root(state, (self.pub / "metadata/1.root.json").read_bytes(), now=self.now)
+        root = (self.pub / "metadata/1.root.json").read_bytes()
+        pin_root(state, root, now=pinned_at or self.now)
         return Robot(self, state, name)
+
+    def permissions_ca(self) -> Authority:
+        """Return the permissions CA of the keystore, with its key."""
+        keystore = Keystore(self.root)
+        return load_authority(keystore, PERMISSIONS, keystore.template, IN_KEYSTORE, self.now)
 
     def kept(self, name: str) -> Path:
         """Return a copy of the publishing folder as it is now."""

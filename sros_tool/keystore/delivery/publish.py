@@ -294,24 +294,27 @@ class _Keys:
         self.has_new_root = True
 
     def stage_elsewhere(self) -> None:
-        """Write a new root key that is not in the keystore, next to the one before."""
+        """Write a new root key that is not in the keystore, next to the one that it replaces."""
         if self._new_elsewhere and self._elsewhere:
-            write_new_file(self._beside(self._elsewhere), self._new_elsewhere)
+            exists = self._elsewhere.exists()
+            path = self._next_to(self._elsewhere) if exists else self._elsewhere
+            write_new_file(path, self._new_elsewhere)
 
     def finish(self) -> None:
         """Put a new root key that is elsewhere in its place, and remove the keys of before."""
-        if self._new_elsewhere and self._elsewhere and self._elsewhere.exists():
-            with staged_file(self._elsewhere, self._new_elsewhere) as put_in_place:
-                put_in_place()
+        if self._new_elsewhere and self._elsewhere:
             with Folder(self._elsewhere.parent) as folder:
-                folder.unlink(self._beside(self._elsewhere).name)
+                spare = self._next_to(self._elsewhere).name
+                if folder.state(spare):
+                    folder.replace(spare, self._elsewhere.name)
         with Folder(self._root) as folder:
             for role in _ONLINE:
                 folder.unlink(fleet_key(f"{role}.{_BEFORE}"), missing_ok=True)
 
-    def _beside(self, path: Path) -> Path:
-        """Return where a new root key is until it is in use; the first is there at once."""
-        return path.with_name(f"{path.name}.new") if path.exists() else path
+    @staticmethod
+    def _next_to(path: Path) -> Path:
+        """Return where a new root key is until robots know it."""
+        return path.with_name(f"{path.name}.new")
 
 
 class _Changed(NamedTuple):

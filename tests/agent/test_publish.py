@@ -1,0 +1,420 @@
+"""What home publishes: who gets what, with which keys, and that it is whole at every moment."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import stat
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+
+from sros_tool.agent.fetch import FetchProblem
+from sros_tool.errors import DocumentError, KeystoreError, SrosError
+from sros_tool.folders import Folder
+from sros_tool.keystore.delivery import publish as publishing
+from sros_tool.keystore.delivery.published import (
+    MetadataExpiry,
+    PublishedRelease,
+    read_published,
+)
+from sros_tool.keystore.delivery.release import (
+    Release,
+    pack_release,
+    read_release,
+    seal_problem,
+    seal_releases,
+)
+from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer, read_present
+from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.transaction import recovery
+from tests.agent.published import DAY, Home
+from tests.support.harness import snapshot
+
+
+def archives(publisher: Home) -> dict[str, bytes]:
+    """Return the archives in the publishing folder by the names of robots, the newest of each."""
+    found = {}
+    for path in sorted((publisher.pub / "targets/robots").iterdir(), key=os.path.getmtime):
+        digest, robot = path.name.split(".")[:2]
+        found[robot] = path.read_bytes()
+        assert hashlib.sha256(found[robot]).hexdigest() == digest
+    return found
+
+
+def numbers(publisher: Home) -> dict[str, int]:
+    return {robot: read_release(data).number for robot, data in archives(publisher).items()}
+
+
+# ── who gets what ──────────────────────────────────────────────────────────────────────────
+
+
+def test_only_what_changes_is_published_again(publisher: Home) -> None:
+    before, old = archives(publisher), numbers(publisher)
+    assert not publisher.publish().names("published")
+    publisher.run("renew", "ks", "/r1/base")
+    assert publisher.publish().names("published") == ["r1"]
+    after, new = archives(publisher), numbers(publisher)
+    assert {robot for robot in after if after[robot] != before[robot]} == {"r1"}
+    assert new["r1"] > old["r1"]
+    for file in (publisher.root / "enclaves/r2/base").iterdir():
+        os.utime(file)  # another time, and the same content
+    assert not publisher.publish().names("published")
+    assert archives(publisher) == after
+
+
+def test_no_private_key_is_published(publisher: Home) -> None:
+    publisher.publish(rotate=("timestamp", "root"))
+    secrets = [path.read_bytes() for path in publisher.root.rglob("*.pem") if "key" in path.name]
+    secrets += [path.read_bytes() for path in (publisher.root / "private").glob("fleet_*")]
+    assert len(secrets) == 9
+    bodies = [b"".join(secret.split(b"\n")[1:-2]) for secret in secrets]
+    for path in publisher.pub.rglob("*.json"):
+        assert b"PRIVATE" not in path.read_bytes()
+    for data in archives(publisher).values():
+        for content in read_release(data).files.values():
+            assert b"PRIVATE" not in content
+            assert not any(body in content.replace(b"\n", b"") for body in bodies)
+    for path in (publisher.root / "private").iterdir():
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def test_revoked_robots_lose_their_release_and_others_learn_of_it(publisher: Home) -> None:
+    robot, other = publisher.robot("r1"), publisher.robot("r2")
+    robot.gets()
+    assert "/r2/base" in other.gets().enclaves()
+    publisher.run("revoke", "ks", "--robot", "r1")
+    result = publisher.publish()
+    assert (result.names("removed"), result.names("published")) == (["r1"], ["r2", "r5"])
+    robot.refuses(FetchProblem.NOT_FOR_ROBOT)
+    release = other.gets()
+    assert release.enclaves()["/r2/base"]["crl.pem"]
+    (publisher.folder / "fleet.toml").write_text("[robots.r5]\n")
+    publisher.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    assert publisher.publish().names("removed") == ["r2"]
+    other.refuses(FetchProblem.NOT_FOR_ROBOT)
+    publisher.robot("r5").gets()
+
+
+def test_one_bad_enclave_keeps_no_other_robot_from_a_revocation(publisher: Home) -> None:
+    bad = publisher.root / "enclaves/r1/base/permissions.p7s"
+    kept = bad.read_bytes()
+    publisher.run("revoke", "ks", "--robot", "r5")
+    bad.write_bytes(b"x")
+    before = publisher.robot("r1").gets()
+    result = publisher.publish()
+    assert (result.names("refused"), result.names("published")) == (["r1"], ["r2"])
+    assert publisher.robot("r1").gets() == before
+    assert publisher.robot("r2").gets().enclaves()["/r2/base"]["crl.pem"]
+    bad.write_bytes(kept)
+    assert publisher.publish().names("published") == ["r1"]
+
+
+def test_an_expired_enclave_still_gets_the_revocation_list(publisher: Home) -> None:
+    publisher.run("revoke", "ks", "--robot", "r5")
+    result = publisher.publish(after=200 * DAY)
+    assert result.names("published") == ["r1", "r2"]
+    assert {note.id for note in result.notes} >= {"fleet.release-not-valid"}
+    robot = publisher.robot(pinned_at=publisher.now - 200 * DAY)
+    assert robot.gets().enclaves()["/r1/base"]["crl.pem"]
+
+
+def test_a_private_key_in_a_file_that_would_be_published(publisher: Home) -> None:
+    cert = publisher.root / "enclaves/r1/base/cert.pem"
+    cert.write_bytes(cert.read_bytes() + (cert.parent / "key.pem").read_bytes())
+    result = publisher.publish()
+    assert result.names("refused") == ["r1"]
+    assert b"PRIVATE" not in b"".join(read_release(archives(publisher)["r1"]).files.values())
+
+
+def test_a_dry_run_writes_nothing(publisher: Home) -> None:
+    publisher.run("renew", "ks", "/r1/base")
+    before = snapshot(publisher.folder)
+    assert publisher.publish(dry_run=True).names("published") == ["r1"]
+    assert snapshot(publisher.folder) == before
+    assert publisher.publish().names("published") == ["r1"]
+
+
+def test_the_ledger_has_what_was_published(publisher: Home) -> None:
+    entries = [each for each in Keystore(publisher.root).ledger.entries if each.what == "release"]
+    lines = sorted(
+        f"{hashlib.sha256(data).hexdigest()}  {robot}\n"
+        for robot, data in archives(publisher).items()
+    )
+    (entry,) = entries
+    assert entry.sha256 == hashlib.sha256("".join(lines).encode()).hexdigest()
+    assert numbers(publisher) == dict.fromkeys(("r1", "r2", "r5"), entry.number)
+    assert "release" in publisher.run("inspect", "ks", "--history").out
+
+
+# ── whole at every moment ──────────────────────────────────────────────────────────────────
+
+
+class _Killed(BaseException):
+    pass
+
+
+def test_a_kill_at_any_write_leaves_whole_metadata(
+    made_publisher: Home, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """New releases and new keys of three roles: robots get the old release, or the new one."""
+    put = publishing._put
+    writes = 0
+    for kill in range(100):
+        home = made_publisher.copy(tmp_path / f"at{kill}")
+        home.run("renew", "ks", "/r1/base")
+        robot, count = home.robot(), iter(range(100))
+        old = robot.gets()
+
+        def killed(
+            folder: Folder, path: str, data: bytes, count: object = count, kill: int = kill
+        ) -> None:
+            if next(count) == kill:  # type: ignore[call-overload]
+                raise _Killed
+            put(folder, path, data)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(publishing, "_put", killed)
+            try:
+                home.publish(rotate=("timestamp", "snapshot", "targets", "root"))
+                writes = kill
+            except _Killed:
+                pass
+        then = robot.gets()
+        assert home.robot().gets() == then
+        assert then == old or then.number > old.number
+        home.publish()
+        assert not [*(home.root / "private").glob("*before*")]
+        assert robot.gets() == home.robot().gets() != old
+        shutil.rmtree(home.folder)
+        if writes:
+            break
+    assert writes >= 6
+
+
+def test_a_kill_after_the_keystore_changed_keeps_the_number(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publisher.run("renew", "ks", "/r1/base")
+    with monkeypatch.context() as patched:
+        patched.setattr(publishing._Run, "write", _raise_killed)
+        with pytest.raises(_Killed):
+            publisher.publish()
+    number = read_published(Keystore(publisher.root)).robots["r1"].release.number
+    assert not publisher.publish().names("published")
+    assert publisher.robot().gets().number == number
+
+
+def _raise_killed(*_words: object) -> None:
+    raise _Killed
+
+
+def test_old_files_stay_for_a_while(publisher: Home) -> None:
+    def count() -> int:
+        return len([*publisher.pub.rglob("*.r1.tar.gz")])
+
+    publisher.run("renew", "ks", "/r1/base")
+    publisher.publish(after=10 * DAY)
+    assert count() == 2
+    publisher.publish(after=DAY)
+    assert count() == 2
+    publisher.publish(after=DAY)
+    assert count() == 1
+    assert not [*publisher.pub.rglob("1.snapshot.json")]
+    assert [*publisher.pub.rglob("1.root.json")]
+    publisher.robot().gets()
+
+
+def test_two_at_once(publisher: Home, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recovery, "_LOCK_SECONDS", 0.0)
+    with Folder(publisher.pub) as folder:
+        lock = recovery.KeystoreLock(folder).acquire()
+        try:
+            with pytest.raises(KeystoreError, match="is busy"):
+                publisher.publish()
+        finally:
+            lock.release()
+    publisher.publish()
+
+
+# ── keys and times ─────────────────────────────────────────────────────────────────────────
+
+
+def test_a_root_key_that_is_kept_elsewhere(publisher: Home) -> None:
+    safe = publisher.folder / "safe.pem"
+    (publisher.root / "private/fleet_root.pem").rename(safe)
+    robot = publisher.robot()
+    publisher.publish()
+    for wrong in (None, publisher.root / "private/fleet_targets.pem", publisher.folder / "none"):
+        with pytest.raises(KeystoreError):
+            publisher.publish(rotate=("timestamp",), root_key=wrong)
+    publisher.publish(rotate=("timestamp", "root"), root_key=safe)
+    robot.gets()
+    assert not [*publisher.folder.glob("safe.pem.*")]
+    publisher.publish(rotate=("snapshot",), root_key=safe)
+    robot.gets()
+    assert not (publisher.root / "private/fleet_root.pem").exists()
+
+
+def test_a_first_root_key_that_is_made_elsewhere(publisher: Home) -> None:
+    shutil.rmtree(publisher.pub)
+    for name in ("fleet_root.json", "published.json"):
+        (publisher.root / name).unlink()
+    with pytest.raises(KeystoreError, match=r"no fleet_root\.json"):
+        publisher.publish()
+    for path in (publisher.root / "private").glob("fleet_*"):
+        path.unlink()
+    safe = publisher.folder / "safe.pem"
+    assert publisher.publish(root_key=safe).names("published") == ["r1", "r2", "r5"]
+    assert stat.S_IMODE(safe.stat().st_mode) == 0o600
+    publisher.robot().gets()
+    publisher.publish(rotate=("root",), root_key=safe)
+
+
+def test_a_key_that_was_lost(publisher: Home) -> None:
+    (publisher.root / "private/fleet_snapshot.pem").unlink()
+    with pytest.raises(KeystoreError, match="--rotate-key snapshot"):
+        publisher.publish()
+    publisher.publish(rotate=("snapshot",))
+    publisher.robot().gets()
+
+
+def test_what_is_about_to_expire_is_renewed(publisher: Home) -> None:
+    robot = publisher.robot()
+    publisher.publish(after=DAY)
+    assert publisher.publish(after=DAY).versions["snapshot"] == 1
+    assert publisher.publish(after=2 * DAY).versions["snapshot"] == 2
+    assert publisher.publish(after=50 * DAY).versions["targets"] == 2
+    assert publisher.publish(after=250 * DAY).root.name == "2.root.json"
+    robot.gets()
+    (publisher.root / "private/fleet_root.pem").unlink()
+    notes = publisher.publish(after=250 * DAY).notes
+    assert [note.id for note in notes] == ["fleet.root-expires"]
+    robot.gets()
+    quick = MetadataExpiry(timestamp=timedelta(hours=1))
+    publisher.publish(expiry=quick)
+    robot.refuses(FetchProblem.EXPIRED, now=publisher.now + timedelta(hours=2))
+
+
+# ── folders and keystores that are not what they should be ─────────────────────────────────
+
+
+def test_a_keystore_that_was_restored(publisher: Home) -> None:
+    backup = publisher.folder / "backup"
+    shutil.copytree(publisher.root, backup, symlinks=True)
+    publisher.run("revoke", "ks", "--robot", "r5")
+    publisher.publish()
+    robot = publisher.robot()
+    latest = robot.gets().number
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    with pytest.raises(KeystoreError, match="restored from a backup"):
+        publisher.publish()
+    robot.gets()
+    publisher.run("revoke", "ks", "--robot", "r5")
+    with pytest.raises(KeystoreError, match="--restored"):
+        publisher.publish()
+    publisher.publish(restored=True)
+    assert robot.gets().number > latest
+    assert not publisher.publish().names("published")
+
+
+def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:
+    """Versions go on, and archives come again under later numbers."""
+    robot, before = publisher.robot(), numbers(publisher)
+    publisher.publish(rotate=("timestamp",))
+    robot.gets()
+    shutil.rmtree(publisher.pub)
+    assert publisher.publish().names("published") == ["r1", "r2", "r5"]
+    assert all(number > before[robot] for robot, number in numbers(publisher).items())
+    assert robot.gets() == publisher.robot().gets()
+
+
+def test_the_folder_of_another_keystore(publisher: Home) -> None:
+    for name in ("fleet_root.json", "published.json"):
+        (publisher.root / name).unlink()
+    for path in (publisher.root / "private").glob("fleet_*"):
+        path.unlink()
+    before = snapshot(publisher.folder)
+    with pytest.raises(KeystoreError, match="did not write"):
+        publisher.publish()
+    assert snapshot(publisher.folder) == before
+
+
+def test_damaged_metadata_and_lists_are_said(publisher: Home) -> None:
+    for path in (publisher.pub / "metadata/1.targets.json", publisher.root / "published.json"):
+        kept = path.read_bytes()
+        for damaged in (b"", b"{}", b"[" * 100_000, b'{"robots": [1]}'):
+            path.write_bytes(damaged)
+            with pytest.raises((KeystoreError, DocumentError)):
+                publisher.publish()
+        path.write_bytes(kept)
+    publisher.publish()
+
+
+def test_keystore_and_folder_in_one_another(publisher: Home) -> None:
+    for pub in (publisher.root / "pub", publisher.folder, publisher.root):
+        with pytest.raises(KeystoreError, match="in one another"):
+            publishing.publish(publisher.root, pub, now=publisher.now)
+    assert not (publisher.root / "pub").exists()
+
+
+# ── releases ───────────────────────────────────────────────────────────────────────────────
+
+
+def test_releases_that_are_none(publisher: Home) -> None:
+    authority = publisher.permissions_ca()
+    good = {"enclaves/r1/base/cert.pem": b"x"}
+
+    def read(files: dict[str, bytes], robot: str = "r1") -> Release:
+        (seal,) = seal_releases([(robot, 1, files)], authority)
+        return read_release(pack_release(Release(robot, 1, files, seal)))
+
+    assert seal_problem(read(good), [authority.certificate]) == ""
+    assert seal_problem(read(good), [])
+    for path in (
+        "enclaves/r1/base/key.pem",
+        "enclaves/r1/base/key.p11",
+        "enclaves/../cert.pem",
+        "/enclaves/r1/cert.pem",
+        "private/cert.pem",
+        "enclaves/r1/base/cert.pem/..",
+        "enclavesr1/cert.pem",
+    ):
+        with pytest.raises(DocumentError):
+            read({**good, path: b"x"})
+    for robot in ("", "../r1", "r1\nnumber 9"):
+        with pytest.raises(DocumentError):
+            read(good, robot)
+    for data in (b"", b"x", pack_release(Release("r1", 1, good, b"x"))):
+        with pytest.raises(SrosError):
+            read_release(data)
+
+
+def test_bins_grow_with_the_fleet(publisher: Home) -> None:
+    """Robots accept the lists of ten times as many robots, and names of earlier bins stay."""
+    robot = publisher.robot()
+    robot.gets()
+    keystore = Keystore(publisher.root)
+    roots = Roots(json.loads((publisher.root / "fleet_root.json").read_text())["roots"])
+    private = publisher.root / "private"
+    signers = {
+        role: [load_signer((private / f"fleet_{role}.pem").read_bytes(), role)]
+        for role in ("targets", "snapshot", "timestamp")
+    }
+    releases = {name: each.release for name, each in read_published(keystore).robots.items()}
+    sizes = []
+    for count in (60, 300, 1200, 300):
+        present = read_present(publisher.pub, roots)
+        more = {f"x{number}": PublishedRelease(1, "0" * 64, 1) for number in range(count)}
+        composer = Composer(present, signers, known={}, expiry=MetadataExpiry(), now=publisher.now)
+        for path, data in composer.compose(releases | more).files:
+            (publisher.pub / path).write_bytes(data)
+        now = read_present(publisher.pub, roots)
+        assert now.releases() == releases | more
+        sizes.append(len(now.bins))
+        assert robot.gets()
+    assert sizes == [2, 16, 64, 64]
