@@ -410,12 +410,20 @@ def _blocked(denied: list[str], denied_too: set[str], is_allowed: Meets) -> list
     return [each for each in denied if each not in denied_too and is_allowed(each)]
 
 
+_FEW_PARTS = 20
+"""Parts of new names that are looked for in all names: for more, comparing takes less time."""
+
+
 def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
     """Yield a note on enclaves that Cyclone DDS mistakes for each other.
 
     ``names`` are all enclaves; a pair is reported if one of the two is in ``new``.
     """
     fresh = set(new)
+    # Of two names that are mistaken, one has all parts of the other.
+    parts = {part for name in fresh for part in name.strip("/").split("/")}
+    if len(parts) <= _FEW_PARTS:
+        names = fresh.union(name for name in names if any(part in name for part in parts))
     pairs = [pair for pair in mistaken_names(names) if not fresh.isdisjoint(pair)]
     if pairs:
         yield Note(

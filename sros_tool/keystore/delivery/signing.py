@@ -251,11 +251,8 @@ def certify_requests(
     kept: tuple[str, ...] = ()
     with change:
         if not renew:
-            existing = frozenset(change.names)
             kept = tuple(
-                request.name
-                for request in requests
-                if _is_certified(change.keystore, request, existing)
+                request.name for request in requests if _is_certified(change.keystore, request)
             )
         signer = _Signer(change, domain, stated, replace_keys=replace_keys)
         for request in requests:
@@ -317,9 +314,9 @@ def _check_distinct(requests: Sequence[SigningRequest]) -> None:
             )
 
 
-def _is_certified(keystore: Keystore, request: SigningRequest, existing: Collection[str]) -> bool:
+def _is_certified(keystore: Keystore, request: SigningRequest) -> bool:
     """Return whether the enclave of a request already has a certificate for the request's key."""
-    if request.name not in existing:
+    if not has_enclave(keystore.root, request.name):
         return False
     return keystore.certificate_of(request.name).public_key() == request.public_key
 
@@ -455,7 +452,9 @@ class _Signer:
         """Yield notes on the names of new enclaves that vendors or users may confuse."""
         if not self._new:
             return iter(())
-        return name_notes({*self._change.names, *self._new}, self._new)
+        recorded = self._change.keystore.ledger_file.recorded_enclaves()
+        names = self._change.names if recorded is None else recorded
+        return name_notes({*names, *self._new}, self._new)
 
     def result(
         self,
