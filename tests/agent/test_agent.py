@@ -249,7 +249,8 @@ def test_an_older_release_is_refused_also_without_a_state(home: Home, r1: Robot)
     whole = json.loads(path.read_text())
     damaged: list[object] = [[], None, {**whole, "due": ["x"]}, {**whole, "more": 1}]
     damaged += [{key: whole[key] for key in whole if key != left_out} for left_out in whole]
-    damaged += [{**whole, key: wrong} for key in whole for wrong in ({}, True)]
+    damaged += [{**whole, key: {}} for key in whole]
+    damaged += [{**whole, key: True} for key in whole]
     for value in damaged:
         path.write_text(json.dumps(value))
         assert read_state(r1.folder).accepted == 2, value
