@@ -68,7 +68,7 @@ _MOST_NAMES = 100_000
 """Names in an inbox that are looked at, to name those of no robot of the fleet."""
 _SHOWN = 5
 _FEW = 4
-"""Number of certificates up to which the ledger is searched for each of them."""
+"""Number of certificates up to which a ledger without index is searched for each of them."""
 
 
 # ── what is done with messages and requests ────────────────────────────────────────────────
@@ -426,7 +426,7 @@ class _Verifier:
 
     def _issued(self, sha256: str) -> Entry | None:
         """Return the ledger's entry of a certificate (SHA-256 of its DER), or None."""
-        if self._searched < _FEW:
+        if self._searched < _FEW or self._keystore.ledger_file.is_indexed:
             self._searched += 1
             entries = self._keystore.ledger_with("sha256", sha256).entries
             entry = next((entry for entry in entries if entry.sha256 == sha256), None)
