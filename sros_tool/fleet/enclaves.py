@@ -1,6 +1,6 @@
-"""The enclaves of a robot and the robot of an enclave, by the fleet's path patterns.
+"""Which enclaves a robot has, and which robot an enclave belongs to.
 
-A fleet has the paths of its enclaves with placeholders, so that neither answer needs a list of all
+A fleet has paths of enclaves with placeholders, so that neither answer needs a list of all
 enclaves.
 """
 
@@ -72,7 +72,7 @@ def enclaves_of(fleet: Fleet, robot: Robot) -> tuple[str, ...]:
 
 
 def size_problem(fleet: Fleet) -> str:
-    """Return why the fleet would have too many enclaves, as a sentence; "" if it would not."""
+    """Return why the fleet would have too many enclaves, as a sentence, or ""."""
     if len(fleet.enclaves) > MAX_PATTERNS:
         return f"It has {len(fleet.enclaves)} paths with a placeholder, more than {MAX_PATTERNS}."
     members = {name: len(robots) for name, robots in fleet.groups.items()}
@@ -92,10 +92,10 @@ def robot_of(fleet: Fleet, enclave: str) -> Robot | None:
 
 
 def left_robot_of(fleet: Fleet, enclave: str) -> str:
-    """Return the name of the former owner of an enclave: a robot that left the fleet or its group.
+    """Return the robot that an enclave belonged to before it left the fleet or its group, or "".
 
-    Return "" for an enclave of a robot, and for one whose path names none.  A path with a namespace
-    alone tells only of robots that are still in the fleet.
+    The result is "" for an enclave of a robot, and if its path names no robot.  If a path has only
+    a namespace, only robots that are still in the fleet can be found.
     """
     if robot_of(fleet, enclave):
         return ""
@@ -111,10 +111,10 @@ def left_robot_of(fleet: Fleet, enclave: str) -> str:
 
 
 class Unrecorded(NamedTuple):
-    """Enclaves with a robot's name in their path that match no path pattern of the fleet.
+    """Enclaves whose path has a robot's name, but matches no path pattern of the fleet.
 
-    ``below`` are in a folder that is the robot's alone, such as ``/r3``; ``naming`` have its name
-    as a part of their path elsewhere, such as ``/desk/r3``.
+    ``below`` are in a folder of this robot only, such as ``/r3``; ``naming`` have its name as
+    another part of their path, such as ``/desk/r3``.
     """
 
     below: tuple[str, ...] = ()
@@ -124,7 +124,7 @@ class Unrecorded(NamedTuple):
 def unrecorded_enclaves(
     fleet: Fleet, names: Iterable[str], robots: Collection[str]
 ) -> dict[str, Unrecorded]:
-    """Map each robot to those of the enclaves ``names`` that are `Unrecorded` for it."""
+    """Map each robot to the enclaves, out of ``names``, that are `Unrecorded` for it."""
     folders = _folders(fleet)
     below: dict[str, list[str]] = {robot: [] for robot in robots}
     naming: dict[str, list[str]] = {robot: [] for robot in robots}
@@ -142,7 +142,7 @@ def unrecorded_enclaves(
 
 
 def _upwards(name: str) -> Iterator[str]:
-    """Yield an enclave's path and the folders that it is in, up to the root, which is left out."""
+    """Yield the path of an enclave and of the folders above it, without the root."""
     while name:
         yield name
         name = name.rpartition("/")[0]
@@ -156,7 +156,7 @@ def folders_of_robots(fleet: Fleet, robots: Collection[str]) -> tuple[str, ...]:
 def _folders(fleet: Fleet) -> Mapping[str, frozenset[str]]:
     """Map enclave folders of robots, such as ``/r3``, to the names of the robots (usually one).
 
-    They are the paths of the fleet down to the part with the first placeholder.
+    A folder is a path of the fleet up to the part with the first placeholder.
     """
     folders: dict[str, set[str]] = {}
     for begin in dict.fromkeys(_begin(parts_of(path)) for path in fleet.enclaves):
@@ -239,13 +239,12 @@ _SHOWN = 20  # robots that a line names; --json has all
 
 
 def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """Yield lines about enclaves, with lines that differ only in the robot merged into one.
+    """Yield lines about enclaves; lines that differ only in the robot become one line.
 
-    Those that are the same but for the name and namespace of the robot become one line, with
-    placeholders in place of them, and the robots behind it.
+    That line has placeholders for the robot's name and namespace, and lists the robots at its end.
 
     Args:
-        fleet: the robots; without them every line stays as it is.
+        fleet: the robots; None leaves every line as it is.
         lines: pairs of an enclave and a text about it.
     """
     kinds: dict[str, list[tuple[str, str]]] = {}
@@ -283,7 +282,7 @@ def _with_placeholders(text: str, enclave: str, robot: Robot) -> str:
 
 @lru_cache(maxsize=4096)
 def _whole(value: str) -> re.Pattern[str]:
-    """Return a regular expression for ``value`` as a whole name, not as part of a longer name."""
+    """Return a regular expression that matches ``value`` only as a whole name."""
     before = "(?<![A-Za-z0-9_/])" if value.startswith("/") else "(?<![A-Za-z0-9_{])"
     return re.compile(f"{before}{re.escape(value)}(?![A-Za-z0-9_}}])")
 

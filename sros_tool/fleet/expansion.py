@@ -1,4 +1,4 @@
-"""One policy for many robots: its placeholders filled in from a fleet.
+"""One policy for many robots, whose placeholders are filled in from a fleet.
 
 Values are filled into the names of a policy that was read, and every name is checked again by the
 grammar of a policy, so that no value can add an element, a right or a wildcard.
@@ -84,7 +84,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         return len(self._of)
 
     def stated(self, path: str) -> tuple[Enclave, Robot | None]:
-        """Return the unexpanded policy enclave that a path comes from, and the path's robot."""
+        """Return the enclave, with placeholders, that a path comes from, and the path's robot."""
         return self._of[path]
 
     def policy(self) -> Policy:
@@ -94,7 +94,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         return replace(self._policy, enclaves=tuple(self.values()))
 
     def for_one_robot(self) -> Policy:
-        """Return the policy with every enclave expanded for a single robot, the first one."""
+        """Return the policy with every enclave expanded only for the first robot."""
         first: dict[int, str] = {}
         for path, (enclave, _) in self._of.items():
             first.setdefault(id(enclave), path)
@@ -173,7 +173,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         return replace(group, names=tuple(names), lines=tuple(lines))
 
     def _several(self, name: str, written: str, source: Source) -> tuple[str, ...]:
-        """Return the distinct names that a name expands to: a single one, or one per robot."""
+        """Return the different names that a name expands to: one name, or one for each robot."""
         if not has_placeholder(name):
             if name != written and (problem := _name_problem(name)):
                 raise _not_valid(name, problem, source)
@@ -232,17 +232,20 @@ _NAMESPACE = "{namespace"
 
 
 def absolute(policy: Policy) -> Policy:
-    """Return the policy with "/" before every leading ``{namespace}``: names become absolute."""
+    """Return the policy with "/" before each name that begins with ``{namespace}``.
+
+    A namespace begins with "/", so such names are absolute; with the "/" they also look so.
+    """
     return _renamed(policy, lambda name: f"/{name}" if name.startswith(_NAMESPACE) else name)
 
 
 def as_written(text: str) -> str:
-    """Undo `absolute` in a name or a text: return names as a policy file writes them."""
+    """Return names in a text as the policy file has them: the reverse of `absolute`."""
     return text.replace(f"/{_NAMESPACE}", _NAMESPACE)
 
 
 def written(policy: Policy) -> Policy:
-    """Undo `absolute`."""
+    """Return the policy with names as the policy file has them: the reverse of `absolute`."""
     return _renamed(policy, as_written)
 
 
@@ -255,10 +258,10 @@ def _renamed(policy: Policy, change: Callable[[str], str]) -> Policy:
 
 
 def with_placeholders(policy: FleetPolicy, observed: Iterable[Right]) -> frozenset[Right]:
-    """Return observed rights with placeholders for names of robots, in the form of `absolute`.
+    """Return observed rights, in which placeholders replace the names of robots.
 
-    A right that the policy does not state keeps its name.  A right of an enclave that is not in the
-    policy also keeps its enclave.
+    Names have the form of `absolute`.  A right that the policy does not state keeps its name; if
+    the policy does not have its enclave, the right also keeps the enclave.
     """
     expanded: set[Right] = set()
     for path, rights in _by_enclave(observed).items():
@@ -270,7 +273,11 @@ def with_placeholders(policy: FleetPolicy, observed: Iterable[Right]) -> frozens
 
 
 def unobserved_robots(policy: FleetPolicy, observed: Iterable[Right]) -> dict[str, list[str]]:
-    """Map the paths that were observed for some robots to the other robots, in their order."""
+    """Map enclave paths with placeholders to the robots for which they were not observed.
+
+    Only paths that were observed for another robot are included; robots are in the order of the
+    fleet.
+    """
     seen = _by_enclave(observed)
     missing: dict[str, list[str]] = defaultdict(list)
     some = {policy.stated(path)[0].path for path in seen if path in policy}
@@ -316,7 +323,10 @@ def _by_enclave(observed: Iterable[Right]) -> dict[str, list[Right]]:
 
 
 def _stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterator[Right]:
-    """Yield an enclave's observed rights as the policy states them, actions as their parts."""
+    """Yield the observed rights of an enclave as the policy states them.
+
+    A right to an action is yielded as rights to its parts.
+    """
     enclave, robot = policy.stated(path)
     policy[path]  # which has a bounded number of names
     stated = [e for e in policy_rights(absolute(Policy((enclave,)))) if e.qualifier is ALLOW]
@@ -348,7 +358,10 @@ def _stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterat
 
 
 def _names(policy: FleetPolicy, name: str, robot: Robot | None) -> Iterable[str]:
-    """Return the names that a name of `absolute` expands to for a robot."""
+    """Return the names that a name with placeholders stands for, for a robot.
+
+    The name has the form of `absolute`.
+    """
     if not has_placeholder(name):
         return (name,)
     parts = parts_of(as_written(name))
@@ -364,7 +377,7 @@ def _names(policy: FleetPolicy, name: str, robot: Robot | None) -> Iterable[str]
 
 
 def _likely(name: str, robot: Robot | None) -> Iterator[str]:
-    """Yield a robot's name with its namespace and robot name replaced by placeholders."""
+    """Yield forms of a name in which placeholders replace the robot's name or namespace."""
     if robot:
 
         def named(text: str) -> str:

@@ -1,8 +1,8 @@
-"""Files that name the robots of a fleet: TOML, and inventories of Ansible.
+"""Files that name the robots of a fleet: TOML, or inventories of Ansible.
 
-In an inventory, hosts are robots and groups are groups.  Read are static inventories in YAML, and
-the JSON or YAML of ``ansible-inventory --list``.  Source: Ansible's inventory plugin "yaml", and
-"Developing dynamic inventory".
+In an inventory, robots are hosts, and groups of robots are groups.  Static inventories in YAML can
+be read, and the output of ``ansible-inventory --list`` in JSON or YAML.  Source: Ansible's
+inventory plugin "yaml", and "Developing dynamic inventory".
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _VALUES: Mapping[str, Callable[[str], str]] = {
     "renewal": renewal_problem,
     "renewal_grace": grace_problem,
 }
-"""Text settings of a robot, with the function that returns what is wrong with a value."""
+"""Settings of a robot that are text, each with a function that returns why a value is invalid."""
 _OF_GROUP = ("domain", *_VALUES, "crossing")
 _OF_ROBOT = "{robot}"
 """The placeholder for a robot's name in the settings of a group."""
@@ -90,7 +90,7 @@ def read_fleet(path: Path) -> Fleet:
 
 
 def read_connections(path: Path) -> dict[str, str]:
-    """Return the connection settings in an inventory of Ansible (`_connections`); {} for TOML.
+    """Return how Ansible connects to the hosts of an inventory, by key; {} for a TOML file.
 
     Raises:
         SrosError: as `read_fleet`.
@@ -192,7 +192,7 @@ class _Reader:
     def _values(
         self, values: Mapping[str, Any], places: Mapping[str, str], name: str = ""
     ) -> dict[str, Any]:
-        """Check settings and return them; fill the robot's ``name`` into settings of a group."""
+        """Return settings after a check; ``name`` is filled into the settings of a group."""
         checked: dict[str, Any] = {}
         for key, value in values.items():
             if key == "domain":
@@ -525,7 +525,7 @@ class _Inventory:
                 self._groups[group].add(host)
 
     def _known(self, value: Any, at: object) -> dict[str, Any]:
-        """Return the variables that a fleet uses; drop all others."""
+        """Return the variables that a fleet uses; other variables are left out."""
         values = self._mapping(value, at)
         return {key: values[key] for key in (*_VARIABLES.values(), _ROBOT) if key in values}
 

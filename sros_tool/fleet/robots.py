@@ -1,7 +1,7 @@
-"""A fleet and the settings of its robots, with the grammar of each setting.
+"""A fleet, and the settings of its robots, with a check of each setting.
 
-Every value has such a grammar that it can stand in a policy, a command or a path and stay one
-name: no markup, no wildcard, no white space, and "/" only in a namespace.
+The grammar of every value allows it to be one name in a policy, a command or a path: no markup, no
+wildcard, no white space, and "/" only in a namespace.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ _USER = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}\$?", re.ASCII)
 class Robot(NamedTuple):
     """A robot: its ROS namespace, and its network address.
 
-    ``domain`` is its ROS_DOMAIN_ID, or None for every domain of the keystore.  ``address`` is a
-    host name or IP address, ``user`` the account there, or "" for the default of ssh.  ``groups``
-    are sorted.  ``router`` is where sessions and other routers connect to its Zenoh router, as
-    ``HOST:PORT``, or "" if it has none of its own; ``crossing`` are the names that may pass between
-    that router and others, if not all.  ``distribution`` is its distribution of ROS 2, or "" for
-    those of the keystore.  ``renewal`` is `RENEWAL_ALLOWED` if `sros fleet collect` may sign its
-    requests for renewal; ``renewal_grace`` is a duration, such as ``30d``, for which an expired
-    certificate still vouches for such a request, or "" for none.
+    ``domain`` is its ROS_DOMAIN_ID; None stands for every domain of the keystore.  ``address`` is a
+    host name or IP address, ``user`` the account there ("": the default of ssh).  ``groups`` are
+    sorted.  ``router`` is the address (``HOST:PORT``) at which sessions and other routers connect
+    to its Zenoh router, or "" if it has none; ``crossing`` are the names that may pass between that
+    router and others, if not all may.  ``distribution`` is its distribution of ROS 2 ("": those of
+    the keystore).  ``renewal`` is `RENEWAL_ALLOWED` if `sros fleet collect` may sign its requests
+    for renewal; ``renewal_grace`` is a duration, such as ``30d``, for which a certificate is still
+    accepted with such a request after its expiry ("": none).
     """
 
     name: str
@@ -104,16 +104,20 @@ class Fleet:
         ).with_enclaves(enclaves)
 
     def robot(self, name: str) -> Robot:
-        """Return the robot named ``name``; raise `DocumentError` with similar names if none is."""
+        """Return the robot with this name.
+
+        Raises:
+            DocumentError: there is none; the error has similar names.
+        """
         if name in self.robots:
             return self.robots[name]
         raise DocumentError(f"the fleet has no robot {name!r}", remedy=_near(name, self.robots))
 
     def members(self, group: str) -> tuple[Robot, ...]:
-        """Return the robots of a group, or all for "".
+        """Return the robots of a group; "" stands for the whole fleet.
 
         Raises:
-            DocumentError: the fleet has no such group; the error names near ones.
+            DocumentError: the fleet has no such group; the error has similar names.
         """
         if not group:
             return tuple(self.robots.values())
@@ -124,7 +128,10 @@ class Fleet:
         return tuple(self.robots[name] for name in self.groups[group])
 
     def with_enclaves(self, enclaves: Sequence[str]) -> Fleet:
-        """Return the fleet with these enclave paths, and the path of routers if robots have any."""
+        """Return the fleet with these enclave paths.
+
+        The path of routers is added if a robot has a router.
+        """
         of_routers = [self.routers] if any(robot.router for robot in self.robots.values()) else []
         return replace(self, enclaves=tuple(dict.fromkeys((*enclaves, *of_routers))))
 

@@ -56,9 +56,9 @@ def load_fleet(keystore: Keystore) -> Fleet | None:
 
 
 def stated_distributions(keystore: Keystore, enclave: str) -> tuple[str, ...]:
-    """Return the distributions of ROS 2 that an enclave is for, as far as anything says it.
+    """Return the distributions of ROS 2 that an enclave is for; () if nothing states any.
 
-    That is the one of its robot in the fleet, or else those in the settings of the keystore.
+    They are the distribution of its robot in the fleet, or else those in the keystore's settings.
 
     Raises:
         SrosError: the fleet or the settings cannot be read.
@@ -71,9 +71,9 @@ def stated_distributions(keystore: Keystore, enclave: str) -> tuple[str, ...]:
 
 
 def of_several_distributions(keystore: Keystore) -> dict[tuple[str, ...], list[str]]:
-    """Map the distributions of ROS 2, where there are several, to the enclaves that are for them.
+    """Map tuples of several distributions of ROS 2 to the enclaves that are for all of them.
 
-    Enclaves whose settings or fleet cannot be read are left out: that is a finding of the keystore.
+    Enclaves whose settings or fleet cannot be read are left out: another finding reports that.
     """
     enclaves: dict[tuple[str, ...], list[str]] = {}
     for name in keystore.names:
@@ -159,7 +159,7 @@ def enclaves_of_robot(root: Path, fleet: Fleet, robot: Robot) -> tuple[str, ...]
 
 
 class EnclaveDomains(NamedTuple):
-    """The ROS domains of enclaves: the domain of the robot, or else the keystore's domains."""
+    """The ROS domains of enclaves: the domain of their robot, else the keystore's domains."""
 
     keystore: DomainSet
     fleet: Fleet | None = None
@@ -306,7 +306,7 @@ def refuse_stale_domains(
 
 
 def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
-    """Yield notes for robots that lose enclaves, or their Zenoh router, which the keystore has.
+    """Yield a note for each robot that no longer has enclaves, or a router, that the keystore has.
 
     No two robots of ``after`` have an enclave in common, as `write_fleet` makes sure.
     """

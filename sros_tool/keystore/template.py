@@ -283,7 +283,7 @@ def _zenoh(table: _Table) -> ZenohNetwork:
 
 
 def _zenoh_routers(tables: _Table) -> Iterator[ZenohRouter]:
-    """Yield the other routers of a network, each with its enclaves."""
+    """Yield the further routers of a Zenoh network, each with its enclaves."""
     from sros_tool.zenoh.configuration import ZenohRouter
 
     for name in tables.names():

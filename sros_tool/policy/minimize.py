@@ -375,7 +375,7 @@ def _narrowed_enclave(
 def _profile(
     path: str, profile: Profile, kept: Set[Right], pending: dict[Right, Sequence[Right]]
 ) -> Profile:
-    """Return the narrowed profile; remove the replacements that it states from ``pending``."""
+    """Return the narrowed profile, and remove the replacements that it states from ``pending``."""
     said: dict[tuple[str, str, Level | None], dict[tuple[str, Qualifier], None]] = {}
     for group in profile.groups:
         level = group.protect

@@ -90,9 +90,9 @@ _Pieces = tuple[frozenset[str], ...]
 
 
 class _Form:
-    """An expression as pieces, with its positions as the bits of an integer.
+    """An expression as a sequence of pieces; sets of positions are bits of an integer.
 
-    Bit i of a set of positions stands for "the first i pieces matched".
+    Bit i of a set of positions stands for "the first i pieces have matched".
     """
 
     __slots__ = ("_covering", "_letters", "_meeting", "back", "front", "pieces", "starred", "stars")
@@ -459,7 +459,7 @@ def _search(wanted: tuple[str, ...], unwanted: tuple[str, ...], absolute: bool) 
 
 
 class TooManyNames(Exception):  # noqa: N818 - the caller makes an error of it
-    """An expression stands for too many others."""
+    """An expression stands for too many names to list."""
 
 
 def listed(expression: str, most: int) -> list[str]:

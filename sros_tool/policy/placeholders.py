@@ -36,7 +36,7 @@ Parts = tuple[str | Placeholder, ...]
 
 
 def has_placeholder(text: str) -> bool:
-    """Return whether ``text`` contains a brace, which only placeholders use."""
+    """Return whether ``text`` contains a brace, which stands only in placeholders."""
     return "{" in text or "}" in text
 
 
@@ -99,10 +99,10 @@ def sample(parts: Parts) -> str:
 
 
 def check_path(path: Parts) -> None:
-    """Raise unless an enclave path names one enclave, or one enclave for each robot of one group.
+    """Check that an enclave path stands for one enclave, or one for each robot of a group.
 
     Raises:
-        ValueError: it is not; the message is a sentence.
+        ValueError: it does not; the message is a sentence.
     """
     found = placeholders_of(path)
     if plural := next((part for part in found if part.plural), None):
@@ -113,15 +113,15 @@ def check_path(path: Parts) -> None:
 
 
 def check_name(name: Parts, path: Parts, *, several: bool) -> None:
-    """Raise unless all placeholders of a name have a value in the name's enclave.
+    """Check that all placeholders of a name have a value in the name's enclave.
 
     Args:
         name: the name.
         path: the path of the enclave that states it, which `check_path` accepts.
-        several: whether names for each robot can stand in its place.
+        several: whether the name may stand for one name for each robot.
 
     Raises:
-        ValueError: it has another placeholder; the message is a sentence.
+        ValueError: a placeholder has no value; the message is a sentence.
     """
     of_path = placeholders_of(path)
     for placeholder in placeholders_of(name):

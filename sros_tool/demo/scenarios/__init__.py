@@ -110,10 +110,10 @@ _FITTING: Mapping[str, tuple[Role, ...]] = {
     "server": (Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED),
     "party": tuple(Role),
 }
-"""Roles that a claim's key accepts for its party."""
+"""Roles that a party may have, by the key of a claim that names it."""
 
 _NAMED = (Role.SERVER, Role.CLIENT, Role.ACTION_SERVER, Role.ACTION_CLIENT)
-"""Roles whose parties must name their service or action."""
+"""Roles of parties that have to name a service or an action."""
 
 _VARIABLES = (DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY)
 """Environment variables that a party may set; others, such as LD_PRELOAD, could run code."""
@@ -139,9 +139,10 @@ def read_scenario(path: Path) -> Scenario:
 
 
 class _Table(NamedTuple):
-    """A table of a scenario file: its ``kind`` ("party"; "": top level), and its index.
+    """A table of a scenario file.
 
-    ``place`` is the index among the tables of that kind, to find the line for an error.
+    ``kind`` is "party", "row" and so on ("": top level); ``place`` is its index among the tables of
+    this kind, to find the line for an error.
     """
 
     path: Path
@@ -332,7 +333,7 @@ def _claim(table: _Table, key: str, claim: Any, parties: Mapping[str, Party]) ->
 
 
 def _check_controls(table: _Table, claims: Sequence[Claim], controls: Sequence[Claim]) -> None:
-    """Raise unless a row that expects silence also has a claim that something works."""
+    """Raise `DocumentError` if a row expects silence and no claim that something works."""
     happening = [claim for claim in (*claims, *controls) if _happens(claim)]
     for claim in claims:
         heard = claim.relation is Relation.HEARS

@@ -1,8 +1,9 @@
-"""The scenario of all known attacks on DDS; every attack has a control and a row without defence.
+"""The scenario of all known attacks on DDS.
 
-The attacker is the intruder of the row.  A row that expects the attack to fail has a control: the
-same listener must hear the permitted talker at the same time.  A row with ``removed`` shows that
-the same attack succeeds without that defence: an attack that never works would prove nothing.
+The attacker is the intruder of a row.  A row that expects the attack to fail has a control: the
+same listener must hear the permitted talker at the same time.  For each attack there is also a row
+with ``removed``, which shows that the attack succeeds without that defence: an attack that never
+works would prove nothing.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ _UNCONTROLLED = (
 
 
 def _open_to(success: RowStatus, expected: RowStatus) -> tuple[Variant, ...]:
-    """Return variants that expect ``success`` with templates that do not stop the attack."""
+    """Return variants of a row that expect ``success`` if the template does not stop the attack."""
     if expected is RowStatus.REFUSED:
         return (Variant((Condition.UNCONTROLLED,), success, *_UNCONTROLLED),)
     if expected is success or expected is RowStatus.NOT_LET_IN:
@@ -116,7 +117,10 @@ def _tampered(name: str, expected: RowStatus, mechanism: str, victims: KeystoreC
 def _succeeds(
     name: str, attacker: Identity, removed: str, victims: KeystoreChoice | None = None
 ) -> Row:
-    """Return a row in which the listener hears the attacker, whose files are valid."""
+    """Return a row in which the listener hears the attacker, because a defence is removed.
+
+    The files of the attacker are valid.
+    """
     mechanism = "an attacker with valid files is heard"
     return _injection(name, attacker, RowStatus.HEARD, mechanism, removed=removed, victims=victims)
 
@@ -184,7 +188,7 @@ def _discovering(
 
 
 def _on_service(role: Role, identity: Identity, name: str = "") -> Party:
-    """Return a client or server of the service; the attacker's name is not its role."""
+    """Return a client or server of the service; with a ``name``, it is the attacker."""
     return Party(name or role.value, role, identity, SERVICE, intruder=bool(name))
 
 
@@ -479,9 +483,9 @@ def _trespass(
     forge: Forge,
     opened: str,
 ) -> tuple[Row, ...]:
-    """Return rows of an enclave that exceeds its rights, and of one with wide permissions.
+    """Return rows in which an enclave exceeds its rights, and in which its rights are wide enough.
 
-    ``forge`` gives the enclave in that ``part`` the permissions, and ``opened`` says what they
+    ``forge`` gives the enclave of the ``part`` wide permissions, and ``opened`` says what they
     allow.
     """
     given = " that it was not given" if attack.startswith("an enclave ") else ""
@@ -627,7 +631,7 @@ def joining(enclave: str, fault: str) -> Row:
 def revoked_joining(enclave: str, own: bool) -> Row:
     """Return a row that shows whether a revoked enclave can join the others.
 
-    ``own`` says whether the enclave itself has the list that revokes it.
+    ``own`` says whether the enclave itself has the revocation list with its certificate.
     """
     return _discovering(
         f"{enclave}, revoked, joins the other enclaves",

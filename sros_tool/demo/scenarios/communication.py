@@ -43,7 +43,7 @@ TALKER_DENIED = Identity(OWN, "talker without permission")
 
 
 def _refused(name: str, mechanism: str, intruder: Party, rightful: Party) -> Row:
-    """Return a row that refuses a process, while the same program runs in another enclave."""
+    """Return a row with a process that is refused; in another enclave, its program runs."""
     return Row(
         name,
         RowStatus.REFUSED,
@@ -393,7 +393,7 @@ _KINDS = {
     "sign": Undefended(template=forger.signed),
     "encrypt": Undefended(template=forger.encrypted),
 }
-"""Maps protection kinds to their keystores."""
+"""Maps the name of a protection kind to a keystore that has this protection."""
 
 
 def _protected(name: str, kind: str, expected: RowStatus, mechanism: str) -> Row:

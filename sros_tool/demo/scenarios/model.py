@@ -1,7 +1,7 @@
-"""The data model of scenarios: parties, claims about them, rows.
+"""The data model of scenarios: parties, claims about them, and rows.
 
 A row is one line of the table: processes that start together, claims about them, and controls,
-which prove that a silence is not a crash.
+which prove that silence is not caused by a crash.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Role(StrEnum):
     FLOODER = "flooder"
     """A program that opens useless connections to the router."""
     ERASER = "eraser"
-    """A node that takes the nodes of talkers out of the graph of Zenoh."""
+    """A node that removes the nodes of talkers from the graph of Zenoh."""
 
 
 SPEAKING = frozenset({Role.TALKER, Role.RELAY, Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED})
@@ -157,7 +157,7 @@ A `Forge` changes a copy of the scenario's own keystore, `Undefended` changes a 
 
 @dataclass(frozen=True)
 class Identity:
-    """The keystore and enclave a process runs with (without a keystore: unsecured).
+    """The keystore and the enclave that a process runs with; without a keystore it is unsecured.
 
     ``enclave`` is a part of the scenario's cast ("talker") or the name of an enclave
     ("/arm/camera").  ``variables`` replace environment variables of a secured process.  On Zenoh, a
@@ -197,11 +197,11 @@ class Party:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim that ``relation`` holds between ``subject`` and ``talker``, or not (``holds``).
+    """A claim that ``relation`` holds between ``subject`` and ``talker``, or does not (``holds``).
 
     ``denied`` is the denial that must be the reason, a status in `DENIALS`; None: any reason.
-    ``evidence`` is a text that a party of the row must have logged about a process that was not let
-    in ("": none).
+    ``evidence`` is a text that a party of the row must have logged about a process that was refused
+    ("": none).
     """
 
     relation: Relation
