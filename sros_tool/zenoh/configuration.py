@@ -212,7 +212,11 @@ _CONTROL = ',\n "access_control": {\n'
 
 
 def _control(every: Sequence[RenderedRights], *, once: bool) -> str:
-    """Return the access control of a file, with shared rules ``once`` or once for each enclave."""
+    """Return the text of the access control of a file.
+
+    With ``once``, a rule that several enclaves have is written once, otherwise once for each
+    enclave.
+    """
     rules: dict[str, str] = {}
     lines: dict[str, list[str]] = {"rules": [], "subjects": [], "policies": []}
     names = [rights.name for rights in every]
