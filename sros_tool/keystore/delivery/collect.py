@@ -183,12 +183,21 @@ def collect(
     for name in restored:
         fleet.robot(name)
     verifier = _Verifier(keystore, fleet, now, frozenset(restored))
-    taken = list(_read_inbox(inbox, fleet, verifier))
     renewals = _Renewals(keystore, fleet, now)
-    for message in taken:
+    changes: list[FileChange] = []
+    taken: list[_Taken] = []
+    for message in _read_inbox(inbox, fleet, verifier):
         if message.verified:
             message.requests = renewals.judge(message.robot, message.verified)
-    not_signed, notes, changes = _sign(
+        if message.received:
+            path = confirmation_file(message.robot.name)
+            action = "replace" if (root / path).exists() else "create"
+            changes.append(FileChange(action, str(root / path)))
+            if not dry_run:
+                # If this run is killed now, the next one judges the requests of the same message.
+                keep(root, message.received)
+        taken.append(message.without_confirmation())
+    not_signed, notes, signed = _sign(
         root,
         taken,
         now=now,
@@ -196,13 +205,6 @@ def collect(
         keyring=keyring,
         dry_run=dry_run,
     )
-    for message in taken:
-        if message.received:
-            path = confirmation_file(message.robot.name)
-            action = "replace" if (root / path).exists() else "create"
-            changes.append(FileChange(action, str(root / path)))
-            if not dry_run:
-                keep(root, message.received)
     return CollectedInbox(
         root,
         inbox,
@@ -210,7 +212,7 @@ def collect(
         not_signed,
         None,
         dry_run,
-        changes,
+        [*changes, *signed],
         [*_unknown_names(inbox, fleet), *notes],
     )
 
@@ -233,20 +235,33 @@ class _Taken:
     robot: Robot
     outcome: str
     why: str = ""
+    enclave: str = ""
+    sequence: int | None = None
     verified: _Verified | None = None
     received: Received | None = None
     remarks: list[str] = field(default_factory=list)
     requests: list[_Judged] = field(default_factory=list)
 
+    def without_confirmation(self) -> _Taken:
+        """Return the message without what was kept of it: there are thousands of robots."""
+        if self.verified is None:
+            return self
+        return replace(
+            self,
+            enclave=self.verified.enclave,
+            sequence=self.verified.confirmation.sequence,
+            verified=None,
+            received=None,
+        )
+
     def result(self) -> CollectedMessage:
         """Return what was done with the message."""
-        verified = self.verified
         return CollectedMessage(
             self.robot.name,
             self.outcome,
             self.why,
-            verified.enclave if verified else "",
-            verified.confirmation.sequence if verified else None,
+            self.enclave,
+            self.sequence,
             self.remarks,
             [request.result for request in self.requests],
         )
