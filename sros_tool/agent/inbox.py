@@ -40,10 +40,10 @@ def send(
     if not inbox.startswith(("https://", "http://")):
         _write(Path(inbox), robot, message)
         return
-    url = urlsplit(inbox)
-    where = f"{url.path.rstrip('/')}/{quote(robot)}/{MESSAGE_FILE}"
-    what = f"the inbox {url.scheme}://{url.netloc} does not take the message"
+    what = f"the inbox {inbox} does not take the message"
     try:
+        url = urlsplit(inbox)
+        where = f"{url.path.rstrip('/')}/{quote(robot)}/{MESSAGE_FILE}"
         if url.scheme == "https":
             context = ssl.create_default_context(cafile=str(tls_ca) if tls_ca else None)
             if client_certificate:

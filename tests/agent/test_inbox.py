@@ -1,0 +1,85 @@
+"""Messages to an inbox: a server that takes PUT, one that does not, and folders."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from threading import Thread
+
+import pytest
+
+from sros_tool.agent.inbox import send
+from sros_tool.errors import KeystoreError, UnavailableError
+
+
+class Inbox(HTTPServer):
+    """A server that keeps what is put into it, and answers with ``status``."""
+
+    status = 201
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Put)
+        self.kept: dict[str, bytes] = {}
+        self.url = f"http://127.0.0.1:{self.server_port}/inbox/"
+
+
+class Put(BaseHTTPRequestHandler):
+    server: Inbox
+
+    def do_PUT(self) -> None:
+        data = self.rfile.read(int(self.headers["Content-Length"]))
+        self.server.kept[self.path] = data
+        self.send_response(self.server.status)
+        self.send_header("Location", "/elsewhere")
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        """Print nothing."""
+
+
+@pytest.fixture
+def server() -> Iterator[Inbox]:
+    inbox = Inbox()
+    thread = Thread(target=inbox.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    yield inbox
+    inbox.shutdown()
+    thread.join()
+    inbox.server_close()
+
+
+def test_a_server_gets_the_message_of_the_robot(server: Inbox) -> None:
+    send(server.url, "r1", b"first")
+    send(server.url.rstrip("/"), "r1", b"second")
+    assert server.kept == {"/inbox/r1/confirmation.p7s": b"second"}
+
+
+@pytest.mark.parametrize("status", [301, 403, 500])
+def test_a_server_that_does_not_take_it_is_said(status: int, server: Inbox) -> None:
+    """No redirect is followed, which could lead anywhere."""
+    server.status = status
+    with pytest.raises(UnavailableError, match=f"It answers {status} to PUT"):
+        send(server.url, "r1", b"message")
+    assert list(server.kept) == ["/inbox/r1/confirmation.p7s"]
+
+
+@pytest.mark.parametrize("inbox", ["http://127.0.0.1:1/x", "http://[::1", "http://127.0.0.1:x/"])
+def test_a_server_that_is_not_there_is_said(inbox: str) -> None:
+    with pytest.raises(UnavailableError, match="does not take the message"):
+        send(inbox, "r1", b"message")
+
+
+def test_a_folder_gets_the_message_whole_and_no_link_is_followed(tmp_path: Path) -> None:
+    for data in (b"first", b"second"):
+        send(str(tmp_path), "r1", data)
+        assert (tmp_path / "r1/confirmation.p7s").read_bytes() == data
+    assert os.listdir(tmp_path / "r1") == ["confirmation.p7s"]
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "r2").symlink_to("elsewhere")
+    with pytest.raises(KeystoreError, match="is a symbolic link"):
+        send(str(tmp_path), "r2", b"message")
+    with pytest.raises(UnavailableError, match="cannot be written"):
+        send(str(tmp_path / "none"), "r1", b"message")
+    assert not any((tmp_path / "elsewhere").iterdir())
