@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import sqlite3
 import sys
 from collections.abc import Callable
@@ -24,7 +26,7 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.certificates import make_request
 from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import generate_key, load_key
-from tests.support.harness import certificate
+from tests.support.harness import certificate, remains
 
 NOW = datetime.now(UTC) + timedelta(hours=1)
 QUESTIONS = [("enclave", "/a"), ("what", "settings"), ("what", "revocation"), ("enclave", "/none")]
@@ -172,24 +174,27 @@ def test_a_restored_keystore_has_its_own_index(root: Path, tmp_path: Path) -> No
     check_answers(backup)
 
 
-@pytest.mark.parametrize("moment", ["before the index", "in the index"])
+def kill(*_: object) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def kill_within(update: IndexUpdate, connection: sqlite3.Connection) -> None:
+    connection.execute("DELETE FROM buckets")
+    connection.commit()
+    kill()
+
+
+@pytest.mark.parametrize(("method", "killing"), [("save", kill), ("_write", kill_within)])
 def test_a_kill_between_keystore_and_index_is_noticed(
-    moment: str, root: Path, monkeypatch: pytest.MonkeyPatch
+    method: str, killing: Callable[..., None], root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class KilledError(BaseException):
-        pass
-
-    def killed(*_: object) -> None:
-        raise KilledError
-
     before = certificate(root / "enclaves/a/cert.pem").serial_number
-    with monkeypatch.context() as during:
-        if moment == "before the index":
-            during.setattr(IndexUpdate, "save", killed)
-        else:
-            during.setattr(IndexUpdate, "_write", lambda self, connection: killed())
-        with pytest.raises(KilledError):
-            renew(root, ["/a"], now=NOW)
+    process = os.fork()
+    if not process:
+        monkeypatch.setattr(IndexUpdate, method, killing)
+        renew(root, ["/a"], now=NOW)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == -signal.SIGKILL
     assert certificate(root / "enclaves/a/cert.pem").serial_number != before
     assert not is_indexed(root)
     check_answers(root)
@@ -197,6 +202,7 @@ def test_a_kill_between_keystore_and_index_is_noticed(
     assert is_indexed(root)
     check_answers(root)
     assert Keystore(root).ledger.gaps == ()
+    assert remains(root) == [LEDGER_INDEX]
 
 
 @pytest.mark.parametrize("end", [b"{}\n", b""])
