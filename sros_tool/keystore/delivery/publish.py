@@ -171,10 +171,11 @@ def publish(
         run.check_numbers(restored)
         keys = _Keys(run.roots, root, root_key)
         keys.open(rotate, now, run.expiry)
-        if run.changed() or keys.new or keys.has_new_root:
+        changed = run.changed()
+        if changed or keys.new or keys.has_new_root:
             with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
                 run.keystore = change.keystore
-                run.release(change)
+                run.release(changed, change)
                 run.compose(keys)
                 run.stage(change, keys)
                 change.record()
@@ -387,11 +388,15 @@ class _Run:
 
     # ── which robots ───────────────────────────────────────────────────────────────────────
 
-    def changed(self) -> list[_Changed]:
-        """Return the robots that may need a new release; forget those that have no enclaves."""
+    def changed(self, among: Sequence[_Changed] | None = None) -> list[_Changed]:
+        """Return the robots that may need a new release; forget those that have no enclaves.
+
+        Only the robots ``among`` are looked at; None looks at all.
+        """
         root, fleet = self.keystore.root, recorded_fleet(self.keystore)
         found, wanted = [], set()
-        for robot in fleet.robots.values():
+        looked_at = fleet.robots.keys() if among is None else {robot.robot for robot in among}
+        for robot in (fleet.robots[name] for name in looked_at if name in fleet.robots):
             names = [
                 name
                 for name in enclaves_of_robot(root, fleet, robot)
@@ -404,9 +409,11 @@ class _Run:
             before = self.list.robots.get(robot.name)
             if not before or before.files != state or not self._has(robot.name, before.release):
                 found.append(_Changed(robot.name, names, state))
-        for name in self.list.robots.keys() - wanted:
-            del self.list.robots[name]
-        self._removed = sorted(self._there.keys() - wanted)
+        known = self.list.robots.keys() | self._there.keys()
+        gone = (known if among is None else looked_at) - wanted
+        for name in gone:
+            self.list.robots.pop(name, None)
+        self._removed = sorted({*self._removed, *(gone & self._there.keys())})
         return found
 
     def _has(self, robot: str, release: PublishedRelease) -> bool:
@@ -418,9 +425,12 @@ class _Run:
 
     # ── their releases ─────────────────────────────────────────────────────────────────────
 
-    def release(self, change: KeystoreChange) -> None:
-        """Make and write the archives of new releases, which nothing names yet."""
-        changed = self.changed()
+    def release(self, found: Sequence[_Changed], change: KeystoreChange) -> None:
+        """Make and write the archives of new releases, which nothing names yet.
+
+        ``found`` are the robots that seemed changed before the keystore was locked.
+        """
+        changed = self.changed(found)
         number = max(change.ledger.next_number(), self._number + 1)
         authority = None if self._dry_run or not changed else change.permissions
 
