@@ -24,6 +24,7 @@ from tools.steps import CHECKOUT, SetupError, output_of, say
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 EXTRAS = {
     "": "sros_tool.cli.program",
+    "fetch": "tuf.ngclient",
     "fleet": "ansible",
     "pkcs11": "pkcs11",
     "ros": "rclpy",
