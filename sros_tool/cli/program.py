@@ -261,6 +261,7 @@ _PHRASES = {
     "audit": "audit the robot",
     "metrics": "give the metrics",
     "review": "review the change",
+    "agent": "do this for the agent",
     "fleet": "do this for the fleet",
 }
 
