@@ -31,9 +31,9 @@ NO_JSON = {
 }
 READS = {
     "list_enclaves", "inspect", "verify", "diff_policy", "explain", "check", "doctor", "env",
-    "completion", "fleet report", "fleet inventory", "review",
+    "completion", "fleet report", "fleet inventory", "review", "agent status",
 }  # fmt: skip
-RUNS = {"run", "demo"}
+RUNS = {"run", "demo", "agent run"}
 NEW_NAMES = {("create_request", "name")}
 """Arguments that are a name which does not exist yet."""
 GROWS = {
@@ -170,6 +170,9 @@ STATUS: dict[str, tuple[str, str, str]] = {
     "completion": ("bash", NEVER, "powershell"),
 }
 ELSEWHERE = {
+    "agent init": "tests/agent/test_agent_verbs.py",
+    "agent run": "tests/agent/test_agent_verbs.py",
+    "agent status": "tests/agent/test_agent_verbs.py",
     "generate_policy": "tests/graph", "minimize_policy": "tests/policy",
     "audit": "tests/cli/test_audit.py", "doctor": "tests/checks", "run": "tests/runtime",
     "demo": "tests/demo", "fleet publish": "tests/agent", "review": "tests/test_pull_requests.py",
