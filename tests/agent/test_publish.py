@@ -32,7 +32,7 @@ from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer,
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction import recovery
 from tests.agent.published import DAY, Home
-from tests.support.harness import snapshot
+from tests.support.harness import snapshot, sros
 
 
 def archives(publisher: Home) -> dict[str, bytes]:
@@ -272,6 +272,17 @@ def test_a_first_root_key_that_is_made_elsewhere(publisher: Home) -> None:
     assert stat.S_IMODE(safe.stat().st_mode) == 0o600
     publisher.robot().gets()
     publisher.publish(rotate=("root",), root_key=safe)
+
+
+def test_check_knows_the_files_and_who_may_read_the_keys(publisher: Home) -> None:
+    publisher.publish(rotate=("timestamp",))
+    found = sros("check", "ks", "--severity", "note", cwd=publisher.folder)
+    assert "unknown-file" not in found.out and "fleet_" not in found.out
+    (publisher.root / "private/fleet_targets.pem").chmod(0o644)
+    assert "fleet_targets.pem" in sros("check", "ks", cwd=publisher.folder).out
+    (publisher.root / "fleet_roots.json").touch()
+    found = sros("check", "ks", "--severity", "note", cwd=publisher.folder)
+    assert "fleet_roots.json" in found.out
 
 
 def test_a_key_that_was_lost(publisher: Home) -> None:

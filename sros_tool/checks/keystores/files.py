@@ -18,6 +18,7 @@ from sros_tool.keystore.layout import (
     CONFIRMED,
     ENCLAVES,
     FLEET,
+    FLEET_ROOT,
     IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_URI_FILE,
@@ -26,6 +27,7 @@ from sros_tool.keystore.layout import (
     OPTIONAL_FILES,
     PRIVATE,
     PUBLIC,
+    PUBLISHED,
     REQUEST,
     REQUIRED_FILES,
     RETIRED,
@@ -217,7 +219,7 @@ _KNOWN = (
     SEAL,
     "governance.xml",
 )
-_TOP = (SETTINGS, FLEET, LEDGER, LEDGER_HEAD, ROTATION)
+_TOP = (SETTINGS, FLEET, FLEET_ROOT, PUBLISHED, LEDGER, LEDGER_HEAD, ROTATION)
 _KNOWN_ANYWHERE = re.compile(
     r".*\.(?:cert|key|crl)\.pem\Z|.*\.p11\Z|.*\.srl\Z|index\.txt.*|serial.*"
 )
