@@ -412,7 +412,7 @@ def test_renewals_are_signed_in_one_change(home: Home) -> None:
     for name, old in before.items():
         new = home.certificate(name)
         assert new.public_key() == old.public_key() and new != old
-        assert new.not_valid_after_utc > old.not_valid_after_utc
+        assert validity_of(new).not_after > validity_of(old).not_after
     after = (home.root / "enclaves/r1/base/permissions.xml").read_text()
     assert without_times(after) == without_times(rights) and after != rights
     # The agent repeats its request until it has the answer: nothing is signed again.
