@@ -678,8 +678,6 @@ def test_every_public_name_is_needed_by_another_module() -> None:
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     groups = project["entry-points"].values()  # what other programs load
     found -= {each for group in groups for each in group.values()}
-    # The room of the agent is being built.
-    found = {name for name in found if not name.startswith("sros_tool.agent.")}
     assert sorted(found - printed_classes()) == []
 
 

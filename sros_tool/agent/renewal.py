@@ -27,7 +27,7 @@ from sros_tool.xml import read_bytes
 _NEW_KEYS = "new-keys"
 
 
-def is_due(validity: Window, now: datetime) -> bool:
+def _is_due(validity: Window, now: datetime) -> bool:
     """Return whether at most a third of the validity of a certificate is left."""
     return now >= validity.not_after - (validity.not_after - validity.not_before) / 3
 
@@ -73,7 +73,7 @@ def renewals(
         place = enclave_path(folder, name)
         try:
             validity = validity_of(read_certificate(place / CERTIFICATE_FILE))
-            if not is_due(validity, now) or len(requests) == MOST_REQUESTS - 1:
+            if not _is_due(validity, now) or len(requests) == MOST_REQUESTS - 1:
                 continue
             if new_key and (place / KEY_FILE).exists():
                 with_new_keys.append(name)

@@ -201,7 +201,7 @@ class Systemd:
         return done.stdout
 
 
-def due_units(
+def _due_units(
     settings: AgentSettings, due: Sequence[str], routers: Iterable[str], active: Iterable[str]
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield the units to restart and their enclaves, those of Zenoh routers first.
@@ -253,7 +253,7 @@ def restart_units(
     except UnavailableError as error:
         active = frozenset()
         yield str(error)
-    for unit, enclaves in due_units(settings, due, routers, active):
+    for unit, enclaves in _due_units(settings, due, routers, active):
         if broken := [name for name in enclaves if name in unusable]:
             yield f"{unit} is not restarted: {broken[0]} could not start: {unusable[broken[0]]}."
             continue
