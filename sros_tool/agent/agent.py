@@ -503,4 +503,5 @@ def _short(problems: Iterable[str]) -> tuple[str, ...]:
 
 def _sentence(error: SrosError) -> str:
     text = str(error)
-    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")
+    begun = text if text.startswith("http") else text[:1].upper() + text[1:]
+    return begun + ("" if text.endswith(".") else ".")

@@ -634,7 +634,7 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     elif robot.fetches and robot.pending:
         yield "not published yet"
     if robot.restart:
-        yield f"processes of {first_few(robot.restart, _MOST_GROUPS)} run with earlier files"
+        yield f"processes of {first_few(robot.restart, _MOST_GROUPS)} may run with earlier files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"CA files of the stage {robot.stage}"
     if robot.crl_in_force is False and robot.received:

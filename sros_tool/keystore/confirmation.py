@@ -67,7 +67,7 @@ _MOST_CERTIFICATES = 32  # in a file
 _MOST_LIBRARIES, _MOST_UNSEEN = 100, 1_000_000
 _MOST_NUMBER = 2**53 - 1  # what every reader of JSON takes exactly
 MOST_PROBLEMS, LONGEST_PROBLEM = 50, 300
-"""Problems in a confirmation, and characters of a problem."""
+"""Maximum number of problems in a confirmation, and of characters in a problem."""
 MOST_REQUESTS = 500
 """Signing requests in a confirmation; the agent makes further requests in later ones."""
 _LONGEST_REQUEST = 16 * 1024
@@ -88,7 +88,7 @@ class Seen(StrEnum):
     PROCESS = "process"
     """At least one running process has loaded it."""
     INSTALLED = "installed"
-    """It is installed, and no process that could be looked at has loaded it."""
+    """The library is installed, and no process that could be looked at has loaded it."""
 
 
 class RobotLibrary(NamedTuple):

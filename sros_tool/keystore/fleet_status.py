@@ -201,8 +201,8 @@ class RobotStatus:
     pending: tuple[ConfirmedFile, ...]
     """Files that differ from the keystore; empty if the robot sent no confirmation."""
     restart: tuple[str, ...] | None
-    """The robot's enclaves whose processes still run with earlier files, by its last confirmation;
-    null if it does not say it."""
+    """The robot's enclaves whose processes may still run with earlier files, by its last
+    confirmation; null if it does not say it."""
     running: Mapping[str, RunningFiles] | None
     """The files that the processes of each enclave of the robot have loaded, by its last
     confirmation; null if it does not say it."""
@@ -745,7 +745,7 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_restarts_due",
-            "Number of enclaves whose processes still run with earlier files, for robots that "
+            "Number of enclaves whose processes may still run with earlier files, for robots that "
             "say it.",
             tuple(
                 Sample(len(robot.restart), labels)

@@ -408,7 +408,7 @@ def _fleet_row(robot: Json) -> str:
         f"{number} {kind} {state}{f' of {whose}' if whose else ''}{f', {since}' if since else ''}"
         for (kind, state, whose, since), number in differences.items()
     ]
-    due = [f"processes of {name} run with earlier files" for name in robot["restart"] or ()]
+    due = [f"processes of {name} may run with earlier files" for name in robot["restart"] or ()]
     if robot["crl_in_force"] is False and robot["received"]:
         due.append("the revocation list is not in force")
     cells = (
