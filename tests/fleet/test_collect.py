@@ -377,6 +377,15 @@ def test_when_a_message_arrived(home: Home) -> None:
     assert arrived(NOW + 5 * day, NOW + 2 * day) == NOW + 2 * day
 
 
+@pytest.mark.parametrize("seconds", [2**40, -(2**40)])
+def test_a_message_whose_file_has_a_time_of_no_year(home: Home, seconds: int) -> None:
+    os.utime(home.send("r1"), (seconds, seconds))
+    home.send("r2")
+    assert home.outcomes() == {"r1": "kept", "r2": "kept", "r3": "missing"}
+    last = last_confirmation(home.root, "r1")
+    assert last and last.time <= NOW
+
+
 def test_remarks_on_clocks(home: Home) -> None:
     home.send("r1")
     assert home.of("r1").remarks == []
@@ -467,6 +476,16 @@ def test_only_an_enclave_itself_vouches_for_its_new_key(home: Home) -> None:
     assert done.outcome == "renewed" and done.key_sha256 == key_digest(new.public_key())
     assert home.certificate("/r1/arm").public_key() == new.public_key()
     assert key_on_robot(home.root / "enclaves/r1/arm")
+
+
+def test_a_key_that_was_replaced_vouches_for_no_other(home: Home) -> None:
+    """Its certificate is still valid, and a copy of it may be in a backup."""
+    home.send("r1", DUE, requests=(home.request("r1", key=generate_key()),))
+    assert home.of("r1", DUE).requests[0].outcome == "renewed"
+    later = DUE + timedelta(days=95)
+    for key in (generate_key(), home.key("r1", "/r1/base")):
+        why = refused(home, "r1", later, requests=(home.request("r1", key=key),))
+        assert "an earlier one signed the message" in why
 
 
 def test_the_grace_after_expiry(home: Home) -> None:

@@ -67,6 +67,7 @@ from sros_tool.wording import counted, first_few
 _MOST_NAMES = 100_000
 """Names in an inbox that are looked at, to name those of no robot of the fleet."""
 _SHOWN = 5
+_EARLIEST = datetime.fromtimestamp(0, UTC)
 _FEW = 4
 """Number of certificates up to which a ledger without index is searched for each of them."""
 
@@ -320,7 +321,15 @@ def _read_message(inbox: Folder, robot: str) -> _File | None:
         raise _RefusedError(f"it cannot be read: {os.strerror(error.errno or 0)}") from error
     except KeystoreError as error:  # a link or file in place of the robot's folder
         raise _RefusedError(error.what) from error
-    return _File(data, datetime.fromtimestamp(state.st_mtime, UTC))
+    return _File(data, _time_of_file(state.st_mtime))
+
+
+def _time_of_file(seconds: float) -> datetime:
+    """Return the time in the state of a file; whoever wrote it can set any, also one of no year."""
+    try:
+        return datetime.fromtimestamp(seconds, UTC)
+    except (ValueError, OverflowError, OSError):
+        return datetime.max.replace(tzinfo=UTC) if seconds > 0 else _EARLIEST
 
 
 def _unknown_names(inbox: Path, fleet: Fleet) -> Iterator[Note]:
@@ -555,6 +564,11 @@ class _Renewals:
             raise _RefusedError(
                 f"it has a new key, which only {name} itself can vouch for, and {message.enclave} "
                 "signed the message"
+            )
+        if not same_key and message.certificate.public_key() != present.public_key():
+            raise _RefusedError(
+                f"it has a new key, which only the present key of {name} can vouch for, and an "
+                "earlier one signed the message"
             )
         for certificate in (message.certificate, present):
             self._check_grace(robot, validity_of(certificate))
