@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import ssl
 from pathlib import Path
 from urllib.parse import quote, urlsplit
 
+from sros_tool.agent.connection import GuardedConnection
 from sros_tool.agent.fetch import ClientCertificate
 from sros_tool.errors import UnavailableError
 from sros_tool.files import staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import MESSAGE_FILE
-
-_SECONDS = 30.0
-_MOST_REPLY = 4096
 
 
 def send(
@@ -44,21 +43,17 @@ def send(
     try:
         url = urlsplit(inbox)
         where = f"{url.path.rstrip('/')}/{quote(robot)}/{MESSAGE_FILE}"
+        context = None
         if url.scheme == "https":
             context = ssl.create_default_context(cafile=str(tls_ca) if tls_ca else None)
             if client_certificate:
                 context.load_cert_chain(client_certificate.certificate, client_certificate.key)
-            connection: http.client.HTTPConnection = http.client.HTTPSConnection(
-                url.netloc, timeout=_SECONDS, context=context
-            )
-        else:
-            connection = http.client.HTTPConnection(url.netloc, timeout=_SECONDS)
-        try:
+        port = url.port or (443 if context else 80)
+        with GuardedConnection(url.hostname or "", port, context) as connection:
             connection.request("PUT", where, message, {"Content-Type": "application/pkcs7-mime"})
             reply = connection.getresponse()
-            reply.read(_MOST_REPLY)
-        finally:
-            connection.close()
+            if connection.is_cut_off:  # what came may be a part of the answer
+                raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
     except (OSError, http.client.HTTPException, ValueError) as error:
         raise UnavailableError(what, f"{error}.", "It is tried again at the next run.") from error
     if not 200 <= reply.status < 300:

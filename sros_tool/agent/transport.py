@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import errno
 import http.client
-import socket
 import ssl
-import threading
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -26,14 +23,11 @@ from tuf.api.exceptions import (
 )
 from tuf.ngclient.fetcher import FetcherInterface
 
+from sros_tool.agent.connection import GuardedConnection
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.folders import Folder
 
 _BLOCK = 1 << 16
-_SILENCE = 30.0
-"""Longest wait for the next byte of a server, in seconds."""
-_MOST_SECONDS = 300.0
-"""Longest time in seconds that all files of one visit may take together."""
 
 
 class FolderTransport(FetcherInterface):
@@ -80,7 +74,7 @@ class FolderTransport(FetcherInterface):
 class HttpTransport(FetcherInterface):
     """Gets the files of a publishing folder from a web server, over one connection.
 
-    A context manager: when `_MOST_SECONDS` are over, what still goes on is cut off.
+    A context manager: what still goes on after some minutes is cut off.
     """
 
     def __init__(
@@ -126,12 +120,10 @@ class HttpTransport(FetcherInterface):
         context = ssl.create_default_context(cafile=tls_ca) if secure else None
         if context and certificate:
             context.load_cert_chain(*certificate)
-        self._connection = _GuardedConnection(parts.hostname, port, context)
-        self._timer = threading.Timer(_MOST_SECONDS, self._connection.cut_off)
-        self._timer.daemon = True
+        self._connection = GuardedConnection(parts.hostname, port, context)
 
     def __enter__(self) -> Self:
-        self._timer.start()
+        self._connection.__enter__()
         return self
 
     def __exit__(
@@ -140,8 +132,7 @@ class HttpTransport(FetcherInterface):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._timer.cancel()
-        self._connection.end()
+        self._connection.__exit__(kind, error, trace)
 
     def _fetch(self, url: str) -> Iterator[bytes]:
         path = f"{self._path}{url.removeprefix(self.base)}"
@@ -177,44 +168,6 @@ class HttpTransport(FetcherInterface):
     def _request(self, path: str) -> http.client.HTTPResponse:
         self._connection.request("GET", path, headers={"User-Agent": "sros"})
         return self._connection.getresponse()
-
-
-class _GuardedConnection(http.client.HTTPConnection):
-    """A connection that another thread can cut off at any point, also in its handshake."""
-
-    def __init__(self, host: str, port: int, context: ssl.SSLContext | None) -> None:
-        super().__init__(host, port, timeout=_SILENCE)
-        self._context = context
-        self._guard: socket.socket | None = None
-        self.is_cut_off = False
-
-    def connect(self) -> None:
-        self._end_guard()
-        plain = socket.create_connection((self.host, self.port), _SILENCE)
-        self._guard = plain.dup()
-        self.sock = plain
-        if self.is_cut_off:  # before there was a guard
-            raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
-        if self._context:
-            self.sock = self._context.wrap_socket(plain, server_hostname=self.host)
-
-    def end(self) -> None:
-        """Close everything; `close` leaves an answer open that ends with the connection."""
-        self.close()
-        self._end_guard()
-
-    def _end_guard(self) -> None:
-        if self._guard:
-            self._guard.close()
-            self._guard = None
-
-    def cut_off(self) -> None:
-        """End all reading and writing now."""
-        self.is_cut_off = True
-        guard = self._guard
-        with suppress(OSError):
-            if guard:
-                guard.shutdown(socket.SHUT_RDWR)
 
 
 def _clause(error: Exception) -> str:

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.agent import transport
+from sros_tool.agent import connection
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, pin_root
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.delivery.release import (
@@ -314,7 +314,7 @@ def test_data_that_comes_slowly(
                 raise BrokenPipeError
             self.close_connection = True
 
-    monkeypatch.setattr(transport, "_MOST_SECONDS", 0.3)
+    monkeypatch.setattr(connection, "_MOST_SECONDS", 0.3)
     with serving(partial(Slow, directory=str(publisher.pub))) as address:
         publisher.robot().refuses(FetchProblem.UNREACHABLE, address)
         ended.set()

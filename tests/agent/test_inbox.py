@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import socket
 from collections.abc import Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 
 import pytest
 
+from sros_tool.agent import connection
 from sros_tool.agent.inbox import send
 from sros_tool.errors import KeystoreError, UnavailableError
 
@@ -63,6 +66,31 @@ def test_a_server_that_does_not_take_it_is_said(status: int, server: Inbox) -> N
     with pytest.raises(UnavailableError, match=f"It answers {status} to PUT"):
         send(server.url, "r1", b"message")
     assert list(server.kept) == ["/inbox/r1/confirmation.p7s"]
+
+
+@pytest.mark.parametrize("begin", [b"", b"HTTP/1.1 201 Created\r\nX: "])
+def test_a_server_whose_answer_does_not_end_is_left(
+    begin: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each line comes in time, and there is no end of them."""
+    monkeypatch.setattr(connection, "_MOST_SECONDS", 0.3)
+    again = b"x" if begin else b"HTTP/1.1 100 Continue\r\n\r\n"
+
+    def answer() -> None:
+        taken, _ = listening.accept()
+        with taken, suppress(OSError):
+            taken.sendall(begin)
+            while not ended.wait(0.01):
+                taken.sendall(again)
+
+    ended = Event()
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = Thread(target=answer, daemon=True)
+        thread.start()
+        with pytest.raises(UnavailableError, match="does not take the message"):
+            send(f"http://127.0.0.1:{listening.getsockname()[1]}", "r1", b"message")
+        ended.set()
+        thread.join()
 
 
 @pytest.mark.parametrize("inbox", ["http://127.0.0.1:1/x", "http://[::1", "http://127.0.0.1:x/"])

@@ -1,0 +1,75 @@
+"""A connection to a web server that neither endless nor slow answers keep open for ever."""
+
+from __future__ import annotations
+
+import errno
+import http.client
+import socket
+import ssl
+import threading
+from contextlib import suppress
+from types import TracebackType
+from typing import Self
+
+_MOST_SECONDS = 300.0
+"""Longest time in seconds that all requests of one visit may take together."""
+_SILENCE = 30.0
+"""Longest wait for the next byte of a server, in seconds."""
+
+
+class GuardedConnection(http.client.HTTPConnection):
+    """A connection that is cut off when `_MOST_SECONDS` are over, also in its handshake.
+
+    A context manager: the time begins when it is entered.
+    """
+
+    def __init__(self, host: str, port: int, context: ssl.SSLContext | None) -> None:
+        """Prepare to connect; ``context`` is None for a connection without TLS."""
+        super().__init__(host, port, timeout=_SILENCE)
+        self._context = context
+        self._guard: socket.socket | None = None
+        self._timer = threading.Timer(_MOST_SECONDS, self._cut_off)
+        self._timer.daemon = True
+        self.is_cut_off = False
+
+    def __enter__(self) -> Self:
+        self._timer.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._timer.cancel()
+        self.end()
+
+    def connect(self) -> None:
+        """Connect, and agree on TLS if there is a context."""
+        self._end_guard()
+        plain = socket.create_connection((self.host, self.port), _SILENCE)
+        self._guard = plain.dup()
+        self.sock = plain
+        if self.is_cut_off:  # before there was a guard
+            raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
+        if self._context:
+            self.sock = self._context.wrap_socket(plain, server_hostname=self.host)
+
+    def end(self) -> None:
+        """Close everything; `close` leaves an answer open that ends with the connection."""
+        self.close()
+        self._end_guard()
+
+    def _end_guard(self) -> None:
+        if self._guard:
+            self._guard.close()
+            self._guard = None
+
+    def _cut_off(self) -> None:
+        """End all reading and writing now."""
+        self.is_cut_off = True
+        guard = self._guard
+        with suppress(OSError):
+            if guard:
+                guard.shutdown(socket.SHUT_RDWR)
