@@ -75,7 +75,8 @@ class Installation(NamedTuple):
     kept: Mapping[str, str] = {}
     """Enclaves that kept their files, except perhaps the revocation list, and why, as a clause."""
     latest: datetime | None = None
-    """When the newest certificate or revocation list in the release was made, as it says."""
+    """When the newest certificate or revocation list was made, as it says, of the enclaves that did
+    not keep their files."""
 
 
 @dataclass(slots=True)
@@ -154,7 +155,8 @@ def install_release(
         tuple(name for name in changes if name in enclaves),
         tuple(name for name in removed if name in changes),
         kept,
-        made_at(release),
+        # What is not valid yet proves nothing: the clock at home may have been ahead.
+        _made_at(files for name, files in enclaves.items() if name not in kept),
     )
 
 
@@ -271,8 +273,13 @@ def _newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationL
 
 def made_at(release: Release) -> datetime | None:
     """Return when the newest certificate or revocation list in a release began to be valid."""
+    return _made_at(release.enclaves().values())
+
+
+def _made_at(enclaves: Iterable[Mapping[str, bytes]]) -> datetime | None:
+    """Return when the newest certificate or revocation list of enclaves began to be valid."""
     moments = []
-    for files in release.enclaves().values():
+    for files in enclaves:
         with suppress(SrosError):
             own = load_certificates(files.get(CERTIFICATE_FILE, b""), CERTIFICATE_FILE)
             moments += [validity_of(certificate).not_before for certificate in own]

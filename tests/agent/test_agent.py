@@ -302,10 +302,24 @@ def test_on_a_wrong_clock_nothing_is_installed_that_is_not_valid_then(
     """A clock that was never right: no document tells what has passed."""
     before = content(r1.folder / "enclaves")
     r1.release = home.revoked
-    done = r1.round(datetime(2020, 1, 1, tzinfo=UTC))
-    assert not done.changed and content(r1.folder / "enclaves") == before
-    assert any("not valid" in problem or "not yet valid" in problem for problem in done.problems)
+    for _ in range(2):
+        done = r1.round(datetime(2020, 1, 1, tzinfo=UTC))
+        assert not done.changed and content(r1.folder / "enclaves") == before
+        assert any("not valid before" in problem for problem in done.problems)
     assert r1.round().changed == NAMES
+
+
+def test_a_clock_at_home_that_was_ahead_locks_no_robot_out(home: Home, r1: Robot) -> None:
+    """What is not valid yet proves no time, by which all that is published would have expired."""
+    r1.release = home.revoked
+    early = validity_of(read_certificate(r1.folder / "enclaves/r1/b/cert.pem")).not_before
+    done = r1.round(early + timedelta(minutes=5))
+    assert any("/r1/a keeps its files" in problem for problem in done.problems)
+    assert done.changed, "the revocation list"
+    latest = read_state(r1.folder).latest
+    assert latest and latest <= early + timedelta(minutes=5)
+    assert r1.round(early + timedelta(minutes=6)).changed == ()
+    assert r1.round().changed == ("/r1/a",)
 
 
 # ── restarts ───────────────────────────────────────────────────────────────────────────────
