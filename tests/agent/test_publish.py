@@ -325,6 +325,11 @@ def test_a_keystore_that_was_restored(publisher: Home) -> None:
     with pytest.raises(KeystoreError, match="restored from a backup"):
         publisher.publish()
     robot.gets()
+    # What a timer renews meanwhile has the numbers of what came after the backup.
+    publisher.run("renew", "ks", "--all")
+    assert Keystore(publisher.root).ledger.next_number() > latest
+    with pytest.raises(KeystoreError, match="restored from a backup"):
+        publisher.publish()
     publisher.run("revoke", "ks", "--robot", "r5")
     with pytest.raises(KeystoreError, match="--restored"):
         publisher.publish()
