@@ -234,6 +234,13 @@ class RobotStatus:
         """
         return self.others.naming
 
+    @property
+    def heard(self) -> datetime | None:
+        """When the robot was certainly there last; None if it sent no confirmation."""
+        if self.fetches and self.received and self.clock:
+            return min(self.received, self.clock)
+        return self.received
+
     def offline(self) -> RobotStatus:
         """Return the status after nothing was heard of the robot for too long."""
         state = max(self.state, State.OFFLINE, key=_BADNESS.__getitem__)
@@ -277,15 +284,16 @@ class FleetStatus:
         """Return a copy in which the robots that were not heard of for too long are offline.
 
         These are the robots whose last confirmation is older than ``max_age``; without it, the
-        robots that fetch and were not heard of for more than a day.
+        robots that fetch and were not heard of for more than a day.  Messages of robots that fetch
+        are also as old as they say themselves: whoever has the inbox could hold them back.
         """
         late = frozenset(
             robot.robot
             for robot in self.robots
             if robot.enclaves
-            and robot.received
+            and (heard := robot.heard)
             and (max_age or robot.fetches)
-            and now - robot.received > (max_age or _LONGEST_SILENCE)
+            and now - heard > (max_age or _LONGEST_SILENCE)
         )
         robots = (robot.offline() if robot.robot in late else robot for robot in self.robots)
         return replace(self, robots=tuple(robots), overdue=late)

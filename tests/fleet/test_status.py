@@ -348,6 +348,20 @@ def test_a_robot_that_fetches_is_offline_after_a_day(field: Field) -> None:
     assert field.states()["r2"] == "offline" and field.pending("r2")["certificate"][0] == "earlier"
 
 
+def test_messages_that_were_held_back_are_as_old_as_they_say(field: Field) -> None:
+    """Whoever has the inbox could hand out one of them each day, long after the robot is gone."""
+    hours, now = timedelta(hours=1), datetime.now(UTC).replace(microsecond=0)
+    field.send("r1", time=now - 23 * hours)
+    assert field.states()["r1"] == "current"
+    field.send("r1", time=now - 25 * hours)
+    found = field.status()
+    assert (found["overdue"], found["robots"]["r1"]["state"]) == (["r1"], "offline")
+    field.run("fleet", "status", "ks", "--max-age", "7d")
+    field.confirm("r2", time=iso(now - 25 * hours))
+    field.send("r1", time=now + 25 * hours)
+    assert field.states() == dict.fromkeys(ROBOTS, "current")
+
+
 def test_a_rotation_waits_for_robots_that_are_offline(field: Field) -> None:
     field.run("rotate_ca", "ks", "--next")
     field.deliver(*ROBOTS)
