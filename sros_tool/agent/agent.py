@@ -190,7 +190,7 @@ class _Round:
 
     def _clock(self) -> RobotClock:
         now, latest = self._machine.now, self._state.latest
-        if latest and now < latest - _TOLERANCE:
+        if latest and now + _TOLERANCE < latest:
             self._problems.append(
                 f"The clock shows {iso(now)}, but documents that this robot verified were made at "
                 f"{iso(latest)}: it is at least {elapsed(latest - now)} behind. Nothing is "

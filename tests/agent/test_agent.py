@@ -256,6 +256,7 @@ def test_an_older_release_is_refused_also_without_a_state(home: Home, r1: Robot)
         assert read_state(r1.folder).accepted == 2, value
     path.write_text("damaged")
     assert read_state(r1.folder).accepted == 2
+    path.write_text(json.dumps({**whole, "latest": "0001-01-01T00:00:00Z"}))
     r1.release = home.first
     done = r1.round()
     assert any("older than release 2" in problem for problem in done.problems)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import json
 import os
 import shutil
 import stat
+import tarfile
 from datetime import timedelta
 from pathlib import Path
 
@@ -405,7 +407,10 @@ def test_releases_that_are_none(publisher: Home) -> None:
     for robot in ("", "../r1", "r1\nnumber 9"):
         with pytest.raises(DocumentError):
             read(good, robot)
-    for data in (b"", b"x", pack_release(Release("r1", 1, good, b"x"))):
+    headers = tarfile.TarInfo("x")
+    headers.type, headers.size = tarfile.GNUTYPE_LONGNAME, 2
+    nested = gzip.compress((headers.tobuf() + bytes(512)) * 5000)  # each names the next one
+    for data in (b"", b"x", nested, pack_release(Release("r1", 1, good, b"x"))):
         with pytest.raises(SrosError):
             read_release(data)
 

@@ -87,7 +87,15 @@ def unpack(data: bytes, limits: ArchiveLimits = _OF_ONE_ENCLAVE) -> dict[str, by
     try:
         with tarfile.open(fileobj=io.BytesIO(_unzip(data, limits)), mode="r:") as tar:
             return dict(_members(tar, limits.members))
-    except (tarfile.TarError, zlib.error, EOFError, OSError, ValueError, OverflowError) as error:
+    except (
+        tarfile.TarError,
+        zlib.error,
+        EOFError,
+        OSError,
+        ValueError,
+        OverflowError,
+        RecursionError,
+    ) as error:
         raise DocumentError("it is not a .tar.gz archive, or it is damaged") from error
 
 
