@@ -10,11 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from cryptography import x509
 
-from sros_tool.errors import DocumentError
+from sros_tool.errors import DocumentError, KeystoreError
 from sros_tool.keystore.confirmation import (
     MAX_BYTES,
     MESSAGE_FILE,
@@ -22,12 +24,16 @@ from sros_tool.keystore.confirmation import (
     last_confirmation,
     render_confirmation,
 )
+from sros_tool.keystore.delivery import collect as collecting
 from sros_tool.keystore.delivery.collect import (
     CollectedInbox,
     CollectedMessage,
+    CollectedRequest,
+    _Judged,
     collect,
 )
 from sros_tool.keystore.delivery.published import read_published
+from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import key_on_robot
 from sros_tool.keystore.reader import Keystore, read_certificate
 from sros_tool.pki import smime
@@ -503,6 +509,32 @@ def test_one_request_that_cannot_be_signed_stops_no_other(home: Home) -> None:
     home.send("r2", DUE, requests=(home.request("r2"),))
     found = home.collect(DUE)
     assert [robot.requests[0].outcome for robot in found.robots[:2]] == ["refused", "renewed"]
+
+
+def test_one_request_that_cannot_be_signed_does_not_make_as_many_changes_as_robots(
+    home: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[list[str]] = []
+
+    def certify(*_: object, only: list[str], **_more: object) -> SimpleNamespace:
+        tried.append(only)
+        if "/r33/base" in only:
+            raise KeystoreError("it is the key of another enclave")
+        return SimpleNamespace(notes=(), changes=())
+
+    monkeypatch.setattr(collecting, "certify_requests", certify)
+    taken: list[Any] = []
+    for number in range(64):
+        request: Any = SimpleNamespace(pem=b"", name=f"/r{number}/base")
+        judged = _Judged(CollectedRequest(request.name, "", "renewed", ""), request)
+        taken.append(SimpleNamespace(requests=[judged]))
+    collecting._sign(
+        home.root, taken, now=DUE, allow_refusal=(), keyring=IN_KEYSTORE, dry_run=False
+    )
+    outcomes = [message.requests[0].result.outcome for message in taken]
+    assert outcomes == ["refused" if number == 33 else "renewed" for number in range(64)]
+    signed = [only for only in tried if "/r33/base" not in only]
+    assert sum(map(len, signed)) == 63 and len(tried) == 13
 
 
 def test_cas_that_cannot_sign(home: Home) -> None:

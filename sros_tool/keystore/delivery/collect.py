@@ -11,7 +11,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -613,7 +613,8 @@ def _sign(
 ) -> tuple[str, list[Note], list[FileChange]]:
     """Sign the requests that may be signed, all in one change of the keystore if that is possible.
 
-    Otherwise those of each robot are a change of their own, so that one robot stops no other.
+    Otherwise it is tried with half of the robots each time, so that one robot neither stops nor
+    slows down the others.
     Return why the CAs cannot sign ("" if they can), the notes, and the files that changed.
     """
     by_robot = [[request for request in message.requests if request.request] for message in taken]
@@ -621,50 +622,45 @@ def _sign(
     notes: list[Note] = []
     changes: list[FileChange] = []
 
-    def sign(judged: Sequence[_Judged]) -> None:
-        requests = [request.request for request in judged if request.request]
-        signed = certify_requests(
-            root,
-            b"".join(request.pem for request in requests),
-            now=now,
-            only=[request.name for request in requests],
-            renew=True,
-            replace_keys=True,
-            allow_refusal=allow_refusal,
-            keyring=keyring,
-            dry_run=dry_run,
-        )
+    def sign(robots: Sequence[Sequence[_Judged]]) -> SrosError | None:
+        """Sign the requests of robots; return the error if that fails."""
+        requests = [request.request for judged in robots for request in judged if request.request]
+        try:
+            signed = certify_requests(
+                root,
+                b"".join(request.pem for request in requests),
+                now=now,
+                only=[request.name for request in requests],
+                renew=True,
+                replace_keys=True,
+                allow_refusal=allow_refusal,
+                keyring=keyring,
+                dry_run=dry_run,
+            )
+        except SrosError as error:
+            return error
         notes.extend(signed.notes)
         changes.extend(changes_below(root, signed.changes))
+        return None
+
+    def sign_parts(robots: Sequence[Sequence[_Judged]], error: SrosError | None) -> None:
+        if error and len(robots) > 1:
+            middle = len(robots) // 2
+            for part in (robots[:middle], robots[middle:]):
+                sign_parts(part, sign(part))
+        elif error:
+            for request in robots[0]:
+                request.done("refused", error.what)
 
     if not by_robot:
         return "", notes, changes
-    everything = [request for requests in by_robot for request in requests]
-    try:
-        sign(everything)
-    except SrosError as joint:
-        if problem := _cannot_sign(root, now, keyring):
-            for request in everything:
-                request.done("not_signed", problem)
-            return problem, notes, changes
-        for requests in by_robot:
-            error: SrosError | None = joint
-            if len(by_robot) > 1:
-                error = _failure(sign, requests)
-            for request in requests if error else ():
-                request.done("refused", error.what if error else "")
+    joint = sign(by_robot)
+    if joint and (problem := _cannot_sign(root, now, keyring)):
+        for request in (request for judged in by_robot for request in judged):
+            request.done("not_signed", problem)
+        return problem, notes, changes
+    sign_parts(by_robot, joint)
     return "", notes, changes
-
-
-def _failure(
-    sign: Callable[[Sequence[_Judged]], None], requests: Sequence[_Judged]
-) -> SrosError | None:
-    """Sign the requests of a robot; return the error if that fails."""
-    try:
-        sign(requests)
-    except SrosError as error:
-        return error
-    return None
 
 
 def _cannot_sign(root: Path, now: datetime, keyring: Keyring) -> str:
