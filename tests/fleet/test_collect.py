@@ -57,7 +57,7 @@ NOW = datetime.now(UTC).replace(microsecond=0) + timedelta(days=1)
 """After everything that the tests make, however long they take."""
 DUE = NOW + timedelta(days=150)
 """More than half of the validity of permissions (180 days) is over."""
-LATE = NOW + timedelta(days=365 + 10)
+LATE = NOW + timedelta(days=365 + 9, hours=12)
 """Certificates (365 days) expired ten days ago."""
 
 
