@@ -50,6 +50,15 @@ class Window:
         """Return whether ``moment`` is within the window."""
         return self.not_before <= moment <= self.not_after
 
+    def life(self) -> timedelta:
+        """Return how long a document with this validity is valid from when it was made.
+
+        A validity begins `BACKDATE` before that; a shorter one was not made by sros, and begins
+        when the document was made.
+        """
+        length = self.not_after - self.not_before
+        return length - BACKDATE if length > BACKDATE else length
+
     def within(self, outer: Window) -> Window:
         """Return the part of this window that is in ``outer``."""
         return Window(max(self.not_before, outer.not_before), min(self.not_after, outer.not_after))

@@ -48,6 +48,11 @@ WRITING = (
     "rotate_ca {k} --same-key",
     "sign_request {k} {w}/request.pem -o {w}/answer.tar.gz",
 )
+NOT_NEEDED = {
+    ("renew {k} /b", "enclaves/a/key.pem"),
+    ("renew {k} /b", "enclaves/a/permissions.p7s"),
+}
+"""What the renewal of one enclave does not look at: key and permissions of another one."""
 READING = (
     "list_enclaves {k}",
     "check {k}",
@@ -129,6 +134,8 @@ def test_a_verb_that_writes_refuses_what_it_cannot_read(
     sros(*words(verb, spare)).ok()
     before = snapshot(place)
     for part in PARTS:
+        if (verb, part) in NOT_NEEDED:
+            continue
         with closed(place / "ks" / part):
             ended = as_owner(verb, place)
         assert ended.status == 2, (part, ended)

@@ -58,6 +58,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.crl import last_update, list_number, next_update, read_lists, signed_by
 from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem, load_key
 from sros_tool.validity import iso
+from sros_tool.wording import enumerated
 
 _OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
 _OF_ENCLAVE = (*sorted(RELEASE_FILES), *KEY_FILES, REQUEST, SEAL)
@@ -199,7 +200,17 @@ def _check_release(
         raise KeystoreError(
             f"release {release.number} comes from another keystore",
             f"No permissions CA that '{folder}' trusts has sealed it: {problem.rstrip('.')}.",
-            "Nothing was changed. Find out who can write to the publishing folder.",
+            "Nothing was changed. If this robot missed a stage of a CA rotation, bring its files "
+            f"by `sros distribute_key KEYSTORE --robot {robot} FOLDER --force`; if not, find out "
+            "who can write to the publishing folder.",
+        )
+    if present and not {*present} & release.enclaves().keys():
+        raise KeystoreError(
+            f"the release of robot {robot} has no enclave that is here",
+            f"'{folder}' has {enumerated(present)}, the release has "
+            f"{enumerated(sorted(release.enclaves()))}. Installing it would remove every key here. "
+            "Nothing was changed.",
+            "See whether this robot has the right name (`sros agent init --robot`).",
         )
     if release.number < installed:
         raise KeystoreError(

@@ -28,8 +28,8 @@ _NEW_KEYS = "new-keys"
 
 
 def _is_due(validity: Window, now: datetime) -> bool:
-    """Return whether at most a third of the validity of a certificate is left."""
-    return now >= validity.not_after - (validity.not_after - validity.not_before) / 3
+    """Return whether at most a third of the life of a certificate is left."""
+    return now >= validity.not_after - validity.life() / 3
 
 
 def enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:

@@ -111,7 +111,11 @@ class FindingFilter:
 
 
 class ChosenFindings(NamedTuple):
-    """The shown findings, the accepted ones that are not shown, and the number of hidden ones."""
+    """The findings to show, and those that are left out.
+
+    ``accepted`` are left out because the keystore accepts the weakness; ``hidden`` is the
+    number of those left out because their severity is too low.
+    """
 
     shown: tuple[Finding, ...]
     accepted: tuple[Finding, ...]

@@ -122,7 +122,7 @@ DENY_IN_WILDCARD = FindingKind(
 DENY_OVERRULED = FindingKind(
     "zenoh.deny-overruled",
     ERROR,
-    "a denial that another subject overrules",
+    "a denial without effect, because another subject of the access control allows the name",
     "Where a process matches two subjects, it is enough that one of them allows a message.",
     "Zenoh 1.6.2 and 1.10.2, measured.",
     "Use one subject for each name, and rules that allow.",

@@ -165,7 +165,7 @@ _VENDORS = (*(vendor.value for vendor in MEASURED), _ZENOH)
 )
 @distro_option(
     "Report only findings for the nodes and the DDS of this ROS 2 distribution, such as lyrical. "
-    "[default: those of the keystore's settings; $ROS_DISTRO for the nodes in policies]"
+    "[default: the distributions in the keystore's settings; $ROS_DISTRO for nodes in policies]"
 )
 @all_distros_option("Report the findings for all supported distributions of ROS 2.")
 @distro_option(

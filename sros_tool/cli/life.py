@@ -247,7 +247,7 @@ def crl(
     """
     from datetime import timedelta
 
-    from sros_tool.keystore.layout import list_enclaves
+    from sros_tool.keystore.layout import PUBLIC, list_enclaves
     from sros_tool.keystore.lifecycle.revoke import refresh_crl
     from sros_tool.keystore.reader import Keystore
 
@@ -263,6 +263,12 @@ def crl(
         print_follow_up(result, restart=not dry_run)
     keystore = Keystore(root)
     lists = keystore.revocation_lists
+    if not (lists or (root / PUBLIC).is_dir()):
+        raise UsageError(
+            f"'{root}' is an export, which has no CAs",
+            "The revocation list is in the folder of each enclave.",
+            f"Look at it: `sros inspect {quote(str(root / 'enclaves'))}/ENCLAVE/crl.pem`.",
+        )
     soon = bool(lists) and min(revoked.next_update for revoked in lists) - now() < timedelta(
         days=30
     )

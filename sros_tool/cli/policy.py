@@ -331,7 +331,7 @@ class _SeveralObserved(SeveralValues):
 @click.option(
     "--strict",
     is_flag=True,
-    help="Also remove unused rights that every node needs (common/node.xml).",
+    help="Also remove the standard rights of nodes (common/node.xml) that were not seen in use.",
 )
 @force_option
 @dry_run_option

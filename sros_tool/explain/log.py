@@ -233,7 +233,8 @@ def explain_log(
     """Return the security messages of a log, each once, in the order of the log.
 
     ``find`` loads an enclave; ``context`` returns domain and time for it.  ``root`` is the path of
-    the keystore in commands; ``keystore`` is searched for the enclaves of peers and nodes.
+    the keystore as suggested commands name it.  The enclaves of peers and nodes in the log are
+    looked up in ``keystore``.
     """
     plain = plain_text(text)
     examiner = _Examiner(find, context, root, keystore)

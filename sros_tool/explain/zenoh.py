@@ -156,7 +156,7 @@ class ZenohAnswer:
     text: str
     checks: tuple[Check, ...] = ()
     reached: tuple[Reached, ...] = ()
-    """The enclaves that have the right at the other end."""
+    """The enclaves with the matching right, such as to subscribe to what this one publishes."""
     wildcards: tuple[DecidingWildcard, ...] = ()
     """Key expressions with wildcards that decide."""
     until: datetime | None = None

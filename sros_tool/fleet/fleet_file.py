@@ -431,7 +431,9 @@ def _load_yaml(data: bytes, what: str) -> Any:
     except (yaml.YAMLError, ValueError) as error:
         why = " ".join(str(error).split())
         raise DocumentError(
-            f"{what} is not valid YAML of plain values", f"{why}.", _WRITE_OUT
+            f"{what} is not valid YAML with only text, numbers, lists and mappings",
+            f"{why}.",
+            _WRITE_OUT,
         ) from error
 
 

@@ -294,7 +294,10 @@ def mismatch(old: Governance, new: Governance) -> Mismatch:
 
 
 def compare_settings(old: Template, new: Template, now: datetime) -> tuple[SettingChange, ...]:
-    """Return the changes between two settings of a keystore, without protection and names."""
+    """Return the changes between two settings of a keystore.
+
+    Changes of the protection of topics and of the names of CAs are not among them.
+    """
     return tuple(_settings_changes(old, new, now))
 
 

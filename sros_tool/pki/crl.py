@@ -447,9 +447,10 @@ def _best(
 def _issuer(
     chain: Sequence[x509.Certificate], crl: x509.CertificateRevocationList
 ) -> x509.Certificate | None:
-    """Return the CA in the chain that issued the list, or None (crl_akid_check).
+    """Return the CA in ``chain`` that issued the revocation list, or None.
 
-    The list has the name of the certificate's issuer.
+    Returns None, too, if the issuer's name in the list is not that of the issuer of ``chain[0]``.
+    As crl_akid_check in OpenSSL.
     """
     if not same_name(crl.issuer, chain[0].issuer):
         return None

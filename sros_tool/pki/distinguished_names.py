@@ -89,8 +89,8 @@ def reading(what: str, why: str, remedy: str = "") -> Iterator[None]:
     """Turn all errors of `cryptography` in the ``with`` block into a `PkiError` with these texts.
 
     For a damaged or hostile document it raises errors of more than ten classes, most of them at the
-    first use of a part (``subject``, ``extensions``, ``public_key()``).  So the block also uses
-    each part that is used later.
+    first use of a part (``subject``, ``extensions``, ``public_key()``).  So use each part that is
+    needed later inside the block.
     """
     try:
         yield

@@ -38,7 +38,10 @@ def states_routers(side: AccessSource) -> bool:
 def more_crossing(
     old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield changes of settings and fleet by which more names cross in ``new`` than in ``old``."""
+    """Yield the changes of settings and fleet file that let more names pass between Zenoh routers.
+
+    More names pass in ``new`` than in ``old``.
+    """
     before, after = _network(old, new), _network(new, old)
     if before is None or not _limited(before):
         return

@@ -730,7 +730,11 @@ class _Stated:
         domain: int,
         limit: SearchLimit,
     ) -> Iterator[Gain]:
-        """Yield a gain for each right that states some of the topics ``more``, and for the rest."""
+        """Yield the access that an enclave gains to the topics ``more``.
+
+        That is one `Gain` for each right of the policy that covers some of these topics, and one
+        for the topics that no right covers.
+        """
         lenders = world.lenders(self._new, enclave)
         key = enclave, lenders, verb, more, world.style, world.longest  # often in several domains
         if key not in self._found:

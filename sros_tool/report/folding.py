@@ -177,7 +177,10 @@ class _Draft:
         self._find_words()
 
     def _find_words(self) -> None:
-        """Find the words that are names of units, and the unit of each enclave.
+        """Find where the names of units stand in texts, and the unit of each enclave.
+
+        A unit is a robot, or one of several namespaces that look alike; equal units can be folded:
+        they are drawn as one.
 
         An enclave belongs to the unit whose name is in its path, even if it is outside of the
         unit's namespace; it belongs to none if its path has the names of several units.  A unit can

@@ -373,5 +373,9 @@ def example_token(
 
 
 def _any_as(name: str, part: str) -> str:
-    """Return ``part``, a chunk of a token, or ``name`` if the chunk is only a wildcard."""
+    """Return an example of what a chunk of a liveliness token's key expression matches.
+
+    The example is ``name`` if the chunk ``part`` is only a wildcard, else the chunk without its
+    wildcards.
+    """
     return name if part == "*" else part.replace(ANY_PART, "")

@@ -44,6 +44,7 @@ from sros_tool.runtime.processes import (
     RunningProcesses,
     UnseenProcess,
 )
+from sros_tool.validity import BACKDATE, Window
 from tests.agent.releases import NAMES, Home, moment
 from tests.agent.test_install import content, has
 from tests.keystore.test_transaction import DIED, in_child, run_out_of_space
@@ -434,6 +435,13 @@ def test_renewal_is_asked_for_in_the_last_third_of_a_certificate(home: Home, r1:
     assert [request.name for request in requests] == list(NAMES)
     own = read_certificate(r1.folder / "enclaves/r1/a/cert.pem")
     assert requests[0].public_key == own.public_key()
+
+
+def test_the_life_of_a_certificate_begins_when_it_was_made() -> None:
+    """Its validity begins a day earlier, which would be all the life of one for an hour."""
+    made = datetime(2027, 1, 2, tzinfo=UTC)
+    assert Window(made - BACKDATE, made + timedelta(hours=1)).life() == timedelta(hours=1)
+    assert Window(made, made + timedelta(hours=4)).life() == timedelta(hours=4)  # another CA's
 
 
 def test_a_new_key_waits_beside_the_present_one(r1: Robot) -> None:

@@ -162,6 +162,19 @@ def test_a_release_that_is_not_for_here_changes_nothing(name: str, home: Home, r
     ), "the right one is taken"
 
 
+def test_the_release_of_a_robot_with_other_enclaves_takes_no_key(home: Home, robot: Path) -> None:
+    """As after `agent init` with the name of another robot; the folder of that one is `robot`."""
+    other = robot.parent / "other"
+    shutil.copytree(robot, other)
+    for name in ("a", "b", "c"):
+        (other / f"enclaves/r1/{name}").rename(other / f"enclaves/r1/{name}{name}")
+    before = content(other)
+    with pytest.raises(KeystoreError, match="has no enclave that is here"):
+        install(other, home.renewed)
+    assert content(other) == before
+    assert install(robot, home.renewed).changed == ("/r1/a",)
+
+
 def test_another_keystore_with_the_same_names_is_refused(
     home: Home, robot: Path, tmp_path: Path
 ) -> None:

@@ -397,6 +397,9 @@ def test_the_program(tmp_path: Path) -> None:
     sros("create_enclave", root, "/a", "/b", "/c").ok()
     assert "nothing was ever revoked" in sros("crl", root).ok().err
     assert json.loads(sros("crl", root, "--json").ok().out)["number"] is None
+    sros("distribute_key", root, "--all", tmp_path / "robot").ok()
+    exported = sros("crl", tmp_path / "robot")
+    assert exported.status == 2 and "is an export" in exported.err
     before = snapshot(root)
     plan = sros("revoke", root, "/a", "--dry-run").ok()
     assert snapshot(root) == before

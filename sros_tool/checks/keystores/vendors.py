@@ -124,9 +124,10 @@ _REFUSES = ("refuse it", "refuses it")
 
 
 def asked_vendors(words: Sequence[str]) -> tuple[Vendor, ...]:
-    """Return the measured DDS vendors that the words name; all if there are no words.
+    """Return the DDS vendors with the names in ``words``, or all if ``words`` is empty.
 
-    The word ``zenoh`` names none.
+    Only vendors are returned whose real library was tried.  ``zenoh`` is no DDS vendor, so that
+    ``("zenoh",)`` gives no vendor.
     """
     return tuple(vendor for vendor in MEASURED if not words or vendor.value in words)
 

@@ -78,7 +78,8 @@ def _injection(
 ) -> Row:
     """Return a row that shows whether the attacker is heard on the topic.
 
-    The control is a permitted talker; a row with ``removed`` has no control.
+    A permitted talker on the same topic shows that the listener can hear, unless ``removed`` names
+    a defence that is switched off.
     """
     talker, listener = talker_and_listener(victims or _victims(attacker, removed))
     return Row(

@@ -37,7 +37,7 @@ from sros_tool.keystore.confirmation import (
     parse_confirmation,
 )
 from sros_tool.keystore.delivery.signing import certify_requests
-from sros_tool.keystore.expiry import Lifetime, read_credentials
+from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.fleet import checked_fleet, recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
@@ -551,9 +551,16 @@ class _Renewals:
             f"{enclave_folder(name)}/{CERTIFICATE_FILE}", ()
         )
         is_there = digest(present) in on_robot
-        if self._now < (due := _due(read_credentials(keystore, name).lifetime())):
-            if same_key and not is_there:
-                return "answered", "its new certificate comes with the next release"
+        if same_key and not is_there and validity_of(present).contains(self._now):
+            # Also if it is due again: the robot has to fetch what was signed before.
+            return "answered", "its new certificate comes with the next release"
+        lifetime = read_credentials(keystore, name).lifetime()
+        # Robots ask in the last third; the rest is for clocks that are wrong.
+        due = min(
+            validity.not_after - validity.life() / 2
+            for validity in (lifetime.certificate, lifetime.permissions)
+        )
+        if self._now < due:
             return "not_due", f"it can be renewed from {iso(due)}"
         if robot.renewal != RENEWAL_ALLOWED:
             return (
@@ -589,17 +596,6 @@ class _Renewals:
     @cached_property
     def _revoked(self) -> Collection[int]:
         return _revoked_serials(self._keystore)
-
-
-def _due(lifetime: Lifetime) -> datetime:
-    """Return from when an enclave may be renewed: from half of a validity.
-
-    Robots ask from two thirds; the rest is for clocks that are wrong.
-    """
-    return min(
-        validity.not_before + (validity.not_after - validity.not_before) / 2
-        for validity in (lifetime.certificate, lifetime.permissions)
-    )
 
 
 def _sign(

@@ -79,7 +79,7 @@ def check_tuf() -> None:
 
 
 def release_target(robot: str) -> str:
-    """Return the path of a robot's release among the targets of a publishing folder."""
+    """Return the TUF target path of a robot's release, the archive that its agent downloads."""
     return f"robots/{robot}.tar.gz"
 
 

@@ -287,11 +287,12 @@ class RequestAnswer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImportedEnclave(Changed):
-    """The result of installing an answer; ``changes`` is empty if it was installed already.
+    """The result of installing the answer to a signing request.
 
-    ``first`` says whether the folder trusted no CA before, so that nothing verified the CAs of the
-    answer.  ``until`` is the first expiry of certificate and permissions.  ``restart`` has the
-    enclave if its running processes on Zenoh keep the old rules until they are restarted.
+    ``changes`` is empty if the answer was installed already.  ``first`` says whether the folder
+    trusted no CA before, so that nothing verified the CAs of the answer.  ``until`` is the first
+    expiry of certificate and permissions.  ``restart`` has the name of the enclave if its running
+    processes on Zenoh keep the old rules until they are restarted, and is empty otherwise.
     """
 
     name: str

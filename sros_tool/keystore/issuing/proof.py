@@ -4,10 +4,12 @@ A policy allows a topic if a rule allows it and no rule denies it.  DDS applies 
 matches.  Both decide the same for every topic name if
 
 - the document has one grant, its deny rules come first, every rule is for all domains of the
-  keystore and without partitions, the default is to deny, and its expressions equal the policy's,
-  but for names that a wildcard of the same list matches anyway: a comparison of sets;
-- the vendors match each expression with wildcards as a policy does: a comparison of matchers, for
-  names that distinguish them.  (Without wildcards, an expression matches only itself.)
+  keystore and without partitions, the default is to deny, and its expressions equal the policy's.
+  (A name can be missing if a wildcard of the same list matches it anyway.)  This is checked by
+  comparing the two sets of expressions;
+- the function by which each vendor matches an expression with wildcards matches the same names as a
+  policy does.  This is checked with test names on which two such functions could differ.  (Without
+  wildcards, an expression matches only itself.)
 
 Both comparisons are made for every document.  If one fails, the decision engine is asked about
 example topics: every name in the policy or the document, and names in neither.
