@@ -94,9 +94,9 @@ DIAMONDS = {f"g{i}": {"children": [f"g{i + 1}", f"h{i + 1}"]} for i in range(30)
         ("h.yml", "[" * 500, "nested too deeply"),
         ("h.yml", "[" * 100_000, "nest"),  # a newer libyaml says so itself
         ("h.yml", "a: &x {hosts: {}}\nb: *x\n", "alias"),
-        ("h.yml", "a: !vault x\n", "plain values"),
-        ("h.yml", "a: !!python/object/apply:os.system ['id']\n", "plain values"),
-        ("h.yml", "a: {\n", "plain values"),
+        ("h.yml", "a: !vault x\n", "text, numbers, lists"),
+        ("h.yml", "a: !!python/object/apply:os.system ['id']\n", "text, numbers, lists"),
+        ("h.yml", "a: {\n", "text, numbers, lists"),
         ("h.yml", "all: {hosts: {'r[1:50]': }}", "r[1:50]"),
         ("h.yml", "all: {hosts: {r-1: }}", "sros_robot: r7"),
         ("h.yml", "all: {hosts: {'<r7/>': }}", "sros_robot: r7"),
