@@ -204,12 +204,14 @@ def _check_release(
             f"by `sros distribute_key KEYSTORE --robot {robot} FOLDER --force`; if not, find out "
             "who can write to the publishing folder.",
         )
-    if present and not {*present} & release.enclaves().keys():
+    with Folder(folder) as opened:
+        usable = [name for name in present if _had_certificate(opened, name)]
+    if usable and not {*usable} & release.enclaves().keys():
         raise KeystoreError(
             f"the release of robot {robot} has no enclave that is here",
-            f"'{folder}' has {enumerated(present)}, the release has "
-            f"{enumerated(sorted(release.enclaves()))}. Installing it would remove every key here. "
-            "Nothing was changed.",
+            f"'{folder}' has {enumerated(usable)}, the release has "
+            f"{enumerated(sorted(release.enclaves()))}. Installing it would remove the keys of "
+            "these enclaves. Nothing was changed.",
             "See whether this robot has the right name (`sros agent init --robot`).",
         )
     if release.number < installed:

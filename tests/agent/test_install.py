@@ -168,11 +168,25 @@ def test_the_release_of_a_robot_with_other_enclaves_takes_no_key(home: Home, rob
     shutil.copytree(robot, other)
     for name in ("a", "b", "c"):
         (other / f"enclaves/r1/{name}").rename(other / f"enclaves/r1/{name}{name}")
+    sros("create_request", "/r1/new", other).ok()
     before = content(other)
-    with pytest.raises(KeystoreError, match="has no enclave that is here"):
+    with pytest.raises(KeystoreError, match="has no enclave that is here") as refused:
         install(other, home.renewed)
     assert content(other) == before
+    assert "/r1/aa, /r1/bb and /r1/cc, the release" in str(refused.value), "not /r1/new"
     assert install(robot, home.renewed).changed == ("/r1/a",)
+
+
+def test_a_robot_that_waits_for_its_first_answer_takes_a_release(
+    home: Home, tmp_path: Path
+) -> None:
+    """No certificate is here yet, so the release without this enclave takes nothing away."""
+    sros("create_request", "/r1/new", tmp_path / "waits").ok()
+    before = content(tmp_path / "waits")
+    pinned = frozenset({digest(home.authority.certificate)})
+    kept = install(tmp_path / "waits", home.renewed, pinned=pinned).kept
+    assert set(kept) == set(NAMES) and all("is not on this robot" in why for why in kept.values())
+    assert content(tmp_path / "waits") == before
 
 
 def test_another_keystore_with_the_same_names_is_refused(

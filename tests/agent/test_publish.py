@@ -261,6 +261,48 @@ def test_a_root_key_that_is_kept_elsewhere(publisher: Home) -> None:
     assert not (publisher.root / "private/fleet_root.pem").exists()
 
 
+@pytest.mark.parametrize("after", ["stage_elsewhere", "stage", "release", "keep_changes"])
+def test_a_killed_rotation_of_a_root_key_elsewhere_recovers(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch, after: str
+) -> None:
+    """Before the keystore names the new key, it is dropped; from then on, it takes its place."""
+    safe, spare = (publisher.folder / name for name in ("safe.pem", "safe.pem.new"))
+    (publisher.root / "private/fleet_root.pem").rename(safe)
+    robot, old = publisher.robot(), safe.read_bytes()
+    owner = publishing._Keys if after == "stage_elsewhere" else publishing._Run
+    done = getattr(owner, after)
+
+    def killed(*words: object) -> None:
+        done(*words)
+        raise _Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr(owner, after, killed)
+        with pytest.raises(_Killed):
+            publisher.publish(rotate=("root",), root_key=safe)
+    made = spare.read_bytes() if after != "release" else b""
+    before = snapshot(publisher.folder)
+    publisher.publish(root_key=safe, dry_run=True)
+    assert snapshot(publisher.folder) == before
+    publisher.publish(root_key=safe)
+    assert safe.read_bytes() == (made if after == "keep_changes" else old)
+    assert not spare.exists()
+    publisher.publish(rotate=("root",), root_key=safe)
+    assert robot.gets() and safe.read_bytes() not in (old, made)
+
+
+def test_a_file_that_is_no_key_next_to_the_root_key_stays(publisher: Home) -> None:
+    safe, note = (publisher.folder / name for name in ("safe.pem", "safe.pem.new"))
+    (publisher.root / "private/fleet_root.pem").rename(safe)
+    note.write_text("mine")
+    publisher.publish(rotate=("timestamp",), root_key=safe)
+    with pytest.raises(KeystoreError, match=r"safe\.pem\.new' is in the way"):
+        publisher.publish(rotate=("root",), root_key=safe)
+    assert note.read_text() == "mine"
+    note.unlink()
+    publisher.publish(rotate=("root",), root_key=safe)
+
+
 def test_a_first_root_key_that_is_made_elsewhere(publisher: Home) -> None:
     shutil.rmtree(publisher.pub)
     for name in ("fleet_root.json", "published.json"):

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from sros_tool.errors import KeystoreError, Note, SrosError
-from sros_tool.files import staged_file, write_new_file
+from sros_tool.files import remove_file, staged_file
 from sros_tool.folders import Folder, make_folders
 from sros_tool.keystore.delivery.archive import listed_digests
 from sros_tool.keystore.delivery.export import released_files
@@ -170,6 +170,7 @@ def publish(
         run = _Run(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
         run.check_numbers(restored)
         keys = _Keys(run.roots, root, root_key)
+        keys.recover(dry_run)
         keys.open(rotate, now, run.expiry)
         changed = run.changed()
         if changed or keys.new or keys.has_new_root:
@@ -213,7 +214,35 @@ class _Keys:
         self.notes: list[Note] = []
         self._root = root
         self._elsewhere = root_key
+        self._root_file = root_key or self._path("root")
         self._new_elsewhere = b""
+
+    def recover(self, dry_run: bool) -> None:
+        """Complete or undo the rotation of a root key elsewhere that was killed.
+
+        The root metadata of the keystore tells whether the new key counts already.
+        """
+        if not self._elsewhere or not self.roots.versions:
+            return
+        spare = self._next_to(self._elsewhere)
+        is_new_key = self._is_root_key(spare)
+        if is_new_key and dry_run:
+            self._root_file = spare
+        elif is_new_key:
+            with Folder(spare.parent) as folder:
+                folder.replace(spare.name, self._elsewhere.name)
+        elif is_new_key is False and not dry_run and self._is_root_key(self._elsewhere):
+            remove_file(spare)
+
+    def _is_root_key(self, path: Path) -> bool | None:
+        """Return whether a file has the key that robots trust; None if it has no key."""
+        from sros_tool.keystore.delivery.repository import load_signer
+
+        try:
+            signer = load_signer(read_bytes(path, "root key"), f"'{path}'")
+        except (SrosError, OSError):
+            return None
+        return self.roots.has_key("root", signer)
 
     def open(self, rotate: Collection[str], now: datetime, expiry: MetadataExpiry) -> None:
         """Open or make the key of each role, and add a version of the root if they change.
@@ -269,7 +298,7 @@ class _Keys:
         """Add a version of the root, if its key is here; ``new`` makes another root key."""
         from sros_tool.keystore.delivery.repository import load_signer, new_key
 
-        path = self._elsewhere or self._path("root")
+        path = self._root_file
         keys = []
         if path.exists():
             keys.append(load_signer(read_bytes(path, "root key"), f"'{path}'"))
@@ -299,7 +328,14 @@ class _Keys:
         if self._new_elsewhere and self._elsewhere:
             exists = self._elsewhere.exists()
             path = self._next_to(self._elsewhere) if exists else self._elsewhere
-            write_new_file(path, self._new_elsewhere)
+            if os.path.lexists(path):
+                raise KeystoreError(
+                    f"'{path}' is in the way",
+                    "The new root key is there until the keystore names it.",
+                    "Move it away.",
+                )
+            with staged_file(path, self._new_elsewhere) as put_in_place:
+                put_in_place()
 
     def finish(self) -> None:
         """Put a new root key that is elsewhere in its place, and remove the keys of before."""

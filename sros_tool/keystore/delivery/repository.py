@@ -76,6 +76,12 @@ def replaced_key(role: str) -> str:
     return f"Restore it from a backup, or make another with --rotate-key {role}."
 
 
+_NAME_ROOT = (
+    "Name the right file with --root-key. After a rotation of this key that was killed, it is "
+    "FILE.new, next to the earlier one."
+)
+
+
 # ── root ───────────────────────────────────────────────────────────────────────────────────
 
 
@@ -130,13 +136,17 @@ class Roots:
             version.sign(key, append=True)
         self.versions.append(version)
 
+    def has_key(self, role: str, signer: CryptoSigner) -> bool:
+        """Return whether the present root metadata names the key of ``signer`` for ``role``."""
+        return signer.public_key.keyid in self.last.roles[role].keyids
+
     def check_signer(self, role: str, signer: CryptoSigner, path: Path) -> None:
         """Raise `KeystoreError` unless the key of ``signer``, at ``path``, is that of ``role``."""
-        if signer.public_key.keyid not in self.last.roles[role].keyids:
+        if not self.has_key(role, signer):
             raise KeystoreError(
                 f"'{path}' is not the {role} key of what this keystore publishes",
                 "Robots would refuse what it signs.",
-                "Name the right file with --root-key." if role == _ROOT else replaced_key(role),
+                _NAME_ROOT if role == _ROOT else replaced_key(role),
             )
 
     def verify(
