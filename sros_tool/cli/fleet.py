@@ -164,7 +164,13 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
             sros fleet confirm keystore --robot r7 -
       kept what r7 has: 18 files of 2 enclaves
     """
-    from sros_tool.keystore.confirmation import MAX_BYTES, KeptConfirmation, keep, receive
+    from sros_tool.keystore.confirmation import (
+        MAX_BYTES,
+        KeptConfirmation,
+        keep,
+        locked_confirmations,
+        receive,
+    )
     from sros_tool.keystore.fleet import recorded_fleet
     from sros_tool.keystore.layout import confirmation_file
     from sros_tool.keystore.reader import Keystore
@@ -177,7 +183,8 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     path = confirmation_file(robot)
     changes = file_change(root / path, existed=(root / path).exists())
     if not dry_run:
-        keep(root, received)
+        with locked_confirmations(root):
+            keep(root, received)
     confirmation = received.confirmation
     enclaves = confirmation.enclaves()
     notes = [Note("fleet.clock", f"{robot}: {text}")] if (text := received.clock_note()) else []

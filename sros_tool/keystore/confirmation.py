@@ -13,7 +13,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
@@ -40,6 +40,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
     search_enclaves,
 )
+from sros_tool.keystore.transaction.recovery import KeystoreLock
 from sros_tool.names import check_enclave_name
 from sros_tool.validity import elapsed, iso, parse_iso
 from sros_tool.values import DryRun, FileChange, NamedKeystore, Notes, as_plain, parse_json
@@ -384,10 +385,30 @@ def receive(data: bytes, robot: str, what: str, *, now: datetime) -> Received:
     return Received(confirmation, now.replace(microsecond=0))
 
 
+@contextmanager
+def locked_confirmations(root: Path) -> Iterator[None]:
+    """Lock the confirmations of a keystore: nobody else keeps one until the body ends.
+
+    Raises:
+        KeystoreError: another process keeps confirmations, and does not end.
+    """
+    with Folder(root, for_owner=True) as folder:
+        if not folder.is_folder(CONFIRMED):
+            folder.mkdir(CONFIRMED, 0o755)
+    with Folder(root / CONFIRMED, for_owner=True) as folder:
+        lock = KeystoreLock(folder, "folder of confirmations")
+        try:
+            lock.acquire()
+            yield
+        finally:
+            lock.release()
+
+
 def keep(root: Path, received: Received) -> str:
     """Write a robot's confirmation to the keystore, replacing the previous one.
 
-    What is known of the last message of its agent stays.  Return its path relative to the keystore.
+    What is known of the last message of its agent stays.  The caller holds `locked_confirmations`.
+    Return its path relative to the keystore.
     """
     robot = received.confirmation.robot
     path, message = confirmation_file(robot), received.message
@@ -399,9 +420,6 @@ def keep(root: Path, received: Received) -> str:
         **({"message": as_plain(message)} if message else {}),
         "confirmation": _value_of(received.confirmation),
     }
-    with Folder(root, for_owner=True) as folder:
-        if not folder.is_folder(CONFIRMED):
-            folder.mkdir(CONFIRMED, 0o755)
     with staged_file(root / path, _json(value), mode=0o644) as put_in_place:
         put_in_place()
     return path

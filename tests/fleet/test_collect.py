@@ -21,6 +21,7 @@ from sros_tool.keystore.confirmation import (
     MAX_BYTES,
     MESSAGE_FILE,
     Confirmation,
+    Received,
     last_confirmation,
     render_confirmation,
 )
@@ -36,6 +37,7 @@ from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import key_on_robot
 from sros_tool.keystore.reader import Keystore, read_certificate
+from sros_tool.keystore.transaction import recovery
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
 from sros_tool.pki.keys import PrivateKey, generate_key, load_key
@@ -165,6 +167,30 @@ def test_messages_are_kept_once_each(home: Home) -> None:
     assert found.complete and found.robots[0].enclave == "/r1/base"
     last = last_confirmation(home.root, "r1")
     assert last and last.confirmation.sequence == 3 and last.time <= NOW
+
+
+def test_two_at_once(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody keeps an earlier message, or signs again, while another process takes them in."""
+    monkeypatch.setattr(recovery, "_LOCK_SECONDS", 0.0)
+    (home.folder / "said").write_bytes(render_confirmation(home.said("r1", NOW, sequence=None)))
+    home.send("r1")
+    kept = collecting.keep
+    refused = []
+
+    def meanwhile(root: Path, received: Received) -> str:
+        assert home.collect(dry_run=True).complete
+        with pytest.raises(KeystoreError, match="is busy"):
+            home.collect()
+        ended = sros("fleet", "confirm", "ks", "said", "--robot", "r1", cwd=home.folder)
+        refused.append((ended.status, "is busy" in ended.err))
+        return kept(root, received)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(collecting, "keep", meanwhile)
+        assert home.of("r1").outcome == "kept"
+    assert refused == [(2, True)]
+    assert home.of("r1").outcome == "unchanged" and not [*home.root.rglob(".sros-lock")]
+    home.run("fleet", "confirm", "ks", "said", "--robot", "r1")
 
 
 def test_the_verb_says_what_it_did(home: Home) -> None:

@@ -12,6 +12,7 @@ import errno
 import hashlib
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -34,6 +35,7 @@ from sros_tool.keystore.confirmation import (
     Received,
     keep,
     last_confirmation,
+    locked_confirmations,
     parse_confirmation,
 )
 from sros_tool.keystore.delivery.signing import certify_requests
@@ -174,38 +176,40 @@ def collect(
         dry_run: change nothing.
 
     Raises:
-        KeystoreError: the keystore has no fleet, or cannot be read.
+        KeystoreError: the keystore has no fleet, or cannot be read; another process takes in
+            messages, too.
         DocumentError: ``restored`` names no robot of the fleet; the inbox is no folder.
     """
-    keystore = Keystore(root)
-    recorded_fleet(keystore)
-    fleet = checked_fleet(keystore)
-    assert fleet
-    for name in restored:
-        fleet.robot(name)
-    verifier = _Verifier(keystore, fleet, now, frozenset(restored))
-    renewals = _Renewals(keystore, fleet, now)
-    changes: list[FileChange] = []
-    taken: list[_Taken] = []
-    for message in _read_inbox(inbox, fleet, verifier):
-        if message.verified:
-            message.requests = renewals.judge(message.robot, message.verified)
-        if message.received:
-            path = confirmation_file(message.robot.name)
-            action = "replace" if (root / path).exists() else "create"
-            changes.append(FileChange(action, str(root / path)))
-            if not dry_run:
-                # If this run is killed now, the next one judges the requests of the same message.
-                keep(root, message.received)
-        taken.append(message.without_confirmation())
-    not_signed, notes, signed = _sign(
-        root,
-        taken,
-        now=now,
-        allow_refusal=allow_refusal,
-        keyring=keyring,
-        dry_run=dry_run,
-    )
+    recorded_fleet(Keystore(root))
+    with nullcontext() if dry_run else locked_confirmations(root):
+        keystore = Keystore(root)
+        fleet = checked_fleet(keystore)
+        assert fleet
+        for name in restored:
+            fleet.robot(name)
+        verifier = _Verifier(keystore, fleet, now, frozenset(restored))
+        renewals = _Renewals(keystore, fleet, now)
+        changes: list[FileChange] = []
+        taken: list[_Taken] = []
+        for message in _read_inbox(inbox, fleet, verifier):
+            if message.verified:
+                message.requests = renewals.judge(message.robot, message.verified)
+            if message.received:
+                path = confirmation_file(message.robot.name)
+                action = "replace" if (root / path).exists() else "create"
+                changes.append(FileChange(action, str(root / path)))
+                if not dry_run:
+                    # If this run is killed now, the next one judges the same requests.
+                    keep(root, message.received)
+            taken.append(message.without_confirmation())
+        not_signed, notes, signed = _sign(
+            root,
+            taken,
+            now=now,
+            allow_refusal=allow_refusal,
+            keyring=keyring,
+            dry_run=dry_run,
+        )
     return CollectedInbox(
         root,
         inbox,
