@@ -16,9 +16,11 @@ from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
+from cryptography.hazmat.primitives.serialization import Encoding
+
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
 from sros_tool.agent.inbox import send
-from sros_tool.agent.install import Installation, install_release, made_at
+from sros_tool.agent.install import Installation, install_release, made_at, newest_list
 from sros_tool.agent.renewal import (
     Renewals,
     drop_installed_keys,
@@ -39,6 +41,7 @@ from sros_tool.agent.state import read_seal, read_state, write_seal, write_state
 from sros_tool.errors import SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
+    LONGEST_LIST,
     LONGEST_PROBLEM,
     MOST_PROBLEMS,
     Confirmation,
@@ -51,8 +54,11 @@ from sros_tool.keystore.delivery.archive import listed_digests
 from sros_tool.keystore.delivery.release import Release
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
+    CRL_FILE,
+    IDENTITY_CA_FILE,
     KEY_FILE,
     ROUTER_FILE,
+    enclave_folder,
     enclave_path,
     search_enclaves,
 )
@@ -61,6 +67,7 @@ from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, open_enclave
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import validity_of
+from sros_tool.pki.crl import list_number
 from sros_tool.pki.token import Secrets
 from sros_tool.runtime.processes import RunningProcesses, boot_id
 from sros_tool.validity import elapsed, iso
@@ -124,6 +131,8 @@ class _Round:
         self._machine = machine
         self._problems: list[str] = []
         self._state = read_state(folder)
+        self._is_in_step = False
+        """Whether home publishes what is here, so that it knows the revocation list."""
 
     def run(self) -> Round:
         now, before = self._machine.now, self._state
@@ -228,6 +237,7 @@ class _Round:
             self._problems.append(self._refused(error))
             return Installation(), False
         if release is None:
+            self._is_in_step = True
             return Installation(), True
         return self._install(release, certain), True
 
@@ -296,6 +306,7 @@ class _Round:
             latest=latest,
         )
         self._save()
+        self._is_in_step = not installation.kept
         drop_installed_keys(self._folder, keys)
         return installation
 
@@ -403,6 +414,7 @@ class _Round:
             clock=clock,
             problems=_short(self._problems),
             requests=asked.requests,
+            crl=None if self._is_in_step else self._revocation_list(names),
         )
         message = self._signed(confirmation, (asked.signer,) if asked.signer else names)
         if not message:
@@ -422,6 +434,24 @@ class _Round:
         if arrived:
             self._state = replace(self._state, sent=now)
         return arrived
+
+    def _revocation_list(self, names: Iterable[str]) -> str | None:
+        """Return the newest revocation list of these enclaves as PEM; None without one."""
+        lists = []
+        with Folder(self._folder) as opened:
+            for name in names:
+                with suppress(SrosError, OSError):
+                    place = enclave_folder(name)
+                    data = opened.read_inside(f"{place}/{CRL_FILE}")
+                    newest = newest_list(data, opened.read_inside(f"{place}/{IDENTITY_CA_FILE}"))
+                    lists += [newest] if newest else []
+        if not lists:
+            return None
+        text = max(lists, key=list_number).public_bytes(Encoding.PEM).decode()
+        if len(text) > LONGEST_LIST:
+            self._problems.append("The revocation list here is too long for a message to home.")
+            return None
+        return text
 
     def _unreadable(self, name: str, error: Exception) -> None:
         text = self._refused(error) if isinstance(error, OSError) else str(error)

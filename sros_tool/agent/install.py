@@ -253,10 +253,10 @@ def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) ->
         authorities = files.get(IDENTITY_CA_FILE, b"")
         path = f"{enclave_folder(name)}/{CRL_FILE}"
         try:
-            present = _newest_list(folder.read_inside(path), authorities)
+            present = newest_list(folder.read_inside(path), authorities)
         except (SrosError, OSError):
             continue  # nothing that a process could load
-        sent = _newest_list(files.get(CRL_FILE, b""), authorities)
+        sent = newest_list(files.get(CRL_FILE, b""), authorities)
         if present is None or sent == present:
             continue
         number = list_number(present)
@@ -273,7 +273,7 @@ def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) ->
 
 
 @lru_cache(maxsize=8)
-def _newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationList | None:
+def newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationList | None:
     """Return the list with the highest number in a file that one of ``authorities`` signed."""
     try:
         signers = load_certificates(authorities, IDENTITY_CA_FILE)
@@ -450,7 +450,7 @@ def _list_alone(folder: Folder, name: str, files: Mapping[str, bytes], now: date
         authorities = files.get(IDENTITY_CA_FILE, b"")
         same = _content(folder, f"{place}/{IDENTITY_CA_FILE}") == authorities
         path, sent = f"{place}/{CRL_FILE}", files.get(CRL_FILE, b"")
-        newest = _newest_list(sent, authorities)
+        newest = newest_list(sent, authorities)
         expiry = next_update(newest) if newest else None
         fits = same and _had_certificate(folder, name) and _content(folder, path) != sent
         valid = newest and last_update(newest) <= now and (expiry is None or now < expiry)

@@ -358,7 +358,8 @@ _VALIDITIES = {
 @click.option(
     "--restored",
     is_flag=True,
-    help="Go on although PUB has later releases than the keystore, which was restored.",
+    help="Go on although PUB has later releases than the keystore, which was restored; what these "
+    "releases revoke is revoked again.",
 )
 @dry_run_option
 @json_option

@@ -60,7 +60,7 @@ CONFIRMED_FILES = (
 _CERTIFICATE_FILES = (CERTIFICATE_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
 _KEYS = {"format", "robot", "time", "files"}
-_OF_AGENT = ("sequence", "release", "expiry", "running", "clock", "problems", "requests")
+_OF_AGENT = ("sequence", "release", "expiry", "running", "clock", "problems", "requests", "crl")
 """Keys that only `sros agent` writes."""
 _OPTIONAL_KEYS = {"certificates", "restart", "dds", *_OF_AGENT}
 _CLOCK_TOLERANCE = timedelta(minutes=1)
@@ -72,6 +72,8 @@ MOST_PROBLEMS, LONGEST_PROBLEM = 50, 300
 MOST_REQUESTS = 500
 """Signing requests in a confirmation; the agent makes further requests in later ones."""
 _LONGEST_REQUEST = 16 * 1024
+LONGEST_LIST = 1024 * 1024
+"""Maximum number of characters of a revocation list in a confirmation."""
 _LIBRARY_VERSION = re.compile(r"\d{1,6}\.\d{1,6}\.\d{1,6}\Z", re.ASCII)
 _LIBRARY_PATH = re.compile(r"/[\w.+/ ?-]{1,199}\Z")
 """Paths as a robot makes them plain; they are shown, and never opened."""
@@ -80,6 +82,7 @@ _MOMENT = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z\Z"
 _REQUEST = re.compile(
     r"-----BEGIN CERTIFICATE REQUEST-----\n[A-Za-z0-9+/=\n]+-----END CERTIFICATE REQUEST-----\n\Z"
 )
+_LIST = re.compile(r"-----BEGIN X509 CRL-----\n[A-Za-z0-9+/=\n]+-----END X509 CRL-----\n\Z")
 _PEM = re.compile(rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERTIFICATE-----")
 
 
@@ -159,7 +162,9 @@ class Confirmation:
     ``sequence`` is higher in each message of a robot.  ``release`` is the number of the release
     that is installed; 0 for none.  ``expiry`` and ``running`` map enclaves to when their files
     expire, and to what their processes have loaded.  ``problems`` are short sentences, and
-    ``requests`` signing requests (PEM) for certificates that expire.
+    ``requests`` signing requests (PEM) for certificates that expire.  ``crl`` is the newest
+    revocation list (PEM) on the robot, if it is perhaps not what home published last: a keystore
+    that was restored from a backup learns from it what it has revoked since.
     """
 
     robot: str
@@ -175,6 +180,7 @@ class Confirmation:
     clock: RobotClock | None = None
     problems: tuple[str, ...] | None = None
     requests: tuple[str, ...] | None = None
+    crl: str | None = None
 
     def enclaves(self) -> tuple[str, ...]:
         """Return the names of the enclaves in the confirmation, sorted."""
@@ -586,6 +592,12 @@ def _requests_from(value: Any, what: str) -> tuple[str, ...]:
     return tuple(value)
 
 
+def _crl_from(value: Any, what: str) -> str:
+    if not (isinstance(value, str) and len(value) <= LONGEST_LIST and _LIST.match(value)):
+        raise _refused(what, "its crl is not one revocation list in PEM")
+    return value
+
+
 _AGENT_READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "sequence": _sequence_from,
     "release": _release_from,
@@ -594,6 +606,7 @@ _AGENT_READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "clock": _clock_from,
     "problems": _problems_from,
     "requests": _requests_from,
+    "crl": _crl_from,
 }
 
 

@@ -540,7 +540,7 @@ class _Known:
                 self._revoked.discard(entry.enclave)
             elif entry.what == "revocation":
                 self._revoked_serials.add(entry.serial)
-                if entry.reason != SUPERSEDED:
+                if entry.enclave and entry.reason != SUPERSEDED:
                     self._revoked.add(entry.enclave)
         robots = {robot.robot.name for robot in compared}
         self._unrecorded = unrecorded_enclaves(fleet, self._revoked, robots)

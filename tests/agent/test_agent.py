@@ -264,6 +264,22 @@ def test_an_older_release_is_refused_also_without_a_state(home: Home, r1: Robot)
     assert has(r1.folder, home.renewed)
 
 
+def test_a_revocation_list_that_home_may_have_lost_is_sent(home: Home, r1: Robot) -> None:
+    """Not with each message, but where home does not publish what is here."""
+    r1.release = home.revoked
+    for _ in range(2):
+        r1.round()
+        assert r1.message().crl is None
+    mine = (r1.folder / "enclaves/r1/a" / CRL_FILE).read_text()
+    for other in (home.release(home.renewed.files), FetchError(FetchProblem.ROLLED_BACK, "x", "")):
+        r1.release = other
+        r1.round()
+        assert r1.message().crl == mine
+    r1.release = home.release(home.revoked.files, 12)
+    r1.round()
+    assert r1.message().crl is None
+
+
 def test_a_disk_of_yesterday_goes_on(home: Home, r1: Robot, tmp_path: Path) -> None:
     r1.round()
     yesterday = tmp_path / "yesterday"

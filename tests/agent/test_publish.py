@@ -33,6 +33,7 @@ from sros_tool.keystore.delivery.release import (
 from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer, read_present
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction import recovery
+from sros_tool.pki.crl import load_crl
 from tests.agent.published import DAY, Home
 from tests.support.harness import snapshot, sros
 
@@ -364,6 +365,8 @@ def test_a_keystore_that_was_restored(publisher: Home) -> None:
     publisher.publish()
     robot = publisher.robot()
     latest = robot.gets().number
+    listed = Keystore(publisher.root).revocation_list
+    assert listed
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
     with pytest.raises(KeystoreError, match="restored from a backup"):
@@ -374,11 +377,20 @@ def test_a_keystore_that_was_restored(publisher: Home) -> None:
     assert Keystore(publisher.root).ledger.next_number() > latest
     with pytest.raises(KeystoreError, match="restored from a backup"):
         publisher.publish()
-    publisher.run("revoke", "ks", "--robot", "r5")
-    with pytest.raises(KeystoreError, match="--restored"):
-        publisher.publish()
-    publisher.publish(restored=True)
-    assert robot.gets().number > latest
+    archives = publisher.pub / "targets/robots"
+    archives.rename(publisher.folder / "archives")
+    with pytest.raises(KeystoreError, match="which revocations the keystore lacks"):
+        publisher.publish(restored=True)
+    shutil.rmtree(archives)
+    (publisher.folder / "archives").rename(archives)
+    done = publisher.publish(restored=True)
+    assert [note.id for note in done.notes] == ["fleet.revocations-restored"]
+    assert "/r5/base" in done.notes[0].text and not (publisher.root / "enclaves/r5/base").exists()
+    release = robot.gets()
+    assert release.number > latest
+    (own,) = (data for path, data in release.files.items() if path.endswith("crl.pem"))
+    assert load_crl(own, "it").number > listed.number
+    assert load_crl(own, "it").revoked[0].serial == listed.revoked[0].serial
     assert not publisher.publish().names("published")
 
 

@@ -22,6 +22,7 @@ from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
     Confirmation,
     Received,
+    keep,
     last_confirmation,
     render_confirmation,
 )
@@ -40,6 +41,7 @@ from sros_tool.keystore.reader import Keystore, read_certificate
 from sros_tool.keystore.transaction import recovery
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
+from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, load_key
 from sros_tool.validity import iso
 from tests.support.harness import policy_text, publish, sros
@@ -174,7 +176,7 @@ def test_two_at_once(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recovery, "_LOCK_SECONDS", 0.0)
     (home.folder / "said").write_bytes(render_confirmation(home.said("r1", NOW, sequence=None)))
     home.send("r1")
-    kept = collecting.keep
+    kept = keep
     refused = []
 
     def meanwhile(root: Path, received: Received) -> str:
@@ -327,6 +329,72 @@ def test_a_damaged_message(home: Home, change: Callable[[bytes], bytes], why: st
 def test_a_signed_message_that_is_none(home: Home, changed: dict[str, object], why: str) -> None:
     home.send("r1", NOW, "", **changed)
     assert why in home.of("r1").why
+
+
+# ── a keystore that was restored ──
+
+
+def lose_revocations(home: Home) -> str:
+    """Revoke r2 and an enclave of after the backup, restore the backup; return the list of r1."""
+    backup = shutil.copytree(home.root, home.folder / "backup", symlinks=True)
+    home.run("create_enclave", "ks", "/r3/later")
+    home.run("revoke", "ks", "/r3/later", "/r2/base", "--reason", "key_compromise")
+    home.run("distribute_key", "ks", "--robot", "r1", "r1", "--force")
+    shutil.rmtree(home.root)
+    backup.rename(home.root)
+    return (home.folder / "r1/enclaves/r1/base/crl.pem").read_text()
+
+
+def test_what_only_robots_know_to_be_revoked_is_revoked_again(home: Home) -> None:
+    """Also in the run that takes in a request of the revoked robot."""
+    crl, known = lose_revocations(home), [*(home.root / "revoked").glob("*")]
+    home.send("r2", DUE, requests=(home.request("r2"), home.request("r2", "/r2/arm")))
+    assert home.of("r2", DUE, dry_run=True).requests[0].outcome == "renewed", "nobody says it"
+    home.send("r1", DUE, crl=crl, requests=(home.request("r1"),))
+    before = home.collect(DUE, dry_run=True)
+    assert not known and not (home.root / "revoked").exists()
+    found = home.collect(DUE)
+    for inbox in (before, found):
+        (note,) = (note for note in inbox.notes if note.id == "fleet.revocations-restored")
+        assert "r1 has a revocation list" in note.text and "/r2/base" in note.text
+        requests = {of.enclave: of.outcome for robot in inbox.robots for of in robot.requests}
+        assert requests == {"/r1/base": "renewed", "/r2/base": "refused", "/r2/arm": "refused"}
+    lost, now = load_crl(crl.encode(), "r1"), Keystore(home.root).revocation_list
+    assert now and now.number > lost.number
+    assert {of[:1] + of[2:] for of in now.revoked} == {of[:1] + of[2:] for of in lost.revoked}
+    assert len(now.revoked) == 2 and not (home.root / "enclaves/r2/base").exists()
+    assert "[keystore." not in sros("check", "ks", cwd=home.folder).out
+    again = home.collect(DUE)
+    assert not again.changes and not again.notes
+    assert "was revoked" in again.robots[1].why
+    home.run("inspect", "ks", "--history")
+    assert sros("fleet", "status", "ks", "--json", cwd=home.folder).status == 1
+
+
+def test_a_list_of_another_keystore_revokes_nothing(home: Home) -> None:
+    home.run("create_keystore", "other")
+    home.run("create_enclave", "other", "/r2/base")
+    home.run("revoke", "other", "/r2/base")
+    foreign = (home.folder / "other/public/identity_ca.crl.pem").read_text()
+    home.send("r1", crl=foreign)
+    found = home.collect()
+    assert found.robots[0].outcome == "kept" and not found.notes
+    home.send("r1", crl=foreign.replace("\n-----END", "\nAAAA\n-----END"))
+    assert home.of("r1").outcome == "kept"
+    assert Keystore(home.root).revocation_list is None
+
+
+def test_a_list_is_not_lost_while_the_ca_cannot_sign(home: Home) -> None:
+    crl, key = lose_revocations(home), home.root / "private/identity_ca.key.pem"
+    home.send("r1", crl=crl, requests=(home.request("r1"),))
+    key.rename(home.folder / "key.pem")
+    found = home.collect(DUE)
+    assert "r1 has a revocation list" in found.not_signed
+    assert [request.outcome for request in found.robots[0].requests] == ["not_signed"]
+    (home.folder / "key.pem").rename(key)
+    found = home.collect(DUE)
+    assert not found.not_signed and found.notes
+    assert [request.outcome for request in found.robots[0].requests] == ["renewed"]
 
 
 # ── the inbox ──────────────────────────────────────────────────────────────────────────────

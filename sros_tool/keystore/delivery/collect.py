@@ -51,6 +51,8 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
+from sros_tool.keystore.lifecycle.revocation_list import ForgottenLists, revoked_serials
+from sros_tool.keystore.lifecycle.revoke import restore_revocations, restored_note
 from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
@@ -189,11 +191,16 @@ def collect(
             fleet.robot(name)
         verifier = _Verifier(keystore, fleet, now, frozenset(restored))
         renewals = _Renewals(keystore, fleet, now)
+        forgotten = ForgottenLists(keystore)
+        telling: list[str] = []
         changes: list[FileChange] = []
         taken: list[_Taken] = []
         for message in _read_inbox(inbox, fleet, verifier):
             if message.verified:
                 message.requests = renewals.judge(message.robot, message.verified)
+                crl = message.verified.confirmation.crl
+                if crl and forgotten.add(crl.encode()):
+                    telling.append(message.robot.name)
             if message.received:
                 path = confirmation_file(message.robot.name)
                 action = "replace" if (root / path).exists() else "create"
@@ -202,14 +209,19 @@ def collect(
                     # If this run is killed now, the next one judges the same requests.
                     keep(root, message.received)
             taken.append(message.without_confirmation())
-        not_signed, notes, signed = _sign(
-            root,
-            taken,
-            now=now,
-            allow_refusal=allow_refusal,
-            keyring=keyring,
-            dry_run=dry_run,
+        not_signed, notes, signed = _revoke_again(
+            root, forgotten, telling, taken, now=now, keyring=keyring, dry_run=dry_run
         )
+        if not not_signed:
+            not_signed, more_notes, more_signed = _sign(
+                root,
+                taken,
+                now=now,
+                allow_refusal=allow_refusal,
+                keyring=keyring,
+                dry_run=dry_run,
+            )
+            notes, signed = [*notes, *more_notes], [*signed, *more_signed]
     return CollectedInbox(
         root,
         inbox,
@@ -393,7 +405,7 @@ class _Verifier:
                 f"--restored {robot.name})"
             )
         received = Received(
-            replace(verified.confirmation, requests=None),
+            replace(verified.confirmation, requests=None, crl=None),
             self._arrival(file, last),
             LastMessage(sequence, sha256, verified.enclave),
         )
@@ -471,7 +483,7 @@ class _Verifier:
     @cached_property
     def _revoked(self) -> Collection[int]:
         """Serial numbers of revoked certificates, by the ledger and the revocation lists."""
-        return _revoked_serials(self._keystore)
+        return revoked_serials(self._keystore)
 
     def _expired(self, certificate: x509.Certificate) -> Iterator[str]:
         validity = validity_of(certificate)
@@ -480,14 +492,6 @@ class _Verifier:
             yield f"its certificate expired {late} ago, at {iso(validity.not_after)}"
         elif self._now < validity.not_before:
             yield f"its certificate is valid only from {iso(validity.not_before)}"
-
-
-def _revoked_serials(keystore: Keystore) -> frozenset[int]:
-    """Return the serial numbers of all revoked certificates, also of those that were replaced."""
-    entries = keystore.ledger_with("what", "revocation").entries
-    recorded = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
-    listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}
-    return frozenset(recorded | listed)
 
 
 # ── requests for renewal ───────────────────────────────────────────────────────────────────
@@ -499,10 +503,13 @@ class _Judged:
 
     result: CollectedRequest
     request: SigningRequest | None = None
+    vouching: Collection[int] = ()
+    """Serial numbers of the certificates that vouch for the request."""
 
     def done(self, outcome: str, why: str = "") -> None:
-        """Say what was done with the request."""
+        """Say what was done with the request, which is not signed."""
         self.result = self.result._replace(outcome=outcome, why=why)
+        self.request = None
 
 
 class _Renewals:
@@ -531,7 +538,12 @@ class _Renewals:
             except SrosError as error:
                 outcome, why = "refused", error.what
             result = result._replace(outcome=outcome, why=why)
-            judged.append(_Judged(result, request if outcome == "renewed" else None))
+            if outcome == "renewed":
+                present = self._keystore.certificate_of(request.name)
+                vouching = (message.certificate.serial_number, present.serial_number)
+                judged.append(_Judged(result, request, vouching))
+            else:
+                judged.append(_Judged(result))
         return judged
 
     def _judge(self, robot: Robot, message: _Verified, request: SigningRequest) -> tuple[str, str]:
@@ -599,7 +611,46 @@ class _Renewals:
 
     @cached_property
     def _revoked(self) -> Collection[int]:
-        return _revoked_serials(self._keystore)
+        return revoked_serials(self._keystore)
+
+
+def _revoke_again(
+    root: Path,
+    forgotten: ForgottenLists,
+    telling: Sequence[str],
+    taken: Sequence[_Taken],
+    *,
+    now: datetime,
+    keyring: Keyring,
+    dry_run: bool,
+) -> tuple[str, list[Note], list[FileChange]]:
+    """Revoke what lists of robots revoke and the keystore does not; refuse what they vouched for.
+
+    ``telling`` are robots with such lists.  If it fails, nothing is signed.  Return as `_sign`.
+    """
+    if not forgotten.lists:
+        return "", [], []
+    again = {entry.serial for crl in forgotten.lists for entry in crl.revoked}
+    requests = [request for message in taken for request in message.requests if request.request]
+    for request in requests:
+        if again & {*request.vouching}:
+            request.done("refused", "its certificate was revoked")
+    have = "has" if len(telling) == 1 else "have"
+    try:
+        restored = restore_revocations(
+            root, forgotten.lists, now=now, keyring=keyring, dry_run=dry_run
+        )
+    except SrosError as error:
+        why = (
+            f"{first_few(telling, _SHOWN)} {have} a revocation list that the keystore signed and "
+            f"does not know, and it cannot sign another: {error.what}"
+        )
+        for request in requests:
+            if request.request:
+                request.done("not_signed", why)
+        return why, [], []
+    note = restored_note(restored, f"{first_few(telling, _SHOWN)} {have}")
+    return "", [note, *restored.notes], [*changes_below(root, restored.changes)]
 
 
 def _sign(

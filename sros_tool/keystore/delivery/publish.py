@@ -33,12 +33,14 @@ from sros_tool.keystore.delivery.release import (
     Release,
     check_tuf,
     pack_release,
+    read_release,
     seal_releases,
 )
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
+    CRL_FILE,
     FLEET_ROOT,
     PUBLISHED,
     enclave_path,
@@ -46,6 +48,8 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
+from sros_tool.keystore.lifecycle.revocation_list import ForgottenLists
+from sros_tool.keystore.lifecycle.revoke import restore_revocations, restored_note
 from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction.recovery import KeystoreLock
@@ -168,7 +172,8 @@ def publish(
             stack.callback(lock.release)
             lock.acquire()
         run = _Run(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
-        run.check_numbers(restored)
+        if run.check_numbers(restored):
+            run.revoke_again(keyring)
         keys = _Keys(run.roots, root, root_key)
         keys.recover(dry_run)
         keys.open(rotate, now, run.expiry)
@@ -400,19 +405,21 @@ class _Run:
         self._changes: Sequence[FileChange] = ()
         self._notes: list[Note] = []
 
-    def check_numbers(self, restored: bool) -> None:
+    def check_numbers(self, restored: bool) -> bool:
         """Refuse a folder with later releases than the keystore knows, unless it is ``restored``.
+
+        Return whether it was restored.
 
         Raises:
             KeystoreError: the keystore was restored from a backup.
         """
         latest = max((release.number for release in self._there.values()), default=0)
         if latest <= self.list.number:
-            return
+            return False
         # Not by the next number of the ledger: a restored keystore may have issued files since.
         entries = self.keystore.ledger_with("what", "release").entries
         if any(entry.what == "release" and entry.number == latest for entry in entries):
-            return
+            return False
         if not restored:
             robots = [robot for robot, there in self._there.items() if there.number == latest]
             raise KeystoreError(
@@ -420,11 +427,51 @@ class _Run:
                 f"knows: {first_few(robots, 3)} with the number {latest}",
                 "The keystore was restored from a backup, or is a copy. What was changed since, "
                 "such as a revocation, would be undone.",
-                "Restore a later backup. If there is none, repeat what was changed, above all "
-                "revocations, and then add --restored.",
+                "Restore a later backup. If there is none, repeat what was changed, and then add "
+                "--restored, which revokes again what these releases revoke.",
             )
         self.list.robots.clear()
         self._number = latest
+        return True
+
+    def revoke_again(self, keyring: Keyring) -> None:
+        """Revoke what the last releases revoke, and the restored keystore does not.
+
+        Raises:
+            KeystoreError: their revocation list cannot be read, or the CA cannot sign another.
+        """
+        forgotten = ForgottenLists(self.keystore)
+        problem = ""
+        by_number = sorted(self._there.items(), key=lambda robot: robot[1].number, reverse=True)
+        for robot, there in by_number:
+            try:
+                with Folder(self._folder) as folder:
+                    data = folder.read(there.path(robot), most=there.length)
+                files = read_release(data).files
+            except (SrosError, OSError) as error:
+                problem = problem or str(error)
+                continue
+            for path, content in files.items():
+                if path.endswith(f"/{CRL_FILE}"):
+                    forgotten.add(content)
+            break  # the last release has the last list
+        else:
+            raise KeystoreError(
+                f"no release in '{self._folder}' can be read",
+                f"{problem} So it cannot be told which revocations the keystore lacks.",
+                "Restore the folder, or repeat the revocations, and publish in another folder.",
+            )
+        if forgotten.lists:
+            revocation = restore_revocations(
+                self.keystore.root,
+                forgotten.lists,
+                now=self._now,
+                keyring=keyring,
+                dry_run=self._dry_run,
+            )
+            self.keystore = Keystore(self.keystore.root)
+            whence = f"the last release in '{self._folder}' has"
+            self._notes += [restored_note(revocation, whence), *revocation.notes]
 
     # ── which robots ───────────────────────────────────────────────────────────────────────
 

@@ -48,8 +48,70 @@ from sros_tool.pki.certificates import (
     same_key,
     validity_of,
 )
-from sros_tool.pki.crl import REASONS, SUPERSEDED, RevocationList, Revoked, sign_crl, signed_by
+from sros_tool.pki.crl import (
+    REASONS,
+    SUPERSEDED,
+    RevocationList,
+    Revoked,
+    load_crl,
+    sign_crl,
+    signed_by,
+)
 from sros_tool.validity import BACKDATE, Window, iso
+
+
+def revoked_serials(keystore: Keystore) -> frozenset[int]:
+    """Return the serial numbers of all revoked certificates, also of those that were replaced."""
+    entries = keystore.ledger_with("what", "revocation").entries
+    recorded = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
+    listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}
+    return frozenset(recorded | listed)
+
+
+class ForgottenLists:
+    """Lists of a keystore that it does not know any more, as after a backup was restored.
+
+    An identity CA of the keystore signed them, so they are true wherever they come from.
+    """
+
+    def __init__(self, keystore: Keystore) -> None:
+        self.lists: list[RevocationList] = []
+        self._issuing = keystore.ca_certificate(IDENTITY)
+        self._authorities = keystore.authority(IDENTITY)
+        self._revoked = set(revoked_serials(keystore))
+        own = keystore.revocation_list
+        self._latest = own if own and signed_by(own.list, self._issuing) else None
+        self._seen: set[bytes] = set()
+
+    def add(self, document: bytes) -> bool:
+        """Add the lists in a PEM file that tell more than what is known; return whether any does.
+
+        These revoke other certificates, or are not earlier than the keystore's, so that robots
+        would refuse its next list.
+        """
+        sha256 = hashlib.sha256(document).digest()
+        if sha256 in self._seen:
+            return False
+        self._seen.add(sha256)
+        try:
+            crl = load_crl(document, "of a robot")
+            signers = [ca for ca in self._authorities if signed_by(crl.list, ca)]
+        except SrosError:
+            return False
+        serials = {entry.serial for entry in crl.revoked}
+        latest = self._latest
+        is_later = self._issuing in signers and (
+            latest is None
+            or crl.number > latest.number
+            or (crl.number == latest.number and crl[:4] != latest[:4])
+        )
+        if not signers or not (is_later or serials - self._revoked):
+            return False
+        if is_later:
+            self._latest = crl
+        self._revoked |= serials
+        self.lists.append(crl)
+        return True
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,12 +350,17 @@ class RevocationListSigner:
         return None
 
     def sign(
-        self, revocations: Sequence[Entry], names: Sequence[str], *, incomplete: bool
+        self,
+        revocations: Sequence[Entry],
+        names: Sequence[str],
+        *,
+        incomplete: bool,
+        least: int = 0,
     ) -> tuple[datetime, list[Entry]]:
         """Sign and stage the lists; return their first expiry (UTC) and the new ledger entries.
 
         ``revocations`` are the entries of new revocations; the enclaves ``names`` get the lists,
-        except the `recipients`, who have them.
+        except the `recipients`, who have them.  The number of the list is at least ``least``.
         Each list has all serial numbers: the ledger does not say which of two CAs issued a
         certificate, and a serial number of the other CA does no harm.
 
@@ -311,7 +378,7 @@ class RevocationListSigner:
                 "revocations were restored."
             )
             self.remarks.append(Note("crl.put-back", text))
-        signed = self._sign(self._authority, self.present, new_entries, expiries, 0)
+        signed = self._sign(self._authority, self.present, new_entries, expiries, least)
         self._transaction.write(CRL, signed.document)
         signed_lists = [signed]
         if second := self._sign_second(new_entries, names, expiries, incomplete=incomplete):

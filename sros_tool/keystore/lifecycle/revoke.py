@@ -25,10 +25,13 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
+from sros_tool.keystore.lifecycle.revocation_list import revoked_serials
 from sros_tool.keystore.selection import no_such_enclave
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import issued_by
-from sros_tool.pki.crl import REASONS, SUPERSEDED
+from sros_tool.pki.crl import REASONS, SUPERSEDED, RevocationList
+from sros_tool.validity import iso
+from sros_tool.wording import first_few
 
 _FILES = (
     *REQUIRED_FILES,
@@ -39,6 +42,7 @@ _FILES = (
     REQUEST,
 )
 _PRIVATE = "key.pem"
+_SHOWN = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,6 +120,85 @@ def revoke(
         next_update=next_update,
         reason=reason,
     )
+
+
+def restore_revocations(
+    root: Path,
+    forgotten: Sequence[RevocationList],
+    *,
+    now: datetime,
+    keyring: Keyring = IN_KEYSTORE,
+    dry_run: bool = False,
+) -> Revocation:
+    """Revoke again what lists of the keystore revoke that it does not know any more.
+
+    The next list has a higher number than these.  Enclaves that they revoke are moved to
+    ``revoked``, as they were before, also if they were renewed since; those of which only an
+    earlier certificate was replaced stay.
+
+    Raises:
+        KeystoreError: as `revoke`.
+    """
+    change = KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run)
+    with change:
+        lists, known = change.revocation_lists(), revoked_serials(change.keystore)
+        reasons = {
+            f"{entry.serial:x}": entry.reason
+            for crl in forgotten
+            for entry in crl.revoked
+            if entry.serial not in known
+        }
+        recorded = change.keystore.ledger_file.with_values("serial", reasons).entries
+        issued = {
+            entry.serial: entry
+            for entry in recorded
+            if entry.what == "certificate" and entry.serial in reasons
+        }
+        again = {
+            entry.enclave: reasons[serial]
+            for serial, entry in sorted(issued.items())
+            if reasons[serial] != SUPERSEDED and has_enclave(root, entry.enclave)
+        }
+        _check_names(change, tuple(again))
+        revocations = []
+        for name, reason in again.items():
+            revocations += lists.revocations({name: _move_away(change, name)}, reason)
+        done = {entry.serial for entry in revocations}
+        for serial, reason in reasons.items():
+            if serial not in done:
+                # Without the enclave, which may be there with another certificate.
+                entry = Entry(iso(now), "revocation", serial=serial, reason=reason)
+                if (of := issued.get(serial)) and reason != SUPERSEDED:
+                    entry = entry._replace(subject=of.subject, key=of.key)
+                revocations.append(entry)
+        gone = frozenset(again)
+        change.restart = tuple(name for name in change.names if name not in gone)
+        next_update, change.entries = lists.sign(
+            revocations,
+            change.restart,
+            incomplete=True,
+            least=max(crl.number for crl in forgotten) + 1,
+        )
+        change.remarks += lists.remarks
+        _drop_routers(change, gone)
+        change.keep_zenoh({}, gone=gone)
+        change.record()
+        change.finish(aim="revoke")
+    return change.result(
+        Revocation, outcomes=dict.fromkeys(again, "revoked"), next_update=next_update
+    )
+
+
+def restored_note(restored: Revocation, whence: str) -> Note:
+    """Return a note on revocations that `restore_revocations` took from ``whence``."""
+    again = "would be revoked again" if restored.dry_run else "is revoked again"
+    text = (
+        f"{whence} a revocation list that the keystore signed and does not know: it was restored "
+        f"from a backup, or is a copy. What the list revokes {again}"
+    )
+    if restored.outcomes:
+        text += f", with {first_few(tuple(restored.outcomes), _SHOWN)}"
+    return Note("fleet.revocations-restored", f"{text}.")
 
 
 def refresh_crl(
