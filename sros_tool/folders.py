@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import stat
 import sys
 from collections.abc import Iterable, Iterator
@@ -30,6 +31,8 @@ _OLD_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _MOST_OPEN = 64
 _MOST_BYTES = 128 * 1024 * 1024
 _RENAME_EXCHANGE = 2
+_SIMPLE_LINK = re.compile(r"(?:\.\./)*(?:[^/.][^/]*/)*[^/.][^/]*")
+"""Targets of links that mean the same after a text replacement of their leading ``..``."""
 _NOT_SUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
 
 
@@ -141,6 +144,16 @@ class Folder:
         Raises:
             KeystoreError: a link leads out of the folder.
         """
+        try:  # faster, for a file or a simple link to one: `read` follows no link
+            target = self.link_target(path)
+            if target is None:
+                return self.read(path)
+            if _SIMPLE_LINK.fullmatch(target):
+                parent = path.rpartition("/")[0]
+                return self.read(os.path.normpath(f"{parent}/{target}" if parent else target))
+        except (OSError, ValueError, KeystoreError) as error:
+            if isinstance(error, FileNotFoundError) and not os.path.lexists(self.path / path):
+                raise
         real, top = (os.path.realpath(each) for each in (self.path / path, self.path))
         if not Path(real).is_relative_to(top):
             raise KeystoreError(

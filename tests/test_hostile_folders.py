@@ -553,6 +553,39 @@ _BELOW_A_LINK: dict[str, Callable[[Folder], object]] = {
 }
 
 
+def test_a_file_is_read_through_links_that_stay_in_the_folder(tmp_path: Path) -> None:
+    top = tmp_path / "top"
+    for name in ("a/b", "far/deep/below"):
+        (top / name).mkdir(parents=True)
+    for path in ("top/far/file", "top/far/deep/file", "top/file", "file", "top/a/file"):
+        (tmp_path / path).write_text(path)
+    (top / "a/link").symlink_to(top / "far/deep")
+    targets = {
+        "../file": "top/a/file",
+        "../../file": "top/file",
+        "../../../file": None,
+        "../link/file": "top/far/deep/file",
+        "../link/../file": "top/far/file",
+        "../../far/deep/below/../file": "top/far/deep/file",
+        str(top / "file"): "top/file",
+        str(tmp_path / "file"): None,
+        "/file": None,
+    }
+    with Folder(top) as folder:
+        for target, expected in targets.items():
+            (top / "a/b/link").symlink_to(target)
+            if expected:
+                assert folder.read_inside("a/b/link").decode() == expected
+            else:
+                with pytest.raises(KeystoreError, match="is a link out of"):
+                    folder.read_inside("a/b/link")
+            (top / "a/b/link").unlink()
+        assert folder.read_inside("a/link/file") == b"top/far/deep/file"
+        for missing in ("a/b/link", "a/none/file"):
+            with pytest.raises(FileNotFoundError):
+                folder.read_inside(missing)
+
+
 @pytest.mark.parametrize("operation", _BELOW_A_LINK.values(), ids=_BELOW_A_LINK)
 def test_no_operation_goes_through_a_link(
     operation: Callable[[Folder], object], tmp_path: Path

@@ -9,7 +9,7 @@ import os
 import shutil
 import stat
 import tarfile
-from datetime import timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,8 @@ from sros_tool.agent.fetch import FetchProblem
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery import publish as publishing
+from sros_tool.keystore.delivery.export import ReleasedEnclave
+from sros_tool.keystore.delivery.export import released_enclave as evaluate
 from sros_tool.keystore.delivery.published import (
     MetadataExpiry,
     PublishedRelease,
@@ -123,6 +125,71 @@ def test_an_expired_enclave_still_gets_the_revocation_list(publisher: Home) -> N
     assert {note.id for note in result.notes} >= {"fleet.release-not-valid"}
     robot = publisher.robot(pinned_at=publisher.now - 200 * DAY)
     assert robot.gets().enclaves()["/r1/base"]["crl.pem"]
+
+
+def evaluations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return a list that gets the name of each enclave that is evaluated from now on."""
+    evaluated: list[str] = []
+
+    def released_enclave(root: Path, name: str, now: datetime) -> ReleasedEnclave:
+        evaluated.append(name)
+        return evaluate(root, name, now)
+
+    monkeypatch.setattr(publishing, "released_enclave", released_enclave)
+    return evaluated
+
+
+def test_a_revocation_evaluates_one_enclave_of_those_that_stay(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluated = evaluations(monkeypatch)
+    publisher.run("revoke", "ks", "--robot", "r5")
+    assert publisher.publish().names("published") == ["r1", "r2"]
+    assert len(evaluated) == 1
+    for name in ("r1", "r2"):
+        assert publisher.robot(name).gets().enclaves()[f"/{name}/base"]["crl.pem"]
+
+
+def test_what_else_changed_with_a_revocation_is_evaluated(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A changed file, a later version of sros, and the expiry of what was evaluated."""
+    publisher.run("revoke", "ks", "--robot", "r5")
+    evaluated = evaluations(monkeypatch)
+    publisher.run("renew", "ks", "/r2/base")
+    publisher.publish()
+    assert sorted(evaluated) == ["/r1/base", "/r2/base"]
+    for days, version in ((1, "later"), (200, "later")):
+        monkeypatch.setattr(publishing, "__version__", version)
+        publisher.run("crl", "ks", "--refresh")
+        evaluated.clear()
+        assert publisher.publish(after=days * DAY).names("published") == ["r1", "r2"]
+        assert sorted(evaluated) == ["/r1/base", "/r2/base"]
+
+
+def test_a_revoked_enclave_that_is_put_back_is_refused(publisher: Home) -> None:
+    kept = publisher.copy(publisher.folder.with_name("kept")).root / "enclaves/r2"
+    publisher.run("revoke", "ks", "--robot", "r2")
+    shutil.copytree(kept, publisher.root / "enclaves/r2", symlinks=True)
+    (publisher.root / "enclaves/r2/base/crl.pem").symlink_to("../../../public/identity_ca.crl.pem")
+    result = publisher.publish()
+    assert (result.names("published"), result.names("refused")) == (["r1", "r5"], ["r2"])
+    assert "revoked" in next(robot.why for robot in result.robots if robot.why)
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_a_damaged_archive_is_published_again(publisher: Home, missing: bool) -> None:
+    assert not publisher.publish().notes
+    (archive,) = (publisher.pub / "targets/robots").glob("*.r2.tar.gz")
+    data = archive.read_bytes()
+    archive.write_bytes(data[:-9] + bytes([data[-9] ^ 1]) + data[-8:])
+    if missing:
+        archive.unlink()
+    publisher.robot("r2").refuses(FetchProblem.UNREACHABLE if missing else FetchProblem.NOT_SIGNED)
+    result = publisher.publish()
+    assert result.names("published") == ["r2"]
+    assert [note.id for note in result.notes] == ["fleet.archive-damaged"]
+    assert publisher.robot("r2").gets().number > read_release(data).number
 
 
 def test_a_private_key_in_a_file_that_would_be_published(publisher: Home) -> None:

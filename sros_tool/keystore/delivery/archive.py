@@ -7,8 +7,7 @@ import hashlib
 import io
 import tarfile
 import zlib
-from collections.abc import Iterator, Mapping
-from pathlib import PurePosixPath
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 from sros_tool.errors import DocumentError
@@ -47,18 +46,9 @@ def pack(files: Mapping[str, bytes]) -> bytes:
 
     It has no users, groups and times, so the same files always give the same bytes.
     """
-    buffer = io.BytesIO()
-    with (
-        gzip.GzipFile(fileobj=buffer, mode="wb", filename="", mtime=0) as packed,
-        tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as tar,
-    ):
-        folders = {
-            str(parent)
-            for path in files
-            for parent in PurePosixPath(path).parents
-            if str(parent) != "."
-        }
-        for folder in sorted(folders):
+    plain, buffer = io.BytesIO(), io.BytesIO()
+    with tarfile.open(fileobj=plain, mode="w", format=tarfile.PAX_FORMAT) as tar:
+        for folder in sorted(_folders(files)):
             entry = tarfile.TarInfo(folder)
             entry.type, entry.mode = tarfile.DIRTYPE, folder_mode(folder)
             tar.addfile(entry)
@@ -66,7 +56,20 @@ def pack(files: Mapping[str, bytes]) -> bytes:
             entry = tarfile.TarInfo(path)
             entry.size, entry.mode = len(data), file_mode(path)
             tar.addfile(entry, io.BytesIO(data))
+    with gzip.GzipFile(fileobj=buffer, mode="wb", filename="", mtime=0) as packed:
+        packed.write(plain.getbuffer())
     return buffer.getvalue()
+
+
+def _folders(paths: Iterable[str]) -> set[str]:
+    """Return the folders that relative paths are in, at all depths."""
+    folders: set[str] = set()
+    for path in paths:
+        folder = path.rpartition("/")[0]
+        while folder and folder not in folders:
+            folders.add(folder)
+            folder = folder.rpartition("/")[0]
+    return folders
 
 
 def listed_digests(files: Mapping[str, bytes]) -> bytes:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
+from functools import lru_cache
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, NamedTuple
@@ -18,10 +20,12 @@ from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack
 from sros_tool.keystore.delivery.robot import check_same_authority
 from sros_tool.keystore.layout import (
     ENCLAVES,
+    IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_FILES,
     KEY_URI_FILE,
     OPTIONAL_FILES,
+    PERMISSIONS_CA_FILE,
     PRIVATE,
     REQUIRED_FILES,
     ZENOH_FILES,
@@ -43,6 +47,7 @@ from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
+from sros_tool.pki.certificates import load_certificates, validity_of
 from sros_tool.pki.keys import holds_private_key
 from sros_tool.pki.token import read_token_file
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words
@@ -215,24 +220,71 @@ def exported_files(
     return dict(sorted(files.items()))
 
 
-def released_files(root: Path, name: str, now: datetime) -> tuple[dict[str, bytes], str]:
-    """Return the files of an enclave without its key, and what of them is not valid at ``now``.
+class ReleasedEnclave(NamedTuple):
+    """The files of an enclave without its key, and what was found when they were evaluated.
+
+    ``not_valid`` is a clause on what is not valid now, or "".  Until ``until``, files with another
+    revocation list are as good as these if that list is good and does not revoke the enclave.
+    """
+
+    files: Mapping[str, bytes]
+    not_valid: str
+    until: datetime
+
+
+def released_enclave(root: Path, name: str, now: datetime) -> ReleasedEnclave:
+    """Return the files of an enclave for its robot, after evaluating them.
 
     An enclave that cannot run only because of the time is still released: its robot may have
-    another that can, and has to get the revocation list.  What is not valid is a clause, or "".
+    another that can, and has to get the revocation list.
 
     Raises:
         KeystoreError: the enclave cannot run for another reason.
     """
     evaluation = _evaluated(root, name, now)
-    problems = evaluation.state.problems_at_home
+    state = evaluation.state
+    problems = state.problems_at_home
     lasting = [str(problem) for problem in problems if problem.fault not in _OF_TIME]
     if lasting or (evaluation.problems and not problems):
         raise _not_running(root, name, lasting or evaluation.problems)
-    files = _files_of(root, name, evaluation)
-    for file in KEY_FILES:
-        files.pop(f"{enclave_folder(name)}/{file}", None)
-    return files, "; ".join(map(str, problems))
+    _check_zenoh(root, enclave_path(root, name), name, state)
+    _check_no_authority(enclave_path(root, name), state)
+    files = released_files(root, name)
+    until = now if problems else _evaluated_until(files, state, now)
+    return ReleasedEnclave(files, "; ".join(map(str, problems)), until)
+
+
+def released_files(root: Path, name: str) -> dict[str, bytes]:
+    """Map the paths of all files of an enclave but its key to their content, not evaluated.
+
+    Raises:
+        KeystoreError: a file has a private key.
+    """
+    return _read_files(root, name, (file for file in _FILES if file not in KEY_FILES))
+
+
+def _evaluated_until(files: Mapping[str, bytes], state: OpenedEnclave, now: datetime) -> datetime:
+    """Return the first moment at which files without problems may have one, whatever the list.
+
+    It is ``now`` for files whose evaluation looks at revocation lists in other ways: there are
+    lists in the file of a CA, or configurations of Zenoh.
+    """
+    by_name = {path.rpartition("/")[2]: data for path, data in files.items()}
+    authorities = [by_name[file] for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)]
+    if by_name.keys() & {*ZENOH_FILES} or any(b"X509 CRL" in data for data in authorities):
+        return now
+    if not (state.certificate and state.permissions):
+        return now
+    return min(
+        validity_of(state.certificate).not_after,
+        *(grant.validity.not_after for grant in state.permissions.grants),
+        *map(_first_expiry, authorities),
+    )
+
+
+@lru_cache(maxsize=16)
+def _first_expiry(authorities: bytes) -> datetime:
+    return min(validity_of(each).not_after for each in load_certificates(authorities, ""))
 
 
 _OF_TIME = frozenset(
@@ -271,22 +323,38 @@ def _files_of(root: Path, name: str, evaluation: EvaluatedEnclave) -> dict[str, 
             be used.
     """
     folder, state = enclave_path(root, name), evaluation.state
-    files: dict[str, bytes] = {}
     _check_zenoh(root, folder, name, state)
-    authorities = (state.identity_ca, state.permissions_ca)
-    if any(
-        authority and state.certificate and authority.public_key() == state.certificate.public_key()
-        for authority in authorities
-    ):
-        raise _holds_ca_key(folder / KEY_FILE)
+    _check_no_authority(folder, state)
+    return _read_files(root, name, _FILES)
+
+
+_FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES)
+
+
+def _read_files(root: Path, name: str, wanted: Iterable[str]) -> dict[str, bytes]:
+    """Map the paths of those of an enclave's files that exist to their content.
+
+    Raises:
+        KeystoreError: a file other than that of the key has a private key.
+    """
+    files: dict[str, bytes] = {}
     with Folder(root) as opened:
-        for file in (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES):
+        for file in wanted:
             path = f"{enclave_folder(name)}/{file}"
-            if (folder / file).exists():
+            with suppress(FileNotFoundError):
                 files[path] = opened.read_inside(path)
                 if file != KEY_FILE and holds_private_key(files[path]):
-                    raise _holds_ca_key(folder / file)
+                    raise _holds_ca_key(root / path)
     return files
+
+
+def _check_no_authority(folder: Path, state: OpenedEnclave) -> None:
+    """Raise `KeystoreError` if the key of an enclave is the key of a CA."""
+    if any(
+        authority and state.certificate and authority.public_key() == state.certificate.public_key()
+        for authority in (state.identity_ca, state.permissions_ca)
+    ):
+        raise _holds_ca_key(folder / KEY_FILE)
 
 
 def _check_zenoh(root: Path, folder: Path, name: str, state: OpenedEnclave) -> None:

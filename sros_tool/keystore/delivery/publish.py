@@ -11,18 +11,24 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import datetime, timedelta
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
+from cryptography import x509
+from cryptography.x509.oid import ExtensionOID
+
+from sros_tool import __version__
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.files import remove_file, staged_file
 from sros_tool.folders import Folder, make_folders
 from sros_tool.keystore.delivery.archive import listed_digests
-from sros_tool.keystore.delivery.export import released_files
+from sros_tool.keystore.delivery.export import released_enclave, released_files
 from sros_tool.keystore.delivery.published import (
+    Evaluated,
     MetadataExpiry,
     PublishedRelease,
     PublishedRobot,
@@ -42,7 +48,9 @@ from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
     FLEET_ROOT,
+    IDENTITY_CA_FILE,
     PUBLISHED,
+    enclave_folder,
     enclave_path,
     fleet_key,
 )
@@ -54,6 +62,7 @@ from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction.recovery import KeystoreLock
 from sros_tool.parallel import map_slices, tick
+from sros_tool.pki.crl import lists_as_revoked, read_list
 from sros_tool.validity import iso
 from sros_tool.values import (
     DryRun,
@@ -377,6 +386,92 @@ class _Made(NamedTuple):
     not_valid: str = ""
 
 
+class _RobotFiles(NamedTuple):
+    """The files of a robot's release by path, sorted, and what their evaluation found."""
+
+    files: Mapping[str, bytes]
+    not_valid: str
+    evaluated: Evaluated | None
+
+
+class _Evaluator:
+    """Evaluator of the files of releases.
+
+    A revocation changes one file of each enclave.  Where the others were evaluated before, it is
+    enough to evaluate the new list with one enclave of each kind, and to look for the certificates
+    of the others in the list.
+    """
+
+    def __init__(self, root: Path, now: datetime) -> None:
+        self._root = root
+        self._now = now
+        self._lists: dict[object, bool] = {}
+
+    def files(self, enclaves: Sequence[str], before: Evaluated | None) -> _RobotFiles:
+        """Return the files of a robot with these enclaves.
+
+        ``before`` are the files that were evaluated for its last release.
+
+        Raises:
+            SrosError: an enclave cannot run, or its files cannot be read.
+        """
+        if before:
+            by_enclave = {name: released_files(self._root, name) for name in enclaves}
+            files = _sorted(by_enclave.values())
+            if before.holds(_without_lists(files), self._now) and all(
+                self._is_list_good(name, of_enclave) for name, of_enclave in by_enclave.items()
+            ):
+                return _RobotFiles(files, "", before)
+        released = {name: released_enclave(self._root, name, self._now) for name in enclaves}
+        files = _sorted(enclave.files for enclave in released.values())
+        not_valid = (f"{name}: {of.not_valid}" for name, of in released.items() if of.not_valid)
+        until = min(enclave.until for enclave in released.values())
+        evaluated = Evaluated(_without_lists(files), self._now, until)
+        return _RobotFiles(files, "; ".join(not_valid), evaluated if until > self._now else None)
+
+    def _is_list_good(self, name: str, files: Mapping[str, bytes]) -> bool:
+        """Return whether a list is good for an enclave like this one, and does not revoke it.
+
+        False also where only the whole evaluation can tell.
+        """
+        folder = enclave_folder(name)
+        data = files.get(f"{folder}/{CRL_FILE}")
+        try:
+            certificate = x509.load_pem_x509_certificate(files[f"{folder}/{CERTIFICATE_FILE}"])
+            extensions = frozenset(
+                (extension.oid, extension.critical, extension.value.public_bytes())
+                for extension in certificate.extensions
+                if extension.oid != ExtensionOID.SUBJECT_KEY_IDENTIFIER
+            )
+            revokes = data is not None and lists_as_revoked(
+                _read_list(data), certificate.serial_number
+            )
+        except (ValueError, SrosError):
+            return False
+        kind = data, files[f"{folder}/{IDENTITY_CA_FILE}"], certificate.issuer, extensions
+        if kind not in self._lists:
+            try:
+                enclave = released_enclave(self._root, name, self._now)
+                self._lists[kind] = not enclave.not_valid
+            except SrosError:
+                self._lists[kind] = False
+        return self._lists[kind] and not revokes
+
+
+_read_list = lru_cache(maxsize=16)(partial(read_list, name=CRL_FILE))
+
+
+def _sorted(enclaves: Iterable[Mapping[str, bytes]]) -> dict[str, bytes]:
+    """Return the files of all enclaves by path, sorted."""
+    return dict(sorted(item for files in enclaves for item in files.items()))
+
+
+def _without_lists(files: Mapping[str, bytes]) -> str:
+    """Return a digest of files without revocation lists, and of the version that evaluates them."""
+    others = {path: data for path, data in files.items() if not path.endswith(f"/{CRL_FILE}")}
+    return hashlib.sha256(__version__.encode() + b"\n" + listed_digests(others)).hexdigest()
+
+
 class _Run:
     """One run of `publish`: what is there, what is to be, and the writing."""
 
@@ -401,6 +496,7 @@ class _Run:
         self._composed: Composed | None = None
         self._made: list[_Made] = []
         self._removed: list[str] = []
+        self._damaged: set[str] = set()
         self._number = 0
         self._changes: Sequence[FileChange] = ()
         self._notes: list[Note] = []
@@ -494,8 +590,11 @@ class _Run:
             wanted.add(robot.name)
             state = _state(root, names)
             before = self.list.robots.get(robot.name)
-            if not before or before.files != state or not self._has(robot.name, before.release):
+            if not before or before.files != state:
                 found.append(_Changed(robot.name, names, state))
+            elif not self._has(robot.name, before.release):
+                found.append(_Changed(robot.name, names, state))
+                self._damaged |= {robot.name} if robot.name in self._there else set()
         known = self.list.robots.keys() | self._there.keys()
         gone = (known if among is None else looked_at) - wanted
         for name in gone:
@@ -504,11 +603,12 @@ class _Run:
         return found
 
     def _has(self, robot: str, release: PublishedRelease) -> bool:
-        """Return whether the folder has the archive of a release."""
+        """Return whether the folder has the archive of a release, undamaged."""
         try:
-            return (self._folder / release.path(robot)).stat().st_size == release.length
-        except OSError:
+            data = read_bytes(self._folder / release.path(robot), "archive", most=release.length)
+        except SrosError:
             return False
+        return hashlib.sha256(data).hexdigest() == release.sha256
 
     # ── their releases ─────────────────────────────────────────────────────────────────────
 
@@ -527,6 +627,10 @@ class _Run:
         alone = authority is not None and authority.on_token
         made = [(changed, work(changed))] if alone else map_slices(changed, work)
         self._made = [robot for _, part in made for robot in part]
+        if self._damaged:
+            text = f"missing or damaged in '{self._folder}', so that robots refused them: the "
+            text += f"archives of {first_few(sorted(self._damaged), 5)}"
+            self._notes.append(Note("fleet.archive-damaged", text))
         lines = []
         for robot, published, is_new, _, not_valid in self._made:
             if published:
@@ -544,44 +648,40 @@ class _Run:
         self, robots: Sequence[_Changed], number: int, authority: Authority | None
     ) -> Iterator[_Made]:
         """Yield what came of each robot; without ``authority`` nothing is sealed and written."""
-        new: list[tuple[_Changed, dict[str, bytes], str, str]] = []
+        evaluator = _Evaluator(self.keystore.root, self._now)
+        new: list[tuple[_Changed, _RobotFiles, str]] = []
         for robot in robots:
-            files: dict[str, bytes] = {}
-            problems = []
+            before = self.list.robots.get(robot.robot)
             try:
-                for name in robot.enclaves:
-                    of_enclave, problem = released_files(self.keystore.root, name, self._now)
-                    files |= of_enclave
-                    problems += [f"{name}: {problem}"] if problem else []
+                files = evaluator.files(robot.enclaves, before.evaluated if before else None)
             except SrosError as error:
                 yield _Made(robot.robot, None, why=str(error))
                 continue
-            files = dict(sorted(files.items()))
-            content = hashlib.sha256(listed_digests(files)).hexdigest()
-            before = self.list.robots.get(robot.robot)
+            content = hashlib.sha256(listed_digests(files.files)).hexdigest()
             if before and before.content == content and self._has(robot.robot, before.release):
-                yield _Made(robot.robot, before._replace(files=robot.state))
+                kept = before._replace(files=robot.state, evaluated=files.evaluated)
+                yield _Made(robot.robot, kept)
             else:
-                new.append((robot, files, content, "; ".join(problems)))
+                new.append((robot, files, content))
             tick()
         if authority is None:
-            for robot, _, content, not_valid in new:
+            for robot, files, content in new:
                 planned = PublishedRobot(
                     PublishedRelease(number, "0" * 64, 0), content, robot.state
                 )
-                yield _Made(robot.robot, planned, is_new=True, not_valid=not_valid)
+                yield _Made(robot.robot, planned, is_new=True, not_valid=files.not_valid)
             return
         seals = seal_releases(
-            [(robot.robot, number, files) for robot, files, _, _ in new], authority
+            [(robot.robot, number, files.files) for robot, files, _ in new], authority
         )
         with Folder(self._folder) as folder:
-            for (robot, files, content, not_valid), seal in zip(new, seals, strict=True):
-                data = pack_release(Release(robot.robot, number, files, seal))
+            for (robot, files, content), seal in zip(new, seals, strict=True):
+                data = pack_release(Release(robot.robot, number, files.files, seal))
                 digest = hashlib.sha256(data).hexdigest()
                 release = PublishedRelease(number, digest, len(data))
                 _put(folder, release.path(robot.robot), data)
-                published = PublishedRobot(release, content, robot.state)
-                yield _Made(robot.robot, published, is_new=True, not_valid=not_valid)
+                published = PublishedRobot(release, content, robot.state, files.evaluated)
+                yield _Made(robot.robot, published, is_new=True, not_valid=files.not_valid)
 
     # ── metadata ───────────────────────────────────────────────────────────────────────────
 

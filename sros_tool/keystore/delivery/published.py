@@ -39,6 +39,21 @@ class PublishedRelease(NamedTuple):
         return f"targets/{folder}/{self.sha256}.{name}"
 
 
+class Evaluated(NamedTuple):
+    """Files of a robot that were evaluated without a problem, and for how long that holds.
+
+    ``files`` is a digest of their list without revocation lists, and of the version of sros.
+    """
+
+    files: str
+    since: datetime
+    until: datetime
+
+    def holds(self, files: str, now: datetime) -> bool:
+        """Return whether the files with the digest ``files`` need no evaluation at ``now``."""
+        return self.files == files and self.since <= now < self.until
+
+
 class PublishedRobot(NamedTuple):
     """What was published last for a robot, and what it was made from.
 
@@ -49,6 +64,7 @@ class PublishedRobot(NamedTuple):
     release: PublishedRelease
     content: str
     files: str
+    evaluated: Evaluated | None = None
 
 
 @dataclass
@@ -70,10 +86,7 @@ class Published:
 
     def document(self, now: datetime) -> bytes:
         """Return the content of the file."""
-        robots = {
-            name: {**robot.release._asdict(), "content": robot.content, "files": robot.files}
-            for name, robot in sorted(self.robots.items())
-        }
+        robots = {name: _as_json(robot) for name, robot in sorted(self.robots.items())}
         superseded = {path: iso(time) for path, time in sorted(self.superseded.items())}
         value = {
             "format": _FORMAT,
@@ -110,7 +123,17 @@ def read_published(keystore: Keystore) -> Published:
 
 def _robot(value: Mapping[str, Any]) -> PublishedRobot:
     release = PublishedRelease(int(value["number"]), str(value["sha256"]), int(value["length"]))
-    return PublishedRobot(release, str(value["content"]), str(value["files"]))
+    files, *times = value.get("evaluated", [""])
+    evaluated = Evaluated(str(files), *map(parse_iso, times)) if times else None
+    return PublishedRobot(release, str(value["content"]), str(value["files"]), evaluated)
+
+
+def _as_json(robot: PublishedRobot) -> dict[str, object]:
+    value = {**robot.release._asdict(), "content": robot.content, "files": robot.files}
+    if robot.evaluated is None:
+        return value
+    files, since, until = robot.evaluated
+    return {**value, "evaluated": [files, iso(since), iso(until)]}
 
 
 class MetadataExpiry(NamedTuple):
