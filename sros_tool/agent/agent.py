@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -133,6 +134,7 @@ class _Round:
         self._state = read_state(folder)
         self._is_in_step = False
         """Whether home publishes what is here, so that it knows the revocation list."""
+        self._began = time.clock_gettime(time.CLOCK_BOOTTIME)
 
     def run(self) -> Round:
         now, before = self._machine.now, self._state
@@ -150,9 +152,7 @@ class _Round:
         self._note_due(installation.changed, names)
         if clock is not RobotClock.BEHIND:  # nodes would not accept their certificates
             self._restart(names, opened)
-        seen = look_at_processes(
-            self._folder, names, now=now, zone=self._machine.zone, look=self._machine.look
-        )
+        seen = self._look(names)
         self._problems += [f"{problem}." for problem in seen.problems]
         self._state = replace(self._state, due=still_due(self._state.due, seen))
         asked = self._renewals(names)
@@ -361,9 +361,7 @@ class _Round:
         if not settings.restart or not self._state.due:
             return
         # Only processes that were seen with earlier files, or may have them.
-        seen = look_at_processes(
-            self._folder, names, now=machine.now, zone=machine.zone, look=machine.look
-        )
+        seen = self._look(names)
         routers = [
             name for name in names if (enclave_path(self._folder, name) / ROUTER_FILE).exists()
         ]
@@ -373,6 +371,14 @@ class _Round:
             routers=routers,
             unusable={name: enclave.problem for name, enclave in opened.items() if enclave.problem},
             systemd=machine.systemd or Systemd(settings.systemctl),
+        )
+
+    def _look(self, names: Iterable[str]) -> EnclaveProcesses:
+        """Look at the processes at the present time, which is later than the begin of the round."""
+        passed = timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME) - self._began)
+        machine = self._machine
+        return look_at_processes(
+            self._folder, names, now=machine.now + passed, zone=machine.zone, look=machine.look
         )
 
     def _renewals(self, names: Iterable[str]) -> Renewals:

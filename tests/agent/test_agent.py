@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
@@ -66,6 +67,8 @@ class Robot:
     boot: str = "first"
     restarted: bool = False
     settings: AgentSettings = field(init=False)
+    looked: list[datetime] = field(default_factory=list)
+    """The time of each look at the processes."""
     asked: list[int] = field(default_factory=list)
     """The number of the installed release in each question to the source."""
     systemctl: list[str] = field(default_factory=list)
@@ -85,7 +88,7 @@ class Robot:
             now or moment(),
             UTC,
             no_secrets,
-            look=lambda _now: self.running(),
+            look=self.running,
             systemd=FakeSystemd(self),
             fetch=self.fetch,
             clock=lambda: self.clock,
@@ -102,7 +105,8 @@ class Robot:
         fresh = self.release and self.release.number != more["installed"]
         return self.release if fresh else None
 
-    def running(self) -> RunningProcesses:
+    def running(self, now: datetime) -> RunningProcesses:
+        self.looked.append(now)
         unseen = (UnseenProcess(9, ("x",), "it is closed", speaks=False),) if self.unseen else ()
         return RunningProcesses(tuple(map(self.process, self.started)), unseen)
 
@@ -374,6 +378,16 @@ def test_a_restart_is_due_until_the_processes_were_seen_with_the_new_files(
     assert r1.round().restart == ()
 
 
+def test_a_look_at_the_processes_has_its_own_time(r1: Robot) -> None:
+    """A process seems to start earlier by what passes between the time and the look."""
+    before, now = time.monotonic(), moment()
+    r1.started["/r1/base"] = now
+    r1.round(now)
+    passed = timedelta(seconds=time.monotonic() - before)
+    (looked,) = r1.looked
+    assert now < looked <= now + passed
+
+
 @pytest.mark.parametrize("how", ["restart of the machine", "somebody says so"])
 def test_a_restart_of_all_ends_what_cannot_be_seen(how: str, home: Home, r1: Robot) -> None:
     r1.round()
@@ -430,7 +444,8 @@ def test_what_is_wrong_with_processes_is_confirmed(r1: Robot) -> None:
     process = r1.process("/r1/a")
     permissive = {**process.environment, "ROS_SECURITY_STRATEGY": "Permissive"}
     outside = replace(process, enclave=replace(process.enclave, keystore="/x", here=None))  # type: ignore[type-var]
-    r1.running = lambda: RunningProcesses((replace(process, environment=permissive), outside))  # type: ignore[method-assign]
+    running = RunningProcesses((replace(process, environment=permissive), outside))
+    r1.running = lambda _now: running  # type: ignore[method-assign]
     (problem,) = r1.round().problems
     assert problem.startswith("process 1 (node):") and r1.message().problems == (problem,)
 
