@@ -20,6 +20,7 @@ from pathlib import Path
 from benchmarks.checking import checking
 from benchmarks.deciding import deciding
 from benchmarks.explaining import explaining, explaining_zenoh
+from benchmarks.fetching import fetching
 from benchmarks.fleet import fleet
 from benchmarks.floor import make_enclaves, sizes_of
 from benchmarks.inputs import enclaves_policy, topics_policy
@@ -58,6 +59,9 @@ def main() -> int:
         "--fleet", type=int, default=0, help="only measure a fleet of this number of enclaves"
     )
     parser.add_argument(
+        "--agents", type=int, default=0, help="only measure this number of robots that fetch"
+    )
+    parser.add_argument(
         "--protection",
         choices=("auto", "rclpy", "cyclone"),
         help="only measure what encryption and signatures cost on this back end of the demo",
@@ -68,6 +72,9 @@ def main() -> int:
         folder = Path(name)
         if options.fleet:
             return _report((Row(*each) for each in fleet(folder, options.fleet, RULES)), options)
+        if options.agents:
+            fetched = fetching(folder, options.agents, RULES)
+            return _report((Row(*figure) for figure in fetched), options)
         if options.protection:
             figures = protecting(folder, options.protection, options.rounds)
             return _report((Row(*figure) for figure in figures), options)

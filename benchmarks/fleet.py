@@ -46,7 +46,7 @@ def fleet(folder: Path, enclaves: int, rules: int) -> Iterator[Figure]:
     policy.write_text(fleet_policy(PER_ROBOT, rules))
     robots.write_text(fleet_file(enclaves // PER_ROBOT))
     make = ("generate_artifacts", "-k", root, "-p", policy, "--fleet", robots)
-    made = _cost(*make)
+    made = cost(*make)
     sizes = sizes_of(root / "enclaves/r1/part_0")
     floor = _cost_of(
         [
@@ -87,10 +87,10 @@ def fleet(folder: Path, enclaves: int, rules: int) -> Iterator[Figure]:
     ):
         if words[0] == "fleet":
             _confirm(root, enclaves // PER_ROBOT)
-        cost = _cost(*words)
-        yield (task, cost.passed, None, "-", True, "s")
-        yield (f"{task}: CPU", cost.cpu, None, "-", True, "s")
-        yield (f"{task}: peak memory, in MB", cost.memory, None, "-", True, "MB")
+        taken = cost(*words)
+        yield (task, taken.passed, None, "-", True, "s")
+        yield (f"{task}: CPU", taken.cpu, None, "-", True, "s")
+        yield (f"{task}: peak memory, in MB", taken.memory, None, "-", True, "MB")
 
 
 def _confirm(root: Path, robots: int) -> None:
@@ -112,7 +112,8 @@ def _words(sizes: Sequence[tuple[str, int | str]]) -> list[str]:
     return [f"{name}={size}" for name, size in sizes]
 
 
-def _cost(*words: object) -> Cost:
+def cost(*words: object) -> Cost:
+    """Run sros with these words and return what it cost."""
     return _cost_of([sys.executable, "-m", "sros_tool", *map(str, words)])
 
 

@@ -445,7 +445,7 @@ def test_what_is_wrong_with_processes_is_confirmed(r1: Robot) -> None:
     permissive = {**process.environment, "ROS_SECURITY_STRATEGY": "Permissive"}
     outside = replace(process, enclave=replace(process.enclave, keystore="/x", here=None))  # type: ignore[type-var]
     running = RunningProcesses((replace(process, environment=permissive), outside))
-    r1.running = lambda _now: running  # type: ignore[method-assign]
+    r1.running = lambda now: running  # type: ignore[method-assign]
     (problem,) = r1.round().problems
     assert problem.startswith("process 1 (node):") and r1.message().problems == (problem,)
 

@@ -22,6 +22,7 @@ from tests.integration.fetching_robots import (
     fill,
     killed_at_random,
 )
+from tests.support.children import wait_for
 from tests.support.harness import policy_text, publish, sros
 from tests.support.long_form import ONLY_LONG
 
@@ -97,7 +98,9 @@ def test_robots_that_fetch(home: Home) -> None:
         robots[RESTORED].stop()
         shutil.rmtree(robots[RESTORED].keystore)
         shutil.copytree(backup, robots[RESTORED].keystore)
+        said = message_of(home, RESTORED)
         robots[RESTORED].start()
+        wait_for(lambda: message_of(home, RESTORED) != said, "a message of the restored robot")
         home.until_current(every)
 
         assert put_for_another(home) == "403"
@@ -130,6 +133,10 @@ def test_robots_that_fetch(home: Home) -> None:
             home.until_current(others)
     assert all(rounds), f"killed and ended rounds: {rounds}"
     assert home.lies == []
+
+
+def message_of(home: Home, robot: str) -> bytes:
+    return (home.folder / f"srv/inbox/{robot}/confirmation.p7s").read_bytes()
 
 
 def put_for_another(home: Home) -> str:
