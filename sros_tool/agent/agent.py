@@ -143,12 +143,15 @@ class _Round:
         if self._machine.restarted or before.boot != boot:
             # After a start of the machine no process has files of before; what is seen counts.
             self._state = replace(before, due=(), boot=boot)
-        clock = self._clock()
+        proven = self._proven_moment()
+        clock = self._clock(proven)
         # Documents that were verified prove that this moment has passed, whatever the clock shows.
         certain = max(now, before.latest) if before.latest else now
         installation, fetched = self._fetch_and_install(certain)
         names = self._enclaves()
         opened = self._open(names, now)
+        if clock is not RobotClock.BEHIND:  # what is wrong is seen on a clock that is right
+            self._note_unusable(opened)
         self._note_due(installation.changed, names)
         if clock is not RobotClock.BEHIND:  # nodes would not accept their certificates
             self._restart(names, opened)
@@ -197,16 +200,31 @@ class _Round:
     def _save(self) -> None:
         self._attempt(lambda: write_state(self._folder, self._state))
 
-    def _clock(self) -> RobotClock:
-        now, latest = self._machine.now, self._state.latest
-        if latest and now + _TOLERANCE < latest:
+    def _clock(self, proven: datetime | None) -> RobotClock:
+        now = self._machine.now
+        if proven and now + _TOLERANCE < proven:
+            what = (
+                "documents that this robot verified were made at"
+                if self._state.latest
+                else "its certificates are not valid before"
+            )
             self._problems.append(
-                f"The clock shows {iso(now)}, but documents that this robot verified were made at "
-                f"{iso(latest)}: it is at least {elapsed(latest - now)} behind. Nothing is "
-                "restarted; set the clock."
+                f"The clock shows {iso(now)}, but {what} {iso(proven)}: it is at least "
+                f"{elapsed(proven - now)} behind. Nothing is restarted; set the clock."
             )
             return RobotClock.BEHIND
         return self._machine.clock()
+
+    def _proven_moment(self) -> datetime | None:
+        """Return a moment that has passed, by what was verified or else by the certificates."""
+        if self._state.latest:
+            return self._state.latest
+        begins = []
+        for name in self._enclaves():
+            with suppress(SrosError, OSError):
+                path = enclave_path(self._folder, name) / CERTIFICATE_FILE
+                begins.append(validity_of(read_certificate(path)).not_before)
+        return min(begins, default=None)
 
     def _fetch_and_install(self, certain: datetime) -> tuple[Installation, bool]:
         """Fetch and install a release; return what changed, and whether the source was reached."""
@@ -351,10 +369,12 @@ class _Round:
                 state = open_enclave(place, now=now, files=files)
                 evaluation = evaluated(name, place, state, at=now)
                 opened[name] = _Opened(evaluation.state, "; ".join(evaluation.problems_here))
+        return opened
+
+    def _note_unusable(self, opened: Mapping[str, _Opened]) -> None:
         for name, enclave in opened.items():
             if enclave.problem:
                 self._problems.append(f"{name} could not start: {enclave.problem}.")
-        return opened
 
     def _restart(self, names: Iterable[str], opened: Mapping[str, _Opened]) -> None:
         settings, machine = self._settings, self._machine

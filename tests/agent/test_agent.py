@@ -318,6 +318,16 @@ def test_a_clock_that_is_behind_is_said_and_nothing_restarts(home: Home, r1: Rob
     assert r1.systemctl == ["sros@r1-b.service"] and done.restart == ()
 
 
+def test_a_clock_before_the_first_certificates_is_said(r1: Robot) -> None:
+    """Nothing was verified yet, but the certificates are not valid on that day."""
+    r1.release = None
+    (problem,) = r1.round(moment() - timedelta(days=9)).problems
+    assert problem.startswith("The clock shows") and problem.endswith("; set the clock.")
+    assert "its certificates are not valid before" in problem
+    assert r1.message().clock is RobotClock.BEHIND
+    assert r1.round().problems == ()
+
+
 def test_on_a_wrong_clock_nothing_is_installed_that_is_not_valid_then(
     home: Home, r1: Robot
 ) -> None:

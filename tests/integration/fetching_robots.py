@@ -26,6 +26,7 @@ from typing import Any
 
 from sros_tool.runtime.events import EventKind, read_events
 from sros_tool.runtime.netns import end_with_parent
+from tests.integration.robots import FAKETIME
 from tests.support.children import importing, run, wait_for
 from tests.support.harness import Ended, sros
 
@@ -36,6 +37,7 @@ MISSING = [
     for program in (NGINX, "ip", "nft", "nsenter", "unshare")
     if not shutil.which(program, path=f"{os.environ['PATH']}:/usr/sbin")
 ]
+MISSING += [] if FAKETIME else ["libfaketime"]
 """Programs that these robots need and that are not here."""
 
 HOME_ADDRESS = "203.0.113.1"
@@ -111,13 +113,14 @@ class Robot:
         """Return the folder of the keystore's file system."""
         return self.folder / "disk"
 
-    def start(self, *words: str) -> subprocess.Popen[bytes]:
-        """Start the agent."""
+    def start(self, *words: str, behind: str = "") -> subprocess.Popen[bytes]:
+        """Start the agent, with a clock that is ``behind``, such as "2d"."""
+        clock = {"LD_PRELOAD": FAKETIME, "FAKETIME": f"-{behind}"} if behind else {}
         command = [*self.machine.enter, sys.executable, "-m", "sros_tool", "agent", "run"]
         with (self.folder / "agent.log").open("ab") as log:
             self.agent = subprocess.Popen(
                 [*command, str(self.keystore), *(words or ("--interval", "5s"))],
-                env=importing(),
+                env=importing(**clock),
                 stdout=log,
                 stderr=log,
                 start_new_session=True,

@@ -33,7 +33,7 @@ pytestmark = [
     pytest.mark.skipif(os.getuid() != 0, reason="namespaces with addresses are made by root"),
 ]
 
-ASLEEP, FULL, KILLED, RESTORED, STOLEN, LIAR = "r2", "r3", "r4", "r5", "r6", "r7"
+ASLEEP, FULL, KILLED, RESTORED, STOLEN, LIAR, LATE = "r2", "r3", "r4", "r5", "r6", "r7", "r8"
 NUMBER = 10
 GENERATE = "generate_artifacts -k keystore -p policy.xml --fleet fleet.toml"
 
@@ -61,7 +61,7 @@ def home(tmp_path: Path) -> Iterator[Home]:
     with fetching_robots(tmp_path, NUMBER, small=FULL) as made:
         for robot in made.robots.values():
             if robot.name != KILLED:
-                robot.start()
+                robot.start(behind="2d" if robot.name == LATE else "")
         yield made
 
 
@@ -69,13 +69,19 @@ def test_robots_that_fetch(home: Home) -> None:
     """First delivery, changed policy, renewal, revocation, and rotation of both CAs.
 
     One robot is asleep, one has a full disk, one is killed again and again, one has its disk
-    restored, one sends the message of another, and one is stolen.  No other one waits for them,
-    and none is ever called current that is not.
+    restored, one sends the message of another, one is stolen, and one has the clock of two days
+    ago.  No other one waits for them, and none is ever called current that is not.
     """
     robots = home.robots
     every = list(robots)
     with killed_at_random(robots[KILLED]) as rounds:
+        states = home.until_current([name for name in every if name != LATE])
+        assert states[LATE] == "never"
+        assert "set the clock" in (robots[LATE].folder / "agent.log").read_text()
+        robots[LATE].stop()
+        robots[LATE].start()
         home.until_current(every)
+
         robots[RESTORED].stop()
         backup = shutil.copytree(robots[RESTORED].keystore, home.folder / "backup")
         robots[RESTORED].start()
