@@ -744,9 +744,10 @@ def keyring(
 
 
 def _absolute(place: str) -> str:
+    from sros_tool.keystore.issuing.ca_service import is_ca_service
     from sros_tool.pki.token import is_token_uri
 
-    if is_token_uri(place):
+    if is_token_uri(place) or is_ca_service(place):
         return place
     return f"file:{Path(place.removeprefix('file:')).absolute()}"
 

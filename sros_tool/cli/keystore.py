@@ -436,7 +436,8 @@ if TYPE_CHECKING:
 @click.option(
     "--identity-key",
     metavar="URI",
-    help="Private key of the identity CA, created if missing: file:PATH or pkcs11:...",
+    help="Private key of the identity CA, created if missing: file:PATH or pkcs11:...; "
+    "issuer:NAME for the CA service that the program sros-issuer-NAME asks.",
 )
 @click.option(
     "--permissions-key",

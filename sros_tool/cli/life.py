@@ -12,6 +12,7 @@ import click
 
 from sros_tool.cli.changed import json_form, print_changed, print_follow_up, print_plan
 from sros_tool.cli.common import (
+    PATH,
     allow_refusal_option,
     check_chosen,
     chosen_enclaves,
@@ -36,6 +37,14 @@ if TYPE_CHECKING:
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.keystore.lifecycle.change import Changed
     from sros_tool.pki.crl import RevocationList
+
+
+_crl_option = click.option(
+    "--crl",
+    "crl_file",
+    type=PATH,
+    help="Revocation list (PEM) that the CA service signed, in a keystore with one.",
+)
 
 
 @verb("renew")
@@ -163,6 +172,7 @@ def _complete_reason(
     help="During a CA rotation: revoke even if the key of the old identity CA is gone. The "
     "certificates of that CA are then refused only after the stage retire.",
 )
+@_crl_option
 @allow_refusal_option
 @dry_run_option
 @json_option
@@ -173,6 +183,7 @@ def revoke(
     robots: tuple[str, ...],
     reason: str,
     until_retired: bool,
+    crl_file: Path | None,
     allow_refusal: tuple[Vendor, ...],
     dry_run: bool,
     as_json: bool,
@@ -208,6 +219,7 @@ def revoke(
             reason=reason_text,
             keyring=keyring(),
             until_retired=until_retired,
+            crl=_given_list(crl_file),
             allow_refusal=allow_refusal,
             dry_run=dry_run,
         )
@@ -224,12 +236,14 @@ def revoke(
 @verb("crl")
 @keystore_argument()
 @click.option("--refresh", is_flag=True, help="Sign the list again to extend its validity.")
+@_crl_option
 @allow_refusal_option
 @json_option
 @dry_run_option
 def crl(
     root: Path,
     refresh: bool,
+    crl_file: Path | None,
     allow_refusal: tuple[Vendor, ...],
     as_json: bool,
     dry_run: bool,
@@ -253,9 +267,16 @@ def crl(
 
     list_enclaves(root)
     result = None
+    if crl_file and not refresh:
+        raise UsageError("--crl has no effect without --refresh", "", "Add --refresh.")
     if refresh:
         result = refresh_crl(
-            root, now=now(), keyring=keyring(), allow_refusal=allow_refusal, dry_run=dry_run
+            root,
+            now=now(),
+            keyring=keyring(),
+            crl=_given_list(crl_file),
+            allow_refusal=allow_refusal,
+            dry_run=dry_run,
         )
         if dry_run and not as_json:
             print_plan(root, result.changes)
@@ -291,6 +312,12 @@ def crl(
             err=True,
         )
     return 1 if soon else 0
+
+
+def _given_list(path: Path | None) -> bytes:
+    from sros_tool.xml import read_bytes
+
+    return read_bytes(path, "revocation list") if path else b""
 
 
 def _names(keystore: Keystore) -> dict[str, str]:

@@ -52,6 +52,7 @@ _ENCODINGS = {
 }
 """ASN.1 string type → encoding by which OpenSSL decodes it (a_strex.c, tag2nbyte)."""
 _ESCAPED = re.compile(r'[,+"\\<>;]|^[# ](?!\Z)| \Z')
+_UNIQUE = re.compile(r"[0-9a-f]{16}")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 _SIGNING_KEYS: dict[x509.ObjectIdentifier, type] = {
@@ -90,8 +91,11 @@ def enclave_subject(name: str, *, unique: bool) -> x509.Name:
 
 
 def has_unique_part(subject: x509.Name) -> bool:
-    """Return whether an enclave's subject has a unique OU next to its common name."""
-    return len(subject.rdns) > 1 or any(len(rdn) > 1 for rdn in subject.rdns)
+    """Return whether an enclave's subject has a unique OU, as `enclave_subject` makes it."""
+    if isinstance(subject, TolerantName):
+        return len(subject.rdns) > 1
+    units = subject.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)
+    return any(_UNIQUE.fullmatch(str(unit.value)) for unit in units)
 
 
 def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certificate:
@@ -750,9 +754,13 @@ class SigningRequest(NamedTuple):
     pem: bytes
 
 
-def make_request(key: PrivateKey, name: str) -> bytes:
-    """Return a PEM request, signed with ``key``, for a certificate with the CN ``name``."""
-    builder = x509.CertificateSigningRequestBuilder().subject_name(common_name(name))
+def make_request(key: PrivateKey, subject: str | x509.Name) -> bytes:
+    """Return a PEM request, signed with ``key``, for a certificate with this subject.
+
+    A text is the common name, the only part of the subject.
+    """
+    name = common_name(subject) if isinstance(subject, str) else subject
+    builder = x509.CertificateSigningRequestBuilder().subject_name(name)
     return builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
 
 

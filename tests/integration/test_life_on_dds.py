@@ -12,12 +12,16 @@ import pytest
 
 from sros_tool.dds.decision.vendors import Signers
 from sros_tool.dds.domains import DomainSet
+from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import Template, load_template
+from sros_tool.pki.certificates import common_name, issue_ca, pem
+from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.policy.document import read_policy
+from sros_tool.validity import window
 from tests.integration.converse import ENOUGH, converse, listener, talker
 from tests.integration.fastdds import build, fastdds_stack, fastdds_vendor, run_isolated_program
 from tests.integration.kept.forms import form_of
@@ -295,5 +299,43 @@ def test_permissions_signed_by_the_enclave_itself(
         {
             Question((rogue, "/robot"), (root, "/listener"), "/secret"): expected,
             Question((root, "/robot"), (root, "/listener"), "/chatter"): HEARD,
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    "ask", ["Cyclone DDS", pytest.param("Fast DDS", marks=ONLY_LONG)], indirect=True
+)
+def test_sites_with_one_identity_ca_are_apart_by_their_permissions_cas(
+    ask: Ask, tmp_path: Path
+) -> None:
+    """Berlin and Kyoto each have their own permissions CA; Hamburg has that of Berlin."""
+    now, template = datetime.now(UTC), open_template("production")
+    key = generate_key()
+    (tmp_path / "office.key").write_bytes(key_pem(key))
+    office = pem(issue_ca(key, common_name("office"), window(now, template.authority_validity)))
+    berlin, kyoto, hamburg = (tmp_path / name for name in ("berlin", "kyoto", "hamburg"))
+    for root in (berlin, kyoto, hamburg):
+        places, imported = {"identity": f"file:{tmp_path}/office.key"}, {"identity": office}
+        if root is hamburg:
+            places["permissions"] = f"file:{berlin}/private/permissions_ca.key.pem"
+            imported["permissions"] = (berlin / "public/permissions_ca.cert.pem").read_bytes()
+        create_keystore(
+            root,
+            template=template,
+            domains=DomainSet.of((DOMAIN, DOMAIN)),
+            now=now,
+            keyring=Keyring(places=places),
+            imported=imported,
+        )
+        create_enclaves(root, [f"/{root.name}/talker", f"/{root.name}/listener"], now=now)
+    ask(
+        {
+            Question((one, f"/{one.name}/talker"), (other, f"/{other.name}/listener")): expected
+            for one, other, expected in (
+                (kyoto, kyoto, HEARD),
+                (berlin, hamburg, HEARD),
+                (berlin, kyoto, SILENT),
+            )
         }
     )

@@ -19,6 +19,7 @@ from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import FLEET_REMEDY
+from sros_tool.keystore.issuing.ca_service import is_ca_service
 from sros_tool.keystore.layout import (
     CRL,
     FLEET,
@@ -448,7 +449,7 @@ def _key_elsewhere(keystore: CheckedKeystore, role: str) -> Iterator[Finding]:
     place = (
         {IDENTITY: settings.identity_key}.get(role, settings.permissions_key) if settings else ""
     )
-    if place and not is_token_uri(place):
+    if place and not is_token_uri(place) and not is_ca_service(place):
         path = key_path(keystore.root, place)
         with suppress(OSError):  # it may be on a medium that is not there now
             yield from key_mode_findings(str(path), path.stat().st_mode)

@@ -165,7 +165,8 @@ def sign_request(
         files = _answer_files(root, issued, change.zenoh)
         number = change.keystore.ledger_file.next_number()
         sealed = seal(files, number, change.permissions)
-        _check_result(RequestAnswer(name, files, sealed), request, now)
+        if not change.is_guess:
+            _check_result(RequestAnswer(name, files, sealed), request, change.moment)
         archive = pack({SEAL: sealed, **files})
         change.entries.append(document_entry(now, "answer", sealed, enclave=name, number=number))
         change.record()
@@ -408,7 +409,8 @@ class _Signer:
         unique = change.template.unique_subject or (
             present is not None and has_unique_part(present.subject)
         )
-        identity = NewIdentity(enclave_subject(name, unique=unique), request.public_key)
+        subject = enclave_subject(name, unique=unique)
+        identity = NewIdentity(subject, request.public_key, request=request.pem)
         earlier = (
             earlier_permissions(change.keystore, name, authority, present) if present else None
         )

@@ -17,7 +17,8 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
-from sros_tool.errors import KeystoreError, Note, PkiError, check_meaning
+from sros_tool.errors import KeystoreError, Note, PkiError, UsageError, check_meaning
+from sros_tool.keystore.issuing.ca_service import CaService
 from sros_tool.keystore.issuing.keyring import Keyring, check_imported_keys, check_places
 from sros_tool.keystore.layout import (
     IDENTITY,
@@ -56,15 +57,33 @@ from sros_tool.validity import iso, window
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """A certificate authority that can sign."""
+    """A certificate authority that can sign.
+
+    An identity CA that is a CA ``service`` has no key here, and only issues certificates.
+    """
 
     certificate: x509.Certificate
-    key: PrivateKey
+    own_key: PrivateKey | None
+    service: CaService | None = None
+
+    @property
+    def key(self) -> PrivateKey:
+        """The private key.
+
+        Raises:
+            KeystoreError: it is that of a CA service.
+        """
+        if self.own_key is None:
+            raise KeystoreError(
+                f"only its CA service signs as {authority_text(self.certificate)}",
+                "The key is not here.",
+            )
+        return self.own_key
 
     @property
     def on_token(self) -> bool:
         """Whether the key is on a token, so that forked processes cannot sign."""
-        return isinstance(self.key, TokenKey)
+        return isinstance(self.own_key, TokenKey)
 
     def __post_init__(self) -> None:
         check_signer(self.certificate)
@@ -150,6 +169,18 @@ def create_authorities(
 
     def make(file: str, role: str, name: str) -> Authority:
         path = f"{PRIVATE}/{file}.key.pem"
+        service = keyring.ca_service(transaction.root, role, template)
+        if service:
+            if role not in imported:
+                raise UsageError(
+                    f"the certificate of the CA service '{service.place}' is missing",
+                    "",
+                    "Name it with --identity-ca FILE, with the certificates above it.",
+                )
+            existing = check_imported(role, imported[role], None, now)
+            transaction.write(f"{PUBLIC}/{file}.cert.pem", existing.bundle)
+            notes.extend(existing.notes)
+            return Authority(existing.certificate, None, service)
         key = keyring.make(transaction, path, role, template, compared=role in imported)
         if role in imported:
             existing = check_imported(role, imported[role], key, now)
@@ -206,8 +237,9 @@ def load_authority(
             "Use the keystore that it was exported from.",
         )
     certificate = keystore.ca_certificate(role)
-    key = keyring.open(keystore, role, template)
-    if not same_key(certificate, key):
+    service = keyring.ca_service(root, role, template)
+    key = None if service else keyring.open(keystore, role, template)
+    if key and not same_key(certificate, key):
         raise KeystoreError(
             f"the key and the certificate of the {role} CA do not belong together",
             f"'{keyring.place(role, template)}' is not the key of "
@@ -222,7 +254,7 @@ def load_authority(
             "refuses the certificates and documents of a CA outside its validity.",
             "Check the clock of this machine; otherwise make a new keystore.",
         )
-    return Authority(certificate, key)
+    return Authority(certificate, key, service)
 
 
 def write_bundle(
@@ -268,17 +300,19 @@ class ImportedAuthority:
     notes: tuple[Note, ...]
 
 
-def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> ImportedAuthority:
+def check_imported(
+    role: str, data: bytes, key: PrivateKey | None, now: datetime
+) -> ImportedAuthority:
     """Return the CA certificate of ``key`` with its chain, after checking them.
 
-    ``data`` holds the certificates of the CA and of its issuers as PEM, in any order.  A fault
-    that only some DDS vendors refuse becomes a note.
+    ``data`` holds the certificates of the CA and of its issuers as PEM, in any order; without a
+    ``key``, that of the CA is the first.  A fault that only some DDS vendors refuse becomes a note.
 
     Raises:
         PkiError: the CA cannot be the ``role`` CA.
     """
     certificates = list(load_certificates(data, f"of the {role} CA"))
-    own = [certificate for certificate in certificates if same_key(certificate, key)]
+    own = [certificate for certificate in certificates if key is None or same_key(certificate, key)]
     if len(certificates) > _MOST_CERTIFICATES:
         raise PkiError(
             f"the certificate file of the {role} CA has {len(certificates)} certificates",

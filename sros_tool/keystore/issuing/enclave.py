@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from functools import cache
@@ -25,10 +26,13 @@ from sros_tool.dds.permissions import (
     parse_permissions,
     render_permissions,
 )
-from sros_tool.errors import KeystoreError, Note, PolicyError, check_meaning
+from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, check_meaning
 from sros_tool.files import policies_dir
 from sros_tool.keystore.issuing.authority import Authority
+from sros_tool.keystore.issuing.ca_service import CertificateRequest
+from sros_tool.keystore.issuing.keyring import Secrets, no_secrets
 from sros_tool.keystore.issuing.proof import prove
+from sros_tool.keystore.issuing.tokens import place_in
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -39,6 +43,7 @@ from sros_tool.keystore.layout import (
     KEY_FILE,
     KEY_URI_FILE,
     PERMISSIONS_FILE,
+    REQUEST,
     ROLES,
     ca_certificate,
     enclave_folder,
@@ -49,14 +54,22 @@ from sros_tool.keystore.rights import SignedRights
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.parallel import Progress, tick
-from sros_tool.pki.certificates import pem, subject_text, validity_of
-from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem
-from sros_tool.pki.token import TokenKey
+from sros_tool.pki.certificates import (
+    Issuer,
+    load_request,
+    make_request,
+    pem,
+    subject_text,
+    validity_of,
+)
+from sros_tool.pki.keys import PrivateKey, PublicKey, generate_key, key_pem, load_key
+from sros_tool.pki.token import TokenKey, open_enclave_key
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.policy.rights import nodes_as_text, nodes_not_shown
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window, iso, window
+from sros_tool.xml import read_bytes
 
 Result = TypeVar("Result")
 
@@ -71,12 +84,14 @@ class NewIdentity:
     """The subject and the key that a certificate is issued for.
 
     ``new_key`` is the private key if it was just generated; the key, or its place if it is on a
-    token, is staged with the certificate.
+    token, is staged with the certificate.  ``request`` is the request (PEM) of a robot that has the
+    key.
     """
 
     subject: x509.Name
     public_key: PublicKey
     new_key: PrivateKey | None = None
+    request: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,13 +171,18 @@ class EnclaveWriter:
         identity: Authority | None,
         permissions: Authority | None,
         keys_on_token: bool = False,
+        secrets: Secrets = no_secrets,
     ) -> None:
         self.entries: list[Entry] = []
         self.signed: dict[str, SignedRights] = {}
         self._transaction = transaction
         self._template = template
         self._now = now
-        self._issuer = identity.issuer() if identity else None
+        self._identity = identity
+        self._issuer = identity.issuer() if identity and not identity.service else None
+        if identity and identity.service and transaction.dry_run:  # the service is not asked
+            self._issuer = Issuer(identity.certificate, generate_key())
+        self._secrets = secrets
         self._signer = permissions
         self._certificate_validity = window(now, template.certificate_validity)
         self._permissions_validity = window(now, template.permissions_validity)
@@ -204,8 +224,7 @@ class EnclaveWriter:
         if rights is None:
             return Issued(issuance, certificate)
         subject = subject_text(certificate.subject)
-        validity = self._validity(name, self._permissions_validity)
-        validity = validity.within(validity_of(certificate))
+        validity = self._of_permissions(name, certificate)
         permissions = _permissions(rights, subject, validity)
         message = self._sign(name, permissions)
         if isinstance(rights, SignedRights):
@@ -242,7 +261,7 @@ class EnclaveWriter:
             KeystoreError: the permissions would not decide as the policy does.
         """
         name = rights.enclave.path
-        new = self._validity(name, self._permissions_validity).within(validity_of(certificate))
+        new = self._of_permissions(name, certificate)
         if not validity.lasts(new, self._now):
             return False
         permissions = _permissions(rights, subject_text(certificate.subject), validity)
@@ -253,8 +272,17 @@ class EnclaveWriter:
         longest = self._template.longest_validity(name)
         return usual if longest is None else usual.within(window(self._now, longest))
 
+    def _of_permissions(self, name: str, certificate: x509.Certificate) -> Window:
+        """Return the validity of an enclave's permissions, which expire with their certificate.
+
+        They may begin before it: Fast DDS reads their dates in local time (`BACKDATE`).
+        """
+        validity = self._validity(name, self._permissions_validity)
+        end = validity_of(certificate).not_after
+        return Window(validity.not_before, min(validity.not_after, end))
+
     def _issue(self, name: str, identity: NewIdentity) -> x509.Certificate:
-        if self._issuer is None:
+        if self._identity is None:
             raise KeystoreError("there is no identity CA to issue the certificate")
         folder = enclave_folder(name)
         if isinstance(identity.new_key, TokenKey):
@@ -264,14 +292,56 @@ class EnclaveWriter:
         elif identity.new_key:
             pem_of_key = key_pem(identity.new_key)
             self._transaction.write(f"{folder}/{KEY_FILE}", pem_of_key, private=True)
-        certificate = self._issuer.issue(
-            identity.subject,
-            identity.public_key,
-            self._validity(name, self._certificate_validity),
-        )
+        validity = self._validity(name, self._certificate_validity)
+        if self._issuer:
+            certificate = self._issuer.issue(identity.subject, identity.public_key, validity)
+        else:
+            certificate = self._ask_service(self._identity, name, identity, validity)
         self._transaction.write(f"{folder}/{CERTIFICATE_FILE}", pem(certificate))
         self.entries.append(certificate_entry(self._now, "certificate", certificate, name))
         return certificate
+
+    def _ask_service(
+        self, authority: Authority, name: str, identity: NewIdentity, validity: Window
+    ) -> x509.Certificate:
+        """Return the certificate that the CA service ``authority`` issues for an enclave.
+
+        Raises:
+            CaServiceError: it does not issue the certificate, or another one than was asked for.
+        """
+        assert authority.service
+        asked = CertificateRequest(
+            name,
+            identity.request or self._request(name, identity),
+            identity.subject,
+            identity.public_key,
+            validity.within(validity_of(authority.certificate)),
+        )
+        return authority.service.issue(asked, authority.certificate, self._now)
+
+    def _request(self, name: str, identity: NewIdentity) -> bytes:
+        """Return a request for an enclave's certificate, signed with its key.
+
+        A key on a robot signed the request that the keystore has.
+        """
+        folder = enclave_path(self._transaction.root, name)
+        key = identity.new_key
+        if key is None and (folder / KEY_FILE).exists():
+            key = load_key(read_bytes(folder / KEY_FILE, "private key"), f"'{folder / KEY_FILE}'")
+        elif key is None and (folder / KEY_URI_FILE).exists():
+            key = open_enclave_key(place_in(folder / KEY_URI_FILE), self._secrets)
+        if key:
+            return make_request(key, identity.subject)
+        with suppress(SrosError):
+            known = load_request(read_bytes(folder / REQUEST, "request"), f"of {name}")
+            if known.public_key == identity.public_key:
+                return known.pem
+        raise KeystoreError(
+            f"the key of enclave {name} is not in this keystore, nor a request that it signed",
+            "A CA service wants the proof that somebody has the key.",
+            "Create a request on the robot with `sros create_request`, and sign it here with "
+            "`sros sign_request --renew`.",
+        )
 
     def _sign(self, name: str, permissions: Permissions) -> bytes:
         if self._signer is None:

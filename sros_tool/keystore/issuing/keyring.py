@@ -15,6 +15,7 @@ from shlex import quote
 
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, UsageError
 from sros_tool.files import remove_file, write_new_file
+from sros_tool.keystore.issuing.ca_service import CaService, check_ca_service, is_ca_service
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key, key_path
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import Template
@@ -68,6 +69,7 @@ class Keyring:
         """Raise `UsageError` if a place is not a valid URI, before anything is written."""
         for place in self.places.values():
             refuse_pin(place)
+            check_ca_service(place)
             if is_token_uri(place):
                 parse_token_uri(place)
 
@@ -76,13 +78,42 @@ class Keyring:
         role_key = {IDENTITY: template.identity_key}.get(role, template.permissions_key)
         return self.places.get(role) or role_key or ca_key(role)
 
+    def ca_service(self, root: Path, role: str, template: Template) -> CaService | None:
+        """Return the CA service that signs as the ``role`` CA; None if the CA has a key for sros.
+
+        Raises:
+            UsageError: the place is not a valid one, or is that of the permissions CA.
+            KeystoreError: only the keystore, of another user, names the service, which could make
+                it issue with the rights of this user.
+        """
+        place = self.place(role, template)
+        if not is_ca_service(place):
+            return None
+        check_ca_service(place)
+        if role != IDENTITY or not template.separate_authorities:
+            raise UsageError(
+                "a CA service can be the identity CA alone",
+                "sros itself signs permissions and governance, so the permissions CA needs a key "
+                "of its own.",
+                "Use --ca-layout separate, and issuer:NAME only for --identity-key.",
+            )
+        owner = root.stat().st_uid if root.exists() else os.geteuid()
+        if not self._is_from_user(role) and owner not in (0, os.geteuid()):
+            raise KeystoreError(
+                f"the keystore '{root}' of user {owner} names the CA service '{place}'",
+                "It would issue certificates with your rights.",
+                f"If it may, set SROS_IDENTITY_KEY={place}.",
+            )
+        return CaService(place, root)
+
     def open(self, keystore: Keystore, role: str, template: Template) -> PrivateKey:
         """Return the private key of the ``role`` CA.
 
         Raises:
-            KeystoreError: the key is missing, or cannot be opened.
+            KeystoreError: the key is missing, cannot be opened, or is that of a CA service.
         """
         root, place = keystore.root, self.place(role, template)
+        _refuse_ca_service(role, place)
         try:
             if is_token_uri(place):
                 token_key = open_token_key(place, self.secrets, named=self._is_from_user(role))
@@ -126,6 +157,7 @@ class Keyring:
         place = self.places.get(role) or (
             template.identity_key if role == IDENTITY else template.permissions_key
         )
+        _refuse_ca_service(role, place)
         if is_token_uri(place):
             parse_token_uri(place)
             if transaction.dry_run and not compared:
@@ -210,6 +242,15 @@ class Keyring:
 
     def _passphrase(self, role: str) -> Callable[[], str]:
         return lambda: self.secrets(f"the passphrase of the {role} CA key")
+
+
+def _refuse_ca_service(role: str, place: str) -> None:
+    if is_ca_service(place):
+        raise KeystoreError(
+            f"the key of the {role} CA is that of a CA service, '{place}'",
+            "The service issues certificates, and sros has no key to sign anything else, or to "
+            "replace the CA.",
+        )
 
 
 IN_KEYSTORE = Keyring()

@@ -56,8 +56,10 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
 
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from datetime import timedelta
 
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
@@ -67,9 +69,14 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import certificate_entry, document_entry
 from sros_tool.keystore.settings import present_settings, write_settings
+from sros_tool.pki.certificates import validity_of
 from sros_tool.translate import protection_for
+from sros_tool.validity import iso, parse_iso, window
+from sros_tool.wording import counted
 
 Result = TypeVar("Result", bound="Changed")
+_NOTED = timedelta(days=1)
+"""How much earlier than asked a certificate of a CA service may expire without a note."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +116,7 @@ class KeystoreChange:
 
     ``entries`` are for the ledger.  ``notes``, ``remarks``, ``revoked`` (number of revoked
     certificates) and ``restart`` (enclaves whose processes have to be restarted) are for the
-    result.
+    result.  ``crl`` is the revocation list (PEM) that a CA service signed.
     """
 
     def __init__(
@@ -146,6 +153,7 @@ class KeystoreChange:
         self.revoked = 0
         self.restart: tuple[str, ...] = ()
         self.zenoh = KeptZenoh()
+        self.crl = b""
         self._allowed = allow_refusal
 
     def __enter__(self) -> Self:
@@ -322,8 +330,20 @@ class KeystoreChange:
             places, self.keyring.secrets, self.known, self.authorities, self.dry_run
         )
 
-    def writer(self, *, keys_on_token: bool = False) -> EnclaveWriter:
-        """Return a writer of enclaves that uses the new settings and CAs."""
+    def writer(self, *, keys_on_token: bool = False, revoke_old: bool = False) -> EnclaveWriter:
+        """Return a writer of enclaves that uses the new settings and CAs.
+
+        Raises:
+            KeystoreError: earlier certificates are to be revoked, too, and a CA service has to sign
+                the revocation list.
+        """
+        if revoke_old and self.identity.service:
+            raise KeystoreError(
+                "a CA service does not revoke earlier certificates in the same step",
+                "It signs its revocation list only once the new certificates are there.",
+                "Leave --revoke-old out, revoke the earlier ones there, and give its list: `sros "
+                f"crl {quote(str(self.root))} --refresh --crl FILE`.",
+            )
         return EnclaveWriter(
             self.transaction,
             self.template,
@@ -331,6 +351,7 @@ class KeystoreChange:
             identity=self.identity,
             permissions=self.permissions,
             keys_on_token=keys_on_token,
+            secrets=self.keyring.secrets,
         )
 
     # ── what follows from it ───────────────────────────────────────────────────────────────
@@ -346,6 +367,7 @@ class KeystoreChange:
             template=self.template,
             keyring=self.keyring,
             now=self.now,
+            given=self.crl,
         )
 
     def revoke(self, replaced: Sequence[Superseded], *, names: Sequence[str] | None = None) -> None:
@@ -412,18 +434,67 @@ class KeystoreChange:
     def record(self, signer: Authority | None = None) -> None:
         """Stage the ledger with the new entries, signed by the identity CA or ``signer``.
 
-        In a keystore of ros2/sros2, entries for its existing files come first.
+        If the identity CA is a CA service, the permissions CA signs.  In a keystore of ros2/sros2,
+        entries for its existing files come first.
         """
         if not self.entries:
             return
+        if signer is None:
+            signer = self.permissions if self.identity.service else self.identity
+            self._check_served()
         self.entries = _take_over(self.transaction, self.keystore, self.now, self.entries)
         append(
             self.transaction,
             self.entries,
-            (signer or self.identity).sign,
+            signer.sign,
             self.now,
             self.keystore.ledger_file,
         )
+
+    @property
+    def is_guess(self) -> bool:
+        """Whether certificates stand for those that a CA service would issue: in a dry run."""
+        return self.dry_run and bool(self.identity.service and self._issued())
+
+    @property
+    def moment(self) -> datetime:
+        """The time of the change, or when certificates that a CA service issued begin later."""
+        if not self.identity.service:
+            return self.now
+        return max([self.now, *(parse_iso(entry.not_before) for entry in self._issued())])
+
+    def _issued(self) -> list[Entry]:
+        return [entry for entry in self.entries if entry.what == "certificate"]
+
+    def _check_served(self) -> None:
+        """Note certificates of a CA service that expire earlier than was asked.
+
+        Raises:
+            KeystoreError: a serial number was there before: whoever revokes one certificate would
+                revoke the other one, too.
+        """
+        if not self.identity.service or not (issued := self._issued()):
+            return
+        serials = [entry.serial for entry in issued]
+        known = self.keystore.ledger_file.with_values("serial", serials).entries
+        counts = Counter([*serials, *(entry.serial for entry in known)])
+        if again := [entry for entry in issued if counts[entry.serial] > 1]:
+            raise KeystoreError(
+                f"the CA service issued a certificate for {again[0].enclave} with a serial number "
+                "that another certificate has",
+                f"It is {again[0].serial}; no revocation list could tell them apart. Nothing was "
+                "changed.",
+            )
+        asked = window(self.now, self.template.certificate_validity)
+        end = iso(asked.within(validity_of(self.identity.certificate)).not_after - _NOTED)
+        usual = [e for e in issued if self.template.longest_validity(e.enclave) is None]
+        if early := [entry for entry in usual if entry.not_after < end]:
+            text = (
+                f"the CA service lets the certificates of {counted(len(early), 'enclave')} expire "
+                f"earlier than the keystore asks, the first at "
+                f"{min(entry.not_after for entry in early)}."
+            )
+            self.notes.append(Note("service.expires-early", text))
 
     def finish(self, *, aim: str = "") -> None:
         """Commit the change, unless vendors would refuse enclaves that they accept today.
@@ -433,13 +504,20 @@ class KeystoreChange:
         Raises:
             KeystoreError: nodes of a vendor would stop to work.
         """
-        self.notes += refuse_stopping(
-            self.transaction,
-            self.now,
-            keystore=self.keystore,
-            allowed=self._allowed,
-            remedy=lambda: self._another_ca(aim) if aim else "",
-        )
+        if self.is_guess:
+            text = (
+                "the CA service was not asked in this dry run, so it is unknown whether it would "
+                "issue the certificates, and whether DDS would accept them."
+            )
+            self.notes.append(Note("service.not-asked", text))
+        else:
+            self.notes += refuse_stopping(
+                self.transaction,
+                self.moment,
+                keystore=self.keystore,
+                allowed=self._allowed,
+                remedy=lambda: self._another_ca(aim) if aim else "",
+            )
         self.transaction.commit()
 
     def _another_ca(self, aim: str) -> str:

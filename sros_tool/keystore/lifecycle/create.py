@@ -109,7 +109,7 @@ def create_keystore(
         _write_keystore(change, template, domains, imported)
         change.record()
         change.notes += change.authorities.notes
-        if imported:
+        if imported and not change.identity.service:  # which would issue for the example
             change.notes += imported_notes(
                 change.transaction, template, change.authorities, domains, now
             )

@@ -88,7 +88,7 @@ def write_enclaves(
     network = change.template.zenoh
     if routers := set(network.router_names() if network else ()).difference(change.names):
         wanted = ChainMap(dict.fromkeys(sorted(routers)), wanted)  # type: ignore[arg-type]
-    writer = change.writer(keys_on_token=bool(places))
+    writer = change.writer(keys_on_token=bool(places), revoke_old=revoke_old)
     maker = _EnclaveMaker(change, writer, places, revoke_old=revoke_old, keep_same=keep_same)
     done = writer.for_each(list(wanted), lambda name: maker.make(name, wanted[name]), progress)
     created = tuple(name for name, made in done.items() if made.outcome == "created")

@@ -18,6 +18,7 @@ from sros_tool.keystore.expiry import (
     refuse_unreadable,
 )
 from sros_tool.keystore.issuing.authority import Authorities
+from sros_tool.keystore.issuing.ca_service import CaServiceError
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
@@ -83,7 +84,7 @@ def renew(
         for name in names:
             if not has_enclave(root, check_enclave_name(name)):
                 raise no_such_enclave(change.keystore, name, change.names)
-        writer = change.writer(keys_on_token=bool(places))
+        writer = change.writer(keys_on_token=bool(places), revoke_old=revoke_old)
         thresholds: dict[str, Threshold | None] = dict.fromkeys(names)
         if expiring is not None:
             # A short-lived enclave, such as a person's, ends unless somebody renews it by its name.
@@ -173,6 +174,8 @@ class _Renewer:
             if threshold and not state.lifetime().due(threshold, now):
                 return None
             issued = self._writer.write(self._issuance(state))
+        except CaServiceError:
+            raise
         except SrosError as error:
             return UnreadableEnclave(name, error)
         return Superseded.by(name, state.certificate, issued.certificate, now)

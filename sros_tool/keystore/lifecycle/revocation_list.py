@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from shlex import quote
 
 from cryptography import x509
+from cryptography.hazmat.primitives import serialization
 
-from sros_tool.errors import KeystoreError, Note, SrosError
+from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.issuing.authority import Authority, write_bundle
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import (
@@ -181,7 +182,8 @@ class RevocationListSigner:
     """Signer of the revocation lists of all trusted identity CAs, within a transaction.
 
     ``present`` is the list before the change; None if there is none, or no trusted identity CA
-    signed it.  ``remarks`` are notes on lists that could not be signed or used, and on certificates
+    signed it.  ``given`` is the list (PEM) that a CA service signed, for a keystore with one.
+    ``remarks`` are notes on lists that could not be signed or used, and on certificates
     that may be missing from the ledger.
     """
 
@@ -194,7 +196,15 @@ class RevocationListSigner:
         template: Template,
         keyring: Keyring,
         now: datetime,
+        given: bytes = b"",
     ) -> None:
+        if given and not authority.service:
+            raise UsageError(
+                "the keystore signs its revocation list itself",
+                "Only where a CA service is the identity CA is a list given.",
+                "Leave --crl out.",
+            )
+        self._given = given
         self._transaction = transaction
         self._keystore = keystore
         self._root = keystore.root
@@ -402,12 +412,57 @@ class RevocationListSigner:
         kept = _carried_over(old, expiries)
         listed = {entry.serial for entry in kept}
         kept += [entry for entry in new_entries if entry.serial not in listed]
+        if authority.service:
+            # Its list may also have certificates of others, which it drops once they expired.
+            moment, recorded = iso(self._now), self._keystore.ledger_with("what", "revocation")
+            own = {
+                int(entry.serial, 16) for entry in recorded.entries if entry.what == "revocation"
+            }
+            needed = {each.serial for each in kept if expiries.get(each.serial, moment) >= moment}
+            new = {each.serial for each in new_entries}
+            return self._list_of_service(authority, needed & (own | new))
         # Without an earlier list that is authentic: above every number that was used, because each
         # list that is signed adds an entry to the ledger, and at most 2 to the number.
         lists = self._keystore.ledger_with("what", "crl").entries
         used = 2 * sum(entry.what == "crl" for entry in lists)
         number = max(old.number + 1 if old else used + 1, least)
         return sign_list(authority, kept, number=number, template=self._template, now=self._now)
+
+    def _list_of_service(self, authority: Authority, serials: Set[int]) -> SignedList:
+        """Return the list of the CA service, after verifying it.
+
+        Raises:
+            KeystoreError: it was not given, the identity CA did not sign it, it is not later than
+                the present list, is not valid now, or does not revoke all ``serials``.
+        """
+        numbers = ", ".join(sorted(f"{serial:x}" for serial in serials)) or "nothing"
+        remedy = f"Revoke the certificates there ({numbers}), and give its list with --crl FILE."
+        if not self._given:
+            raise KeystoreError(
+                f"the identity CA of keystore '{self._root}' is a CA service, and it alone signs "
+                "revocation lists",
+                "Nothing was changed.",
+                remedy,
+            )
+        crl = load_crl(self._given, "of the CA service")
+        if not signed_by(crl.list, authority.certificate):
+            fault = f"{authority_text(authority.certificate)} did not sign it"
+        elif not crl.this_update <= self._now < crl.next_update:
+            fault = f"it is valid from {iso(crl.this_update)} to {iso(crl.next_update)}, not now"
+        elif crl.number <= (least := self.present.number if self.present else 0):
+            fault = f"its number is {crl.number}, and has to be higher than {least}"
+        elif missing := sorted(serial for serial in serials if not crl.revokes(serial)):
+            fault = f"it does not revoke {', '.join(f'{serial:x}' for serial in missing)}"
+        else:
+            document = crl.list.public_bytes(serialization.Encoding.PEM)
+            validity = Window(crl.this_update, crl.next_update)
+            entry = document_entry(self._now, "crl", document, validity=validity)
+            return SignedList(document, crl.next_update, entry)
+        raise KeystoreError(
+            "the revocation list of the CA service cannot be used",
+            f"{fault[:1].upper()}{fault[1:]}. Nothing was changed.",
+            remedy,
+        )
 
     def _lost(self, expiries: Mapping[int, str]) -> list[Revoked]:
         """Return the revocations that the present list lacks, if it is older than the last list."""

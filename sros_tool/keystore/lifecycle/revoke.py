@@ -65,6 +65,7 @@ def revoke(
     reason: str = "unspecified",
     keyring: Keyring = IN_KEYSTORE,
     until_retired: bool = False,
+    crl: bytes = b"",
     allow_refusal: Sequence[Vendor] = (),
     dry_run: bool = False,
 ) -> Revocation:
@@ -76,7 +77,7 @@ def revoke(
     get ``crl.pem``, a link to the list.  During a rotation of the identity CA, both CAs sign a
     list; if the key of the old CA is missing, ``until_retired`` accepts that Fast DDS trusts its
     certificates until that CA is retired.  The nodes of the vendors in ``allow_refusal`` may stop
-    to work.
+    to work.  If a CA service is the identity CA, ``crl`` is the list (PEM) that it signed.
 
     Raises:
         KeystoreError: an enclave does not exist, the identity CA did not issue its certificate, the
@@ -98,6 +99,7 @@ def revoke(
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
     )
+    change.crl = crl
     with change:
         _check_names(change, names)
         lists = change.revocation_lists()
@@ -206,16 +208,19 @@ def refresh_crl(
     *,
     now: datetime,
     keyring: Keyring = IN_KEYSTORE,
+    crl: bytes = b"",
     allow_refusal: Sequence[Vendor] = (),
     dry_run: bool = False,
 ) -> Revocation:
     """Sign the revocation list again, so that it is valid for longer.
 
-    Its entries are kept, except certificates that expired before the present list was signed.
+    Its entries are kept, except certificates that expired before the present list was signed.  If
+    a CA service is the identity CA, its new list ``crl`` (PEM) replaces the present list.
     """
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
     )
+    change.crl = crl
     with change:
         lists = change.revocation_lists()
         change.restart = change.names

@@ -749,6 +749,13 @@ def _make_successors(
     template = change.template
     files = change.keystore.authority_files
     wanted = set(roles or ROLES)
+    if IDENTITY in wanted and change.keyring.ca_service(change.root, IDENTITY, template):
+        raise UsageError(
+            f"the identity CA of keystore '{change.root}' is a CA service",
+            "sros cannot replace its CA.",
+            "Replace the permissions CA alone, with --permissions. Once the service has another "
+            "CA, make a new keystore with its certificate.",
+        )
     for file, serves in files.items():
         if wanted & set(serves) and not set(serves) <= wanted:
             raise UsageError(

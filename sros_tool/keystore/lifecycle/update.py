@@ -36,6 +36,7 @@ from sros_tool.keystore.expiry import (
     refuse_unreadable,
 )
 from sros_tool.keystore.fleet import EnclaveDomains, robot_of_router
+from sros_tool.keystore.issuing.ca_service import CaServiceError
 from sros_tool.keystore.issuing.enclave import (
     Issuance,
     NewIdentity,
@@ -433,7 +434,7 @@ class _Updater:
         self._before = EnclaveDomains(present.domains, change.fleet)
         self._after = EnclaveDomains(goal.domains, change.fleet)
         change.template, change.domains = goal.settings, goal.domains
-        self._writer = change.writer()
+        self._writer = change.writer(revoke_old=revoke_old)
 
     def update(
         self,
@@ -523,6 +524,8 @@ class _Updater:
                 if closes and same and allows_everything(state.grant):
                     return _KeptOpen(name, done)
                 return done
+            except CaServiceError:
+                raise
             except SrosError as error:
                 return UnreadableEnclave(name, error)
 

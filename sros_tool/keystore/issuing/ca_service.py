@@ -1,0 +1,235 @@
+"""Identity certificates from an existing CA service, through a program of the user.
+
+The place ``issuer:NAME`` of an identity CA's key stands for the program ``sros-issuer-NAME`` on the
+PATH.  It gets a request (PKCS#10, PEM) on standard input and writes the certificate, as PEM, to
+standard output; a chain may follow.  These variables say what is asked: ``SROS_ENCLAVE``,
+``SROS_SUBJECT`` (RFC 4514), ``SROS_NOT_AFTER`` (ISO 8601, UTC) and ``SROS_KEYSTORE``.
+
+As with ``git-credential-NAME``, a keystore chooses among the programs that the user installed for
+this, and cannot bring its own.  What a program answers is not trusted until it is verified.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import shutil
+import signal
+import subprocess
+import tempfile
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from threading import Timer
+
+from cryptography import x509
+from cryptography.x509.oid import NameOID
+
+from sros_tool.errors import KeystoreError, PkiError, UsageError
+from sros_tool.pki import tolerant
+from sros_tool.pki.certificates import (
+    extension,
+    issued_by,
+    load_certificate,
+    other_issuer,
+    subject_text,
+    validity_of,
+    weakness,
+)
+from sros_tool.pki.chains import denies_issuing
+from sros_tool.pki.keys import PublicKey, algorithm
+from sros_tool.validity import Window, iso
+
+_SCHEME = "issuer:"
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}", re.ASCII)
+_MOST_BYTES = 64 * 1024
+_MOST_SAID = 500
+_SECONDS = 60
+_AHEAD = timedelta(hours=1)
+"""How much later than the change of the keystore began a certificate may become valid.
+
+Services count from when they issue, by a clock of their own.
+"""
+_MOST_SERIAL_BITS = 159
+"""Largest serial number that a revocation list can have (RFC 5280, 4.1.2.2)."""
+
+_LOG = logging.getLogger(__name__)
+
+
+class CaServiceError(KeystoreError):
+    """A CA service did not issue a certificate, or issued one that cannot be used."""
+
+
+@dataclass(frozen=True, slots=True)
+class CertificateRequest:
+    """What a CA service is asked for: the ``request`` (PEM), and what its certificate has to be.
+
+    The ``subject`` may have more than the one in the request, if the request is from a robot.
+    """
+
+    enclave: str
+    request: bytes
+    subject: x509.Name
+    public_key: PublicKey
+    validity: Window
+
+
+def is_ca_service(place: str) -> bool:
+    """Return whether the place of a CA's key stands for a CA service."""
+    return place.startswith(_SCHEME)
+
+
+def check_ca_service(place: str) -> None:
+    """Raise `UsageError` if ``place`` stands for a CA service, and its name is not valid."""
+    if is_ca_service(place) and not _NAME.fullmatch(place.removeprefix(_SCHEME)):
+        raise UsageError(
+            f"'{place}' is not the name of a CA service",
+            "issuer:NAME stands for the program sros-issuer-NAME on the PATH; NAME has lower-case "
+            "letters, digits, '-' and '_'.",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class CaService:
+    """The CA service that issues the identity certificates of the keystore ``root``."""
+
+    place: str
+    root: Path
+
+    @property
+    def program(self) -> str:
+        """The name of the program that asks the service."""
+        return f"sros-issuer-{self.place.removeprefix(_SCHEME)}"
+
+    def issue(
+        self, asked: CertificateRequest, authority: x509.Certificate, now: datetime
+    ) -> x509.Certificate:
+        """Return the certificate that the service issues; ``authority`` is the identity CA.
+
+        Raises:
+            CaServiceError: the program fails, or the certificate is not what was asked for.
+        """
+        answer = self._answer(asked)
+        try:
+            certificate = load_certificate(answer, f"of {self.program}")
+            fault = _fault(certificate, asked, authority, now)
+        except PkiError as error:
+            fault = error.clause
+        if fault:
+            raise self._error(asked, f"The certificate of `{self.program}` is refused: {fault}")
+        _LOG.info("%s issued a certificate for %s", self.program, asked.enclave)
+        return certificate
+
+    def _answer(self, asked: CertificateRequest) -> bytes:
+        """Return what the program writes to its standard output."""
+        program = shutil.which(self.program)
+        if program is None or not Path(program).is_absolute():
+            raise self._error(asked, f"There is no program `{self.program}` on the PATH")
+        told = {
+            "SROS_ENCLAVE": asked.enclave,
+            "SROS_SUBJECT": subject_text(asked.subject),
+            "SROS_NOT_AFTER": iso(asked.validity.not_after),
+            "SROS_KEYSTORE": str(self.root.absolute()),
+        }
+        with tempfile.TemporaryFile() as errors, tempfile.TemporaryFile() as request:
+            request.write(asked.request)
+            request.seek(0)
+            try:
+                process = subprocess.Popen(
+                    [program],
+                    stdin=request,
+                    stdout=subprocess.PIPE,
+                    stderr=errors,
+                    env=os.environ | told,
+                    start_new_session=True,
+                )
+            except OSError as error:
+                why = f"`{self.program}` cannot be started: {error.strerror}"
+                raise self._error(asked, why) from error
+            answer, ended = _bounded_output(process)
+            errors.seek(0)
+            said = " ".join(errors.read(_MOST_SAID).decode(errors="replace").split())
+        if not ended:
+            raise self._error(asked, f"`{self.program}` did not end within {_SECONDS} seconds")
+        if len(answer) > _MOST_BYTES:
+            raise self._error(asked, f"`{self.program}` wrote more than {_MOST_BYTES} bytes")
+        if process.returncode:
+            why = f"`{self.program}` ended with status {process.returncode}"
+            raise self._error(asked, f"{why}: {said}" if said else why)
+        return answer
+
+    def _error(self, asked: CertificateRequest, why: str) -> CaServiceError:
+        return CaServiceError(
+            f"the CA service did not issue a certificate for enclave {asked.enclave}",
+            f"{why}. Nothing was changed.",
+        )
+
+
+def _bounded_output(process: subprocess.Popen[bytes]) -> tuple[bytes, bool]:
+    """Return the output of a program, up to a little too much, and whether it ended in time.
+
+    The program and all that it started is ended with it.
+    """
+    late: list[int] = []
+
+    def end() -> None:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+
+    def end_late() -> None:
+        late.append(process.pid)
+        end()
+
+    timer = Timer(_SECONDS, end_late)
+    timer.start()
+    try:
+        assert process.stdout
+        with process.stdout:
+            answer = process.stdout.read(_MOST_BYTES + 1)
+        if len(answer) <= _MOST_BYTES:
+            process.wait()
+    finally:
+        timer.cancel()
+        end()
+        process.wait()
+    return answer, not late
+
+
+def _fault(
+    certificate: x509.Certificate,
+    asked: CertificateRequest,
+    authority: x509.Certificate,
+    now: datetime,
+) -> str:
+    """Return why a certificate is not what was asked for, as a clause; "" if it is.
+
+    Whether DDS vendors accept it is evaluated later, as for every change of a keystore.
+    """
+    if tolerant.is_tolerated(certificate):
+        return "it breaks rules of X.509 (RFC 5280)"
+    key, validity = certificate.public_key(), validity_of(certificate)
+    if key != asked.public_key:
+        return f"it is for another key ({algorithm(key)}) than the request"
+    if not issued_by(certificate, authority):
+        issuer = other_issuer(certificate, authority)
+        return f"its issuer is {issuer}, not the identity CA of the keystore"
+    subject = {(part.oid, part.value) for part in certificate.subject}
+    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    if len(names) > 1 or not subject.issuperset((part.oid, part.value) for part in asked.subject):
+        has, wanted = subject_text(certificate.subject), subject_text(asked.subject)
+        return f"its subject is {has}, and should be {wanted}, with other kinds of parts at most"
+    constraints = extension(certificate, x509.BasicConstraints)
+    if (constraints and constraints.ca) or not denies_issuing(certificate):
+        return "it is the certificate of a CA, or does not say that it is none"
+    if not (validity.contains(now) or validity.contains(now + _AHEAD)):
+        return f"it is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, not now"
+    if validity.not_after > asked.validity.not_after:
+        return (
+            f"it expires at {iso(validity.not_after)}, later than {iso(asked.validity.not_after)}, "
+            "which was asked for"
+        )
+    if not 0 < certificate.serial_number.bit_length() <= _MOST_SERIAL_BITS:
+        return "no revocation list can have its serial number"
+    return weakness(certificate)

@@ -1,0 +1,281 @@
+"""Identity certificates from a CA service: what is asked, what is taken, and what is refused."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+
+from sros_tool.api import check
+from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.keystore.delivery.signing import sign_request
+from sros_tool.keystore.issuing import ca_service
+from sros_tool.keystore.issuing.keyring import Keyring
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
+from sros_tool.keystore.lifecycle.update import update_keystore
+from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.template import load_template
+from sros_tool.pki.certificates import (
+    common_name,
+    issue_ca,
+    make_request,
+    pem,
+    validity_of,
+)
+from sros_tool.pki.crl import Revoked, sign_crl
+from sros_tool.pki.keys import generate_key, key_pem
+from sros_tool.validity import Window, parse_iso
+from tests.support.harness import certificate, snapshot
+
+DAY = timedelta(days=1)
+
+
+def now() -> datetime:
+    """The real time, which the program of the CA service takes, too."""
+    return datetime.now(UTC).replace(microsecond=0)
+
+
+CA_KEY = generate_key()
+CA = issue_ca(CA_KEY, common_name("head office"), Window(now() - DAY, now() + 900 * DAY))
+TEMPLATE = replace(load_template("production"), certificate_validity=90 * DAY, unique_subject=False)
+SHA256 = hashes.SHA256()
+SERVICE = Keyring(places={"identity": "issuer:test"})
+
+Install = Callable[[str], None]
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
+    """Make a script the program of the CA service; it logs what it is asked for."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    monkeypatch.setenv("PATH", f"{programs}:/usr/bin:/bin")
+
+    def install(script: str) -> None:
+        program = programs / "sros-issuer-test"
+        log = f'echo "$SROS_ENCLAVE $SROS_SUBJECT $SROS_NOT_AFTER" >>{tmp_path}/asked\n'
+        program.write_text(f"#!/bin/sh\nset -e\n{log}{script}\n")
+        program.chmod(0o755)
+
+    return install
+
+
+def office(tmp_path: Path, days: int = 30) -> str:
+    """The script of a CA service that issues what it is asked for."""
+    (tmp_path / "ca.key").write_bytes(key_pem(CA_KEY))
+    (tmp_path / "ca.pem").write_bytes(pem(CA))
+    (tmp_path / "extensions").write_text("basicConstraints = critical, CA:FALSE\n")
+    return (
+        f"exec openssl x509 -req -CA {tmp_path}/ca.pem -CAkey {tmp_path}/ca.key -days {days} "
+        f"-set_serial 0x$(openssl rand -hex 15) -extfile {tmp_path}/extensions"
+    )
+
+
+@pytest.fixture
+def site(tmp_path: Path, install: Install) -> Path:
+    install(office(tmp_path))
+    root = tmp_path / "site"
+    create_keystore(
+        root, template=TEMPLATE, now=now(), keyring=SERVICE, imported={"identity": pem(CA)}
+    )
+    create_enclaves(root, ["/talker", "/listener"], now=now())
+    return root
+
+
+def test_the_service_issues_and_the_permissions_ca_signs(
+    site: Path, tmp_path: Path, install: Install
+) -> None:
+    assert not list((site / "private").glob("identity*"))
+    first = certificate(site / "enclaves/talker/cert.pem")
+    assert first.issuer == CA.subject and validity_of(first).not_after < now() + 31 * DAY
+    asked = [line.split() for line in (tmp_path / "asked").read_text().splitlines()]
+    assert sorted(words[:2] for words in asked) == [
+        ["/listener", "CN=/listener"],
+        ["/talker", "CN=/talker"],
+    ]
+    assert abs(parse_iso(asked[0][2]) - now() - 90 * DAY) < DAY
+    # Robots keep their keys, and do not know the unique part of a subject.
+    robot = make_request(generate_key(), "/arm")
+    assert sign_request(site, robot, now=now()).names("created") == ("/arm",)
+    renewed = renew(site, ["/arm"], now=now())  # by the request that is kept
+    assert renewed.names("renewed") == ("/arm",)
+    assert [note.id for note in renewed.notes] == ["service.expires-early"]
+    assert not check(site)
+    before = snapshot(site)
+    with pytest.raises(KeystoreError, match="its subject is CN=/arm, and should be CN=/arm,OU="):
+        update_keystore(site, replace(TEMPLATE, unique_subject=True), now=now())
+    assert snapshot(site) == before
+
+
+def made(
+    subject: x509.Name, public: Any, *, key: Any = CA_KEY, issuer: x509.Certificate = CA,
+    serial: int = 0, days: int = 30, begin: int = -1, ca: bool = False,
+    digest: Any = SHA256,
+) -> bytes:  # fmt: skip
+    builder = x509.CertificateBuilder(
+        issuer.subject, subject, public, serial or secrets.randbits(120),
+        now() + begin * DAY, now() + days * DAY,
+    ).add_extension(x509.BasicConstraints(ca, None), critical=True)  # fmt: skip
+    return pem(builder.sign(key, digest))
+
+
+OTHER = generate_key()
+ANSWERS: dict[str, tuple[Callable[[x509.Name, Any], bytes], str]] = {
+    "another key": (lambda s, k: made(s, OTHER.public_key()), "it is for another key"),
+    "another CA": (lambda s, k: made(s, k, key=OTHER), "its issuer is another CA named CN=head"),
+    "another name": (
+        lambda s, k: made(common_name("/listener"), k),
+        "its subject is CN=/listener, and should be CN=/talker",
+    ),
+    "two names": (
+        lambda s, k: made(x509.Name([*s, *common_name("/listener")]), k),
+        "CN=/listener,CN=/talker.*, and should be CN=/talker",
+    ),
+    "a CA": (lambda s, k: made(s, k, ca=True), "it is the certificate of a CA"),
+    "longer": (lambda s, k: made(s, k, days=91), "later than .*, which was asked for"),
+    "expired": (lambda s, k: made(s, k, begin=-9, days=-1), "not now"),
+    "not yet valid": (lambda s, k: made(s, k, begin=1), "not now"),
+    "weak": (lambda s, k: made(s, k, digest=hashes.SHA224()), "has a weak signature"),
+    "a long serial": (lambda s, k: made(s, k, serial=1 << 159), "revocation list can have"),
+    "a serial of before": (
+        lambda s, k: made(s, k, serial=7),
+        "serial number that another certificate has",
+    ),
+    "no certificate": (lambda s, k: b"welcome\n", "it is not a PEM certificate"),
+    "no bytes": (lambda s, k: b"", "it is not a PEM certificate"),
+    "much": (lambda s, k: made(s, k) + b"x" * 70_000, "wrote more than 65536 bytes"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ANSWERS)
+def test_another_certificate_than_was_asked_for_is_refused(
+    case: str, site: Path, tmp_path: Path, install: Install
+) -> None:
+    present = certificate(site / "enclaves/talker/cert.pem")
+    answer, words = ANSWERS[case]
+    install(f"cat {tmp_path}/answer")
+    company = x509.NameAttribute(x509.NameOID.ORGANIZATION_NAME, "Company")
+    wider = x509.Name([*present.subject, company])
+    good = made(wider, present.public_key(), serial=7)
+    (tmp_path / "answer").write_bytes(good + pem(CA))
+    assert renew(site, ["/talker"], now=now()).names("renewed") == (
+        "/talker",
+    )  # others' parts stay
+    assert (site / "enclaves/talker/cert.pem").read_bytes() == good
+    (tmp_path / "answer").write_bytes(answer(present.subject, present.public_key()))
+    before = snapshot(site)
+    with pytest.raises(KeystoreError, match=words) as refused:
+        renew(site, ["/talker"], now=now())
+    assert "Nothing was changed" in str(refused.value) and "/talker" in str(refused.value)
+    assert snapshot(site) == before
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        ("echo the quota is used up >&2; exit 3", "ended with status 3: the quota is used up"),
+        ("exit 1", "`sros-issuer-test` ended with status 1. Nothing was changed"),
+        ("yes", "wrote more than 65536 bytes"),
+        ("sleep 100 & wait", "did not end within 0.3 seconds"),
+    ],
+)
+def test_a_program_that_fails_changes_nothing(
+    script: str, words: str, site: Path, install: Install, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "sleep" in script:
+        monkeypatch.setattr(ca_service, "_SECONDS", 0.3)
+    install(script)
+    before = snapshot(site)
+    with pytest.raises(KeystoreError, match=words):
+        renew(site, now=now(), names=["/talker", "/listener"])
+    assert snapshot(site) == before
+
+
+def test_without_the_program_nothing_is_issued_and_a_dry_run_does_not_ask(
+    site: Path, tmp_path: Path, install: Install, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "asked").unlink()
+    before = snapshot(site)
+    planned = renew(site, ["/talker"], now=now(), dry_run=True)
+    assert [note.id for note in planned.notes] == ["service.not-asked"]
+    assert not (tmp_path / "asked").exists()
+    (tmp_path / "bin/sros-issuer-test").unlink()
+    with pytest.raises(KeystoreError, match="no program `sros-issuer-test` on the PATH"):
+        renew(site, ["/talker"], now=now())
+    monkeypatch.chdir(tmp_path)
+    install(office(tmp_path))
+    monkeypatch.setenv("PATH", "bin:/usr/bin:/bin")  # of whoever made the present folder
+    with pytest.raises(KeystoreError, match="no program"):
+        renew(site, ["/talker"], now=now())
+    assert snapshot(site) == before
+
+
+def listed(*serials: int, number: int = 1, key: Any = CA_KEY, days: int = 30) -> bytes:
+    revoked = [Revoked(serial, now()) for serial in serials]
+    end = now() + days * DAY
+    return sign_crl(CA, key, revoked, number=number, this_update=now() - 2 * DAY, next_update=end)
+
+
+def test_the_service_signs_the_revocation_list(site: Path) -> None:
+    serial = certificate(site / "enclaves/talker/cert.pem").serial_number
+    others = 4711  # of another site
+    before = snapshot(site)
+    for crl, words in (
+        (b"", rf"it alone signs .*\({serial:x}\), and give its list with --crl FILE"),
+        (listed(others), f"It does not revoke {serial:x}"),
+        (listed(serial, key=OTHER), "did not sign it"),
+        (listed(serial, days=-1), "not now"),
+        (listed(serial, number=0), "Its number is 0, and has to be higher than 0"),
+    ):
+        with pytest.raises(KeystoreError, match=words):
+            revoke(site, ["/talker"], now=now(), crl=crl)
+        assert snapshot(site) == before
+    revoke(site, ["/talker"], now=now(), crl=listed(serial, others, number=5))
+    assert (site / "enclaves/listener/crl.pem").resolve() == site / "public/identity_ca.crl.pem"
+    assert (site / f"revoked/{serial:x}/cert.pem").exists()
+    with pytest.raises(KeystoreError, match="Its number is 5, and has to be higher than 5"):
+        refresh_crl(site, now=now(), crl=listed(serial, number=5))
+    with pytest.raises(KeystoreError, match=f"It does not revoke {serial:x}"):
+        refresh_crl(site, now=now(), crl=listed(others, number=6))
+    mine = certificate(site / "enclaves/listener/cert.pem").serial_number
+    with pytest.raises(KeystoreError, match="no node could start in /listener"):
+        refresh_crl(site, now=now(), crl=listed(serial, mine, number=6))
+    refresh_crl(site, now=now(), crl=listed(serial, number=6))
+    crl = Keystore(site).revocation_list
+    assert crl and crl.number == 6
+
+
+def test_what_a_service_cannot_do_is_refused(site: Path, tmp_path: Path) -> None:
+    before = snapshot(site)
+    with pytest.raises(KeystoreError, match="does not revoke earlier certificates"):
+        renew(site, ["/talker"], now=now(), revoke_old=True)
+    with pytest.raises(UsageError, match="Replace the permissions CA alone"):
+        rotate_ca(site, now=now())
+    assert snapshot(site) == before
+    rotate_ca(site, now=now(), roles=["permissions"], finish=True)
+    assert not Keystore(site).ledger.gaps
+    for template, imported, words in (
+        (TEMPLATE, {}, "Name it with --identity-ca"),
+        (replace(TEMPLATE, separate_authorities=False), {"identity": pem(CA)}, "layout separate"),
+    ):
+        with pytest.raises(SrosError, match=words):
+            create_keystore(
+                tmp_path / "new", template=template, now=now(), keyring=SERVICE, imported=imported
+            )
+    with pytest.raises(UsageError, match="not the name of a CA service"):
+        Keyring(places={"identity": "issuer:../evil"})
+    own = tmp_path / "own"
+    create_keystore(own, template=TEMPLATE, now=now())
+    create_enclaves(own, ["/talker"], now=now())
+    with pytest.raises(UsageError, match="Leave --crl out"):
+        revoke(own, ["/talker"], now=now(), crl=listed(1))
