@@ -73,6 +73,7 @@ FOR_TESTS: tuple[tuple[str, str, Callable[[], bool]], ...] = (
     ("openssh-client", "the way there", _command("ssh")),
     ("libfaketime", "a robot with a wrong clock", _library("faketime/libfaketime.so.1")),
     ("nginx-light", "a web server between robots and home", Path("/usr/sbin/nginx").exists),
+    ("golang-cfssl", "a CA service that issues certificates", _command("cfssl")),
     ("zsh", "a shell that evaluates what env prints", _command("zsh")),
     ("fish", "another shell that does", _command("fish")),
     ("systemd", "systemd, which verifies its units", _command("systemd-analyze")),

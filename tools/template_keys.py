@@ -104,8 +104,9 @@ KEYS: tuple[Key, ...] = (
         "[authorities]",
         "identity_key",
         '"file:/media/stick/identity.pem"',
-        "a URI, `file:` or `pkcs11:`",
-        "where the key of the identity CA is",
+        "a URI, `file:` or `pkcs11:`, or `issuer:NAME`",
+        "where the key of the identity CA is; `issuer:NAME` for a "
+        "[CA service](../howto/ca_service.md)",
         "`private/` of the keystore",
     ),
     Key(

@@ -437,7 +437,7 @@ if TYPE_CHECKING:
     "--identity-key",
     metavar="URI",
     help="Private key of the identity CA, created if missing: file:PATH or pkcs11:...; "
-    "issuer:NAME for the CA service that the program sros-issuer-NAME asks.",
+    "or issuer:NAME, the CA service that your program sros-issuer-NAME asks.",
 )
 @click.option(
     "--permissions-key",

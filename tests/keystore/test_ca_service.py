@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 from collections.abc import Callable
 from dataclasses import replace
@@ -220,6 +221,15 @@ def test_without_the_program_nothing_is_issued_and_a_dry_run_does_not_ask(
     assert snapshot(site) == before
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may act for others")
+def test_the_keystore_of_another_user_does_not_name_the_service(site: Path) -> None:
+    os.chown(site, 1, 1)
+    os.chown(site / "private/permissions_ca.key.pem", 1, 1)
+    with pytest.raises(KeystoreError, match="of user 1 names the CA service 'issuer:test'"):
+        renew(site, ["/talker"], now=now())
+    assert renew(site, ["/talker"], now=now(), keyring=SERVICE).names("renewed")
+
+
 def listed(*serials: int, number: int = 1, key: Any = CA_KEY, days: int = 30) -> bytes:
     revoked = [Revoked(serial, now()) for serial in serials]
     end = now() + days * DAY
@@ -251,8 +261,8 @@ def test_the_service_signs_the_revocation_list(site: Path) -> None:
     with pytest.raises(KeystoreError, match="no node could start in /listener"):
         refresh_crl(site, now=now(), crl=listed(serial, mine, number=6))
     refresh_crl(site, now=now(), crl=listed(serial, number=6))
-    crl = Keystore(site).revocation_list
-    assert crl and crl.number == 6
+    present = Keystore(site).revocation_list
+    assert present and present.number == 6
 
 
 def test_what_a_service_cannot_do_is_refused(site: Path, tmp_path: Path) -> None:

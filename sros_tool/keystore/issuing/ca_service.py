@@ -149,7 +149,7 @@ class CaService:
                 why = f"`{self.program}` cannot be started: {error.strerror}"
                 raise self._error(asked, why) from error
             answer, ended = _bounded_output(process)
-            errors.seek(0)
+            errors.seek(max(0, errors.seek(0, os.SEEK_END) - _MOST_SAID))
             said = " ".join(errors.read(_MOST_SAID).decode(errors="replace").split())
         if not ended:
             raise self._error(asked, f"`{self.program}` did not end within {_SECONDS} seconds")

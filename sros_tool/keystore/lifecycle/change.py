@@ -454,16 +454,18 @@ class KeystoreChange:
     @property
     def is_guess(self) -> bool:
         """Whether certificates stand for those that a CA service would issue: in a dry run."""
-        return self.dry_run and bool(self.identity.service and self._issued())
+        return self.dry_run and bool(self._served())
 
     @property
     def moment(self) -> datetime:
         """The time of the change, or when certificates that a CA service issued begin later."""
-        if not self.identity.service:
-            return self.now
-        return max([self.now, *(parse_iso(entry.not_before) for entry in self._issued())])
+        return max([self.now, *(parse_iso(entry.not_before) for entry in self._served())])
 
-    def _issued(self) -> list[Entry]:
+    def _served(self) -> list[Entry]:
+        """Return the ledger entries of the certificates that a CA service issued."""
+        identity: Authority | None = self.__dict__.get("identity")  # none is opened for this
+        if identity is None or identity.service is None:
+            return []
         return [entry for entry in self.entries if entry.what == "certificate"]
 
     def _check_served(self) -> None:
@@ -473,7 +475,7 @@ class KeystoreChange:
             KeystoreError: a serial number was there before: whoever revokes one certificate would
                 revoke the other one, too.
         """
-        if not self.identity.service or not (issued := self._issued()):
+        if not (issued := self._served()):
             return
         serials = [entry.serial for entry in issued]
         known = self.keystore.ledger_file.with_values("serial", serials).entries
