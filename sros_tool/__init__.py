@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         Keystore,
         check,
         check_requirements,
+        create_enclaves,
         create_keystore,
         explain_access,
         export_enclaves,
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
         new_access,
         open_keystore,
         read_policy,
+        renew,
+        revoke,
     )
     from sros_tool.checks.kind import Finding
     from sros_tool.errors import (
@@ -45,7 +48,9 @@ if TYPE_CHECKING:
         UsageError,
     )
     from sros_tool.keystore.fleet_status import FleetStatus
+    from sros_tool.keystore.lifecycle.change import Changed
     from sros_tool.keystore.lifecycle.create import Creation
+    from sros_tool.keystore.lifecycle.revoke import Revocation
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
     from sros_tool.proof.growth import Growth
@@ -54,6 +59,7 @@ __version__ = "0.2.0"
 
 __all__ = [
     "AccessAnswer",
+    "Changed",
     "Creation",
     "DocumentError",
     "Finding",
@@ -63,11 +69,13 @@ __all__ = [
     "KeystoreError",
     "Policy",
     "PolicyError",
+    "Revocation",
     "SrosError",
     "Template",
     "UsageError",
     "check",
     "check_requirements",
+    "create_enclaves",
     "create_keystore",
     "explain_access",
     "export_enclaves",
@@ -77,14 +85,18 @@ __all__ = [
     "new_access",
     "open_keystore",
     "read_policy",
+    "renew",
+    "revoke",
 ]
 
 _ELSEWHERE = {
+    "Changed": "sros_tool.keystore.lifecycle.change",
     "Creation": "sros_tool.keystore.lifecycle.create",
     "Finding": "sros_tool.checks.kind",
     "FleetStatus": "sros_tool.keystore.fleet_status",
     "Growth": "sros_tool.proof.growth",
     "Policy": "sros_tool.policy.model",
+    "Revocation": "sros_tool.keystore.lifecycle.revoke",
     "Template": "sros_tool.keystore.template",
     **dict.fromkeys((name for name in __all__ if name.endswith("Error")), "sros_tool.errors"),
 }

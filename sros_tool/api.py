@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.fleet_status import FleetStatus
     from sros_tool.keystore.issuing.keyring import Keyring
+    from sros_tool.keystore.lifecycle.change import Changed
     from sros_tool.keystore.lifecycle.create import Creation
+    from sros_tool.keystore.lifecycle.revoke import Revocation
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
     from sros_tool.proof.growth import Growth
@@ -247,6 +249,143 @@ def _fleet_policies(policies: Iterable[AnyPath | Policy], fleet: AnyPath) -> lis
             )
         read.append(FleetPolicy(read_policy(Path(policy), placeholders=True), robots))
     return read
+
+
+def create_enclaves(
+    keystore: AnyPath,
+    enclaves: Iterable[str],
+    *,
+    domain: int | None = None,
+    secrets: Secrets | None = None,
+    now: datetime | None = None,
+    dry_run: bool = False,
+) -> Creation:
+    """Create enclaves with the default permissions of the keystore's template, all or none.
+
+    An existing enclave keeps its key and its permissions.
+
+    Args:
+        keystore: An existing keystore, or its path.
+        enclaves: The names of the enclaves.
+        domain: The ROS domain id that the enclaves will be used in; the governance must name it.
+        secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
+        now: The time from which validities count; the current time by default.
+        dry_run: Report the changes without making them.
+
+    Raises:
+        KeystoreError: The keystore does not exist, is busy or broken, or is not for ``domain``.
+        InvalidNameError: An enclave's name is not valid.
+
+    Example:
+        >>> sros_tool.create_enclaves(keystore, ["/camera"]).created
+        ('/camera',)
+    """
+    return generate(
+        keystore, enclaves=enclaves, domain=domain, secrets=secrets, now=now, dry_run=dry_run
+    )
+
+
+def renew(
+    keystore: AnyPath,
+    enclaves: Iterable[str] = (),
+    *,
+    expiring: timedelta | None = None,
+    new_key: bool = False,
+    revoke_old: bool = False,
+    secrets: Secrets | None = None,
+    now: datetime | None = None,
+    dry_run: bool = False,
+) -> Changed:
+    """Renew the certificates and permissions of enclaves, with the same rights, all or none.
+
+    Args:
+        keystore: The keystore, or its path.
+        enclaves: The names of enclaves.
+        expiring: Also renew the enclaves that expire within this time, but for those with a
+            validity of their own.
+        new_key: Give the enclaves new keys.
+        revoke_old: Revoke the earlier certificates, which otherwise work until they expire.
+        secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
+        now: The time from which validities count; the current time by default.
+        dry_run: Report the changes without making them.
+
+    Returns:
+        ``names("renewed")``, ``restart`` (the enclaves whose processes have to be restarted) and
+        ``works_until`` (when the last replaced file expires).
+
+    Raises:
+        KeystoreError: An enclave does not exist or cannot be renewed.
+        UsageError: Neither ``enclaves`` nor ``expiring`` is given.
+
+    Example:
+        >>> sros_tool.renew(keystore, expiring=timedelta(days=30)).names("renewed")
+        ('/camera',)
+    """
+    from sros_tool.keystore.expiry import Threshold
+    from sros_tool.keystore.lifecycle import renew as lifecycle
+
+    names = tuple(_several("enclaves", enclaves))
+    if not names and expiring is None:
+        raise UsageError("nothing is given to renew", "", "Pass enclaves, or a time as expiring.")
+    return lifecycle.renew(
+        Path(keystore),
+        names,
+        now=_moment(now),
+        expiring=None if expiring is None else Threshold(remaining=expiring),
+        new_key=new_key,
+        revoke_old=revoke_old,
+        keyring=_keyring(secrets),
+        dry_run=dry_run,
+    )
+
+
+def revoke(
+    keystore: AnyPath,
+    enclaves: Iterable[str],
+    *,
+    reason: str = "unspecified",
+    secrets: Secrets | None = None,
+    now: datetime | None = None,
+    dry_run: bool = False,
+) -> Revocation:
+    """Revoke all certificates of enclaves, and move their files away, all or none.
+
+    The other enclaves get the revocation list, and trust the revoked ones until their processes
+    have it and were restarted.
+
+    Args:
+        keystore: The keystore, or its path.
+        enclaves: The names of the enclaves.
+        reason: Why, as RFC 5280 names reasons: ``keyCompromise``, ``cessationOfOperation``, ...
+        secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
+        now: The time of the revocation; the current time by default.
+        dry_run: Report the changes without making them.
+
+    Returns:
+        ``names("revoked")``, ``restart`` (the enclaves whose processes have to be restarted) and
+        ``next_update`` (when the revocation list expires).
+
+    Raises:
+        KeystoreError: An enclave does not exist, or the key of the identity CA is missing.
+        UsageError: No enclave is given, or ``reason`` is unknown.
+
+    Example:
+        >>> sros_tool.revoke(keystore, ["/camera"], reason="keyCompromise").restart
+        ('/driver',)
+    """
+    from sros_tool.keystore.lifecycle import revoke as lifecycle
+
+    names = tuple(_several("enclaves", enclaves))
+    if not names:
+        raise UsageError("no enclave is given to revoke", "", "Pass at least one enclave name.")
+    return lifecycle.revoke(
+        Path(keystore),
+        names,
+        now=_moment(now),
+        reason=reason,
+        keyring=_keyring(secrets),
+        dry_run=dry_run,
+    )
 
 
 def fleet_status(

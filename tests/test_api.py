@@ -190,6 +190,26 @@ def test_a_dry_run_changes_nothing(keystore: sros_tool.Keystore) -> None:
     assert "/spare" not in keystore.enclaves
 
 
+def test_enclaves_are_created_renewed_and_revoked(keystore: sros_tool.Keystore) -> None:
+    assert sros_tool.create_enclaves(keystore, ["/c"]).created == ("/c",)
+    certificate = keystore.path / "enclaves/c/cert.pem"
+    first = certificate.read_bytes()
+    assert sros_tool.renew(keystore, expiring=timedelta(days=1)).names("renewed") == ()
+    assert sros_tool.renew(keystore, ["/c"], dry_run=True).names("renewed") == ("/c",)
+    assert certificate.read_bytes() == first
+    assert sros_tool.renew(keystore, ["/c"]).names("renewed") == ("/c",)
+    assert certificate.read_bytes() != first
+    gone = sros_tool.revoke(keystore, ["/c"], reason="keyCompromise")
+    assert gone.names("revoked") == ("/c",) and "/c" not in keystore.enclaves
+    assert set(gone.restart) == set(keystore.enclaves)
+    with pytest.raises(UsageError, match="nothing is given to renew"):
+        sros_tool.renew(keystore)
+    with pytest.raises(UsageError, match="unknown reason"):
+        sros_tool.revoke(keystore, ["/c"], reason="spring")
+    with pytest.raises(UsageError, match="one string"):
+        sros_tool.revoke(keystore, "/c")
+
+
 def test_an_encrypted_key_is_asked_for(tmp_path: Path) -> None:
     asked: list[str] = []
 
