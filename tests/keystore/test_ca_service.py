@@ -187,7 +187,7 @@ def test_another_certificate_than_was_asked_for_is_refused(
         ("echo the quota is used up >&2; exit 3", "ended with status 3: the quota is used up"),
         ("exit 1", "`sros-issuer-test` ended with status 1. Nothing was changed"),
         ("yes", "wrote more than 65536 bytes"),
-        ("sleep 100 & wait", "did not end within 0.3 seconds"),
+        ("setsid sleep 1 & sleep 100", "did not end within 0.3 seconds"),
     ],
 )
 def test_a_program_that_fails_changes_nothing(
@@ -263,6 +263,8 @@ def test_the_service_signs_the_revocation_list(site: Path) -> None:
     refresh_crl(site, now=now(), crl=listed(serial, number=6))
     present = Keystore(site).revocation_list
     assert present and present.number == 6
+    (ends,) = (found for found in check(site) if found.id == "keystore.revocation-list-ends")
+    assert f"sros crl {site} --refresh --crl FILE" in ends.remedy
 
 
 def test_what_a_service_cannot_do_is_refused(site: Path, tmp_path: Path) -> None:

@@ -379,6 +379,17 @@ def _left_enclaves(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]
         yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown(FLEET))
 
 
+_NEXT_CA = "Make a new keystore with the certificate of the next CA of the CA service."
+_NEXT_LIST = (
+    "Have the CA service sign a later list, and run `sros crl ROOT --refresh --crl FILE` with it."
+)
+
+
+def _is_served(keystore: CheckedKeystore) -> bool:
+    """Return whether a CA service is the identity CA."""
+    return bool(keystore.settings and is_ca_service(keystore.settings.identity_key))
+
+
 def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Yield findings about the settings and the ledger, which only sros writes."""
     settings, ledger = ((keystore.root / name).exists() for name in (SETTINGS, LEDGER))
@@ -414,10 +425,12 @@ def _authority(
     file, subject = keystore.shown(ca_certificate(role)), f"{role} CA"
     name, validity = authority_text(certificate), validity_of(certificate)
     begin, end = iso(validity.not_before), iso(validity.not_after)
+    remedy = _NEXT_CA if role == IDENTITY and _is_served(keystore) else ""
     if not validity.contains(keystore.now):
-        yield CA_EXPIRED.found(subject, f"{name} is valid from {begin} to {end}", file)
+        text = f"{name} is valid from {begin} to {end}"
+        yield CA_EXPIRED.found(subject, text, file, remedy=remedy)
     elif validity.not_after - keystore.now < _SOON:
-        yield CA_EXPIRES_SOON.found(subject, f"{name} expires at {end}", file)
+        yield CA_EXPIRES_SOON.found(subject, f"{name} expires at {end}", file, remedy=remedy)
     for weak in filter(None, map(weakness, chain)):
         yield WEAK.found(subject, weak, file)
     yield from _authority_findings(role, chain, keystore.now, subject, file)
@@ -515,9 +528,11 @@ def _revocation_list(keystore: CheckedKeystore) -> Iterator[Finding]:
     if crl is None:
         return
     file = keystore.shown(CRL)
+    remedy = _NEXT_LIST if _is_served(keystore) else ""
     if crl.next_update - keystore.now < _LIST_SOON:
         text = f"it expires at {iso(crl.next_update)}, and DDS then refuses every participant"
-        yield CRL_EXPIRES_SOON.found("revocation list", text, file)
+        yield CRL_EXPIRES_SOON.found("revocation list", text, file, remedy=remedy)
     identity = keystore.authorities.get(IDENTITY, ())
     if identity and not any(signed_by(crl.list, certificate) for certificate in identity):
-        yield CRL_ISSUER.found("revocation list", "no identity CA of the keystore signed it", file)
+        text = "no identity CA of the keystore signed it"
+        yield CRL_ISSUER.found("revocation list", text, file, remedy=remedy)

@@ -14,15 +14,16 @@ from __future__ import annotations
 import logging
 import os
 import re
+import select
 import shutil
 import signal
 import subprocess
 import tempfile
+import time
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from threading import Timer
 
 from cryptography import x509
 from cryptography.x509.oid import NameOID
@@ -148,10 +149,10 @@ class CaService:
             except OSError as error:
                 why = f"`{self.program}` cannot be started: {error.strerror}"
                 raise self._error(asked, why) from error
-            answer, ended = _bounded_output(process)
+            answer = _bounded_output(process)
             errors.seek(max(0, errors.seek(0, os.SEEK_END) - _MOST_SAID))
             said = " ".join(errors.read(_MOST_SAID).decode(errors="replace").split())
-        if not ended:
+        if answer is None:
             raise self._error(asked, f"`{self.program}` did not end within {_SECONDS} seconds")
         if len(answer) > _MOST_BYTES:
             raise self._error(asked, f"`{self.program}` wrote more than {_MOST_BYTES} bytes")
@@ -167,34 +168,33 @@ class CaService:
         )
 
 
-def _bounded_output(process: subprocess.Popen[bytes]) -> tuple[bytes, bool]:
-    """Return the output of a program, up to a little too much, and whether it ended in time.
+def _bounded_output(process: subprocess.Popen[bytes]) -> bytes | None:
+    """Return the output of a program, up to a little too much; None if it does not end in time.
 
-    The program and all that it started is ended with it.
+    The program is ended in both cases, with what it started.
     """
-    late: list[int] = []
+    end, answer, ended = time.monotonic() + _SECONDS, b"", False
+    assert process.stdout
+    with process.stdout as output, suppress(subprocess.TimeoutExpired):
+        ready = select.poll()
+        ready.register(output)
+        try:
+            while len(answer) <= _MOST_BYTES and ready.poll(_left(end) * 1000):
+                part = os.read(output.fileno(), _MOST_BYTES)
+                answer += part
+                if not part:
+                    process.wait(_left(end))
+                    ended = True
+                    break
+        finally:
+            if not ended:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+    return answer if ended or len(answer) > _MOST_BYTES else None
 
-    def end() -> None:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
 
-    def end_late() -> None:
-        late.append(process.pid)
-        end()
-
-    timer = Timer(_SECONDS, end_late)
-    timer.start()
-    try:
-        assert process.stdout
-        with process.stdout:
-            answer = process.stdout.read(_MOST_BYTES + 1)
-        if len(answer) <= _MOST_BYTES:
-            process.wait()
-    finally:
-        timer.cancel()
-        end()
-        process.wait()
-    return answer, not late
+def _left(end: float) -> float:
+    return max(0.0, end - time.monotonic())
 
 
 def _fault(
