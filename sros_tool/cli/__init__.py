@@ -4,7 +4,7 @@
 
 - keystores: `keystore`, `inspect`, `life`, `zenoh`
 - robots: `deployment`, `fleet`
-- processes: `running`, `demo`
+- processes: `running`, `close`, `demo`
 - policies: `policy`, `review`, `view`
 - robots that run: `observing`, `audit`
 - answers: `explain`, `check`

@@ -114,7 +114,7 @@ class Process:
     @property
     def label(self) -> str:
         """The name of the process in messages, such as "process 4711 (talker)"."""
-        return f"process {self.pid} ({_program(self.command)})"
+        return f"process {self.pid} ({program_of(self.command)})"
 
     @property
     def asks_for_security(self) -> bool:
@@ -176,7 +176,7 @@ class UnseenProcess(NamedTuple):
     @property
     def label(self) -> str:
         """The name of the process in messages, such as "process 4711 (talker)"."""
-        return f"process {self.pid} ({_program(self.command)})"
+        return f"process {self.pid} ({program_of(self.command)})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +207,7 @@ def plain(text: str, longest: int = _LONGEST) -> str:
     return re.sub(r"[^\w.+/ -]", "?", text[:longest])
 
 
-def _program(command: tuple[str, ...]) -> str:
+def program_of(command: tuple[str, ...]) -> str:
     """Return the name of a command's program, or of the script or module that it interprets."""
     name = Path(command[0]).name if command else ""
     if len(command) > 1 and _INTERPRETER.match(name):
@@ -465,6 +465,25 @@ _LIBRARY_FOLDERS = (
     *("opt/ros/*/lib", "opt/ros/*/lib/*-linux-gnu*"),
     *("usr/lib", "usr/lib/*-linux-gnu*", "usr/local/lib"),
 )
+
+
+def service_of(pid: int, proc: Path = Path("/proc")) -> tuple[str, str]:
+    """Return the system service of systemd that a process belongs to, and its working directory.
+
+    Either is "" if the process has none, has ended, or hides it.
+    """
+    unit = folder = ""
+    with suppress(OSError):
+        text = (proc / str(pid) / "cgroup").read_text(errors="surrogateescape")
+        unit = service[1] if (service := _SERVICE.search(text)) else ""
+        folder = str((proc / str(pid) / "cwd").readlink())
+    return unit, folder
+
+
+_SERVICE = re.compile(
+    r"^(?:0:|\d+:name=systemd):/system\.slice/(?:.*/)?([\w:.@\\-]+\.service)$", re.M | re.A
+)
+"""A line of /proc/PID/cgroup, of version 2 or 1 (cgroups(7)); not for users' own services."""
 
 
 def _version(name: str) -> str:

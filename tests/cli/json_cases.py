@@ -401,6 +401,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks --job check --sros /bin/sros new --dry-run"),
         Case("zenoh /a new --rmw rmw_zenoh_cpp", before=("zenoh zenoh",)),
     ),
+    "close": (Case("none --dry-run"),),
     "review": (
         Case("--base none --policy policy.xml --repository git", 1),
         Case("--base none --policy policy.xml --requirements required.toml --repository git", 1),
@@ -497,6 +498,7 @@ ERRORS = {
     "fleet collect": "ks good",
     "fleet status": "ks",
     "units": "none /a new",
+    "close": "none --apply",
     "check": "none",
     "audit": "none",
     "doctor": "surplus",

@@ -232,8 +232,8 @@ WITH_A_GRAPH = {
 }
 
 
-ON_A_ROBOT = {verb for verb in CASES if verb.startswith("agent ")}
-"""They need a publishing folder: tests/agent/test_agent_verbs.py."""
+ON_A_ROBOT = {verb for verb in CASES if verb.startswith("agent ") or verb == "close"}
+"""They need a publishing folder (tests/agent/test_agent_verbs.py), or processes (test_close.py)."""
 
 
 @pytest.mark.parametrize(

@@ -174,7 +174,8 @@ ELSEWHERE = {
     "agent run": "tests/agent/test_agent_verbs.py",
     "agent status": "tests/agent/test_agent_verbs.py",
     "generate_policy": "tests/graph", "minimize_policy": "tests/policy",
-    "audit": "tests/cli/test_audit.py", "doctor": "tests/checks", "run": "tests/runtime",
+    "audit": "tests/cli/test_audit.py", "close": "tests/cli/test_close.py",
+    "doctor": "tests/checks", "run": "tests/runtime",
     "demo": "tests/demo", "fleet publish": "tests/agent", "review": "tests/test_pull_requests.py",
 }  # fmt: skip
 """Verbs that need a robot, a repository or another program, and where their status is tested."""

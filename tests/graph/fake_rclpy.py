@@ -3,7 +3,9 @@
 $FAKE_GRAPH describes the graph, or names a failure.
 
 JSON: ``{"nodes": [[enclave, namespace, name, participant, ["publish topic", ...]]...]}``, or
-``{"fails": "import" | "init" | "node" | "crash", "says": TEXT}``.
+``{"fails": "import" | "init" | "node" | "crash", "says": TEXT}``.  ``secured`` may have another
+graph, which an observer with an enclave sees; others see no node as soon as the file ``until`` is
+there.
 """
 
 from __future__ import annotations
@@ -15,6 +17,10 @@ from types import SimpleNamespace
 from typing import Any
 
 GRAPH = json.loads(os.environ["FAKE_GRAPH"])
+if os.environ.get("ROS_SECURITY_ENABLE") == "true":
+    GRAPH = GRAPH.get("secured", GRAPH)
+elif os.path.exists(GRAPH.get("until", "")):
+    GRAPH["nodes"] = []
 
 
 def _perhaps_fail(stage: str) -> None:

@@ -1,0 +1,594 @@
+"""The verb `close`: from an open robot to a closed one, by the verbs that do each step."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import click
+
+from sros_tool.cli.common import (
+    PATH,
+    dry_run_option,
+    echo_findings,
+    enclave_environment,
+    json_option,
+    local_zone,
+    now,
+    print_json,
+    verb,
+)
+from sros_tool.errors import DocumentError, SrosError, UnavailableError, UsageError
+from sros_tool.terminal import echo
+from sros_tool.values import FileChange
+from sros_tool.wording import counted, first_few
+
+if TYPE_CHECKING:
+    from sros_tool.closing import CloseStep, ObservedProcesses, Proof
+    from sros_tool.graph.observation import Observation
+    from sros_tool.runtime.processes import RunningProcesses
+
+_SYSTEMD = Path("/etc/systemd/system")
+_OBSERVER = "/sros_observer"
+_RESTART_SECONDS, _START_SECONDS = 30.0, 3.0
+"""How long processes may take until they run in their enclaves: restarted by sros, or by hand."""
+_TRIES = 3
+_MOST_LINES = 5
+
+
+class _Step(NamedTuple):
+    """The words of a command line of sros, what it makes, and where its output goes."""
+
+    words: Sequence[str]
+    made: Path | None = None
+    into: Path | None = None
+
+    @property
+    def command(self) -> str:
+        redirected = f" > {shlex.quote(str(self.into))}" if self.into else ""
+        return f"sros {shlex.join(self.words)}{redirected}"
+
+
+class _Places:
+    """The paths in the folder of a robot that is being closed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.policy, self.observer = folder / "policy.xml", folder / "observer.xml"
+        self.requirements = folder / "requirements.toml"
+        self.keystore, self.export = folder / "keystore", folder / "export"
+        self.start, self.page = folder / "start", folder / "rights.html"
+        self.observed, self.processes = folder / "observed.json", folder / "processes.json"
+
+    def steps(self, domain: int, duration: str | None) -> list[_Step]:
+        """Return the steps; with a ``duration``, the robot is watched even if it was before."""
+        policy, keystore, needed = str(self.policy), str(self.keystore), str(self.requirements)
+        learn = ["generate_policy", policy, "--enclave-per-node", "--domain", str(domain)]
+        learn += ["--watch", duration] if duration else []
+        learn += ["--dry-run"] if self.policy.exists() else []  # it may have been edited
+        only_errors = ("--fail-on", "error")
+        both, created = ("-p", policy, str(self.observer)), ("--template", "production")
+        return [
+            _Step((*learn, "--json"), None if duration else self.processes, self.observed),
+            _Step(("check", policy, "--suggest"), self.requirements, self.requirements),
+            _Step(("create_keystore", keystore, *created, "--domain", str(domain)), self.keystore),
+            _Step(("generate_artifacts", "-k", keystore, *both)),
+            _Step(("distribute_key", keystore, "--all", str(self.export), "--force")),
+            _Step(("check", policy, keystore, "--policy", policy, *only_errors)),
+            _Step(("check", keystore, "--requirements", needed, *only_errors)),
+            _Step(("view", policy, *created, "-o", str(self.page), "--force")),
+        ]
+
+
+def _run(step: _Step, *, quiet: bool = False) -> tuple[int, str]:
+    """Run a verb of sros in this process; return its status and what it prints.
+
+    With ``quiet``, that has its messages, too.
+    """
+    from sros_tool.cli.program import program
+
+    echo(f"$ {step.command}", err=True)
+    output = io.BytesIO()
+    stream = io.TextIOWrapper(output, "utf-8", "surrogateescape", write_through=True)
+    with redirect_stderr(stream if quiet else sys.stderr), redirect_stdout(stream):
+        status = program.main(list(step.words), prog_name="sros", standalone_mode=False)
+        text = output.getvalue().decode("utf-8", "surrogateescape")
+    return (status if isinstance(status, int) else 0), text
+
+
+@verb("close")
+@click.argument("folder", type=PATH)
+@click.option(
+    "--for",
+    "duration",
+    metavar="DURATION",
+    help="Watch the robot for DURATION, such as 5m, or watch it again. [default: until the ROS "
+    "graph stops changing]",
+)
+@click.option(
+    "--domain", "domain_text", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or 0]"
+)
+@click.option(
+    "--apply", "applies", is_flag=True, help="Restart the robot's units of systemd secured."
+)
+@click.option("--proof", "proves", is_flag=True, help="Prove that the robot is closed.")
+@click.option("--undo", "undoes", is_flag=True, help="Restart these units open again.")
+@click.option(
+    "--partial",
+    is_flag=True,
+    help="Accept that some processes or nodes are left out, or could not be asked.",
+)
+@dry_run_option
+@json_option
+def close(
+    folder: Path,
+    duration: str | None,
+    domain_text: str | None,
+    applies: bool,
+    proves: bool,
+    undoes: bool,
+    partial: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    """Close the robot that runs open on this machine, step by step, by what it makes in FOLDER.
+
+    Watches the robot on DDS, and writes its policy, requirements that hold now, a production
+    keystore with an enclave for each process, an export of them without CA keys, and how each
+    process is started secured. Each step is a verb, which is shown. What is there is kept: edit
+    policy.xml and requirements.toml, and run it again.
+
+    Nothing is closed before --apply, which restarts the processes that are units of systemd, and
+    shows the commands for all others. --proof, which --apply does by itself if nothing is left to
+    do by hand, asks: does every process run in its enclave, does everything that talked still talk,
+    does an open listener find nothing? --undo goes back.
+
+    Example:
+      $ sros close robot --for 5m
+      ...
+      nothing is closed yet; next: sros close robot --apply
+      $ sros close robot            # after changing robot/policy.xml
+      $ sros close robot --apply
+      $ sros close robot --proof    # after what is left to do by hand
+      $ sros close robot --undo
+
+    Exit status: 0 if everything is prepared, the robot is proved closed, or is open again; 1 if
+    something is found, is left to do by hand, or does not hold; 2 if it could not be done.
+    """
+    from sros_tool.closing import CloseStep, Closing, ObservedProcesses, read_processes
+
+    if sum((applies, proves, undoes)) > 1:
+        raise UsageError("--apply, --proof and --undo exclude each other", "", "Choose one.")
+    if duration and (applies or proves or undoes):
+        raise UsageError("--for is for watching an open robot", "", "Leave it out.")
+    at = _Places(folder)
+    if (applies or proves or undoes) and not at.processes.exists():
+        name = shlex.quote(str(folder))
+        raise UsageError(f"'{folder}' has no watched robot", "", f"Run `sros close {name}` first.")
+    known = read_processes(at.processes) if at.processes.exists() else None
+    observed = known or ObservedProcesses(_domain(domain_text))
+    if domain_text is not None and observed.domain != _domain(domain_text):
+        raise UsageError(
+            f"the robot was watched in domain {observed.domain}, not {domain_text}",
+            "",
+            "Close each domain into a folder of its own.",
+        )
+    steps: list[CloseStep] = []
+    denied: list[str] = []
+    problems: list[str] = []
+    proofs: list[Proof] = []
+    changes: list[FileChange] = []
+    if undoes:
+        changes = _undo(at, observed, dry_run=dry_run)
+    elif not proves:
+        for step in at.steps(observed.domain, duration):
+            is_kept = bool(step.made and step.made.exists())
+            if dry_run:
+                echo(f"{'kept' if is_kept else 'would run'}: {step.command}", err=True)
+            state = "kept" if is_kept else "open" if dry_run else _do(at, step)
+            steps.append(CloseStep(step.command, state))
+        if not dry_run:
+            observed = read_processes(at.processes)
+            changes = _write_starts(at, observed)
+            denied = _denied(at, observed.domain)
+            problems = _problems(at, observed, steps, partial=partial or not applies)
+    if applies and not problems:
+        changes += _apply(at, observed, dry_run=dry_run)
+    if not dry_run and not problems and (proves or (applies and not observed.by_hand)):
+        proofs = _proofs(at, observed, _START_SECONDS if proves else _RESTART_SECONDS)
+    holds = bool(proofs) and all(proof.holds or (partial and not proof.fails) for proof in proofs)
+    if as_json:
+        print_json(Closing(folder, observed, steps, denied, problems, proofs, dry_run, changes))
+    elif not (dry_run or undoes):
+        if not (applies or proves):
+            _show(at, observed, denied)
+        _show_end(at, observed, problems, proofs, applies=applies, holds=holds)
+    if dry_run or undoes:
+        return 0
+    return int(bool(problems) or ((applies or proves) and not holds))
+
+
+def _domain(text: str | None) -> int:
+    from sros_tool.runtime.variables import DOMAIN, domain_of
+
+    return domain_of(os.environ if text is None else {DOMAIN: text})
+
+
+# ── preparing ───────────────────────────────────────────────────────────────────────────────
+
+
+def _do(at: _Places, step: _Step) -> str:
+    """Do a step; return its state.  Raises `SrosError` if the robot cannot be watched."""
+    from sros_tool.files import replace_file
+
+    watches = step.into == at.observed
+    if watches:
+        _check_open(at)
+    status, output = _run(step, quiet=not step.into)
+    if watches and status:
+        raise UnavailableError("there is no robot to close: no node was observed")
+    if step.into and not status:
+        replace_file(step.into, output.encode())
+    elif not step.into:
+        lines = output.splitlines()
+        shown = lines if status or len(lines) <= _MOST_LINES else lines[: _MOST_LINES - 1]
+        for line in shown:
+            echo(line, err=True)
+        if more := len(lines) - len(shown):
+            echo(f"... and {more} more lines", err=True)
+    if watches:
+        _keep_processes(at, step, output)
+    return "findings" if status else "done"
+
+
+def _check_open(at: _Places) -> None:
+    """Make the folder; raise `SrosError` if the robot cannot be watched as an open one."""
+    from sros_tool.folders import make_folders
+    from sros_tool.runtime.processes import ProcessTable
+    from sros_tool.runtime.variables import ENABLE
+
+    if os.environ.get(ENABLE) == "true":
+        raise UsageError(
+            f"{ENABLE} is set, so this shell does not see an open robot", "", f"Unset {ENABLE}."
+        )
+    for process in ProcessTable().look(now()).processes:
+        if process.is_zenoh:
+            raise UnavailableError(
+                f"{process.label} speaks Zenoh, and `sros close` is for DDS",
+                "",
+                "Close it by `sros generate_policy`, `sros generate_artifacts` and `sros zenoh`.",
+            )
+    make_folders(at.folder)
+
+
+def _keep_processes(at: _Places, step: _Step, document: str) -> None:
+    """Write which process has which nodes, and the policy of the observer."""
+    from sros_tool.closing import assign, processes_document
+    from sros_tool.files import policies_dir, replace_file
+    from sros_tool.graph.learn import is_tool
+    from sros_tool.runtime.processes import ProcessTable
+
+    replace_file(at.observer, (policies_dir() / "observer.xml").read_bytes())
+    added = json.loads(document)["added"] if "--dry-run" in step.words else ()
+    if added:
+        command = f"sros generate_policy {shlex.quote(str(at.policy))} --enclave-per-node"
+        lacks = f"lacks {counted(len(added), 'right')} seen now; add them: {command}"
+        echo(f"'{at.policy}' stays as it is, and {lacks}", err=True)
+    nodes = [node for node in _observation(at).nodes if not is_tool(node)]
+    domain = int(step.words[step.words.index("--domain") + 1])
+    observed = assign(nodes, ProcessTable().look(now()).processes, domain)
+    replace_file(at.processes, processes_document(observed))
+    number = counted(len(observed.processes), "process", "processes")
+    echo(f"saw {counted(len(nodes), 'node')} in {number} of this machine", err=True)
+
+
+def _observation(at: _Places) -> Observation:
+    from sros_tool.graph.observation import from_json
+    from sros_tool.xml import read_bytes
+
+    try:
+        return from_json(json.loads(read_bytes(at.observed, "observation")))
+    except (ValueError, TypeError, KeyError) as error:
+        raise DocumentError(
+            f"'{at.observed}' is no observation", f"{error}", "Watch the robot again: --for 1m."
+        ) from error
+
+
+def _write_starts(at: _Places, observed: ObservedProcesses) -> list[FileChange]:
+    """Write how each process is started secured; return what changed."""
+    from sros_tool.closing import start_files
+    from sros_tool.runtime.units import unit_changes, write_units
+
+    domain = str(observed.domain)
+    variables = {
+        process.enclave: enclave_environment(at.export, process.enclave, domain).variables
+        for process in observed.processes
+    }
+    files = start_files(at.folder.absolute(), at.export.absolute(), observed.processes, variables)
+    changes = unit_changes(at.start, files, force=True)
+    write_units(at.start, files, changes)
+    return [FileChange(action, str(at.start / path)) for path, action in changes.items()]
+
+
+def _denied(at: _Places, domain: int) -> list[str]:
+    """Return what the keystore denies to the nodes as they were observed."""
+    from sros_tool.explain.audit import audit, audited_enclaves
+    from sros_tool.keystore.participant import JoinContext
+    from sros_tool.runtime.rmw import chosen_vendor
+
+    context = JoinContext(domain, now(), local_zone(os.environ))
+    vendor = chosen_vendor(None, None, os.environ)[0]
+    audited = audit(_observation(at), audited_enclaves(at.keystore, vendor, context), _OBSERVER)
+    return [str(right) for right in audited.denied]
+
+
+def _problems(
+    at: _Places, observed: ObservedProcesses, steps: Sequence[CloseStep], *, partial: bool
+) -> list[str]:
+    """Return what keeps the robot from running closed, with what to do."""
+    problems = [f"findings of `{step.command}`" for step in steps if step.state == "findings"]
+    owner = at.export.stat().st_uid
+    for user in sorted({process.user for process in observed.processes} - {owner}):
+        problems.append(
+            f"processes run as user {user}, and only user {owner} can read the enclaves: "
+            f"chown -R {user} {shlex.quote(str(at.export))}"
+        )
+    if (observed.unknown or observed.elsewhere) and not partial:
+        problems.append("some processes or nodes would not be heard any more (accept: --partial)")
+    return problems
+
+
+# ── applying ────────────────────────────────────────────────────────────────────────────────
+
+
+def _apply(at: _Places, observed: ObservedProcesses, *, dry_run: bool) -> list[FileChange]:
+    """Add the drop-ins of systemd, and restart the units that do not run in their enclaves."""
+    from sros_tool.closing import DROP_IN
+    from sros_tool.runtime.processes import ProcessTable
+    from sros_tool.runtime.units import unit_changes, write_units
+    from sros_tool.xml import read_bytes
+
+    units = {process.enclave: process.unit for process in observed.processes if process.unit}
+    paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(units.values())]
+    files = {path: read_bytes(at.start / "units" / path, "unit").decode() for path in paths}
+    changes = unit_changes(_SYSTEMD, files, force=True)
+    if not dry_run:
+        write_units(_SYSTEMD, files, changes)
+    closed = _in_their_enclaves(at, observed, ProcessTable().look(now()))
+    _restart(sorted(units[enclave] for enclave in units.keys() - closed), dry_run=dry_run)
+    return [FileChange(action, str(_SYSTEMD / path)) for path, action in changes.items()]
+
+
+def _restart(units: Sequence[str], *, dry_run: bool) -> None:
+    """Let systemd read its units again, and restart some.  Raises `SrosError`."""
+    for words in [["daemon-reload"], ["restart", *units]] if units else []:
+        command = ["systemctl", *words]
+        echo(f"{'would run:' if dry_run else '$'} {shlex.join(command)}", err=True)
+        try:
+            ended = 0 if dry_run else subprocess.run(command, check=False).returncode
+        except OSError as error:
+            raise UnavailableError(f"systemctl cannot be run: {error.strerror}") from error
+        if ended:
+            raise SrosError(
+                f"`{shlex.join(command)}` ended with {ended}",
+                "Secured and open processes do not hear each other.",
+                "Mend it and run --apply again, or go back with --undo.",
+            )
+
+
+def _undo(at: _Places, observed: ObservedProcesses, *, dry_run: bool) -> list[FileChange]:
+    """Remove the drop-ins of this folder, restart their units, and show what to do by hand."""
+    from sros_tool.closing import DROP_IN, mark
+    from sros_tool.files import remove_file
+    from sros_tool.xml import read_bytes
+
+    drop_ins = [
+        path
+        for path in sorted(_SYSTEMD.glob(f"*.d/{DROP_IN}"))
+        if read_bytes(path, "unit").startswith(mark(at.folder.absolute()).encode())
+    ]
+    for path in drop_ins:
+        echo(f"{'would remove' if dry_run else 'removed'} {path}", err=True)
+        if not dry_run:
+            remove_file(path)
+    units = {process.unit for process in observed.processes if process.unit}
+    units |= {path.parent.name.removesuffix(".d") for path in drop_ins}
+    _restart(sorted(units), dry_run=dry_run)
+    for process in observed.by_hand:
+        command = f"cd {shlex.quote(process.folder)} && {shlex.join(process.command)}"
+        echo(f"by hand, restart it open: {command}", err=True)
+    return [FileChange("remove", str(path)) for path in drop_ins]
+
+
+# ── the proof ───────────────────────────────────────────────────────────────────────────────
+
+
+def _in_their_enclaves(
+    at: _Places, observed: ObservedProcesses, running: RunningProcesses
+) -> set[str]:
+    """Return the enclaves in which a process runs with the present files of the export."""
+    from sros_tool.checks.processes import newer_files
+
+    export = str(at.export.absolute())
+    return {
+        process.enclave.name
+        for process in running.processes
+        if process.asks_for_security and process.domain == str(observed.domain)
+        if process.enclave and process.enclave.keystore == export and not process.network
+        if process.enclave.is_there and not [*newer_files(process, process.enclave)]
+    } & {process.enclave for process in observed.processes}
+
+
+def _proofs(at: _Places, observed: ObservedProcesses, patience: float) -> list[Proof]:
+    """Wait until each process runs in its enclave, and prove that the robot is closed."""
+    from sros_tool.closing import Proof
+    from sros_tool.runtime.processes import ProcessTable
+
+    table, expected = ProcessTable(), {process.enclave for process in observed.processes}
+    end = time.monotonic() + patience
+    while True:
+        running = table.look(now())
+        missing = sorted(expected - _in_their_enclaves(at, observed, running))
+        if not missing:
+            break
+        if time.monotonic() > end:
+            return [Proof(_CLAIM, False, f"not in {first_few(missing, 3)}")]
+        time.sleep(0.2)
+    before = _observation(at)
+    return [
+        _proof_of_processes(at, observed, running),
+        _proof_of_talk(at, before, observed.domain),
+        _proof_of_silence(at, before, observed.domain),
+    ]
+
+
+_CLAIM = "every process runs in its enclave"
+
+
+def _proof_of_processes(
+    at: _Places, observed: ObservedProcesses, running: RunningProcesses
+) -> Proof:
+    """Look for processes that are open, or that something is wrong with."""
+    from sros_tool.checks.kind import NOTE
+    from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
+    from sros_tool.closing import Proof
+    from sros_tool.runtime.variables import ENCLAVE
+
+    export = shlex.quote(str(at.export))
+    echo(f'$ eval "$(sros env {export} {_OBSERVER})"; sros check runtime', err=True)
+    here = enclave_environment(at.export, _OBSERVER, str(observed.domain)).variables
+    here[ENCLAVE] = ""  # this shell starts no node
+    neighbours = [
+        process
+        for process in running.processes
+        if process.domain == str(observed.domain) and not process.network
+    ]
+    running = replace(running, processes=tuple(neighbours))
+    zone = local_zone(os.environ)
+    findings = [
+        finding
+        for finding in process_findings({**os.environ, **here}, running, now=now(), zone=zone)
+        if finding.severity > NOTE
+    ]
+    for finding in findings:
+        echo_findings([finding], err=True)
+    wrong = [finding for finding in findings if finding.id != PROCESS_NOT_SEEN.id]
+    if findings:
+        first = (wrong or findings)[0]
+        return Proof(_CLAIM, False if wrong else None, f"{first.subject}: {first.text}")
+    number = len({process.enclave for process in observed.processes})
+    return Proof(_CLAIM, True, f"{counted(number, 'enclave')}, and no open process")
+
+
+def _proof_of_talk(at: _Places, before: Observation, domain: int) -> Proof:
+    """Compare what an observer in an enclave sees now with what was seen before."""
+    from sros_tool.closing import Proof, lost_endpoints
+    from sros_tool.graph.observation import from_json
+
+    claim, export = "everything that talked still talks", str(at.export)
+    words = ("audit", export, "--keystore", export, "--enclave", _OBSERVER)
+    step = _Step((*words, "--domain", str(domain), "--json"))
+    reason = ""
+    for _ in range(_TRIES):  # nodes may still be starting
+        try:
+            status, output = _run(step)
+        except UnavailableError as error:
+            return Proof(claim, None, f"{error}")
+        value = json.loads(output)
+        lost = lost_endpoints(before, from_json(value))
+        if not (status or lost):
+            number = f"{counted(len(before.nodes), 'node')} with {before.endpoint_count} endpoints"
+            return Proof(claim, True, f"{number} as before, and nothing is denied")
+        reason = f"gone: {first_few(lost, 3)}" if lost else "not all is allowed, or was judged"
+    return Proof(claim, False, f"{reason}; see `{step.command.removesuffix(' --json')}`")
+
+
+def _proof_of_silence(at: _Places, before: Observation, domain: int) -> Proof:
+    """Look for nodes as an open listener, who saw them before."""
+    from sros_tool.closing import Proof
+
+    claim = "an open listener finds nothing"
+    words = ("generate_policy", str(at.folder / "open.xml"), "--domain", str(domain))
+    step = _Step((*words, "--dry-run", "--json"))
+    echo(f"$ {step.command}", err=True)
+    try:
+        with redirect_stderr(io.StringIO()):  # why no node was observed
+            _, output = _run(step)
+    except UnavailableError as error:
+        return Proof(claim, None, f"{error}")
+    nodes = json.loads(output)["nodes"]
+    if nodes:
+        names = sorted(f"{node['namespace'].rstrip('/')}/{node['name']}" for node in nodes)
+        return Proof(claim, False, f"it sees {first_few(names, 3)}")
+    number = counted(len(before.nodes), "node")
+    return Proof(claim, True, f"the observer that saw {number} before sees none")
+
+
+# ── output ──────────────────────────────────────────────────────────────────────────────────
+
+
+def _show(at: _Places, observed: ObservedProcesses, denied: Sequence[str]) -> None:
+    """Print on one screen who may do what, how processes are restarted, and what looks wrong."""
+    from sros_tool.closing import access_lines
+    from sros_tool.files import policies_dir
+    from sros_tool.policy.document import read_policy
+
+    echo(f"who may do what, without what every node needs (all of it: {at.page}):")
+    for line in access_lines(read_policy(at.policy), at.folder, policies_dir()):
+        echo(f"  {line}")
+    echo(f"how each process is restarted secured (all of it: {at.start}):")
+    for process in observed.processes:
+        how = f"--apply restarts {process.unit}" if process.unit else "by hand"
+        echo(f"  {process.enclave}: process {process.pid}, known by its {process.known_by}: {how}")
+    for text in observed.unknown:
+        echo(f"looks wrong: no node is known of {text}")
+    for enclave in observed.elsewhere:
+        echo(f"looks wrong: no process of this machine is known to have the nodes of {enclave}")
+    for right in denied:
+        echo(f"looks wrong: seen, and denied from now on: {right}")
+
+
+def _show_end(
+    at: _Places,
+    observed: ObservedProcesses,
+    problems: Sequence[str],
+    proofs: Sequence[Proof],
+    *,
+    applies: bool,
+    holds: bool,
+) -> None:
+    """Print problems and proofs, and what to do next."""
+    folder = shlex.quote(str(at.folder))
+    for proof in proofs:
+        echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}")
+    for problem in problems:
+        echo(f"looks wrong: {problem}")
+    if holds:
+        left = "" if all(proof.holds for proof in proofs) else ", but for what was not asked"
+        keys = f"bring {folder}/keystore to another machine: it has the CA keys"
+        echo(f"the robot is closed{left}; {keys}", err=True)
+    elif proofs:
+        again = f"ask again with sros close {folder} --proof, or go back with --undo"
+        echo(f"this is not proved; {again}", err=True)
+    elif problems and applies:
+        echo("nothing was closed", err=True)
+    elif applies:
+        for process in observed.by_hand:
+            echo(f"stop process {process.pid}, and start it by:")
+            echo(f"  {process.secured_command(at.export.absolute())}")
+        echo(f"then: sros close {folder} --proof", err=True)
+    else:
+        echo(f"nothing is closed yet; next: sros close {folder} --apply", err=True)
+
+
+_ANSWERS = {True: "yes", False: "no", None: "not asked"}

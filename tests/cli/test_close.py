@@ -1,0 +1,477 @@
+"""``sros close`` beside a graph that is made up: what it makes, keeps, refuses, proves, undoes."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sros_tool.cli import close
+from sros_tool.closing import assign
+from sros_tool.graph import observe
+from sros_tool.graph.observation import Endpoint, ObservedNode
+from sros_tool.keystore.layout import list_enclaves
+from sros_tool.runtime.environment import secured_environment
+from sros_tool.runtime.processes import (
+    FileReader,
+    Process,
+    ProcessRoot,
+    ProcessTable,
+    RunningProcesses,
+    UnseenProcess,
+    service_of,
+    with_files,
+)
+from tests.cli.test_json import Seen
+from tests.graph.fake_graph import Beside, graph
+from tests.support.harness import Ended, snapshot
+from tests.support.long_form import some
+
+pytest_plugins = ["tests.graph.beside"]
+
+PID = {"/talker": 4711, "/listener": 4712}
+SERVICES = (
+    *("describe_parameters", "get_parameter_types", "get_parameters", "list_parameters"),
+    *("set_parameters", "set_parameters_atomically", "get_type_description"),
+)
+
+
+def ros_node(name: str, participant: str, *endpoints: str) -> Any:
+    """A node of the graph with what every node has."""
+    own = [f"publish rr/{name}/{service}Reply" for service in SERVICES]
+    own += [f"subscribe rq/{name}/{service}Request" for service in SERVICES]
+    return "/", "/", name, participant, [*endpoints, *own, "publish rt/rosout", *EVENTS]
+
+
+EVENTS = ("publish rt/parameter_events", "subscribe rt/parameter_events")
+TALKER = ros_node("talker", "010f0000671200000000", "publish rt/chatter")
+LISTENER = ros_node("listener", "010f0000681200000000", "subscribe rt/chatter")
+SYSTEMCTL = '#!/bin/sh\necho "$@" >> {log}\nexit $(cat {status})\n'
+
+
+def secured(*nodes: tuple[str, str, str, str, list[str]]) -> list[Any]:
+    return [(f"{ns}{name}", ns, name, of, rights) for _, ns, name, of, rights in nodes]
+
+
+@dataclass
+class Robot:
+    """A robot of two processes, of which systemd starts those in ``units``."""
+
+    folder: Path
+    beside: Beside
+    units: dict[str, str] = field(default_factory=dict)
+    more: tuple[Process, ...] = ()
+    unseen: tuple[UnseenProcess, ...] = ()
+    by_hand: set[str] = field(default_factory=set)
+    nodes: tuple[Any, ...] = (TALKER, LISTENER)
+    remaining: tuple[Any, ...] = (TALKER, LISTENER)
+    """What an observer with an enclave sees."""
+
+    @property
+    def restarts(self) -> list[str]:
+        log = self.folder / "systemctl.log"
+        return log.read_text().splitlines() if log.exists() else []
+
+    def process(self, enclave: str, *, is_secured: bool) -> Process:
+        command = ("/opt/run", enclave.strip("/"))
+        libraries, now = frozenset({"libfastrtps"}), datetime.now(UTC)
+        process = Process(PID[enclave], command, {}, now, libraries=libraries, user=os.geteuid())
+        if not is_secured:
+            return process
+        export = self.folder / "robot" / "export"
+        process = replace(
+            process,
+            environment=secured_environment(export, enclave, 0),
+            started=now + timedelta(seconds=1),
+        )
+        root = os.open("/", os.O_PATH | os.O_DIRECTORY)
+        try:
+            return with_files(process, ProcessRoot(root, FileReader()), "/")
+        finally:
+            os.close(root)
+
+    def look(self, _table: object, _now: datetime) -> RunningProcesses:
+        """Return the processes, secured if they were restarted with a drop-in, or by hand."""
+        drop_ins = [*self.folder.glob("systemd/*.d/sros-close.conf")]
+        restarted = {
+            enclave
+            for enclave, unit in self.units.items()
+            if unit in {path.parent.name.removesuffix(".d") for path in drop_ins}
+            and any("restart" in line and unit in line for line in self.restarts)
+        }
+        processes = tuple(
+            self.process(enclave, is_secured=enclave in restarted | self.by_hand) for enclave in PID
+        )
+        return RunningProcesses((*processes, *self.more), self.unseen)
+
+    def close(self, *words: str, status: int = 0, **environment: str) -> Ended:
+        now_open = [node for node in self.nodes if f"/{node[2]}" not in self._closed()]
+        seen = graph(*now_open) | {"secured": graph(*secured(*self.remaining))}
+        if "--apply" in words:
+            seen["until"] = str(self.folder / "systemd/talker.service.d/sros-close.conf")
+        ended = self.beside("close", seen, "robot", *words, **environment)
+        assert ended.status == status, ended
+        return ended
+
+    def _closed(self) -> set[str]:
+        running = self.look(None, datetime.now(UTC)).processes
+        return {process.enclave.name for process in running if process.enclave}
+
+
+@pytest.fixture
+def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
+    robot = Robot(tmp_path, beside_graph)
+    settling = observe.Settling(0.2, 0.1, 5.0)
+    monkeypatch.setattr(observe, "Settling", lambda: settling)
+    monkeypatch.setattr(observe, "SECURED", settling)
+    monkeypatch.setattr(ProcessTable, "look", lambda table, now: robot.look(table, now))
+    units = {PID[enclave]: enclave for enclave in PID}
+    monkeypatch.setattr(
+        "sros_tool.closing.service_of",
+        lambda pid: (robot.units.get(units.get(pid, ""), ""), "/opt"),
+    )
+    monkeypatch.setattr(close, "_SYSTEMD", tmp_path / "systemd")
+    monkeypatch.setattr(close, "_RESTART_SECONDS", 0.1)
+    monkeypatch.setattr(close, "_START_SECONDS", 0.1)
+    for name in ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", "ROS_SECURITY_ENABLE"):
+        monkeypatch.delenv(name, raising=False)
+    (tmp_path / "systemd").mkdir()
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "status").write_text("0")
+    script = tmp_path / "bin/systemctl"
+    text = SYSTEMCTL.format(log=tmp_path / "systemctl.log", status=tmp_path / "status")
+    script.write_text(text)
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    return robot
+
+
+UNITS = {"/talker": "talker.service", "/listener": "listener.service"}
+
+
+def made(folder: Path) -> list[str]:
+    return sorted(path.name for path in (folder / "robot").iterdir())
+
+
+MADE = [
+    *("common", "export", "keystore", "observed.json", "observer.xml", "policy.xml"),
+    *("processes.json", "requirements.toml", "rights.html", "start"),
+]
+
+
+def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
+    robot.units = {"/talker": "talker.service"}
+    ended = robot.close()
+    assert made(robot.folder) == MADE
+    export = robot.folder / "robot/export"
+    assert list_enclaves(export) == ("/listener", "/sros_observer", "/talker")
+    assert not (export / "private").exists()
+    assert "  topic /chatter: /talker -> /listener\n" in ended.out
+    assert "/talker: process 4711, known by its process id: --apply restarts talker.s" in ended.out
+    assert "/listener: process 4712, known by its process id: by hand\n" in ended.out
+    commands = (robot.folder / "robot/start/commands.sh").read_text()
+    assert f"\ncd /opt && sros run {export} /listener -- /opt/run listener\n" in commands
+    assert "/talker --" not in commands
+    drop_in = robot.folder / "robot/start/units/talker.service.d/sros-close.conf"
+    assert 'Environment="ROS_SECURITY_ENCLAVE_OVERRIDE=/talker"\n' in drop_in.read_text()
+    assert not robot.restarts and not [*(robot.folder / "systemd").iterdir()]
+    assert ended.err.endswith("nothing is closed yet; next: sros close robot --apply\n")
+
+
+def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
+    robot.close()
+    policy = robot.folder / "robot/policy.xml"
+    policy.write_text(policy.read_text().replace("chatter", "gossip", 1))
+    changed = policy.read_text()
+    ended = robot.close()
+    assert policy.read_text() == changed
+    assert "/listener subscribe topic /chatter (/listener)" in ended.out
+    again = robot.close("--for", "1s")
+    assert policy.read_text() == changed
+    assert "stays as it is, and lacks 1 right seen now; add them: sros generate_pol" in again.err
+
+
+def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
+    robot.units = UNITS
+    robot.close()
+    closed = robot.close("--apply")
+    assert robot.restarts == ["daemon-reload", "restart listener.service talker.service"]
+    assert closed.out.splitlines()[-3:] == [
+        "yes: every process runs in its enclave: 2 enclaves, and no open process",
+        "yes: everything that talked still talks: 2 nodes with 36 endpoints as before, and nothing "
+        "is denied",
+        "yes: an open listener finds nothing: the observer that saw 2 nodes before sees none",
+    ]
+    assert "the robot is closed; bring robot/keystore to another machine" in closed.err
+    robot.close("--apply")
+    assert len(robot.restarts) == 2  # they run in their enclaves already
+    undone = robot.close("--undo")
+    assert [*robot.folder.glob("systemd/*.d/*")] == []
+    assert robot.restarts[2:] == ["daemon-reload", "restart listener.service talker.service"]
+    assert undone.err.count("removed ") == 2
+    robot.close("--proof", status=1)
+    assert made(robot.folder) == MADE
+
+
+def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
+    robot.close()
+    ended = robot.close("--apply", status=1)
+    assert robot.restarts == []
+    assert "stop process 4711, and start it by:\n  cd /opt && sros run " in ended.out
+    assert ended.err.endswith("then: sros close robot --proof\n")
+    assert (
+        "no: every process runs in its enclave: not in /listener, /talker\n"
+        in robot.close("--proof", status=1).out
+    )
+    robot.by_hand = {"/talker", "/listener"}
+    robot.close("--proof")
+    assert "by hand, restart it open: cd /opt && /opt/run talker\n" in robot.close("--undo").err
+
+
+def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
+    robot.units = UNITS
+    robot.close()
+    robot.close("--apply")
+    robot.more = (Process(5, ("spy", "--ros-args"), {}, datetime.now(UTC)),)
+    assert (
+        "no: every process runs in its enclave: process 5 (spy)"
+        in robot.close("--proof", status=1).out
+    )
+    robot.more = ()
+    robot.remaining = (TALKER,)
+    assert (
+        "no: everything that talked still talks: gone: /listener "
+        in robot.close("--proof", status=1).out
+    )
+    robot.remaining = (TALKER, LISTENER)
+    robot.nodes = (*robot.nodes, ("/", "/", "spy", "03", ["subscribe rt/chatter"]))
+    assert (
+        "no: an open listener finds nothing: it sees /spy\n" in robot.close("--proof", status=1).out
+    )
+    robot.nodes = (TALKER, LISTENER)
+    robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
+    assert "not asked: every process runs in its enclave" in robot.close("--proof", status=1).out
+    assert "closed, but for what was not asked" in robot.close("--proof", "--partial").err
+
+
+# ── interrupted ────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("after", some([False, True], 1))
+def test_what_is_interrupted_at_any_step_goes_on(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, after: bool
+) -> None:
+    run = close._run
+    robot.units = UNITS
+    policy = robot.folder / "robot/policy.xml"
+    for step in close._Places(Path("robot")).steps(0, None):
+
+        def interrupted(done: Any, step: Any = step, **more: Any) -> Any:
+            is_it = done.words == step.words or done.words[0] == step.words[0] == "generate_policy"
+            ended = run(done, **more) if after or not is_it else None
+            if is_it:
+                raise KeyboardInterrupt
+            return ended
+
+        with monkeypatch.context() as patched:
+            patched.setattr(close, "_run", interrupted)
+            before = policy.read_bytes() if policy.exists() else b""
+            robot.close(status=130)
+            assert not before or policy.read_bytes() == before
+    assert robot.restarts == []
+    robot.close()
+    assert made(robot.folder) == MADE
+    robot.close("--apply")
+
+
+@pytest.mark.parametrize("function", ["write_units", "_restart"])
+def test_applying_that_is_interrupted_goes_on_or_back(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, function: str
+) -> None:
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    robot.units = UNITS
+    robot.close()
+    place = "sros_tool.runtime.units" if function == "write_units" else "sros_tool.cli.close"
+    with monkeypatch.context() as patched:
+        patched.setattr(f"{place}.{function}", interrupted)
+        robot.close("--apply", status=130)
+    assert robot.restarts == []
+    robot.close("--undo")
+    assert [*robot.folder.glob("systemd/*.d/*")] == []
+    robot.close("--apply")
+
+
+def test_units_that_do_not_restart_are_named(robot: Robot) -> None:
+    robot.units = UNITS
+    robot.close()
+    (robot.folder / "status").write_text("1")
+    ended = robot.close("--apply", status=2)
+    assert "`systemctl daemon-reload` ended with 1" in ended.err and "--undo" in ended.err
+    (robot.folder / "status").write_text("0")
+    robot.close("--apply")
+
+
+# ── refused ────────────────────────────────────────────────────────────────────────────────
+
+
+def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
+    robot.units = UNITS
+    robot.more = (Process(5, ("other", "--ros-args"), {}, datetime.now(UTC)),)
+    assert "looks wrong: no node is known of process 5 (other)" in robot.close().out
+    assert "would not be heard any more (accept: --partial)" in robot.close("--apply", status=1).out
+    assert robot.restarts == []
+    robot.more = (replace(robot.more[0], pid=6, environment={"ROS_DOMAIN_ID": "1"}),)
+    assert "process 6" not in robot.close("--for", "1s").out
+    robot.close("--apply")
+
+
+def test_a_policy_with_an_error_closes_nothing(robot: Robot) -> None:
+    robot.units = UNITS
+    robot.close()
+    policy = robot.folder / "robot/policy.xml"
+    rosout = policy.read_text()
+    policy.write_text("".join(e for e in rosout.splitlines(True) if "<xi:include" not in e))
+    assert policy.read_text() != rosout
+    ended = robot.close("--apply", status=1)
+    assert "looks wrong: findings of `sros check robot/policy.xml" in ended.out
+    assert robot.restarts == []
+
+
+def test_processes_of_another_user_need_the_files(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot.units = UNITS
+    of_root = robot.process
+    monkeypatch.setattr(
+        robot, "process", lambda enclave, **more: replace(of_root(enclave, **more), user=1234)
+    )
+    assert "chown -R 1234 robot/export" in robot.close(status=1).out
+    robot.close("--apply", status=1)
+    assert robot.restarts == []
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--apply --undo", "exclude each other"),
+        ("--apply --for 1s", "--for is for watching"),
+        ("--apply", "has no watched robot"),
+        ("--proof", "has no watched robot"),
+        ("--undo", "has no watched robot"),
+    ],
+)
+def test_what_is_refused(robot: Robot, words: str, said: str) -> None:
+    assert said in robot.close(*words.split(), status=2).err
+    assert not (robot.folder / "robot").exists()
+
+
+def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
+    assert "is set" in robot.close(status=2, ROS_SECURITY_ENABLE="true").err
+    robot.more = (Process(5, ("rmw_zenohd",), {}, datetime.now(UTC)),)
+    assert "speaks Zenoh" in robot.close(status=2).err
+    assert not (robot.folder / "robot").exists()
+    robot.more, robot.nodes = (), ()
+    assert "no node was observed" in robot.close(status=2).err
+    robot.nodes = (TALKER, LISTENER)
+    robot.close()
+    assert "was watched in domain 0, not 7" in robot.close("--domain", "7", status=2).err
+    (robot.folder / "robot/processes.json").write_text("{}")
+    assert "is no list of processes" in robot.close(status=2).err
+
+
+def test_a_dry_run_changes_nothing(robot: Robot) -> None:
+    assert "would run: sros generate_policy robot/policy.xml" in robot.close("--dry-run").err
+    assert not (robot.folder / "robot").exists()
+    robot.units = UNITS
+    robot.close()
+    before = snapshot(robot.folder)
+    ended = robot.close("--apply", "--dry-run")
+    assert "kept: sros create_keystore" in ended.err
+    assert "would run: systemctl restart listener.service talker.service" in ended.err
+    assert snapshot(robot.folder) == before
+    robot.close("--apply")
+    before = snapshot(robot.folder)
+    assert "would remove " in robot.close("--undo", "--dry-run").err
+    assert snapshot(robot.folder) == before
+
+
+def test_what_is_printed_as_json(robot: Robot) -> None:
+    seen = Seen()
+    robot.units = UNITS
+    for words in ("--dry-run", "", "--apply", "--proof", "--undo"):
+        seen.check("close", robot.close(*words.split(), "--json"))
+    assert seen.unseen("close") == []
+
+
+# ── which process ──────────────────────────────────────────────────────────────────────────
+
+
+def process(pid: int, *command: str, **more: Any) -> Process:
+    return Process(pid, command, {}, datetime.now(UTC), frozenset({"libfastrtps"}), **more)
+
+
+def node(name: str, participant: str = "01", ns: str = "/") -> ObservedNode:
+    enclave = f"{ns.rstrip('/')}/{name}"
+    writes = frozenset({Endpoint("rt/x", "publish")})
+    return ObservedNode((enclave,), ns, name, participant, writes)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "processes", "known"),
+    [
+        (
+            [node("a", "010f7f01a530")],
+            [process(0x130A5, "x"), process(2, "a")],
+            {"/a": "process id"},
+        ),
+        ([node("a", "01107f01a530")], [process(0x130A5, "x"), process(2, "y")], {}),
+        (
+            [node("a", "1", "/n"), node("b", "2")],
+            [process(1, "x", "--ros-args", "-r", "__node:=a", "-r", "__ns:=/n"), process(2, "y")],
+            {"/n/a": "node name", "/b": "elimination"},
+        ),
+        (
+            [node("a", "1"), node("b", "2")],
+            [process(1, "python3", "/opt/a.py"), process(2, "/opt/b")],
+            {"/a": "program", "/b": "program"},
+        ),
+        ([node("a", "1")], [process(1, "/opt/a"), process(2, "/usr/a")], {}),
+        (
+            [node("a", "1"), node("a", "2")],
+            [process(1, "/opt/a"), process(2, "/usr/a")],
+            {"/a": "program"},
+        ),
+        ([node("a")], [process(1, "x", network="net:[1]")], {}),
+        ([node("a")], [process(1, "x")], {"/a": "elimination"}),
+    ],
+)
+def test_the_enclave_of_a_process(
+    nodes: list[ObservedNode], processes: list[Process], known: dict[str, str]
+) -> None:
+    observed = assign(nodes, processes, 0)
+    assert {each.enclave: each.known_by for each in observed.processes} == known
+    assert set(observed.elsewhere) == {each.enclaves[0] for each in nodes} - known.keys()
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("0::/system.slice/robot@3.service\n", "robot@3.service"),
+        ("1:name=systemd:/system.slice/system-r.slice/r@3.service\n0::/\n", "r@3.service"),
+        ("0::/user.slice/user-1000.slice/user@1000.service/app.slice/x.service\n", ""),
+        ("0::/system.slice/../x y.service\n", ""),
+        ("0::/\n", ""),
+    ],
+)
+def test_the_service_of_a_process(tmp_path: Path, text: str, unit: str) -> None:
+    (tmp_path / "7").mkdir()
+    (tmp_path / "7/cgroup").write_text(text)
+    (tmp_path / "7/cwd").symlink_to("/opt")
+    assert service_of(7, tmp_path) == (unit, "/opt")
+    assert service_of(8, tmp_path) == ("", "")
