@@ -112,7 +112,8 @@ def _show_history(root: Path, as_json: bool) -> int:
     else:
         for item in found.entries:
             entry = item.entry
-            until = f"until {entry.not_after}" if entry.not_after else ""
+            expires = entry.not_after and entry.what != "revocation"
+            until = f"until {entry.not_after}" if expires else ""
             named = f" (SHA-256 {entry.sha256[:8]})" if entry.what == "ca" else ""
             subject = f"{entry.enclave or entry.subject}{named}"
             words = (subject, until, entry.serial, entry.reason)

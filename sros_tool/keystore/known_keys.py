@@ -59,9 +59,8 @@ class KnownKeys:
         }
         serials = {entry.serial for entry in recorded}
         indexed = self._keystore.ledger_file.is_indexed
-        for path in revoked_certificates(self._keystore.root):
-            if indexed and path.parent.name in serials:
-                continue  # the ledger has it
+        known = serials if indexed else ()  # the ledger has them
+        for path in revoked_certificates(self._keystore.root, known):
             try:
                 descriptions.update([_described(self._keystore.certificate(path))])
             except SrosError:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import chain, islice
 from pathlib import Path
@@ -385,8 +385,10 @@ def _refuse_unreadable(root: Path, folders: Iterable[_Walked], unread: list[Unre
         raise _unreadable(root, unread, "Enclaves would keep their old files. Nothing was changed.")
 
 
-def revoked_certificates(root: Path) -> tuple[Path, ...]:
+def revoked_certificates(root: Path, known: Container[str] = ()) -> tuple[Path, ...]:
     """Return the sorted paths of the certificates in the folder of revoked enclaves.
+
+    Certificates whose serial number (hexadecimal) is in ``known`` are left out.
 
     Raises:
         KeystoreError: the folder cannot be read.
@@ -399,7 +401,7 @@ def revoked_certificates(root: Path) -> tuple[Path, ...]:
     except OSError as error:
         effect = "Revoked certificates would be left out."
         raise _unreadable(root, [UnreadPath.of(error)], effect) from error
-    files = (folder / name / CERTIFICATE_FILE for name in places)
+    files = (folder / name / CERTIFICATE_FILE for name in places if name not in known)
     return tuple(name for name in files if os.path.lexists(name))
 
 

@@ -189,6 +189,7 @@ def _read_block(block: pem.Block) -> x509.CertificateRevocationList:
     return _read(block.content)
 
 
+@lru_cache(maxsize=8)
 def _read(content: bytes) -> x509.CertificateRevocationList:
     data, _ = der.split(content)
     try:

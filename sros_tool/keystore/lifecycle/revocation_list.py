@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -170,12 +170,11 @@ def _moved_away(keystore: Keystore, known: Container[str] = ()) -> Iterator[x509
     """
     file = keystore.identity_file
     trusted = keystore.certificates_of(file) if file else ()
-    for path in revoked_certificates(keystore.root):
-        if path.parent.name not in known:
-            with suppress(SrosError):  # a file that is no certificate
-                certificate = keystore.certificate(path)
-                if any(issued_by(certificate, authority) for authority in trusted):
-                    yield certificate
+    for path in revoked_certificates(keystore.root, known):
+        with suppress(SrosError):  # a file that is no certificate
+            certificate = keystore.certificate(path)
+            if any(issued_by(certificate, authority) for authority in trusted):
+                yield certificate
 
 
 class RevocationListSigner:
@@ -248,7 +247,7 @@ class RevocationListSigner:
         present = last
         if keep is not None:  # an expired certificate needs no revocation to be replaced
             present = {name: entry for name, entry in last.items() if entry.not_after >= moment}
-        for name, valid in self._still_valid(last, present).items():
+        for name, valid in self._still_valid(last, present, listed).items():
             for serial, entry in valid.items():
                 if serial not in listed:
                     listed.add(serial)
@@ -260,6 +259,7 @@ class RevocationListSigner:
                             entry.enclave,
                             entry.subject,
                             entry.serial,
+                            not_after=entry.not_after,
                             reason=reason,
                             key=key,
                         )
@@ -277,13 +277,13 @@ class RevocationListSigner:
         )
 
     def _still_valid(
-        self, names: Iterable[str], present: Mapping[str, Entry]
+        self, names: Iterable[str], present: Mapping[str, Entry], listed: Collection[int]
     ) -> dict[str, dict[int, Entry]]:
         """Map each enclave to its certificates that have not expired, by serial number.
 
         The certificates are read from the ledger, from the folder ``revoked`` (a new list after a
         lost one lacks them), and from ``present``, because the ledger lacks certificates that
-        ros2/sros2 issued.
+        ros2/sros2 issued.  Serial numbers in ``listed`` are not looked for in the folder.
         """
         certificates: dict[str, dict[int, Entry]] = {name: {} for name in names}
         moment = iso(self._now)
@@ -296,7 +296,7 @@ class RevocationListSigner:
                 and not expired
             ):
                 certificates[entry.enclave][int(entry.serial, 16)] = entry
-        for certificate in _moved_away(self._keystore, self._recorded_as_moved()):
+        for certificate in _moved_away(self._keystore, self._recorded_as_moved(listed)):
             name = common_name_of(certificate.subject)
             if name in certificates and validity_of(certificate).not_after >= self._now:
                 entry = certificate_entry(self._now, "certificate", certificate, name)
@@ -305,14 +305,15 @@ class RevocationListSigner:
             certificates[name][int(entry.serial, 16)] = entry
         return certificates
 
-    def _recorded_as_moved(self) -> Container[str]:
-        """Return the serial numbers in the folder ``revoked`` that the ledger certainly has."""
+    def _recorded_as_moved(self, listed: Collection[int]) -> Container[str]:
+        """Return ``listed``, and the numbers in ``revoked`` that the ledger certainly has."""
+        known = {f"{serial:x}" for serial in listed}
         ledger = self._keystore.ledger_file
         if not ledger.is_indexed:
-            return ()
-        serials = [path.parent.name for path in revoked_certificates(self._keystore.root)]
-        certain = ledger.with_values("serial", serials).certain
-        return {entry.serial for entry in certain if entry.what == "certificate"}
+            return known
+        others = revoked_certificates(self._keystore.root, known)
+        certain = ledger.with_values("serial", [path.parent.name for path in others]).certain
+        return known | {entry.serial for entry in certain if entry.what == "certificate"}
 
     def _note_lack(self) -> None:
         """Add a remark if the ledger may lack earlier certificates of the revoked enclaves."""
@@ -491,13 +492,20 @@ class RevocationListSigner:
 
         A certificate whose ledger entry is not certain has no expiry, and so stays on the list.
         """
-        revocations = self._keystore.ledger_with("what", "revocation").entries
-        serials = {entry.serial for entry in revocations if entry.what == "revocation"}
+        ledger = self._keystore.ledger_with("what", "revocation")
+        serials = {entry.serial for entry in ledger.entries if entry.what == "revocation"}
         for crl in self._keystore.revocation_lists:
             serials.update(f"{entry.serial:x}" for entry in crl.revoked)
         recorded = {
             entry.serial: entry.not_after
-            for entry in self._keystore.ledger_file.with_values("serial", serials).certain
+            for entry in ledger.certain
+            if entry.what == "revocation" and entry.not_after
+        }
+        # Version 0.2 of sros recorded the expiry with the certificate only.
+        others = self._keystore.ledger_file.with_values("serial", serials - recorded.keys())
+        recorded |= {
+            entry.serial: entry.not_after
+            for entry in others.certain
             if entry.what == "certificate" and entry.serial and entry.not_after
         }
         expiries = {int(serial, 16): not_after for serial, not_after in recorded.items()}

@@ -292,8 +292,7 @@ def _move_into_place(folder: Folder, source: str, target: str) -> None:
 
 def _remove_empty_folders(folder: Folder, paths: Iterable[str]) -> None:
     """Remove the empty parent folders of ``paths``, except the folders directly in ``folder``."""
-    for path in paths:
-        parent = path.rpartition("/")[0]
+    for parent in dict.fromkeys(path.rpartition("/")[0] for path in paths):
         with contextlib.suppress(OSError):  # it is not empty
             while "/" in parent:
                 with contextlib.suppress(FileNotFoundError):  # an earlier recovery removed it
