@@ -64,6 +64,10 @@ class KeystoreError(SrosError):
     """A keystore that is missing, broken or busy, or a change that would weaken it."""
 
 
+class IndexDamagedError(SrosError):
+    """The index of a ledger, or a line of it, is not what the head of the ledger states."""
+
+
 class UnavailableError(SrosError):
     """A missing DDS stack, RMW, Python package or privilege."""
 

@@ -39,7 +39,7 @@ from sros_tool.keystore.layout import (
     revoked_certificates,
     search_enclaves,
 )
-from sros_tool.keystore.ledger import GAP, Entry
+from sros_tool.keystore.ledger import GAP, SEALED, Entry
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
 from sros_tool.keystore.reader import FilesReadOnce, Keystore, open_enclave
 from sros_tool.keystore.zenoh_files import OpenedZenoh, ZenohFault, open_zenoh
@@ -953,6 +953,8 @@ class HistoryStatus(StrEnum):
     """Lines of the ledger were missing or changed when the entry was made."""
     SENT = "sent"
     """Sent to a robot; the keystore keeps no copy."""
+    SEALED = "sealed"
+    """A part of the ledger that is never written again."""
 
 
 @shows(spread=("entry",))
@@ -997,6 +999,8 @@ def history(root: Path, *, now: datetime) -> History:
     def status(entry: Entry) -> HistoryStatus:
         if entry.what == GAP:
             return HistoryStatus.DAMAGED
+        if entry.what == SEALED:
+            return HistoryStatus.SEALED
         if entry.what in ("answer", "release"):
             return HistoryStatus.SENT
         if entry.what == "settings":

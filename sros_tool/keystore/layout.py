@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import chain, islice
@@ -28,7 +29,12 @@ FLEET_ROOT = "fleet_root.json"
 PUBLISHED = "published.json"
 """What was published last for each robot of the fleet, and the versions of the metadata."""
 LEDGER = "ledger.jsonl"
-"""The log of issued certificates and documents; keystores of ros2/sros2 do not have it."""
+"""The log of issued certificates and documents; keystores of ros2/sros2 do not have it.
+
+Of a long ledger it is a link to the last part, whose name fits `SEALED_LEDGER`.
+"""
+SEALED_LEDGER = re.compile(r"ledger\.[0-9]{4,9}\.jsonl")
+"""Names of the parts of a long ledger: of the sealed ones, and of the last one."""
 LEDGER_HEAD = "ledger.p7s"
 """The number of lines of the ledger and the digest of the last one, signed by a CA."""
 LEDGER_INDEX = ".sros-index"
@@ -102,6 +108,11 @@ def confirmation_file(robot: str) -> str:
     return f"{CONFIRMED}/{robot}.json"
 
 
+def ledger_part(number: int) -> str:
+    """Return the name of a part of a long ledger; the first one has the number 1."""
+    return f"ledger.{number:04}.jsonl"
+
+
 def ca_certificate(role: str) -> str:
     """Return the path of the certificate of the identity or permissions CA."""
     return f"{PUBLIC}/{role}_ca.cert.pem"
@@ -158,7 +169,7 @@ def is_layout_path(path: str) -> bool:
     """Return whether sros may write a file at ``path``, which is relative to a keystore."""
     top, *rest = path.split("/")
     if not rest:
-        return top in _TOP_FILES
+        return top in _TOP_FILES or SEALED_LEDGER.fullmatch(top) is not None
     return (
         top in _TOP_FOLDERS
         and all(part and not part.startswith(".") and part.isprintable() for part in rest)

@@ -12,6 +12,13 @@ fault that was noticed when a line was added stays visible as an entry ``gap`` b
 The head of a long ledger also states the root of its index (`sros_tool.keystore.ledger_index`).  A
 question that the index answers reads only the lines that it names, each verified by its digest, and
 the end of the ledger; other lines that were changed are noticed by whoever reads all of them.
+
+A change that makes the file longer than 16 MiB seals it: it is never written again, as part
+``ledger.0001.jsonl``, and ``ledger.jsonl`` becomes a link to the next part.  Each part begins with
+an entry ``sealed``, which has the number and the SHA-256 of the part before.  Only who reads all
+lines opens sealed parts, and accepts no part but the one that was sealed; the index has the lines
+for everybody else.  Versions of sros that know no parts refuse to follow the link when they change
+a keystore.
 """
 
 from __future__ import annotations
@@ -38,18 +45,26 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple, TypeAlias
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
-from sros_tool.errors import KeystoreError, PkiError, SrosError
-from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, SETTINGS
+from sros_tool.errors import IndexDamagedError, KeystoreError, PkiError, SrosError
+from sros_tool.keystore.layout import (
+    LEDGER,
+    LEDGER_HEAD,
+    LEDGER_INDEX,
+    SEALED_LEDGER,
+    SETTINGS,
+    ledger_part,
+)
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import digest, subject_text, validity_of
 from sros_tool.validity import Window, iso
 from sros_tool.xml import open_at_once, read_bytes
 
 if TYPE_CHECKING:
-    from sros_tool.keystore.ledger_index import IndexUpdate, LedgerIndex
+    from sros_tool.keystore.ledger_index import IndexUpdate, LedgerIndex, Posting
     from sros_tool.keystore.transaction.transaction import Transaction
 
 GAP = "gap"
+SEALED = "sealed"
 SAME_KEY = "same key"
 """The ``reason`` of a CA certificate that has the same key as the CA's certificate before."""
 
@@ -66,7 +81,8 @@ class Entry(NamedTuple):
     """What was issued or done: ``ca``, ``certificate``, ``permissions``, ``governance``, ``crl``,
     ``revocation``, ``answer`` (the signed list of the files sent to a robot), ``settings`` (of the
     keystore), ``fleet``, ``release`` (the list of the robots' releases that were published at the
-    same time), or ``gap``: lines before were missing or changed."""
+    same time), ``sealed`` (the part of the ledger before this line), or ``gap``: lines before were
+    missing or changed."""
     enclave: str = ""
     """Name of the enclave; empty if the entry is for no enclave. All later keys are empty, too, if
     they do not apply."""
@@ -75,11 +91,11 @@ class Entry(NamedTuple):
     serial: str = ""
     """Serial number, in hexadecimal."""
     sha256: str = ""
-    """SHA-256 of the certificate (DER), or of the document."""
+    """SHA-256 of the certificate (DER), of the document, or of the sealed part."""
     not_before: str = ""
     """Start of the validity, in UTC."""
     not_after: str = ""
-    """Expiry, in UTC."""
+    """Expiry, in UTC; of a revocation, the expiry of the revoked certificate."""
     policy: str = ""
     """SHA-256 of the policy that permissions were made from, with its includes."""
     reason: str = ""
@@ -87,8 +103,8 @@ class Entry(NamedTuple):
     key: str = ""
     """SHA-256 of the public key (DER) of the certificate, or of the revoked certificate."""
     number: int = 0
-    """Number of an answer or of releases (later ones have higher numbers), or last line of a gap;
-    else 0."""
+    """Number of an answer or of releases (later ones have higher numbers), last line of a gap, or
+    number of the sealed part; else 0."""
     settings: str = ""
     """The settings of the keystore, as TOML."""
     nodes: str = ""
@@ -126,7 +142,7 @@ class _Fault(NamedTuple):
     text: str
 
 
-# A hundred thousand enclaves that are renewed every month write 1 GB a year, in 2,400,000 lines.
+# Of one part, and of all parts for whoever reads all lines.
 _MOST_BYTES = 4 * 1024**3
 _MOST_LINES = 8_000_000
 _LONGEST_LINE = 4 * 1024**2
@@ -137,6 +153,10 @@ _MOST_BITS = 159
 """Largest length of a serial number, in bits (RFC 5280, 4.1.2.2)."""
 _MOST_NUMBER = 10**12
 _MOST_KEPT = 16 * 1024 * 1024
+_SEALED_FROM = 16 * 1024 * 1024
+"""Bytes from which a part is sealed: each change copies the last part."""
+_LINE_BYTES = 450
+"""Length of most lines."""
 _HEAD = re.compile(
     rb"sros ledger [12]\nlines ([0-9]{1,12})\nsha256 ([0-9a-f]{64})\n(?:index ([0-9a-f]{64})\n)?"
 )
@@ -242,13 +262,15 @@ class _Files(NamedTuple):
     """The ledger and its head at the same moment.
 
     ``state`` is None without a ledger; ``lines`` is the content of the file, None if it is too long
-    to keep in memory.  ``ledger_index`` is None without an index that fits.
+    to keep in memory, or follows sealed parts.  ``ledger_index`` is None without an index that
+    fits.  ``part`` is the number of the last part, which is the file.
     """
 
     head: _Head | None
     state: os.stat_result | None
     lines: bytes | None
     ledger_index: LedgerIndex | None = None
+    part: int = 1
 
 
 class LedgerFile:
@@ -274,6 +296,8 @@ class LedgerFile:
         self._files: _Files | None = None
         self._readings: dict[bytes, _Reading] = {}
         self._recorded: Sequence[str] | None = None
+        self._entries: dict[bytes, Entry] = {}
+        self._may_restore = not follow_link
 
     def ledger(self) -> Ledger:
         """Return the ledger; empty for a keystore that has none (of ros2/sros2).
@@ -322,10 +346,18 @@ class LedgerFile:
 
         They may be missing in the keystore, and enclaves that were put there by hand lack.
         """
-        if self._recorded is None and (index := self._opened().ledger_index):
-            with suppress(SrosError):  # a damaged index is read no more
-                self._recorded = sorted(index.names())
+        if self._recorded is None:
+            names = self.recorded_with()
+            self._recorded = None if names is None else sorted(names)
         return self._recorded
+
+    def recorded_with(self, *parts: str) -> Collection[str] | None:
+        """Return `recorded_enclaves`, unsorted; only those with one of ``parts`` in their names."""
+        index = self._opened().ledger_index
+        try:
+            return index.names(parts) if index else None
+        except IndexDamagedError:
+            return self.recorded_with(*parts) if self._restored() else None
 
     @property
     def is_indexed(self) -> bool:
@@ -354,10 +386,15 @@ class LedgerFile:
         if index := self._opened().ledger_index:
             return IndexUpdate(index)
         with _open(self.root, self._follow_link) or io.BytesIO() as file:
-            return _index_of(file)
+            return self._new_index(file)
+
+    def last_part(self) -> tuple[int, int]:
+        """Return the number and the size, in bytes, of the part to which lines are added."""
+        files = self._opened()
+        return files.part, files.state.st_size if files.state else 0
 
     def content(self) -> Iterator[bytes]:
-        """Yield the bytes of all lines, in blocks."""
+        """Yield the bytes of the last part, in blocks."""
         if self._files and self._files.lines is not None:
             yield self._files.lines
             return
@@ -377,7 +414,13 @@ class LedgerFile:
         while True:
             known = self._files
             files = known or self._read()
-            if found := self._found(files, terms):
+            try:
+                found = self._found(files, terms)
+            except IndexDamagedError:
+                if self._restored():
+                    continue
+                files, found = files._replace(ledger_index=None), None
+            if found:
                 self._files = files
                 return self._compared_with_head(files, found)
             reading = self._compared_with_head(files, self._lines(files, having))
@@ -388,6 +431,16 @@ class LedgerFile:
                 return reading
             self._files = None
 
+    def _restored(self) -> bool:
+        """Remove a damaged index once, under the lock of the keystore, to make it again."""
+        may_restore, self._may_restore, self._files = self._may_restore, False, None
+        if may_restore:
+            from sros_tool.folders import Folder
+
+            with suppress(OSError, SrosError), Folder(self.root) as folder:
+                folder.unlink(LEDGER_INDEX, missing_ok=True)
+        return may_restore
+
     def _read(self) -> _Files:
         head = self._read_head(self._read_first)
         self._read_first = read_bytes
@@ -396,55 +449,66 @@ class LedgerFile:
             return _Files(head, None, b"")
         with file:
             state = os.fstat(file.fileno())
+            before = _sealed_before(file)
+            part = before.number + 1 if before else 1
             if head and (index := self._index(file, head)):
-                return _Files(head, state, None, index)
-            return _Files(head, state, file.read() if state.st_size <= _MOST_KEPT else None)
+                return _Files(head, state, None, index, part)
+            kept = state.st_size <= _MOST_KEPT and not before
+            return _Files(head, state, file.read() if kept else None, part=part)
 
     def _index(self, file: BinaryIO, head: _Head) -> LedgerIndex | None:
-        """Return the index that the head states; None without one for a ledger with this end."""
-        if not head.index_root:
+        """Return the index that the head states; None without one for a ledger with this end.
+
+        Under the lock of the keystore, an index that is missing, or of another version of sros, is
+        made again.
+        """
+        is_long = head.lines >= _INDEXED_FROM
+        if not head.index_root and (self._follow_link or not is_long):
             return None
         from sros_tool.keystore.ledger_index import LedgerIndex
 
         index = LedgerIndex.open(self.root, head.lines, head.last, head.index_root)
         if index is None and not self._follow_link:
-            # The keystore is locked, so that the index can be made again, from the same lines.
-            made = _index_of(file)
-            if made.root() == head.index_root:
+            made = self._new_index(file)
+            root = made.root()
+            if root == head.index_root or self._is_sound(file, head):
                 made.save(self.root)
-                index = LedgerIndex.open(self.root, head.lines, head.last, head.index_root)
-        ends_so = index and _last_line(file, index.state.size) == head.last
+                index = LedgerIndex.open(self.root, head.lines, head.last, root)
+        last_size = index.state.size - index.state.sealed_size if index else 0
+        ends_so = index and _last_line(file, last_size) == head.last
         file.seek(0)
         return index if ends_so else None
 
+    def _is_sound(self, file: BinaryIO, head: _Head) -> bool:
+        """Return whether all lines of the ledger are the chain that the head signs."""
+        file.seek(0)
+        read = _read_lines(self._every_line(file), _NONE, head.lines, _MOST_LINES, _MOST_BYTES)
+        if read is None or read.faults or read.unchained:
+            return False
+        return not _head_fault(head, read.lines, read.signed, chained=read.chained)
+
     def _found(self, files: _Files, terms: _Terms | None) -> _Lines | None:
-        """Return the lines that the index finds; None if it is not there or finds none of them."""
+        """Return the lines that the index finds; None if it is not there or finds none of them.
+
+        Raises:
+            IndexDamagedError: the index, or a line that it leads to, was changed.
+        """
         if files.ledger_index is None or files.head is None or terms is None:
             return None
-        from sros_tool.keystore.ledger_index import IndexDamagedError, is_indexed, merged
+        from sros_tool.keystore.ledger_index import is_indexed, merged
 
         if not all(is_indexed(*term) for term in terms):
             return None
         index, head = files.ledger_index, files.head
-        entries: list[Entry] = []
-        try:
-            terms = dict.fromkeys([*terms, ("what", "ca"), ("what", GAP)])
-            postings = merged(index.postings(*term) for term in terms)
-            with _open(self.root, self._follow_link) or io.BytesIO() as file:
-                for posting in postings:
-                    file.seek(posting.offset)
-                    line = file.read(posting.length)
-                    entry = _parse(line)
-                    if hashlib.sha256(line).digest() != posting.digest or entry is None:
-                        raise IndexDamagedError(f"line {posting.number} was changed")
-                    entries.append(entry)
-        except IndexDamagedError:
-            self._files = None
-            return None
+        terms = dict.fromkeys([*terms, ("what", "ca"), ("what", GAP)])
+        postings = merged(index.postings(*term) for term in terms)
+        with _open(self.root, self._follow_link) or io.BytesIO() as file:
+            for posting in postings:
+                if posting.digest not in self._entries:
+                    self._entries[posting.digest] = _entry_at(posting, index, file)
+        entries = tuple(self._entries[posting.digest] for posting in postings)
         numbers = [posting.number for posting in postings]
-        return _Lines(
-            tuple(entries), numbers, (), head.lines, 0, True, head.last, head.last, ended=True
-        )
+        return _Lines(entries, numbers, (), head.lines, 0, True, head.last, head.last, ended=True)
 
     def _read_head(self, read: Callable[[Path, str], bytes]) -> _Head | None:
         """Return the head of the ledger; None without one."""
@@ -479,10 +543,66 @@ class LedgerFile:
             read = _remembered(files.lines, having, stated, _MOST_LINES, _MOST_BYTES)
         else:
             with _open(self.root, self._follow_link) or io.BytesIO() as file:
-                read = _read_lines(file, having, stated, _MOST_LINES, _MOST_BYTES)
+                lines = self._every_line(file)
+                read = _read_lines(lines, having, stated, _MOST_LINES, _MOST_BYTES)
         if read is None:
             raise _too_large(self.root / LEDGER)
         return read
+
+    # ── sealed parts ───────────────────────────────────────────────────────────────────────
+
+    def _every_line(
+        self, last: BinaryIO, sealed: Callable[[str], None] = lambda _: None
+    ) -> Iterator[bytes]:
+        """Yield the lines of all parts, the last of which is open, and call ``sealed`` after each.
+
+        Raises:
+            KeystoreError: a sealed part is missing, or is not as it was sealed.
+        """
+        before = _sealed_before(last)
+        parts = [before] if before else []
+        while parts and parts[-1].number > 1:
+            with self._part(parts[-1]) as file:
+                before = _sealed_before(file)
+            if before is None or before.number != parts[-1].number - 1:
+                raise _not_as_sealed(self.root, parts[-1])
+            parts.append(before)
+        for part in reversed(parts):
+            digest = hashlib.sha256()
+            with self._part(part) as file:
+                for line in _lines_in(file):
+                    digest.update(line)
+                    yield line
+            if digest.hexdigest() != part.sha256:
+                raise _not_as_sealed(self.root, part)
+            sealed(ledger_part(part.number))
+        yield from _lines_in(last)
+
+    def _part(self, sealed: Entry) -> BinaryIO:
+        """Return a sealed part, open for reading."""
+        name = ledger_part(sealed.number)
+        if file := _open(self.root, self._follow_link, name):
+            return file
+        raise KeystoreError(
+            f"{name}, a sealed part of the ledger of '{self.root}', is missing",
+            "The answer needs all lines of the ledger.",
+            "Copy it back from your archive.",
+        )
+
+    def _new_index(self, last: BinaryIO) -> IndexUpdate:
+        """Return the index of all lines of the ledger, the last part of which is open.
+
+        Raises:
+            KeystoreError: as `_every_line`.
+        """
+        from sros_tool.keystore.ledger_index import IndexUpdate
+
+        index = IndexUpdate(None)
+        for line in self._every_line(last, index.seal):
+            text = line.removesuffix(b"\n")
+            if entry := _parse(text):
+                index.add(entry, text)
+        return index
 
     def _compared_with_head(self, files: _Files, read: _Lines) -> _Reading:
         if not read.lines:
@@ -508,16 +628,41 @@ class LedgerFile:
         return _Reading(ledger, unrecorded, read.previous, read.ended, sound)
 
 
-def _index_of(file: BinaryIO) -> IndexUpdate:
-    """Return the index of all lines of a ledger."""
-    from sros_tool.keystore.ledger_index import IndexUpdate
+def _lines_in(file: BinaryIO) -> Iterator[bytes]:
+    return iter(lambda: file.readline(_LONGEST_LINE), b"")
 
-    index = IndexUpdate(None)
-    for line in iter(lambda: file.readline(_LONGEST_LINE), b""):
-        text = line.removesuffix(b"\n")
-        if entry := _parse(text):
-            index.add(entry, text)
-    return index
+
+def _sealed_before(file: BinaryIO) -> Entry | None:
+    """Return the entry of the sealed part before ``file``, which is its first line, or None."""
+    line = file.readline(_LONGEST_LINE)
+    file.seek(0)
+    entry = _parse(line.removesuffix(b"\n")) if b'"what":"sealed"' in line else None
+    return entry if entry and entry.what == SEALED else None
+
+
+def _not_as_sealed(root: Path, sealed: Entry) -> KeystoreError:
+    return KeystoreError(
+        f"{ledger_part(sealed.number)} is not the part that was sealed of the ledger of '{root}'",
+        "It was changed, cut off or exchanged.",
+        "Copy the sealed part back from your archive.",
+    )
+
+
+def _entry_at(posting: Posting, index: LedgerIndex, last: BinaryIO) -> Entry:
+    """Return the entry to which a posting leads, in the index or the last part of the ledger.
+
+    Raises:
+        IndexDamagedError: the line was changed.
+    """
+    state = index.state
+    if posting.number <= state.sealed:
+        line = index.line(posting.number)
+    else:
+        line = os.pread(last.fileno(), posting.length, posting.offset - state.sealed_size)
+    entry = _parse(line)
+    if hashlib.sha256(line).digest() != posting.digest or entry is None:
+        raise IndexDamagedError(f"line {posting.number} was changed")
+    return entry
 
 
 _Terms: TypeAlias = Collection[tuple[str, str]]
@@ -553,7 +698,7 @@ class _Lines(NamedTuple):
 
 
 def _read_lines(
-    file: BinaryIO, having: bytes, stated: int, most: int, most_bytes: int
+    lines: Iterable[bytes], having: bytes, stated: int, most: int, most_bytes: int
 ) -> _Lines | None:
     """Return the lines of a ledger; None if they exceed ``most`` lines or ``most_bytes`` bytes.
 
@@ -568,7 +713,7 @@ def _read_lines(
     before = line = b""
     last = signed = ""  # the digests of the line before, and of the line number ``stated``
     all_before = hashlib.sha256()
-    for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), 1):
+    for number, line in enumerate(lines, 1):
         size += len(line)
         if number > most or size > most_bytes:
             return None
@@ -620,7 +765,7 @@ def _read_lines(
 def _remembered(
     data: bytes, having: bytes, stated: int, most: int, most_bytes: int
 ) -> _Lines | None:
-    return _read_lines(io.BytesIO(data), having, stated, most, most_bytes)
+    return _read_lines(_lines_in(io.BytesIO(data)), having, stated, most, most_bytes)
 
 
 def _without_lines(root: Path, *, is_there: bool) -> _Reading:
@@ -641,20 +786,21 @@ def _not_entries(last: int, count: int) -> _Fault:
     return _Fault(last, f"lines {last - count + 1} to {last} are not entries")
 
 
-def _open(root: Path, follow_link: bool) -> BinaryIO | None:
-    """Return the ledger file, open for reading; None if there is none.
+def _open(root: Path, follow_link: bool, name: str = LEDGER) -> BinaryIO | None:
+    """Return the ledger file, or its part ``name``, open for reading; None if there is none.
 
     While a transaction is being committed, the file is a link.  The process that has locked the
     keystore does not follow it: the link could lead to a file outside the keystore.
     """
-    path = root / LEDGER
+    path = root / name
     try:
         if follow_link:
             return _checked(open_at_once(path))
         from sros_tool.folders import Folder  # a question does not load what writes
 
         with Folder(root) as folder:
-            return _checked(folder.open(LEDGER))
+            target = folder.link_target(name) or ""
+            return _checked(folder.open(target if SEALED_LEDGER.fullmatch(target) else name))
     except FileNotFoundError:
         return None
     except (OSError, SrosError) as error:
@@ -820,15 +966,24 @@ def append(
     if not transaction.dry_run:
         index = file.index_with(len(gaps) + len(entries), present)
     links = _Links(chain(gaps, entries), present.previous, index)
+    number, size = file.last_part()
+    seals = index is not None and size + _LINE_BYTES * len(entries) >= _SEALED_FROM
+    is_part = seals or SEALED_LEDGER.fullmatch(transaction.target_after(LEDGER) or "")
+    digest = hashlib.sha256()
 
     def content() -> Iterator[bytes]:
-        yield from file.content()
-        yield b"" if present.ended else b"\n"
-        yield from links
+        for block in chain(file.content(), [b"" if present.ended else b"\n"], links):
+            digest.update(block)
+            yield block
 
-    transaction.write_parts(LEDGER, content())
+    transaction.write_parts(ledger_part(number) if is_part else LEDGER, content())
     for _ in links:  # of a dry run, which writes nothing
         pass
+    if index and seals:
+        index.seal(ledger_part(number))
+        links.add(Entry(iso(now), SEALED, sha256=digest.hexdigest(), number=number))
+        transaction.write_parts(ledger_part(number + 1), links)
+        transaction.link(LEDGER, ledger_part(number + 1))
     lines = present.ledger.lines + links.count
     head = f"lines {lines}\nsha256 {links.previous}\n"
     root = ""
@@ -852,8 +1007,12 @@ class _Links:
     ) -> None:
         self.previous = previous
         self.count = 0
-        self._entries = iter(entries)
+        self._entries: Iterator[Entry] = iter(entries)
         self._index = index
+
+    def add(self, entry: Entry) -> None:
+        """Add an entry after all others, whose lines were taken."""
+        self._entries = iter((entry,))
 
     def __iter__(self) -> Iterator[bytes]:
         for entry in self._entries:

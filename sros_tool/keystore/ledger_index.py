@@ -10,6 +10,9 @@ A *term* is the value of a field of an entry, such as the name of an enclave.  A
 that a line has a term, where the line is, and what its digest is.  Postings are kept in buckets by
 the first bits of their terms, each with the names of the enclaves whose postings are in it and
 whose last certificate was not revoked; the root is the digest of the digests of all buckets.
+
+The index also has the lines of the sealed parts of the ledger, so that nobody needs those files who
+does not read all lines; a line is compared with the digest in its posting.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
 from urllib.parse import quote
 
-from sros_tool.errors import SrosError
+from sros_tool.errors import IndexDamagedError, SrosError
 from sros_tool.keystore.layout import LEDGER_INDEX
 from sros_tool.pki.crl import SUPERSEDED
 
@@ -41,17 +44,16 @@ _FREQUENT = ("certificate", "permissions")
 _SCHEMA = (
     "CREATE TABLE buckets (bucket INTEGER PRIMARY KEY, names BLOB NOT NULL, "
     "postings BLOB NOT NULL)",
+    "CREATE TABLE lines (number INTEGER PRIMARY KEY, line BLOB NOT NULL)",
     "CREATE TABLE state (lines INTEGER NOT NULL, size INTEGER NOT NULL, number INTEGER NOT NULL, "
-    "last TEXT NOT NULL, digests BLOB NOT NULL)",
+    "last TEXT NOT NULL, sealed INTEGER NOT NULL, sealed_size INTEGER NOT NULL, "
+    "digests BLOB NOT NULL)",
 )
-_STATE = "SELECT lines, size, number, last, digests FROM state WHERE length(digests) = ?"
+_STATE = "SELECT * FROM state WHERE length(digests) = ?"
+_STATE_TYPES = [int, int, int, str, int, int, bytes]
 _LARGEST = 128 << 20
 """Size of the largest bucket, in bytes."""
 _SETTINGS = ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0")
-
-
-class IndexDamagedError(SrosError):
-    """The index is not the one that the ledger's head states."""
 
 
 class Posting(NamedTuple):
@@ -70,18 +72,21 @@ class IndexState(NamedTuple):
     """The ledger that an index is of.
 
     ``lines`` and ``size`` are its lines and bytes, ``number`` is the highest number of an entry,
-    ``last`` is the SHA-256 of the last line, in hexadecimal.
+    ``last`` is the SHA-256 of the last line, in hexadecimal.  ``sealed`` and ``sealed_size`` are
+    the lines and bytes of the sealed parts.
     """
 
     lines: int
     size: int
     number: int
     last: str
+    sealed: int
+    sealed_size: int
 
     def root(self, digests: bytes) -> str:
         """Return the root, in hexadecimal, of an index whose buckets have these digests."""
-        text = f"sros index 1\n{self.lines} {self.size} {self.number} {self.last}\n".encode()
-        return hashlib.sha256(text + digests).hexdigest()
+        text = f"sros index 2\n{' '.join(map(str, self))}\n"
+        return hashlib.sha256(text.encode() + digests).hexdigest()
 
 
 class IndexedEntry(Protocol):
@@ -160,7 +165,7 @@ class LedgerIndex:
                 row = connection.execute(_STATE, (_BUCKETS * len(_EMPTY),)).fetchone()
         except (OSError, sqlite3.Error, ValueError, SrosError):
             return None
-        if not row or [type(value) for value in row] != [int, int, int, str, bytes]:
+        if not row or [type(value) for value in row] != _STATE_TYPES:
             return None
         state, digests = IndexState(*row[:-1]), row[-1]
         if (state.lines, state.last) != (lines, last) or state.root(digests) != stated:
@@ -179,7 +184,7 @@ class LedgerIndex:
             IndexDamagedError: the bucket with them is not what it was when the head was signed.
         """
         term = _term(name, value)
-        _, postings = self.bucket(_bucket_of(term))
+        postings = self._postings_in(_bucket_of(term))
         at = postings.find(term)
         while at >= 0:
             if at % _POSTING.size == 0:
@@ -187,16 +192,34 @@ class LedgerIndex:
                 yield Posting(*where)
             at = postings.find(term, at + 1)
 
-    def names(self) -> set[str]:
+    def line(self, number: int) -> bytes:
+        """Return a line of the sealed parts, for the caller to compare with its digest.
+
+        Raises:
+            IndexDamagedError: the index does not have the line.
+        """
+        rows = self._rows("SELECT line FROM lines WHERE number = ?", number)
+        if not rows or type(rows[0][0]) is not bytes:
+            raise IndexDamagedError(f"'{self._path}' lacks line {number}")
+        return rows[0][0]
+
+    def names(self, parts: Iterable[str] = ()) -> set[str]:
         """Return the enclaves whose last certificate in the ledger was not revoked.
+
+        With ``parts``, only names with one of these texts in them are returned.
 
         Raises:
             IndexDamagedError: they are not what they were when the head was signed.
         """
-        names = set()
+        names: set[str] = set()
+        texts = [part.encode("utf-8", "surrogatepass") for part in parts]
         there = dict(self._rows("SELECT bucket, names FROM buckets"))
         for bucket in range(_BUCKETS):
-            names |= _split(self._checked(there.get(bucket, b""), 2 * bucket))
+            data = self._checked(there.get(bucket, b""), 2 * bucket)
+            if not texts or any(text in data for text in texts):
+                names |= _split(data)
+        if texts:
+            return {name for name in names if any(part in name for part in parts)}
         return names
 
     def bucket(self, bucket: int) -> tuple[bytes, bytes]:
@@ -205,9 +228,13 @@ class LedgerIndex:
         Raises:
             IndexDamagedError: it is not what it was when the head was signed.
         """
-        rows = self._rows("SELECT names, postings FROM buckets WHERE bucket = ?", bucket)
-        names, postings = rows[0] if rows else (b"", b"")
-        return self._checked(names, 2 * bucket), self._checked(postings, 2 * bucket + 1)
+        rows = self._rows("SELECT names FROM buckets WHERE bucket = ?", bucket)
+        names = self._checked(rows[0][0] if rows else b"", 2 * bucket)
+        return names, self._postings_in(bucket)
+
+    def _postings_in(self, bucket: int) -> bytes:
+        rows = self._rows("SELECT postings FROM buckets WHERE bucket = ?", bucket)
+        return self._checked(rows[0][0] if rows else b"", 2 * bucket + 1)
 
     def _rows(self, query: str, *values: int) -> list[tuple[Any, ...]]:
         try:
@@ -238,16 +265,18 @@ class IndexUpdate:
     """
 
     def __init__(self, base: LedgerIndex | None) -> None:
-        self.state = base.state if base else IndexState(0, 0, 0, "")
+        self.state = base.state if base else IndexState(0, 0, 0, "", 0, 0)
         self._base = base
         self._added: dict[int, bytearray] = {}
         self._names: dict[str, bool] = {}
+        self._sealed_before = self.state.sealed
         self._buckets: dict[int, tuple[bytes, bytes]] = {}
         self._digests = b""
+        self._sealed: list[str] = []
 
     def add(self, entry: IndexedEntry, line: bytes) -> None:
         """Add the next line of the ledger, without its line end."""
-        lines, size, number, _ = self.state
+        lines, size, number, *_ = self.state
         digest = hashlib.sha256(line)
         for term in _terms(entry):
             posting = _POSTING.pack(term, lines + 1, size, len(line), digest.digest())
@@ -257,7 +286,17 @@ class IndexUpdate:
         elif entry.what == "revocation" and entry.reason != SUPERSEDED:
             self._names[entry.enclave] = False
         number = max(number, entry.number)
-        self.state = IndexState(lines + 1, size + len(line) + 1, number, digest.hexdigest())
+        self.state = self.state._replace(
+            lines=lines + 1,
+            size=size + len(line) + 1,
+            number=number,
+            last=digest.hexdigest(),
+        )
+
+    def seal(self, part: str) -> None:
+        """Note that all lines so far are in sealed parts of the ledger, the last in ``part``."""
+        self.state = self.state._replace(sealed=self.state.lines, sealed_size=self.state.size)
+        self._sealed.append(part)
 
     def root(self) -> str:
         """Return the root of the index with all lines that were added, in hexadecimal.
@@ -294,7 +333,7 @@ class IndexUpdate:
                 return
             _check_file(root / LEDGER_INDEX)
             with closing(_connect(root / LEDGER_INDEX, "rw")) as connection:
-                self._write(connection)
+                self._write(root, connection)
         except (OSError, sqlite3.Error, ValueError, SrosError):
             from sros_tool.folders import Folder
 
@@ -308,16 +347,27 @@ class IndexUpdate:
             folder.unlink(_NEW, missing_ok=True)
             folder.write(_NEW, b"", 0o600)
             with closing(_connect(root / _NEW, "rw", is_new=True)) as connection:
-                self._write(connection)
+                self._write(root, connection)
             folder.replace(_NEW, LEDGER_INDEX)
 
-    def _write(self, connection: sqlite3.Connection) -> None:
+    def _write(self, root: Path, connection: sqlite3.Connection) -> None:
         with connection:
+            lines = enumerate(self._new_sealed_lines(root), self._sealed_before + 1)
+            connection.executemany("REPLACE INTO lines VALUES (?, ?)", lines)
             buckets = ((bucket, *parts) for bucket, parts in self._buckets.items())
             connection.executemany("REPLACE INTO buckets VALUES (?, ?, ?)", buckets)
             connection.execute("DELETE FROM state")
             row = (*self.state, self._digests)
-            connection.execute("INSERT INTO state VALUES (?, ?, ?, ?, ?)", row)
+            connection.execute("INSERT INTO state VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+
+    def _new_sealed_lines(self, root: Path) -> Iterator[bytes]:
+        """Yield the lines of the parts that were sealed since ``base``."""
+        from sros_tool.folders import Folder
+
+        with Folder(root) as folder:
+            for part in self._sealed:
+                with folder.open(part) as file:
+                    yield from (line.removesuffix(b"\n") for line in file)
 
 
 def _is_own(root: Path) -> bool:

@@ -128,12 +128,11 @@ def _near_robots(keystore: Keystore, fleet: Fleet, robots: Sequence[str]) -> Seq
     In a keystore with an index, these are the enclaves in the folders of the robots, and those that
     the ledger has with the name of a robot or such a folder in their paths.
     """
-    recorded = keystore.ledger_file.recorded_enclaves()
+    folders = folders_of_robots(fleet, robots)
+    recorded = keystore.ledger_file.recorded_with(*robots, *folders)
     if recorded is None:
         return keystore.names
-    folders = folders_of_robots(fleet, robots)
-    texts = (*robots, *folders)
-    near = {name for name in recorded if any(text in name for text in texts)}
+    near = set(recorded)
     for folder in folders:
         near.update((folder, *enclaves_below(keystore.root, folder)))
     return sorted(name for name in near if has_enclave(keystore.root, name))

@@ -34,6 +34,7 @@ from sros_tool.keystore.layout import (
     REVOKED,
     ROTATION,
     SEAL,
+    SEALED_LEDGER,
     SETTINGS,
     STAGE,
     ZENOH_FILES,
@@ -487,7 +488,7 @@ def _other(
         yield ARCHIVE.found(path, "an archive or a container of keys is not part of it", path)
         return
     known = (
-        (inside == "." and name in _TOP)
+        (inside == "." and (name in _TOP or SEALED_LEDGER.fullmatch(name)))
         or (place in (PUBLIC, PRIVATE) and _KNOWN_ANYWHERE.match(name))
         or (place == REVOKED and name in _KNOWN)
         or place == RETIRED

@@ -1,0 +1,262 @@
+"""A long ledger has sealed parts: nothing is believed of a part that is not the one sealed.
+
+Only who reads all lines needs the sealed parts; the index answers all others without them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore import ledger as ledger_module
+from sros_tool.keystore.delivery.signing import sign_request
+from sros_tool.keystore.describe import history
+from sros_tool.keystore.layout import LEDGER, LEDGER_INDEX, ledger_part
+from sros_tool.keystore.ledger import LedgerFile
+from sros_tool.keystore.lifecycle.create import create_enclaves
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.reader import Keystore
+from sros_tool.pki.certificates import make_request
+from sros_tool.pki.keys import generate_key, load_key
+from tests.keystore.test_ledger_index import check_answers, is_indexed
+from tests.keystore.test_transaction import DIED, in_child
+from tests.support.harness import check_whole, remains, snapshot, sros
+
+NOW = datetime.now(UTC) + timedelta(hours=1)
+CHECK = ("check", "keystore", "--fail-on", "error", "--exclude", "enclave.node-cannot-start")
+
+
+@pytest.fixture
+def root(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A keystore whose ledger has two sealed parts; the first one has all but a renewal."""
+    monkeypatch.setattr(ledger_module, "_INDEXED_FROM", 1)
+    monkeypatch.setattr(ledger_module, "_LINES_PER_LOOKUP", 0)
+    for sealed_from in (1, 1 << 30, 1, 1 << 30):
+        monkeypatch.setattr(ledger_module, "_SEALED_FROM", sealed_from)
+        renew(keystore, ["/a"], now=NOW)
+    return keystore
+
+
+def parts(root: Path) -> list[str]:
+    return sorted(path.name for path in root.glob("ledger.*.jsonl"))
+
+
+def change_line(part: Path) -> None:
+    part.write_bytes(part.read_bytes().replace(b'"/a"', b'"/x"', 1))
+
+
+def cut(part: Path) -> None:
+    part.write_bytes(b"".join(part.read_bytes().splitlines(keepends=True)[:-1]))
+
+
+def empty(part: Path) -> None:
+    part.write_bytes(b"")
+
+
+def add_line(part: Path) -> None:
+    part.write_bytes(part.read_bytes() + b"{}\n")
+
+
+def exchange(part: Path) -> None:
+    other = part.with_name(ledger_part(2 if part.name == ledger_part(1) else 1))
+    first, second = part.read_bytes(), other.read_bytes()
+    part.write_bytes(second)
+    other.write_bytes(first)
+
+
+def take_from_another(part: Path) -> None:
+    """Put the sealed part of a keystore with other CAs there."""
+    other = part.parents[1] / "other"
+    sros("create_keystore", other).ok()
+    create_enclaves(other, ["/a", "/b"], now=NOW)
+    part.write_bytes((other / LEDGER).read_bytes())
+
+
+BROKEN: dict[str, Callable[[Path], None]] = {
+    "missing": Path.unlink,
+    "changed": change_line,
+    "cut off": cut,
+    "empty": empty,
+    "with a line more": add_line,
+    "exchanged": exchange,
+    "another keystore's": take_from_another,
+}
+
+
+def test_parts_are_sealed_and_read_as_one_ledger(root: Path) -> None:
+    assert parts(root) == [ledger_part(1), ledger_part(2), ledger_part(3)]
+    assert os.readlink(root / LEDGER) == ledger_part(3)
+    sealed = {name: (root / name).read_bytes() for name in parts(root)[:2]}
+    check_answers(root)
+    create_enclaves(root, ["/new"], now=NOW)
+    revoke(root, ["/b"], now=NOW)
+    assert is_indexed(root)
+    check_answers(root)
+    whole = Keystore(root).ledger
+    assert (whole.gaps, whole.unchained, whole.certain) == ((), 0, whole.entries)
+    assert len(whole.entries) == whole.lines
+    assert [entry.number for entry in whole.entries if entry.what == "sealed"] == [1, 2]
+    assert {name: (root / name).read_bytes() for name in sealed} == sealed
+    assert not history(root, now=NOW).unexplained
+    sros(*CHECK, root).ok()
+
+
+def test_without_its_sealed_parts_changes_go_on(root: Path, tmp_path: Path) -> None:
+    key = load_key((root / "enclaves/b/key.pem").read_bytes(), "of the test")
+    revoke(root, ["/b"], now=NOW)
+    archive = tmp_path / "archive"
+    archive.mkdir()
+    for name in (ledger_part(1), ledger_part(2)):
+        shutil.move(root / name, archive / name)
+    renew(root, ["/a"], now=NOW, new_key=True, revoke_old=True)
+    create_enclaves(root, ["/new"], now=NOW)
+    shutil.rmtree(root / "revoked")
+    with pytest.raises(KeystoreError, match="was revoked"):
+        sign_request(root, make_request(key, "/other"), now=NOW)
+    (root / LEDGER_INDEX).unlink()
+    # Now nobody knows whether the key was revoked: there is no answer, least of all "no".
+    before = snapshot(root)
+    for asked in (key, generate_key()):
+        with pytest.raises(KeystoreError, match=f"{ledger_part(2)}, a sealed part .* is missing"):
+            sign_request(root, make_request(asked, "/other"), now=NOW)
+    assert snapshot(root) == before
+    shutil.copytree(archive, root, dirs_exist_ok=True)
+    with pytest.raises(KeystoreError, match="was revoked"):
+        sign_request(root, make_request(key, "/other"), now=NOW)
+    sign_request(root, make_request(generate_key(), "/other"), now=NOW)
+    assert is_indexed(root)
+    check_answers(root)
+    assert Keystore(root).ledger.gaps == ()
+
+
+@pytest.mark.parametrize(("number", "case"), [(1 + i % 2, case) for i, case in enumerate(BROKEN)])
+def test_a_part_that_was_not_sealed_is_noticed(case: str, number: int, root: Path) -> None:
+    part = root / ledger_part(number)
+    sound = {name: (root / name).read_bytes() for name in parts(root)}
+    BROKEN[case](part)
+    found = sros(*CHECK, root)
+    assert found.status == 1
+    said = re.findall(r"(ledger\.000[12]\.jsonl).*sealed", found.out)
+    assert len(said) == 1, found
+    assert said[0] == ledger_part(number) or case == "exchanged"
+    renew(root, ["/a"], now=NOW)
+    revoke(root, ["/b"], now=NOW)
+    (root / LEDGER_INDEX).unlink()
+    before = snapshot(root)
+    for change in (renew, revoke):
+        with pytest.raises(KeystoreError, match="sealed"):
+            change(root, ["/a"], now=NOW)
+    assert snapshot(root) == before
+    for name in (ledger_part(1), ledger_part(2)):
+        (root / name).write_bytes(sound[name])
+    renew(root, ["/a"], now=NOW)
+    check_answers(root)
+    assert Keystore(root).ledger.gaps == ()
+
+
+def test_death_at_every_step_of_sealing(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ledger_module, "_SEALED_FROM", 1)
+
+    def change(keystore: Path) -> None:
+        renew(keystore, ["/a"], now=NOW)
+
+    work = tmp_path / "work"
+    lines = Keystore(root).ledger.lines
+    (root / LEDGER_INDEX).unlink()  # it is made again first; then saved with the new lines
+    shutil.copytree(root, work, symlinks=True)
+    status, steps = in_child(lambda: change(work))
+    assert status == 0
+    assert len(parts(work)) == 4
+    done = set()
+    for step in steps:
+        shutil.rmtree(work)
+        shutil.copytree(root, work, symlinks=True)
+        assert in_child(lambda: change(work), step)[0] in (DIED, 0)
+        ledger = Keystore(work).ledger
+        assert ledger.gaps == (), step
+        assert ledger.lines in (lines, lines + 3), step
+        done.add(ledger.lines)
+        change(work)
+        check_whole(work)
+        assert remains(work) == [LEDGER_INDEX]
+        check_answers(work)
+        assert Keystore(work).ledger.gaps == ()
+    assert len(done) == 2
+
+
+def test_a_damaged_index_is_made_again_at_once(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also one that is damaged where its state does not show it."""
+    import sqlite3
+    from contextlib import closing
+
+    revoke(root, ["/b"], now=NOW)
+    whole: list[str] = []
+    lines = LedgerFile._lines
+
+    def read_all(file: LedgerFile, *given: Any) -> Any:
+        whole.append("all")
+        return lines(file, *given)
+
+    monkeypatch.setattr(LedgerFile, "_lines", read_all)
+    for statement in (
+        "UPDATE buckets SET names = x'00'",
+        "UPDATE buckets SET postings = x''",
+        "DELETE FROM lines",
+        "UPDATE lines SET line = x'7b7d'",
+    ):
+        with closing(sqlite3.connect(root / LEDGER_INDEX)) as connection, connection:
+            connection.execute(statement)
+        create_enclaves(root, ["/spare"], now=NOW)
+        revoke(root, ["/spare"], now=NOW)
+        assert whole == [], statement
+        assert is_indexed(root)
+    check_answers(root)
+
+
+def test_a_copy_without_the_link_goes_on(root: Path, tmp_path: Path) -> None:
+    copied = Path(shutil.copytree(root, tmp_path / "copied", symlinks=True))
+    (copied / LEDGER).unlink()
+    shutil.copy(copied / ledger_part(3), copied / LEDGER)
+    check_answers(copied)
+    renew(copied, ["/a"], now=NOW)
+    assert not (copied / LEDGER).is_symlink()
+    check_answers(copied)
+    assert Keystore(copied).ledger.gaps == ()
+
+
+def test_a_link_elsewhere_is_not_followed(root: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside.jsonl"
+    shutil.copy(root / ledger_part(3), outside)
+    (root / LEDGER).unlink()
+    (root / LEDGER).symlink_to(outside)
+    with pytest.raises(KeystoreError, match="cannot be read"):
+        renew(root, ["/a"], now=NOW)
+    (root / LEDGER).unlink()
+    (root / LEDGER).symlink_to(ledger_part(3))
+    renew(root, ["/a"], now=NOW)
+
+
+def test_an_index_of_another_version_is_made_again_first(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The head states a root that this version never makes; the chain proves the lines."""
+    monkeypatch.setattr(
+        ledger_module._Head, "index_root", property(lambda _: "0" * 64), raising=False
+    )
+    renew(root, ["/a"], now=NOW)
+    monkeypatch.undo()
+    monkeypatch.setattr(ledger_module, "_INDEXED_FROM", 1)
+    assert is_indexed(root)
