@@ -18,7 +18,14 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import Template, load_template
-from sros_tool.pki.certificates import common_name, issue_ca, pem
+from sros_tool.pki.certificates import (
+    Issuer,
+    common_name,
+    issue_ca,
+    load_certificate,
+    pem,
+    validity_of,
+)
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.policy.document import read_policy
 from sros_tool.validity import window
@@ -28,7 +35,7 @@ from tests.integration.kept.forms import form_of
 from tests.integration.kept.replies import answered
 from tests.integration.vendor_oracle import MATCH_SECONDS, cyclone_stack, cyclone_vendor
 from tests.support.children import LATE, run
-from tests.support.harness import policy_text, publish
+from tests.support.harness import certificate, policy_text, publish
 from tests.support.long_form import ONLY_LONG
 
 pytestmark = pytest.mark.dds
@@ -329,6 +336,14 @@ def test_sites_with_one_identity_ca_are_apart_by_their_permissions_cas(
             imported=imported,
         )
         create_enclaves(root, [f"/{root.name}/talker", f"/{root.name}/listener"], now=now)
+    # Whoever gets a certificate of the office for any name can show that robot's permissions.
+    forged = copy(berlin, "forged")
+    folder, forged_key = forged / "enclaves/berlin/talker", generate_key()
+    earlier = certificate(folder / "cert.pem")
+    (folder / "key.pem").write_bytes(key_pem(forged_key))
+    issuer = Issuer(load_certificate(office, "of the office"), key)
+    made = issuer.issue(earlier.subject, forged_key.public_key(), validity_of(earlier))
+    (folder / "cert.pem").write_bytes(pem(made))
     ask(
         {
             Question((one, f"/{one.name}/talker"), (other, f"/{other.name}/listener")): expected
@@ -338,4 +353,5 @@ def test_sites_with_one_identity_ca_are_apart_by_their_permissions_cas(
                 (berlin, kyoto, SILENT),
             )
         }
+        | {Question((forged, "/berlin/talker"), (berlin, "/berlin/listener")): HEARD}
     )

@@ -277,7 +277,7 @@ def test_what_a_service_cannot_do_is_refused(site: Path, tmp_path: Path) -> None
     rotate_ca(site, now=now(), roles=["permissions"], finish=True)
     assert not Keystore(site).ledger.gaps
     for template, imported, words in (
-        (TEMPLATE, {}, "Name it with --identity-ca"),
+        (TEMPLATE, {}, "with --identity-ca FILE"),
         (replace(TEMPLATE, separate_authorities=False), {"identity": pem(CA)}, "layout separate"),
     ):
         with pytest.raises(SrosError, match=words):

@@ -175,7 +175,8 @@ def create_authorities(
                 raise UsageError(
                     f"the certificate of the CA service '{service.place}' is missing",
                     "",
-                    "Name it with --identity-ca FILE, with the certificates above it.",
+                    "Run `sros create_keystore` with --identity-ca FILE, which has it and the "
+                    "certificates above it.",
                 )
             existing = check_imported(role, imported[role], None, now)
             transaction.write(f"{PUBLIC}/{file}.cert.pem", existing.bundle)

@@ -219,7 +219,11 @@ def _fault(
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     if len(names) > 1 or not subject.issuperset((part.oid, part.value) for part in asked.subject):
         has, wanted = subject_text(certificate.subject), subject_text(asked.subject)
-        return f"its subject is {has}, and should be {wanted}, with other kinds of parts at most"
+        return (
+            f"its subject is {has}, and should be {wanted}, to which parts may be added. Let the "
+            "service take it from $SROS_SUBJECT. For a service that takes it from the request of a "
+            "robot, set certificates.unique_subject to false"
+        )
     constraints = extension(certificate, x509.BasicConstraints)
     if (constraints and constraints.ca) or not denies_issuing(certificate):
         return "it is the certificate of a CA, or does not say that it is none"
