@@ -82,7 +82,7 @@ def print_follow_up(
         _tell(rights_lines(result.rights, dry_run=result.dry_run))
     _tell(after)
     if restart:
-        _print_restart(result.restart, result.zenoh, exported=exported)
+        _print_restart(result.root, result.restart, result.zenoh, exported=exported)
     _tell(remark.text for remark in result.remarks)
     print_notes(result.notes)
 
@@ -140,13 +140,15 @@ def shown_names(names: Sequence[str]) -> str:
 
 
 def _print_restart(
-    names: Sequence[str], zenoh: KeptZenoh | None = None, *, exported: bool = True
+    root: Path, names: Sequence[str], zenoh: KeptZenoh | None = None, *, exported: bool = True
 ) -> None:
     """Print on stderr that the processes of the enclaves ``names`` have to be restarted.
 
     ``zenoh`` has the enclaves whose Zenoh processes are affected.  With ``exported``, also print
     that exports are out of date.
     """
+    from sros_tool.keystore.fleet import publish_command
+
     if not names:
         return
     number = counted(len(names), "enclave")
@@ -154,5 +156,7 @@ def _print_restart(
     text += first_few(names, _MAX_NAMES)
     if zenoh and zenoh.files and set(zenoh.restart) != set(names):
         text += f"; of those on Zenoh: {first_few(zenoh.restart, _MAX_NAMES) or 'none'}"
+    if exported and (published := publish_command(root)):
+        text += f"; robots that fetch: {published} first"
     again = "; where they run from an export, export them again first" if exported else ""
     echo(text + again, err=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, NamedTuple
 
 import click
@@ -290,6 +291,14 @@ def _collect(
         ):
             echo(line)
     print_notes((*collected.notes, *(published.notes if published else ())))
+    if collected.has_new_files and not (folder or dry_run):
+        from sros_tool.keystore.fleet import publish_command
+
+        where = quote(str(root))
+        deliver = publish_command(root) or (
+            f"`sros distribute_key {where} --robot NAME FOLDER --force`"
+        )
+        echo(f"robots have new files in the keystore; to bring them there: {deliver}", err=True)
     if problem:
         raise problem
     if collected.not_signed:

@@ -127,6 +127,7 @@ def renew(
 
 def _replaced_lines(result: Changed) -> Iterator[str]:
     """Yield until when replaced certificates still work, and where copies of them are."""
+    from sros_tool.keystore.fleet import publish_command
     from sros_tool.validity import iso
 
     if not result.outcomes and not result.dry_run:
@@ -140,9 +141,11 @@ def _replaced_lines(result: Changed) -> Iterator[str]:
         )
         yield f"{what}, unless revoked: see --revoke-old"
     if result.outcomes and not result.restart:
+        published = publish_command(result.root)
+        deliver = f"publish ({published}) or export again" if published else "export again"
         yield (
             "exports and running processes still have the earlier certificates and permissions: "
-            "export again, and restart, before those expire"
+            f"{deliver}, and restart, before those expire"
         )
 
 
@@ -513,7 +516,7 @@ def rotate_ca(
 def _print_step(
     step: RotationStep, status: RotationStatus, *, together: bool, same_key: bool
 ) -> None:
-    from sros_tool.keystore.lifecycle.rotation import EXPORT_FIRST
+    from sros_tool.keystore.fleet import deliver_first
 
     if not step.changes:
         done = (
@@ -543,7 +546,7 @@ def _print_step(
             if together
             else "at any time; processes before and after the restart communicate"
         )
-        echo(f"Restart all processes {how}. {EXPORT_FIRST}", err=True)
+        echo(f"Restart all processes {how}. {deliver_first(step.root)}", err=True)
     for remark in status.remarks:
         echo(remark, err=True)
 

@@ -19,7 +19,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.fleet.enclaves import enclaves_of, robot_of, router_of, size_problem
 from sros_tool.fleet.robots import Fleet, Robot
-from sros_tool.keystore.layout import FLEET, enclave_names, has_enclave
+from sros_tool.keystore.layout import FLEET, FLEET_ROOT, enclave_names, has_enclave
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import Keystore
 from sros_tool.policy.placeholders import has_placeholder
@@ -156,6 +156,18 @@ def recorded_fleet(keystore: Keystore) -> Fleet:
 def enclaves_of_robot(root: Path, fleet: Fleet, robot: Robot) -> tuple[str, ...]:
     """Return the names of the robot's enclaves that exist in the keystore, sorted."""
     return tuple(name for name in enclaves_of(fleet, robot) if has_enclave(root, name))
+
+
+def publish_command(root: Path) -> str:
+    """Return the command that brings new files to robots that fetch; "" if nothing is published."""
+    return f"`sros fleet publish {quote(str(root))} PUB`" if (root / FLEET_ROOT).exists() else ""
+
+
+def deliver_first(root: Path) -> str:
+    """Return a sentence on how new files get to robots, before processes restart with them."""
+    published = publish_command(root)
+    before = f"Publish them first, for robots that fetch: {published}. " if published else ""
+    return f"{before}Where they run from an export, export the enclaves again first."
 
 
 class EnclaveDomains(NamedTuple):

@@ -208,6 +208,29 @@ def test_a_dry_run_writes_nothing(publisher: Home) -> None:
     assert publisher.publish().names("published") == ["r1"]
 
 
+NEXT_STEPS = (
+    ("renew", "ks", "/r1/base", "--revoke-old"),
+    ("renew", "ks", "/r1/base"),
+    ("update_keystore", "ks", "--domain", "1", "--allow-looser"),
+    ("revoke", "ks", "/r5/base"),
+    ("rotate_ca", "ks", "--next"),
+    ("rotate_ca", "ks", "--status"),
+)
+"""Changes of a keystore, one after the other."""
+
+
+def test_next_steps_name_publishing_where_the_keystore_publishes(publisher: Home) -> None:
+    exports = publisher.folder / "exports"
+    shutil.copytree(publisher.root, exports / "ks", symlinks=True)
+    (exports / "ks/fleet_root.json").unlink()
+    for words in NEXT_STEPS:
+        done = sros(*words, cwd=publisher.folder)
+        assert "`sros fleet publish ks PUB`" in done.err + done.out, (words, done)
+        other = sros(*words, cwd=exports)
+        assert done.status == other.status
+        assert "fleet publish" not in other.err + other.out and "export" in other.err + other.out
+
+
 def test_the_ledger_has_what_was_published(publisher: Home) -> None:
     entries = [each for each in Keystore(publisher.root).ledger.entries if each.what == "release"]
     lines = sorted(

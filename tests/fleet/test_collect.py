@@ -371,6 +371,16 @@ def test_what_only_robots_know_to_be_revoked_is_revoked_again(home: Home) -> Non
     assert sros("fleet", "status", "ks", "--json", cwd=home.folder).status == 1
 
 
+def test_the_verb_names_the_next_step(home: Home) -> None:
+    """Only where robots are to get new files, and nothing published them."""
+    crl, now = lose_revocations(home), datetime.now(UTC)
+    home.send("r1", now)
+    assert "bring them" not in sros("fleet", "collect", "ks", "inbox", cwd=home.folder).err
+    home.send("r1", now, crl=crl)
+    ended = sros("fleet", "collect", "ks", "inbox", cwd=home.folder)
+    assert "bring them there: `sros distribute_key ks --robot NAME FOLDER --force`" in ended.err
+
+
 def test_a_list_of_another_keystore_revokes_nothing(home: Home) -> None:
     home.run("create_keystore", "other")
     home.run("create_enclave", "other", "/r2/base")

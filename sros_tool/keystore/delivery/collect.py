@@ -52,7 +52,11 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import ForgottenLists, revoked_serials
-from sros_tool.keystore.lifecycle.revoke import restore_revocations, restored_note
+from sros_tool.keystore.lifecycle.revoke import (
+    REVOKED_AGAIN,
+    restore_revocations,
+    restored_note,
+)
 from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
@@ -144,6 +148,13 @@ class CollectedInbox(NamedTuple):
     dry_run: DryRun
     changes: FileChanges
     notes: Notes
+
+    @property
+    def has_new_files(self) -> bool:
+        """Whether robots are to get files that are new in the keystore."""
+        requests = (request for robot in self.robots for request in robot.requests)
+        renewed = any(request.outcome == "renewed" for request in requests)
+        return renewed or any(note.id == REVOKED_AGAIN for note in self.notes)
 
     @property
     def complete(self) -> bool:

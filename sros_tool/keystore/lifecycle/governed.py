@@ -10,6 +10,7 @@ from shlex import quote
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.errors import KeystoreError, Note, check_meaning
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
+from sros_tool.keystore.fleet import publish_command
 from sros_tool.keystore.issuing.authority import write_copies
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
@@ -163,6 +164,12 @@ def _restart_text(disturbed: Mismatch, *, revoked: bool) -> str:
 
 def exports_note(root: Path, names: Sequence[str]) -> Note:
     """Return a note that robots need new files, with the commands that deliver them."""
+    if published := publish_command(root):
+        text = (
+            f"Robots have the former files: publish the new ones ({published}); where nodes run "
+            "from an export, export them again."
+        )
+        return Note("keystore.export-again", text)
     shown = quote(str(root))
     text = "Robots have the former files: export the new ones (`sros distribute_key "
     text += f"{shown} NAME TARGET --force`)"

@@ -43,6 +43,8 @@ _FILES = (
 )
 _PRIVATE = "key.pem"
 _SHOWN = 5
+REVOKED_AGAIN = "fleet.revocations-restored"
+"""The kind of note of `restored_note`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,7 +202,7 @@ def restored_note(restored: Revocation, whence: str) -> Note:
     )
     if restored.outcomes:
         text += f", with {first_few(tuple(restored.outcomes), _SHOWN)}"
-    return Note("fleet.revocations-restored", f"{text}.")
+    return Note(REVOKED_AGAIN, f"{text}.")
 
 
 def refresh_crl(

@@ -19,6 +19,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.keystore.fleet import deliver_first
 from sros_tool.keystore.layout import (
     IDENTITY,
     PERMISSIONS,
@@ -266,9 +267,6 @@ def _expiry_remarks(states: Sequence[AuthorityStatus], now: datetime) -> list[st
     return remarks
 
 
-EXPORT_FIRST = "Where they run from an export, export the enclaves again first."
-
-
 def _restart_remarks(keystore: Keystore, rotation: Rotation) -> list[str]:
     """Return remarks, by vendor, on the processes to restart at the stage DISTRIBUTE or REISSUE."""
     files = [replacement.file for replacement in rotation.replacements]
@@ -276,7 +274,7 @@ def _restart_remarks(keystore: Keystore, rotation: Rotation) -> list[str]:
         return [
             "All vendors: restart the processes one by one, at any time; processes before and "
             "after the restart communicate. Continue when all have been restarted.",
-            EXPORT_FIRST,
+            deliver_first(keystore.root),
         ]
     hindrance = _fast_dds_hindrance(keystore, files)
     remarks = [
@@ -298,7 +296,7 @@ def _restart_remarks(keystore: Keystore, rotation: Rotation) -> list[str]:
             "Revocations at this stage are signed by both CAs, if the key of the old CA is "
             "available."
         )
-    return [*remarks, EXPORT_FIRST]
+    return [*remarks, deliver_first(keystore.root)]
 
 
 def crls_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
