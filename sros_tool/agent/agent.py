@@ -48,6 +48,7 @@ from sros_tool.keystore.confirmation import (
     Confirmation,
     EnclaveExpiry,
     RobotClock,
+    RunningFiles,
     make_confirmation,
     render_confirmation,
 )
@@ -90,6 +91,9 @@ class Round(NamedTuple):
     """Enclaves that were removed, because the release does not have them."""
     restart: Sequence[str]
     """Enclaves whose processes were not yet seen with the installed files."""
+    unseen: Sequence[str]
+    """Those of ``restart`` of which no process was seen, while not all processes here can be seen:
+    with ``--restarted``, these restarts are done."""
     requests: int
     """Number of signing requests in the message."""
     sent: bool
@@ -157,7 +161,9 @@ class _Round:
             self._restart(names, opened)
         seen = self._look(names)
         self._problems += [f"{problem}." for problem in seen.problems]
-        self._state = replace(self._state, due=still_due(self._state.due, seen))
+        due = still_due(self._state.due, seen)
+        unseen = tuple(name for name in due if seen.states[name] is RunningFiles.NOT_SEEN)
+        self._state = replace(self._state, due=due, unseen=unseen)
         asked = self._renewals(names)
         arrived = self._confirm(names, opened, seen, clock, asked)
         problems = tuple(dict.fromkeys(self._problems))
@@ -171,6 +177,7 @@ class _Round:
             installation.changed,
             installation.removed,
             self._state.due,
+            self._state.unseen,
             len(asked.requests),
             arrived,
             tuple(dict.fromkeys(self._problems)),

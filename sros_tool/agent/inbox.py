@@ -50,7 +50,8 @@ def send(
                 context.load_cert_chain(client_certificate.certificate, client_certificate.key)
         port = url.port or (443 if context else 80)
         with GuardedConnection(url.hostname or "", port, context) as connection:
-            connection.request("PUT", where, message, {"Content-Type": "application/pkcs7-mime"})
+            headers = {"Content-Type": "application/pkcs7-mime", "User-Agent": "sros"}
+            connection.request("PUT", where, message, headers)
             reply = connection.getresponse()
             if connection.is_cut_off:  # what came may be a part of the answer
                 raise TimeoutError(errno.ETIMEDOUT, "it takes too long")

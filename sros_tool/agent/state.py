@@ -40,8 +40,9 @@ class AgentState:
     ``accepted`` the highest number that was verified: an older release is refused.  ``sequence`` is
     that of the last message.  ``latest`` is the latest moment that has certainly passed: verified
     documents begin to be valid then.  ``due`` are the enclaves whose processes were not yet seen
-    with the installed files, since the start ``boot`` of the machine (see `boot_id`).  ``fetched``
-    and ``sent`` tell when the source and the inbox were last reached.
+    with the installed files, since the start ``boot`` of the machine (see `boot_id`); of those in
+    ``unseen``, no process was seen.  ``fetched`` and ``sent`` tell when the source and the inbox
+    were last reached.
     """
 
     release: int = 0
@@ -49,6 +50,7 @@ class AgentState:
     sequence: int = 0
     latest: datetime | None = None
     due: tuple[str, ...] = ()
+    unseen: tuple[str, ...] = ()
     boot: str = ""
     fetched: datetime | None = None
     sent: datetime | None = None
@@ -91,7 +93,8 @@ def _state_from(value: Any) -> AgentState:
         if value[moment] is not None:
             value[moment] = parse_iso(_text(value[moment]))
     value["boot"] = _text(value["boot"])
-    value["due"] = tuple(check_enclave_name(_text(name)) for name in value["due"])
+    for names in ("due", "unseen"):
+        value[names] = tuple(check_enclave_name(_text(name)) for name in value[names])
     value["problems"] = tuple(map(_text, value["problems"]))
     return AgentState(**value)
 

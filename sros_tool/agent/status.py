@@ -47,6 +47,9 @@ class AgentStatus(NamedTuple):
     """When the inbox was last reached, by the clock of the robot, in UTC; null for never."""
     restart: Sequence[str]
     """Enclaves whose processes were not yet seen with the installed files."""
+    unseen: Sequence[str]
+    """Those of ``restart`` of which no process was seen, while not all processes here can be seen:
+    `sros agent run FOLDER --once --restarted` says that they are done."""
     problems: Sequence[str]
     """What the last round could not do, and what is wrong, as sentences."""
     well: bool
@@ -76,6 +79,7 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
         state.fetched,
         state.sent,
         state.due,
+        state.unseen,
         state.problems,
         recent and whole and not state.due and not state.problems,
     )

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
-from shlex import split
+from shlex import quote, split
 from typing import TYPE_CHECKING
 
 import click
@@ -147,6 +148,7 @@ def _init(
         settings_from,
         write_settings,
     )
+    from sros_tool.agent.state import read_state, write_state
     from sros_tool.agent.status import InitializedAgent
     from sros_tool.files import parse_toml
     from sros_tool.keystore.delivery.robot import read_pin
@@ -187,6 +189,8 @@ def _init(
         make_agent_folder(folder)
         digest = pin_root(agent_folder(folder), root, now=now())
         write_settings(folder, settings)
+        # What was reached before, and was wrong, were perhaps another source and inbox.
+        write_state(folder, replace(read_state(folder), fetched=None, sent=None, problems=()))
     if as_json:
         changes = file_change(path, existed=existed)
         print_json(InitializedAgent(folder, dry_run, robot, digest or None, changes, ()))
@@ -253,12 +257,12 @@ def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool
     if once:
         with only_agent(folder):
             done = _round(folder, read_settings(folder), restarted=restarted)
-        _show(done, as_json=as_json)
+        _show(folder, done, as_json=as_json)
         return int(bool(done.problems))
     while True:
         try:
             with only_agent(folder):
-                _show(_round(folder, read_settings(folder)), as_json=as_json)
+                _show(folder, _round(folder, read_settings(folder)), as_json=as_json)
         except (SrosError, OSError) as error:
             if isinstance(error, BrokenPipeError):
                 raise
@@ -277,27 +281,37 @@ def _round(folder: Path, settings: AgentSettings, *, restarted: bool = False) ->
     return run_round(folder, settings, machine)
 
 
-def _show(done: Round, *, as_json: bool) -> None:
+def _show(folder: Path, done: Round, *, as_json: bool) -> None:
     if as_json:
         print_json(done)
         return
-    for line in _round_lines(done):
+    for line in _round_lines(folder, done):
         echo(visible_line(line))
     for problem in done.problems:
         echo(visible_line(problem), err=True)
 
 
-def _round_lines(done: Round) -> Iterator[str]:
+def _round_lines(folder: Path, done: Round) -> Iterator[str]:
     release = f"release {done.release}" if done.release else "no release"
     changes = [f"changed {counted(len(done.changed), 'enclave')}"] if done.changed else []
     changes += [f"removed {counted(len(done.removed), 'enclave')}"] if done.removed else []
     nothing = "nothing new" if done.fetched else "nothing could be fetched"
     yield f"{release}: {', '.join(changes) or nothing}"
-    if done.restart:
-        yield f"restart due: {first_few(done.restart, _MOST_SHOWN)}"
+    yield from _due_lines(folder, done.restart, done.unseen)
     if done.requests:
         yield f"asked for renewal of {counted(done.requests, 'enclave')}"
     yield "sent to home" if done.sent else "not sent to home"
+
+
+def _due_lines(folder: Path, due: Sequence[str], unseen: Sequence[str]) -> Iterator[str]:
+    if due:
+        yield f"restart due: {first_few(due, _MOST_SHOWN)}"
+    if unseen:
+        yield (
+            f"not all processes here can be seen; once those of {first_few(unseen, _MOST_SHOWN)} "
+            "were restarted, or none runs, say so: `sros agent run "
+            f"{quote(str(folder))} --once --restarted`"
+        )
 
 
 @agent.command("status")
@@ -339,8 +353,7 @@ def _status_lines(status: AgentStatus, moment: datetime) -> Iterator[str]:
     yield f"robot {status.robot}: {release}{newer}"
     yield f"fetched {_ago(status.fetched, moment)} from {status.source}"
     yield f"confirmed {_ago(status.sent, moment)} to {status.inbox}"
-    if status.restart:
-        yield f"restart due: {first_few(status.restart, _MOST_SHOWN)}"
+    yield from _due_lines(status.folder, status.restart, status.unseen)
     yield from status.problems
 
 

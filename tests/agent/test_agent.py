@@ -366,6 +366,11 @@ def test_a_restart_is_due_until_the_processes_were_seen_with_the_new_files(
     r1.release = home.revoked
     done = r1.round()
     assert done.restart == NAMES, "of /r1/c nothing is known"
+    assert done.unseen == ("/r1/c",) == read_state(r1.folder).unseen
+    said = sros("agent", "status", r1.folder).out
+    assert (
+        f"those of /r1/c were restarted, or none runs, say so: `sros agent run {r1.folder}" in said
+    )
     message = r1.message()
     assert message.restart == NAMES and message.running == {
         "/r1/a": RunningFiles.EARLIER,
@@ -381,7 +386,9 @@ def test_a_restart_is_due_until_the_processes_were_seen_with_the_new_files(
         "/r1/c": RunningFiles.NOT_SEEN,
     }
     r1.unseen = False
-    assert r1.round().restart == ("/r1/b",), "all are seen, and nothing runs in /r1/c"
+    done = r1.round()
+    assert done.restart == ("/r1/b",), "all are seen, and nothing runs in /r1/c"
+    assert not done.unseen and "--restarted" not in sros("agent", "status", r1.folder).out
     (r1.folder / ".agent/state.json").unlink()
     assert r1.round().restart == ("/r1/b",), "what is seen is known without the state"
     r1.started["/r1/b"] = later

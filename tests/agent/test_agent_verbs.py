@@ -177,6 +177,20 @@ def test_wrong_options_set_up_nothing(words: tuple[str, ...], why: str, world: W
     assert world.agent().status == 2
 
 
+def test_what_was_reached_before_is_nothing_of_another_source(world: World) -> None:
+    world.run(*INIT).ok()
+    world.agent().ok()
+    (world.folder / "pub").rename(world.folder / "moved")
+    assert world.agent().status == 1
+    assert "/pub': No such file" in world.run("agent", "status", "robot").out
+    moved = [word.replace("pub", "moved") for word in INIT]
+    world.run(*moved, "--force").ok()
+    lines = world.run("agent", "status", "robot").out.splitlines()
+    assert lines[1] == f"fetched never from {world.folder / 'moved'}" and len(lines) == 3
+    world.agent().ok()
+    assert "ago from" in world.run("agent", "status", "robot").out
+
+
 def test_a_keystore_with_its_cas_gets_no_release(world: World) -> None:
     words = [word if word != "robot" else "ks" for word in INIT]
     world.run(*words).ok()

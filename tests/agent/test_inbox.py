@@ -25,6 +25,7 @@ class Inbox(HTTPServer):
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Put)
         self.kept: dict[str, bytes] = {}
+        self.agents: set[str] = set()
         self.url = f"http://127.0.0.1:{self.server_port}/inbox/"
 
 
@@ -34,6 +35,7 @@ class Put(BaseHTTPRequestHandler):
     def do_PUT(self) -> None:
         data = self.rfile.read(int(self.headers["Content-Length"]))
         self.server.kept[self.path] = data
+        self.server.agents.add(self.headers["User-Agent"])
         self.send_response(self.server.status)
         self.send_header("Location", "/elsewhere")
         self.end_headers()
@@ -57,6 +59,7 @@ def test_a_server_gets_the_message_of_the_robot(server: Inbox) -> None:
     send(server.url, "r1", b"first")
     send(server.url.rstrip("/"), "r1", b"second")
     assert server.kept == {"/inbox/r1/confirmation.p7s": b"second"}
+    assert server.agents == {"sros"}
 
 
 @pytest.mark.parametrize("status", [301, 403, 500])
