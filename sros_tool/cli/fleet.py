@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, NamedTuple
@@ -249,7 +250,7 @@ def _collect(
 
     Example:
       $ sros fleet collect keystore inbox
-      3 robots: 2 kept, 1 refused; 1 request renewed
+      3 robots: 2 kept, 1 refused; 1 request: 1 renewed
       r3: refused: it is signed by /r4/base, an enclave of r4
       renewed /r1/base for the key 6f5bbd292e91c5d0...
       $ sros fleet collect keystore inbox --publish pub
@@ -307,29 +308,39 @@ def _collect(
 
 
 def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
-    """Yield the counts, and a line for everything that was refused, renewed or remarked."""
-    messages = Counter(robot.outcome for robot in collected.robots)
-    requests = Counter(request.outcome for robot in collected.robots for request in robot.requests)
+    """Yield the counts, and in their order what is to be said of messages and of requests."""
+    from sros_tool.keystore.delivery.collect import MESSAGE_OUTCOMES, REQUEST_OUTCOMES
+
     would = "would be " if collected.dry_run else ""
-    counts = ", ".join(f"{number} {would}{outcome}" for outcome, number in messages.items())
-    line = f"{counted(len(collected.robots), 'robot')}: {counts}"
+    requests = [(robot.robot, request) for robot in collected.robots for request in robot.requests]
+    messages = Counter(robot.outcome for robot in collected.robots)
+    asked = Counter(request.outcome for _, request in requests)
+    line = f"{counted(len(collected.robots), 'robot')}: "
+    line += _numbers(messages, MESSAGE_OUTCOMES, would)
     if requests:
-        words = (
-            f"{number} {would}{outcome.replace('_', ' ')}" for outcome, number in requests.items()
-        )
-        line += f"; {counted(requests.total(), 'request')}: {', '.join(words)}"
+        line += f"; {counted(len(requests), 'request')}: "
+        line += _numbers(asked, REQUEST_OUTCOMES, would)
     yield line
-    for robot in collected.robots:
+    by_outcome = sorted(collected.robots, key=lambda robot: MESSAGE_OUTCOMES.index(robot.outcome))
+    for robot in by_outcome:
         if robot.why:
             yield f"{robot.robot}: {robot.outcome}: {robot.why}"
         for remark in robot.remarks:
             yield f"{robot.robot}: {remark}"
-        for request in robot.requests:
-            if request.outcome == "renewed":
-                yield f"{would}renewed {request.enclave} for the key {request.key_sha256}"
-            else:
-                enclave = request.enclave or f"a request of {robot.robot}"
-                yield f"{enclave}: {request.outcome.replace('_', ' ')}: {request.why}"
+    for name, request in sorted(
+        requests, key=lambda request: REQUEST_OUTCOMES.index(request[1].outcome)
+    ):
+        if request.outcome == "renewed":
+            yield f"{would}renewed {request.enclave} for the key {request.key_sha256}"
+        else:
+            enclave = request.enclave or f"a request of {name}"
+            yield f"{enclave}: {request.outcome.replace('_', ' ')}: {request.why}"
+
+
+def _numbers(numbers: Mapping[str, int], outcomes: Sequence[str], would: str) -> str:
+    """Return how many have each outcome, in words."""
+    there = (outcome for outcome in outcomes if numbers.get(outcome))
+    return ", ".join(f"{numbers[name]} {would}{name.replace('_', ' ')}" for name in there)
 
 
 def _durations(function: Decorated) -> Decorated:
@@ -504,23 +515,24 @@ def _status(
     earlier (issued for this enclave before); another's (issued for another enclave); revoked;
     missing; or unknown (never issued by this keystore). Processes use new files only after a
     restart: those that are due are in what the Ansible collection and `sros agent` confirm, and not
-    in what `sros fleet report` does. A robot that was not heard of for too long is offline. Then
-    the known vulnerabilities of the DDS that the
-    robots reported are named, by the advisories of sros and of --advisories.
+    in what `sros fleet report` does. A robot that was not heard of for too long is offline. Robots
+    of which the same is to be said share a line. A last line counts what is known of the robots'
+    DDS by the advisories of sros; --robot and --advisories name it.
 
     Example:
       $ sros fleet status keystore
-      50 robots: 47 current, 1 earlier, 1 another's files, 1 never confirmed
-      robot  state            confirmed   what
-      r7     earlier          3 d 4 h ago earlier permissions of 2027-05-01T06:...
-      r8     another's files  2 min ago   10 files of r9
-      r31    never confirmed  -           2 enclaves
+      50 robots: 44 current, 1 earlier, 4 never confirmed, 1 another's files
+      robot                  state            confirmed  to do         what
+      r7                     earlier          3 d ago    deliver       earlier ...
+      r8                     another's files  2 min ago  find out why  10 files of r9
+      r31 to r34 (4)         never confirmed  -          deliver       2 enclaves
+      r1 to r6, r9 ... (44)  current          4 min ago
       $ sros fleet status keystore --max-age 7d
       $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
 
-    The exit status is 0 if every robot confirmed that it has what an export would
-    give it now, and no restart that is due, and 1 if not, or if a robot has a DDS with
-    known vulnerabilities that a later release of the same major version mends.
+    The exit status is 0 if every robot that is not revoked confirmed that it has what an export
+    would give it now, and no restart that is due, and 1 if not, or if a robot has a DDS with known
+    vulnerabilities that a later release of the same major version mends.
     """
     from sros_tool.checks.vulnerabilities import is_mended_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
@@ -563,7 +575,8 @@ def _status(
 
         text = render_fleet_page(as_plain(compared))
     else:
-        text = "".join(f"{visible_line(line)}\n" for line in _lines(compared, robots))
+        lines = _lines(compared, robots, findings=advisories is not None)
+        text = "".join(f"{visible_line(line)}\n" for line in lines)
     if output and not dry_run:
         echo(save(output, text.encode()), err=True)
     elif output:
@@ -580,20 +593,20 @@ _WORDS = {
     "broken": "broken in the keystore",
     "never": "never confirmed",
     "unknown": "unknown files",
-    "revoked": "revoked files",
     "another": "another's files",
 }
 """State of a file or robot → its words in the output, if they differ from the state's name."""
+_DIGITS = re.compile(r"(\d+)")
 _MOST_LINES, _MOST_GROUPS = 50, 3
 """Maximum number of listed files of a robot, and of listed groups or unrecorded enclaves."""
 
 
-def _lines(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[str]:
-    """Yield the counts, a line for every robot that is not current or was named, and findings."""
-    from sros_tool.checks.kind import WARNING
-    from sros_tool.checks.vulnerabilities import NOTES_ON_LIBRARIES
+def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) -> Iterator[str]:
+    """Yield the counts, what is to be done with which robots, and findings on their DDS.
 
-    status, moment = compared.status, compared.at
+    Without ``findings``, or named robots, the findings are only counted.
+    """
+    status = compared.status
     counts = ", ".join(f"{number} {_word(state)}" for state, number in status.counts.items())
     yield f"{counted(len(status.robots), 'robot')}: {counts}"
     if status.stage != "complete":
@@ -602,26 +615,115 @@ def _lines(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[str]:
     if status.unassigned:
         whom = "it" if status.unassigned == 1 else "them"
         yield f"{counted(status.unassigned, 'enclave')} of no robot: nothing is known of {whom}"
-    rows = [("robot", "state", "confirmed", "what")]
-    rows += [
-        (
-            robot.robot,
-            _word(robot.state),
-            _age(robot, moment),
-            "; ".join(_summary(robot, status.stage)),
-        )
-        for robot in status.robots
-        if robots or robot.state not in ("current", "none") or robot.notes or robot.problems
-    ]
-    widths = [max(len(row[column]) for row in rows) for column in range(3)]
-    for row in rows if len(rows) > 1 else ():
+    rows = list(_rows(compared, robots))
+    widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
+    for row in rows:
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=False))
-        yield "  ".join((*cells, row[3])).rstrip()
+        yield "  ".join((*cells, row[4])).rstrip()
     for robot in status.robots if robots else ():
         yield from _details(robot)
+    if robots or findings:
+        yield from _dds_findings(compared)
+    else:
+        yield from _dds_counts(compared)
+
+
+def _rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """Yield the head of a table and its rows, if something is to be said of a robot.
+
+    Unless ``robots`` are named, those of which the same is to be said share a row, and the last row
+    has those that are current.
+    """
+    status = compared.status
+    alike: dict[tuple[str, ...], list[RobotStatus]] = {}
+    current: list[RobotStatus] = []
+    for robot in status.robots:
+        if robots or robot.state not in ("current", "none") or robot.notes or robot.problems:
+            what = "; ".join(_summary(robot, status.stage))
+            row = (_word(robot.state), _to_do(robot), what, robot.robot if robots else "")
+            alike.setdefault(row, []).append(robot)
+        elif robot.state == "current":
+            current.append(robot)
+    if not alike:
+        return
+    if current and any(robot.state != "current" for group in alike.values() for robot in group):
+        alike["current", "", "", ""] = current
+    yield "robot", "state", "confirmed", "to do", "what"
+    fleet = sorted((robot.robot for robot in status.robots), key=_natural)
+    for (state, to_do, what, _), group in alike.items():
+        last = min(group, key=lambda robot: robot.received or compared.at)
+        names = _runs({robot.robot for robot in group}, fleet)
+        yield names, state, _age(last, compared.at), to_do, what
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Return the key that sorts r2 before r10."""
+    return [(int(part or 0), "") if part.isdigit() else (0, part) for part in _DIGITS.split(name)]
+
+
+def _runs(names: Collection[str], fleet: Sequence[str]) -> str:
+    """Return robots in words; ``fleet`` has all names, and tells which of them are neighbours."""
+    runs: list[list[str]] = [[]]
+    for name in fleet:
+        if name in names:
+            runs[-1].append(name)
+        elif runs[-1]:
+            runs.append([])
+    words = []
+    for run in runs:
+        words += [f"{run[0]} to {run[-1]}"] if len(run) > _MOST_GROUPS else run
+    number = f" ({len(names)})" if len(names) > _MOST_GROUPS else ""
+    return first_few(words, _MOST_GROUPS) + number
+
+
+_TO_DO = {
+    "restart": "restart",
+    "offline": "find out why",
+    "broken": "sros check",
+    "never": "deliver",
+    "unknown": "find out why",
+    "another": "find out why",
+}
+"""State of a robot → what is to be done, if the state alone tells it."""
+
+
+def _to_do(robot: RobotStatus) -> str:
+    """Return what is to be done with a robot, in few words; "" if nothing is."""
+    if robot.state == "revoked" and not robot.enclaves:
+        return "take it out"
+    if robot.state in ("current", "none"):
+        return "see what" if robot.problems else ""
+    if robot.state in _TO_DO:
+        return _TO_DO[robot.state]
+    if not robot.fetches:
+        return "deliver"
+    return "publish" if (robot.published or 0) == (robot.release or 0) else "wait: it fetches"
+
+
+def _dds_findings(compared: ComparedFleet) -> Iterator[str]:
+    """Yield the findings on the DDS of robots, but for notes that need no attention."""
+    from sros_tool.checks.kind import WARNING
+    from sros_tool.checks.vulnerabilities import NOTES_ON_LIBRARIES
+
     for finding in compared.findings:
         if finding.severity >= WARNING or finding.kind in NOTES_ON_LIBRARIES:
             yield from finding_lines(finding)
+
+
+def _dds_counts(compared: ComparedFleet) -> Iterator[str]:
+    """Yield the robots with an outdated DDS, and where the findings on the DDS of robots are."""
+    status, outdated = compared.status, compared.outdated_dds
+    if outdated:
+        fleet = sorted((robot.robot for robot in status.robots), key=_natural)
+        yield (
+            "a DDS with known vulnerabilities that a later release mends: "
+            f"{_runs(set(outdated), fleet)}; `sros fleet status {quote(str(status.keystore))} "
+            f"--robot {outdated[0]}` says which to upgrade"
+        )
+    elif list(_dds_findings(compared)):
+        severities = Counter(finding.severity.word for finding in compared.findings)
+        words = ", ".join(counted(number, word) for word, number in severities.items())
+        yield f"on the DDS of robots: {words}; see --robot NAME, or --json"
 
 
 def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:

@@ -84,6 +84,7 @@ class State(StrEnum):
     UNKNOWN = "unknown"
     """A file that the ledger does not record as issued."""
     REVOKED = "revoked"
+    """A revoked file; a robot of which all enclaves were revoked has this state, too."""
     ANOTHER = "another"
     """A file of an enclave of another robot, or of an enclave of no robot."""
 
@@ -173,8 +174,9 @@ class RobotStatus:
     robot: str
     """Name of the robot."""
     state: State
-    """The worst state of the robot's files; ``restart``: they are current, but processes still run
-    with earlier ones; ``offline``: its last confirmation is too old (`overdue`); ``never``: it sent
+    """The worst state of the robot's files; ``revoked`` also if all its enclaves were revoked
+    (``enclaves`` is 0); ``restart``: they are current, but processes still run with earlier ones;
+    ``offline``: its last confirmation is too old (`overdue`); ``never``: it sent
     no confirmation; ``none``: it has no enclave in the keystore."""
     enclaves: int
     """Number of the robot's enclaves in the keystore."""
@@ -235,6 +237,16 @@ class RobotStatus:
         return self.others.naming
 
     @property
+    def settled(self) -> bool:
+        """Whether nothing is to be done with the robot: it has what it should, or nothing to have.
+
+        All enclaves of a revoked robot are gone: the others need the revocation list.
+        """
+        if self.state is State.REVOKED:
+            return not self.enclaves
+        return self.state in (State.CURRENT, State.NONE)
+
+    @property
     def heard(self) -> datetime | None:
         """When the robot was certainly there last; None if it sent no confirmation."""
         if self.fetches and self.received and self.clock:
@@ -274,11 +286,10 @@ class FleetStatus:
     @property
     def complete(self) -> bool:
         """Whether every robot that has enclaves confirmed the present files in time, and no restart
-        that is due; if not, the exit status is 1.
+        that is due; if not, the exit status is 1. Robots of which all enclaves were revoked do not
+        count.
         """
-        return not self.overdue and all(
-            robot.state in (State.CURRENT, State.NONE) for robot in self.robots
-        )
+        return not self.overdue and all(robot.settled for robot in self.robots)
 
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
         """Return a copy in which the robots that were not heard of for too long are offline.
@@ -616,13 +627,16 @@ def _status(
     compared: _ComparedRobot, known: _Known, stages: _Stages, unrecorded: Unrecorded
 ) -> RobotStatus:
     different = tuple(known.file(compared.robot, file) for file in compared.different)
+    revoked = known.revoked(compared.robot)
     counts: dict[str, Counter[State]] = {}
     for kind, number in compared.current.items():
         counts.setdefault(kind, Counter())[State.CURRENT] = number
     for file in different:
         counts.setdefault(file.kind, Counter())[file.state] += 1
     restart = compared.restart()
-    if different:
+    if revoked and not compared.enclaves:
+        state = State.REVOKED  # whatever it says: it has nothing to have
+    elif different:
         state = max((file.state for file in different), key=_BADNESS.__getitem__)
     elif not compared.enclaves:
         state = State.NONE
@@ -638,7 +652,7 @@ def _status(
         compared.robot.name,
         state,
         len(compared.enclaves),
-        known.revoked(compared.robot),
+        revoked,
         unrecorded,
         received.time if received else None,
         confirmed.time if confirmed else None,

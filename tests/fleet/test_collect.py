@@ -210,8 +210,8 @@ def test_the_verb_says_what_it_did(home: Home) -> None:
     lines = ended.out.splitlines()
     assert ended.status == 1
     assert lines[0] == "3 robots: 2 kept, 1 refused; 1 request: 1 not due"
-    assert lines[1].startswith("/r2/base: not due: it can be renewed from ")
-    assert lines[2] == "r3: refused: it is signed by /r1/base, an enclave of r1"
+    assert lines[1] == "r3: refused: it is signed by /r1/base, an enclave of r1"
+    assert lines[2].startswith("/r2/base: not due: it can be renewed from ")
     assert "1 name in 'inbox' is that of no robot" in ended.err and "\x1b" not in ended.err
     home.send("r3", now)
     home.send("r2", now)
@@ -286,6 +286,28 @@ def test_a_certificate_that_proves_nothing(home: Home) -> None:
     assert "was revoked" in home.of("r1").why and home.kept("r1") == 1
     home.send("r1", enclave="/r1/arm")
     assert home.of("r1").outcome == "kept"
+
+
+def test_a_revoked_robot_that_is_still_in_the_fleet(home: Home) -> None:
+    """Its messages are not read, and fail no run; what it said last does not count any more."""
+    home.send("r2")
+    home.send("r3")
+    assert home.collect().complete
+    home.run("revoke", "ks", "/r2/base")
+    home.send("r2")
+    assert home.of("r2").outcome == "refused", "of its other enclave a message would be taken"
+    home.run("revoke", "ks", "/r2/arm")
+    home.send("r3", requests=None)
+    for message in (home.message("r2", NOW), b"hostile"):
+        home.put("r2", message)
+        ended = sros("fleet", "collect", "ks", "inbox", cwd=home.folder)
+        assert ended.status == 0, ended
+        assert "1 revoked" in ended.out.splitlines()[0]
+        assert "r2: revoked: all its enclaves were revoked; its message is not read" in ended.out
+    shutil.rmtree(home.inbox / "r2")
+    assert (home.of("r2").outcome, home.of("r2").why) == ("revoked", "")
+    found = json.loads(sros("fleet", "status", "ks", "--json", cwd=home.folder).out)
+    assert found["robots"][1]["state"] == "revoked" and "r2" not in found["overdue"]
 
 
 def test_a_certificate_of_the_ca_that_a_rotation_replaces(home: Home) -> None:

@@ -90,8 +90,12 @@ class Field:
         """Return what is where; the exit status says whether all of it is as it should be."""
         ended = sros("fleet", "status", "ks", "--json", cwd=self.folder)
         found: dict[str, Any] = json.loads(ended.out)
-        states = {each["state"] for each in found["robots"]}
-        assert found["complete"] == (states <= {"current", "none"})
+        good = (
+            each["state"] in ("current", "none")
+            or (each["state"], each["enclaves"]) == ("revoked", 0)
+            for each in found["robots"]
+        )
+        assert found["complete"] == all(good)
         assert ended.status == (0 if found["complete"] and not found["outdated_dds"] else 1)
         found["robots"] = {each["robot"]: each for each in found["robots"]}
         return found
@@ -142,7 +146,7 @@ def test_a_fleet_that_has_all_it_should_have(field: Field) -> None:
     )
     lines = field.run("fleet", "status", "ks", "--max-age", "1h", status=1).out.splitlines()
     assert lines[0] == "3 robots: 2 current, 1 offline"
-    assert lines[-1].startswith("r1 ")
+    assert lines[-2].startswith("r1 ") and lines[-1].startswith("r2, r3  current ")
     late = json.loads(field.run("fleet", "status", "ks", "--max-age", "1h", "--json", status=1).out)
     assert (late["overdue"], late["complete"]) == (["r1"], False)
     field.run("fleet", "status", "ks")
@@ -217,8 +221,14 @@ def test_a_robot_that_was_revoked(field: Field) -> None:
         ("certificate", "permissions", *SHARED), ("revoked", "remove")
     )
     field.deliver("r1", "r2")
+    assert field.states() == {"r1": "current", "r2": "current", "r3": "revoked"}
     (field.root / "confirmed/r3.json").unlink()
-    assert field.states() == {"r1": "current", "r2": "current", "r3": "none"}
+    assert field.states() == {"r1": "current", "r2": "current", "r3": "revoked"}
+    said = field.run("fleet", "status", "ks").out
+    assert (
+        "3 robots: 2 current, 1 revoked" in said
+        and "r3      revoked  -          take it out" in said
+    )
     revoked = {name: each["revoked"] for name, each in field.status()["robots"].items()}
     assert revoked == {"r1": [], "r2": [], "r3": ["/r3/base"]}
     assert "1 enclave revoked" in field.run("fleet", "status", "ks", "--robot", "r3").out
@@ -482,6 +492,22 @@ def test_a_kept_confirmation_that_was_damaged_counts_as_none(field: Field) -> No
     assert "is a symbolic link" in refused.err
 
 
+def test_fifty_robots_of_which_the_same_is_to_be_said_share_a_line(field: Field) -> None:
+    (field.folder / "fleet.toml").write_text("".join(f"[robots.r{n}]\n" for n in range(1, 51)))
+    field.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    field.run("renew", "ks", "--robot", "r1")
+    field.deliver("r20")
+    lines = field.run("fleet", "status", "ks", status=1).out.splitlines()
+    assert lines[0] == "50 robots: 3 current, 1 earlier, 46 never confirmed"
+    assert [re.split("  +", line)[:4] for line in lines[3:7]] == [
+        ["r1", "earlier", re.split("  +", lines[3])[2], "deliver"],
+        ["r4 to r19, r21 to r50 (46)", "never confirmed", "-", "deliver"],
+        ["r2, r3, r20", "current", re.split("  +", lines[5])[2]],
+    ]
+    found = field.status()["robots"]
+    assert len(found) == 50 and found["r50"]["state"] == "never"
+
+
 def test_the_module_on_the_robot_confirms_the_same(field: Field) -> None:
     parts = "ansible_collections/sros/fleet/plugins/module_utils/exports.py"
     spec = importlib.util.spec_from_file_location("exports", Path(__file__).parents[2] / parts)
@@ -531,7 +557,13 @@ def test_the_dds_of_a_robot(
     libraries = [library] if library else []
     field.confirm("r1", dds={"libraries": libraries, "unseen": unseen})
     ended = field.run("fleet", "status", "ks", status=1 if outdated else 0)
-    assert "3 robots: 3 current" in ended.out and text in ended.out
+    more = "a later release mends: r1; " if outdated else "on the DDS of robots: 1 "
+    assert (
+        "3 robots: 3 current" in ended.out
+        and more in ended.out
+        and len(ended.out.splitlines()) == 3
+    )
+    assert text in field.run("fleet", "status", "ks", "--robot", "r1", status=ended.status).out
     found = json.loads(field.run("fleet", "status", "ks", "--json", status=ended.status).out)
     assert (found["complete"], found["outdated_dds"]) == (True, outdated)
     assert text in " ".join(finding["text"] for finding in found["findings"])
@@ -548,7 +580,10 @@ def test_an_earlier_confirmation_does_not_name_the_dds(field: Field) -> None:
     value = json.loads(kept.read_text())
     del value["confirmation"]["dds"]
     kept.write_text(json.dumps(value))
-    ended = field.run("fleet", "status", "ks")
+    assert (
+        "on the DDS of robots: 1 note; see --robot NAME" in field.run("fleet", "status", "ks").out
+    )
+    ended = field.run("fleet", "status", "ks", "--robot", "r1")
     assert f"[{NOT_SEEN}]" in ended.out and "not reported by r1" in ended.out
 
 

@@ -24,7 +24,7 @@ from cryptography import x509
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
-from sros_tool.fleet.enclaves import robot_of
+from sros_tool.fleet.enclaves import enclaves_of, robot_of
 from sros_tool.fleet.robots import RENEWAL_ALLOWED, Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
@@ -40,7 +40,7 @@ from sros_tool.keystore.confirmation import (
 )
 from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.expiry import read_credentials
-from sros_tool.keystore.fleet import checked_fleet, recorded_fleet
+from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -68,6 +68,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.chains import chain_fault
+from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.validity import Window, elapsed, iso, parse_duration
 from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words
 from sros_tool.wording import counted, first_few
@@ -82,8 +83,9 @@ _FEW = 4
 
 # ── what is done with messages and requests ────────────────────────────────────────────────
 
-_OUTCOMES = ("renewed", "answered", "not_due", "not_allowed", "refused", "not_signed")
-_GOOD = _OUTCOMES[:3]
+REQUEST_OUTCOMES = ("renewed", "answered", "not_due", "not_allowed", "refused", "not_signed")
+_GOOD = REQUEST_OUTCOMES[:3]
+MESSAGE_OUTCOMES = ("kept", "unchanged", "missing", "revoked", "refused")
 
 
 class CollectedRequest(NamedTuple):
@@ -94,7 +96,7 @@ class CollectedRequest(NamedTuple):
     key_sha256: str
     """SHA-256 of the public key (DER) in the request, in hexadecimal; empty if it cannot be read.
     """
-    outcome: Annotated[str, Words(_OUTCOMES)]
+    outcome: Annotated[str, Words(REQUEST_OUTCOMES)]
     """``renewed``: the enclave has a new certificate; ``answered``: it had one already, which comes
     with the next release; ``not_due``: too early; ``not_allowed``: the fleet file does not allow
     it; ``refused``: it must not be signed; ``not_signed``: the CAs cannot sign now."""
@@ -107,15 +109,16 @@ class CollectedMessage(NamedTuple):
 
     robot: str
     """Name of the robot."""
-    outcome: Annotated[str, Words(("kept", "unchanged", "missing", "refused"))]
+    outcome: Annotated[str, Words(MESSAGE_OUTCOMES)]
     """``kept``: a new message, which is the robot's last confirmation now; ``unchanged``: the same
-    message as last time; ``missing``: the inbox has none; ``refused``: it proves nothing."""
+    message as last time; ``missing``: the inbox has none; ``revoked``: all enclaves of the robot
+    were revoked, so that what is in the inbox is not read; ``refused``: it proves nothing."""
     why: str
-    """Why the message was refused, as a clause; else empty."""
+    """Why the message was refused or not read, as a clause; else empty."""
     enclave: str
-    """The enclave whose key signed the message; empty if it is missing or was refused."""
+    """The enclave whose key signed the message; empty without a message that was verified."""
     sequence: int | None
-    """Sequence number of the message; null if it is missing or was refused."""
+    """Sequence number of the message; null without a message that was verified."""
     remarks: Sequence[str]
     """Remarks as clauses, such as on the robot's clock or an expired certificate."""
     requests: Sequence[CollectedRequest]
@@ -318,6 +321,11 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Tak
         ) from error
     with folder:
         for robot in fleet.robots.values():
+            if verifier.was_revoked(robot):
+                there = folder.state(robot.name) is not None
+                why = "all its enclaves were revoked; its message is not read" if there else ""
+                yield _Taken(robot, "revoked", why)
+                continue
             try:
                 file = _read_message(folder, robot.name)
                 taken = verifier.take(robot, file) if file else _Taken(robot, "missing")
@@ -453,6 +461,24 @@ class _Verifier:
         if confirmation.sequence is None:
             raise _RefusedError("it has no sequence number, as `sros agent` gives it")
         return _Verified(confirmation, enclave, signer)
+
+    def was_revoked(self, robot: Robot) -> bool:
+        """Return whether all enclaves that a robot had were revoked."""
+        return bool(
+            self._revoked
+            and not enclaves_of_robot(self._keystore.root, self._fleet, robot)
+            and self._revoked_names.intersection(enclaves_of(self._fleet, robot))
+        )
+
+    @cached_property
+    def _revoked_names(self) -> frozenset[str]:
+        """The enclaves with a certificate that was revoked, and not only replaced."""
+        entries = self._keystore.ledger_with("what", "revocation").entries
+        return frozenset(
+            entry.enclave
+            for entry in entries
+            if entry.what == "revocation" and entry.reason != SUPERSEDED
+        )
 
     def _enclave(self, robot: Robot, signer: x509.Certificate) -> str:
         """Return the robot's enclave that the keystore issued the certificate to.
