@@ -426,6 +426,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("fresh good --publish pub", before=("fleet collect fresh good",)),
         Case("fresh from_fresh", 1),
         Case("fresh from_fresh", 1, before=("renew fresh /a",)),
+        Case("fresh good", before=("revoke fresh /b",)),
         Case("unable from_crew", 2),
     ),
     "fleet publish": (
