@@ -50,14 +50,18 @@ class Window:
         """Return whether ``moment`` is within the window."""
         return self.not_before <= moment <= self.not_after
 
-    def life(self) -> timedelta:
+    def life(self, made: datetime | None = None) -> timedelta:
         """Return how long a document with this validity is valid from when it was made.
 
-        A validity begins `BACKDATE` before that; a shorter one was not made by sros, and begins
-        when the document was made.
+        ``made`` is when that was, or when its file came here.  What sros makes is valid from
+        `BACKDATE` before; other programs may do without, which only ``made`` tells.  A validity
+        that is not longer than that was not made by sros.
         """
-        length = self.not_after - self.not_before
-        return length - BACKDATE if length > BACKDATE else length
+        latest = self.not_before + BACKDATE
+        if latest >= self.not_after:
+            latest = self.not_before
+        begin = latest if made is None else min(max(made, self.not_before), latest)
+        return self.not_after - begin
 
     def within(self, outer: Window) -> Window:
         """Return the part of this window that is in ``outer``."""

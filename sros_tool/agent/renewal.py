@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,15 +21,23 @@ from sros_tool.keystore.reader import read_certificate
 from sros_tool.pki.certificates import make_request, validity_of
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.token import Secrets, open_enclave_key
-from sros_tool.validity import Window
 from sros_tool.xml import read_bytes
 
 _NEW_KEYS = "new-keys"
 
 
-def _is_due(validity: Window, now: datetime) -> bool:
-    """Return whether at most a third of the life of a certificate is left."""
-    return now >= validity.not_after - validity.life() / 3
+def _is_due(file: Path, now: datetime) -> bool:
+    """Return whether at most a third of the life of the certificate in ``file`` is left.
+
+    A file that does not change is never written again, so that its time tells how long the
+    certificate has been here.
+
+    Raises:
+        SrosError: it cannot be read.
+    """
+    validity = validity_of(read_certificate(file))
+    here_since = datetime.fromtimestamp(file.stat().st_mtime, UTC)
+    return now >= validity.not_after - validity.life(here_since) / 3
 
 
 def enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
@@ -72,8 +80,7 @@ def renewals(
     for name in names:
         place = enclave_path(folder, name)
         try:
-            validity = validity_of(read_certificate(place / CERTIFICATE_FILE))
-            if not _is_due(validity, now) or len(requests) == MOST_REQUESTS - 1:
+            if not _is_due(place / CERTIFICATE_FILE, now) or len(requests) == MOST_REQUESTS - 1:
                 continue
             if new_key and (place / KEY_FILE).exists():
                 with_new_keys.append(name)

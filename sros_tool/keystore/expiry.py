@@ -18,7 +18,7 @@ from sros_tool.keystore.template import Template
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
-from sros_tool.validity import BACKDATE, Window, iso, parse_duration
+from sros_tool.validity import Window, iso, parse_duration
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +242,4 @@ def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
 
 def _elapsed(validity: Window, now: datetime) -> float:
     """Return the elapsed fraction of a validity, without its back-dating; above 1 after expiry."""
-    begin = validity.not_before
-    if validity.not_after - begin > BACKDATE:
-        begin += BACKDATE
-    return (now - begin) / (validity.not_after - begin)
+    return 1 - (validity.not_after - now) / validity.life()

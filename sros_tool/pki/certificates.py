@@ -35,7 +35,15 @@ from sros_tool.pki.distinguished_names import (
     same_name,
     short_names,
 )
-from sros_tool.pki.keys import KEY_LABELS, PrivateKey, PublicKey, algorithm, check_key, is_weak
+from sros_tool.pki.keys import (
+    KEY_LABELS,
+    PrivateKey,
+    PublicKey,
+    algorithm,
+    check_key,
+    is_weak,
+    key_problem,
+)
 from sros_tool.pki.tolerant import TolerantName
 from sros_tool.validity import Window
 
@@ -767,12 +775,13 @@ def make_request(key: PrivateKey, subject: str | x509.Name) -> bytes:
 def load_request(data: bytes, what: str) -> SigningRequest:
     """Read a PEM request and verify its signature; ``what`` names the request in errors.
 
-    Only keys that every DDS vendor accepts are allowed: EC prime256v1 and RSA 2048.  Extensions in
+    Only keys that every DDS vendor accepts are allowed: EC prime256v1 and RSA 2048, and no RSA key
+    that is easy to break.  Extensions in
     a request are ignored: the keystore decides the content of a certificate.
 
     Raises:
-        PkiError: the request cannot be read, its signature does not verify, its key is of another
-            kind, or its subject is not exactly one common name.
+        PkiError: the request cannot be read, its signature does not verify, its key is weak or of
+            another kind, or its subject is not exactly one common name.
     """
     with reading(
         f"the request {what} cannot be read",
@@ -795,6 +804,12 @@ def load_request(data: bytes, what: str) -> SigningRequest:
             f"the request {what} is for a key of {algorithm(public)}",
             "Only EC prime256v1 and RSA 2048 are accepted by every DDS vendor.",
             "Create the key with `sros create_request`.",
+        )
+    if problem := key_problem(public):
+        raise PkiError(
+            f"the key of the request {what} is weak",
+            f"Its certificate would be no proof: {problem}.",
+            "Create another key with `sros create_request`, in another folder or on another token.",
         )
     if not isinstance(digest, _DIGESTS) or not _has_valid_signature(request):
         raise PkiError(

@@ -342,6 +342,38 @@ def is_weak(key: object) -> bool:
     return isinstance(key, ec.EllipticCurvePublicKey) and key.key_size < 256
 
 
+_SMALL_PRIMES = tuple(n for n in range(2, 168) if all(n % d for d in range(2, math.isqrt(n) + 1)))
+_FERMAT_ROUNDS = 100
+
+
+def key_problem(key: PublicKey) -> str:
+    """Return why a key that a stranger made must not be certified, as a clause, or "".
+
+    Sources: NIST SP 800-56B rev. 2, 6.2 (exponents); CA/Browser Forum, Baseline Requirements,
+    6.1.1.3 and 6.1.6 (close primes, ROCA: CVE-2017-15361).
+    """
+    if not isinstance(key, rsa.RSAPublicKey):
+        return ""
+    numbers = key.public_numbers()
+    if not (1 << 16 < numbers.e < 1 << 256 and numbers.e % 2):
+        shown = numbers.e if numbers.e < 1 << 64 else "very large"
+        return f"its public exponent, {shown}, is not an odd number from 65537 to 2^256"
+    modulus = numbers.n
+    if any(modulus % prime == 0 for prime in _SMALL_PRIMES):
+        return "its modulus has a small factor"
+    if all(
+        modulus % prime in {pow(65537, power, prime) for power in range(prime)}
+        for prime in _SMALL_PRIMES[1:]
+    ):
+        return "its modulus can be factored: a faulty chip made it (ROCA)"
+    root = math.isqrt(modulus)
+    for middle in range(root + 1, root + 1 + _FERMAT_ROUNDS):
+        square = middle * middle - modulus
+        if math.isqrt(square) ** 2 == square:
+            return "its modulus can be factored: its primes are too close"
+    return ""
+
+
 def algorithm(key: object) -> str:
     """Return the algorithm of a key as text, such as ``EC secp256r1`` or ``RSA 2048``."""
     if isinstance(key, (ec.EllipticCurvePrivateKey, ec.EllipticCurvePublicKey)):

@@ -95,8 +95,10 @@ def unit_instance(enclave: str) -> str:
     return enclave.strip("/").replace("/", "-") or "-"
 
 
-def _check_path(path: str, what: str) -> str:
+def _check_path(path: str, what: str, option: str = "") -> str:
     """Return ``path`` if all directives of a unit read it in the same way.
+
+    ``option`` is the option that names another path.
 
     Raises:
         UsageError: the path is not absolute, or has characters with a meaning in some directives.
@@ -105,10 +107,14 @@ def _check_path(path: str, what: str) -> str:
         raise UsageError(
             f"{what} {path!r} cannot be written in a unit",
             "systemd reads spaces, '%', '$', ':' and quotes in paths in several ways.",
-            "Name an absolute path of letters, digits and /._+- only, without parts that begin "
-            "with '.'.",
+            f"{f'With {option}, name' if option else 'Name'} an absolute path of letters, digits "
+            "and /._+- only, without parts that begin with '.'.",
         )
     return path
+
+
+def _check_program(path: str) -> str:
+    return _check_path(path, "the program", "--sros FILE")
 
 
 def _check_user(name: str) -> str:
@@ -201,7 +207,13 @@ def node_settings(
         for folder_below in below
     ]
     if sros:
-        verify = (_check_path(sros, "the program"), "verify", keystore, "--match", enclave)
+        verify = (
+            _check_program(sros),
+            "verify",
+            keystore,
+            "--match",
+            enclave,
+        )
         lines.append(f"ExecStartPre={' '.join(_words(verify))}")
     return "\n".join((*lines, f"ExecStart={program}")) + "\n"
 
@@ -235,7 +247,10 @@ def job_units(
     if job is Job.AGENT:
         return _agent(keystore, user=user, sros=sros, writable=writable)
     name = f"sros-{job}"
-    root, program = _check_path(keystore, "the keystore"), _check_path(sros, "the program")
+    root, program = (
+        _check_path(keystore, "the keystore"),
+        _check_program(sros),
+    )
     what, words, own = {
         Job.RENEW: (
             f"Renew the enclaves of {root} that expire within {_RENEWED_WITHIN}",
@@ -319,7 +334,7 @@ User=root
 Restart=always
 RestartSec=5
 Nice=10
-ExecStart={" ".join((_check_path(sros, "the program"), "check", "runtime", "--watch"))}
+ExecStart={" ".join((_check_program(sros), "check", "runtime", "--watch"))}
 {_lines(render_environment(variables, "systemd").splitlines())}
 {_CLOSED.replace("CapabilityBoundingSet=", rights)}
 PrivateDevices=yes
@@ -332,7 +347,10 @@ WantedBy=multi-user.target
 
 def _agent(folder: str, *, user: str, sros: str, writable: Sequence[str] = ()) -> dict[str, str]:
     """Return the service and the timer of a robot's agent (`sros agent`)."""
-    root, program = _check_path(folder, "the security folder"), _check_path(sros, "the program")
+    root, program = (
+        _check_path(folder, "the security folder"),
+        _check_program(sros),
+    )
     places = " ".join((root, *(f"-{_check_path(place, 'the inbox')}" for place in writable)))
     what = f"Keep the enclaves in {root} as home publishes them"
     # It asks the kernel whether the clock is set; without capabilities it cannot set it anyway.

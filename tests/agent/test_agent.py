@@ -490,6 +490,28 @@ def test_the_life_of_a_certificate_begins_when_it_was_made() -> None:
     made = datetime(2027, 1, 2, tzinfo=UTC)
     assert Window(made - BACKDATE, made + timedelta(hours=1)).life() == timedelta(hours=1)
     assert Window(made, made + timedelta(hours=4)).life() == timedelta(hours=4)  # another CA's
+    longer = Window(made, made + timedelta(hours=30))
+    assert longer.life() == timedelta(hours=6)
+    assert longer.life(made + timedelta(minutes=1)) == timedelta(hours=29, minutes=59)
+    for wrong in (made - timedelta(days=9), made + timedelta(days=9)):
+        assert timedelta(hours=6) <= longer.life(wrong) <= timedelta(hours=30)
+
+
+def test_how_long_a_certificate_has_been_here_tells_when_it_was_made(home: Home, r1: Robot) -> None:
+    """As of one of another CA, whose validity began when it was made."""
+    file = r1.folder / "enclaves/r1/a/cert.pem"
+    validity = validity_of(read_certificate(file))
+    third = validity.not_after - (validity.not_after - validity.not_before) / 3
+    now = third + timedelta(minutes=1)
+    os.utime(file, ((validity.not_before + BACKDATE).timestamp(),) * 2)
+    assert "/r1/a" not in asked_for(r1, now)
+    os.utime(file, (validity.not_before.timestamp(),) * 2)
+    assert "/r1/a" in asked_for(r1, now)
+
+
+def asked_for(robot: Robot, now: datetime) -> list[str]:
+    robot.round(now)
+    return [load_request(text.encode(), "it").name for text in robot.message().requests or ()]
 
 
 def test_a_new_key_waits_beside_the_present_one(r1: Robot) -> None:

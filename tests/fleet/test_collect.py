@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import rsa
 
 from sros_tool.errors import DocumentError, KeystoreError
 from sros_tool.keystore.confirmation import (
@@ -35,6 +36,7 @@ from sros_tool.keystore.delivery.collect import (
     collect,
 )
 from sros_tool.keystore.delivery.published import read_published
+from sros_tool.keystore.fleet import recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import key_on_robot
 from sros_tool.keystore.reader import Keystore, read_certificate
@@ -43,7 +45,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
 from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, load_key
-from sros_tool.validity import iso
+from sros_tool.validity import BACKDATE, iso
 from tests.support.harness import policy_text, publish, sros
 from tests.support.messages import key_of, said_by, signed_message
 
@@ -393,6 +395,15 @@ def test_what_only_robots_know_to_be_revoked_is_revoked_again(home: Home) -> Non
     assert sros("fleet", "status", "ks", "--json", cwd=home.folder).status == 1
 
 
+def test_a_weak_key_is_not_certified(home: Home) -> None:
+    for exponent, outcome in ((3, "refused"), (65537, "renewed")):
+        key = rsa.generate_private_key(exponent, 2048)
+        home.send("r1", DUE, requests=(home.request("r1", key=key),))
+        (request,) = home.of("r1", DUE).requests
+        assert request.outcome == outcome, request
+        assert ("of the request of r1 is weak" in request.why) == (outcome == "refused")
+
+
 def test_the_verb_names_the_next_step(home: Home) -> None:
     """Only where robots are to get new files, and nothing published them."""
     crl, now = lose_revocations(home), datetime.now(UTC)
@@ -568,6 +579,20 @@ def test_renewals_are_signed_in_one_change(home: Home) -> None:
     home.send("r1", DUE, requests=(home.request("r1"),))
     (request,) = home.of("r1", DUE).requests
     assert request.outcome == "not_due"
+
+
+def test_the_ledger_tells_when_a_life_began(home: Home) -> None:
+    """Also of a certificate of another CA, whose validity began when it was made."""
+    keystore = Keystore(home.root)
+    made = [*collecting._Renewals(keystore, recorded_fleet(keystore), NOW)._issued("/r1/base")]
+    for validity, when in made:
+        assert when and when == validity.not_before + BACKDATE
+    assert len(made) == 2
+    forgetful = home.root / "ledger.jsonl"
+    forgetful.write_text("")
+    keystore = Keystore(home.root)
+    made = [*collecting._Renewals(keystore, recorded_fleet(keystore), NOW)._issued("/r1/base")]
+    assert [when for _, when in made] == [None, None]
 
 
 def without_times(text: str) -> list[str]:

@@ -69,7 +69,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.chains import chain_fault
 from sros_tool.pki.crl import SUPERSEDED
-from sros_tool.validity import Window, elapsed, iso, parse_duration
+from sros_tool.validity import Window, elapsed, iso, parse_duration, parse_iso
 from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words
 from sros_tool.wording import counted, first_few
 
@@ -607,11 +607,9 @@ class _Renewals:
         if same_key and not is_there and validity_of(present).contains(self._now):
             # Also if it is due again: the robot has to fetch what was signed before.
             return "answered", "its new certificate comes with the next release"
-        lifetime = read_credentials(keystore, name).lifetime()
         # Robots ask in the last third; the rest is for clocks that are wrong.
         due = min(
-            validity.not_after - validity.life() / 2
-            for validity in (lifetime.certificate, lifetime.permissions)
+            validity.not_after - validity.life(made) / 2 for validity, made in self._issued(name)
         )
         if self._now < due:
             return "not_due", f"it can be renewed from {iso(due)}"
@@ -633,6 +631,21 @@ class _Renewals:
         for certificate in (message.certificate, present):
             self._check_grace(robot, validity_of(certificate))
         return "renewed", ""
+
+    def _issued(self, name: str) -> Iterator[tuple[Window, datetime | None]]:
+        """Yield the validity of certificate and permissions of an enclave, and when they were made.
+
+        None if the ledger does not tell it, such as of files that it has taken over.
+        """
+        credentials = read_credentials(self._keystore, name)
+        lifetime = credentials.lifetime()
+        for sha256, validity in (
+            (digest(credentials.certificate), lifetime.certificate),
+            (credentials.digest, lifetime.permissions),
+        ):
+            entries = self._keystore.ledger_with("sha256", sha256).entries
+            times = [entry.time for entry in entries if entry.sha256 == sha256]
+            yield validity, parse_iso(times[0]) if times else None
 
     def _check_grace(self, robot: Robot, validity: Window) -> None:
         """Raise `_Refused` if a certificate expired longer ago than the fleet file accepts."""
