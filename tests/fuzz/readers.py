@@ -21,7 +21,12 @@ from sros_tool.demo.scenarios import read_scenario
 from sros_tool.errors import SrosError
 from sros_tool.explain.denials import propose, read_denials
 from sros_tool.explain.log import explain_log
-from sros_tool.keystore.confirmation import keep, last_confirmation, receive
+from sros_tool.keystore.confirmation import (
+    keep,
+    last_confirmation,
+    locked_confirmations,
+    receive,
+)
 from sros_tool.keystore.delivery.robot import import_answer
 from sros_tool.keystore.describe import describe, history
 from sros_tool.keystore.fleet_status import fleet_metrics, fleet_status
@@ -255,7 +260,8 @@ def _confirmation(data: bytes, place: Place) -> None:
     """Receive what a robot says that it has, keep it, and compare it with the keystore."""
     received = receive(data, "r7", "drawn", now=NOW)
     (place.keystore / "fleet.toml").write_text('enclaves = ["/{robot}"]\n[robots.r7]\n')
-    keep(place.keystore, received)
+    with locked_confirmations(place.keystore):
+        keep(place.keystore, received)
     kept = last_confirmation(place.keystore, "r7")
     assert kept and kept.confirmation == received.confirmation
     found = fleet_status(Keystore(place.keystore)).with_overdue(NOW, timedelta(days=1))
