@@ -288,7 +288,7 @@ def test_what_is_interrupted_at_any_step_goes_on(
     robot.close("--apply")
 
 
-@pytest.mark.parametrize("function", ["write_units", "_restart"])
+@pytest.mark.parametrize("function", some(["write_units", "_restart"], 1))
 def test_applying_that_is_interrupted_goes_on_or_back(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, function: str
 ) -> None:

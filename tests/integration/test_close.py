@@ -1,0 +1,119 @@
+"""A robot that runs open on rclpy is closed on Cyclone DDS, and heard by nobody else."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sros_tool.closing import read_processes
+from sros_tool.demo.backend import CYCLONE, RCLPY
+from sros_tool.runtime.events import EventKind, read_events
+from sros_tool.runtime.netns import end_with_parent
+from tests.integration.enforcing import enforces, enforcing_backend
+from tests.support.children import apart, has_isolation, importing, wait_for
+from tests.support.harness import Ended, sros
+from tests.support.long_form import sometimes
+
+pytestmark = [
+    pytest.mark.dds,
+    pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not here"),
+]
+
+DOMAIN = 187
+SCRIPT = Path(__file__).with_name("ros_nodes") / "turning.py"
+ROLES = {"talker": "publish", "listener": "subscribe"}
+IN_EXPORT = (sys.executable, "-m", "sros_tool", "run", "robot/export")
+
+
+@contextmanager
+def running(folder: Path, *, secured: bool) -> Iterator[Mapping[str, Path]]:
+    """Start both nodes; yield the files with their events, if they are secured."""
+    children, reports = [], {}
+    for role, right in ROLES.items():
+        reports[role] = folder / f"{role}.jsonl"
+        reports[role].touch()
+        nodes = [{"name": role, "ns": "/", right: ["chatter"]}]
+        node = [sys.executable, str(SCRIPT), role, str(reports[role]), json.dumps(nodes)]
+        children.append(
+            subprocess.Popen(
+                [*(*IN_EXPORT, f"/{role}", "--"), *node] if secured else node,
+                env=importing(ROS_DOMAIN_ID=str(DOMAIN)),
+                cwd=folder,
+                stdout=(folder / f"{role}.log").open("wb"),
+                stderr=subprocess.STDOUT,
+                preexec_fn=end_with_parent,
+            )
+        )
+    try:
+        yield reports
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+
+
+def heard(report: Path) -> bool:
+    return any(event.kind is EventKind.HEARD for event in read_events(report))
+
+
+def play(folder: Path) -> dict[str, Any]:
+    """Close the robot; tell what sros said at each step."""
+    named = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_SECURITY_ENABLE": None, "RMW_IMPLEMENTATION": None}
+
+    def close(*words: str) -> Ended:
+        return sros("close", "robot", *words, env=named, cwd=folder)
+
+    said: dict[str, Any] = {}
+    with running(folder, secured=False):
+        for role in ROLES:
+            log = folder / f"{role}.log"
+            wait_for(lambda log=log: b"ready\n" in log.read_bytes(), role)  # type: ignore[misc]
+        said["open"] = close()
+        said["applied"] = close("--apply")
+        said["not yet"] = close("--proof", "--partial", "--json")
+    with running(folder, secured=True) as reports:
+        wait_for(lambda: heard(reports["listener"]), "the listener hears the talker")
+        said["closed"] = close("--proof", "--partial", "--json")
+    return said
+
+
+def proofs(ended: Ended) -> dict[str, Any]:
+    return {proof["claim"]: proof for proof in json.loads(ended.out)["proofs"]}
+
+
+@sometimes("a live robot is closed")
+def test_a_robot_is_closed(tmp_path: Path) -> None:
+    if not has_isolation():
+        pytest.skip("needs a network of its own")
+    enforcing_backend(CYCLONE)
+    if enforces(RCLPY):
+        pytest.skip("rclpy is secured itself here, and does not see nodes of Cyclone DDS")
+    said = apart(lambda: play(tmp_path))
+    known = read_processes(tmp_path / "robot/processes.json")
+    assert {(each.enclave, each.known_by) for each in known.processes} == {
+        ("/talker", "process id"),
+        ("/listener", "process id"),
+    }
+    assert said["open"].status == 0, said["open"]
+    assert "  topic /chatter: /talker -> /listener\n" in said["open"].out
+    assert said["applied"].status == 1
+    assert f"start it by:\n  cd {tmp_path} && sros run " in said["applied"].out
+
+    assert said["not yet"].status == 1
+    (first,) = proofs(said["not yet"]).values()
+    assert first["reason"] == "not in /listener, /talker"
+
+    assert said["closed"].status == 0, said["closed"]
+    processes, talk, silence = proofs(said["closed"]).values()
+    assert processes["holds"] is not False, processes
+    # On the wheels of rclpy, which enforce no security, there is no observer with an enclave.
+    assert talk["holds"] is None and "without DDS Security" in talk["reason"], talk
+    assert silence["holds"] is True and "that saw 2 nodes before" in silence["reason"], silence
