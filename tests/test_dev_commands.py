@@ -197,6 +197,59 @@ def test_without_a_fitting_wheel_the_setup_goes_on_without_rclpy(
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize(
+    ("listed", "settings"),
+    [
+        ("", {}),
+        ("global.timeout='9'\nfreeze.exclude='x'", {}),
+        (
+            "global.index-url='/a'\nglobal.find-links='\\nx\\ny'\ninstall.index-url='/b'\n"
+            ":env:.constraint='c d'",
+            {"UV_DEFAULT_INDEX": "/b", "UV_FIND_LINKS": "x,y", "UV_CONSTRAINT": "c d"},
+        ),
+        (":env:.index-url='/a'\ninstall.index-url='/b'", {"UV_DEFAULT_INDEX": "/a"}),
+        ("global.index-url='/a'\nglobal.only-binary=':all:'", None),
+        (None, None),
+    ],
+)
+def test_uv_is_told_all_that_pip_was_told_or_not_used(
+    listed: str | None, settings: dict[str, str] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(environment, "output_of", lambda *_: listed)
+    environment._uv_settings.cache_clear()
+    told = environment._uv_settings()
+    environment._uv_settings.cache_clear()
+    if settings is not None:
+        settings = {"UV_INDEX_STRATEGY": "unsafe-best-match", **settings}
+    assert told == settings
+
+
+@pytest.mark.parametrize(
+    ("refused", "ros_around", "used"),
+    [
+        ("nothing", False, ["pip uv", "uv"]),
+        ("pip uv", False, ["pip uv", "pip"]),
+        ("uv", False, ["pip uv", "uv", "pip"]),
+        ("nothing", True, ["pip"]),
+    ],
+)
+def test_pip_installs_what_uv_cannot(
+    refused: str, ros_around: bool, used: list[str], venv: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = []
+
+    def succeeds(command: list[str], **_: Any) -> bool:
+        program = "uv" if command[0] == str(venv / "bin/uv") else "pip"
+        run.append("pip uv" if environment.INSTALLER in command else program)
+        return run[-1] != refused
+
+    monkeypatch.setattr(environment, "_UV", venv / "bin/uv")
+    monkeypatch.setattr(environment, "_uv_settings", dict)
+    monkeypatch.setattr(environment, "succeeds", succeeds)
+    assert environment._install("test", Record(ros_around=ros_around), 0)
+    assert run == used
+
+
 def test_needed_packages_are_those_that_are_not_here() -> None:
     here = {"libc6"}
     needed = apt.needed("libddsc0debian", lambda name: APT_DEPENDS.get(name, ""), here.__contains__)

@@ -5,13 +5,15 @@ A record in it lists what a finished setup installed; a mark file shows an inter
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import functools
 import importlib.util
 import os
 import platform
 import shutil
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from tools import apt
@@ -43,6 +45,38 @@ GROUPS = ("package", "test", "ros", "ros-test")
 
 ROS_GROUPS = ("ros", "ros-test")
 """Groups that are left out if a sourced ROS 2 has rclpy, or if no wheel fits."""
+
+INSTALLER = "uv>=0.8,<1"
+"""What installs packages in a sixth of pip's CPU time; where it cannot, pip does."""
+
+_UV_VARIABLES = {
+    "cert": "SSL_CERT_FILE",
+    "constraint": "UV_CONSTRAINT",
+    "extra-index-url": "UV_INDEX",
+    "find-links": "UV_FIND_LINKS",
+    "index-url": "UV_DEFAULT_INDEX",
+    "no-cache-dir": "UV_NO_CACHE",
+    "trusted-host": "UV_INSECURE_HOST",
+}
+"""Settings of pip that choose where packages come from, with uv's variable for each."""
+
+_WITHOUT_EFFECT = {
+    "break-system-packages",
+    "default-timeout",
+    "disable-pip-version-check",
+    "no-input",
+    "progress-bar",
+    "retries",
+    "root-user-action",
+    "timeout",
+    "user",
+}
+"""Settings of pip that change nothing of what gets into .venv."""
+
+_PLACES = ("global", "install", ":env:")
+"""Where a setting of `pip install` can come from; the last one holds."""
+
+_UV = PYTHON.with_name("uv")
 
 _TITLES = {
     "package": "sros and its dependencies",
@@ -174,15 +208,53 @@ def _install(group: str, now: Record, lock: int) -> bool:
     if optional and (now.ros_around or not _rclpy_fits(group, now)):
         return True
     say(f"installing {_TITLES[group]}")
-    # Python compiles what is imported, which is a small part of what is installed.
-    options = ["--progress-bar=off", "--no-compile"]
-    command = [str(PYTHON), "-m", "pip", "install", *options, *_requirements(group)]
-    if succeeds(command, env=_quiet_environment(), keep_open=lock):
+    wanted, quiet = _requirements(group), _quiet_environment()
+    settings = None if now.ros_around else _uv_settings()  # uv never looks at packages outside
+    if settings is not None and _has_uv(lock):
+        command = [str(_UV), "pip", "install", "--python", str(PYTHON), *wanted]
+        if succeeds(command, env=quiet | settings, keep_open=lock):
+            return True
+    if succeeds(_pip_install(wanted), env=quiet, keep_open=lock):
         return True
     if not optional:
         raise SetupError(f"pip cannot install {_TITLES[group]}. {log_tail()}")
     say(f"{_TITLES[group]} cannot be installed (see {LOG}); continuing without it")
     return False
+
+
+def _pip_install(words: Sequence[str]) -> list[str]:
+    # Python compiles what is imported, which is a small part of what is installed.
+    options = ["--progress-bar=off", "--no-compile"]
+    return [str(PYTHON), "-m", "pip", "install", *options, *words]
+
+
+def _has_uv(lock: int) -> bool:
+    """Return whether uv is in .venv, after trying to install it, but never to build it."""
+    words = ["--only-binary=:all:", INSTALLER]
+    return _UV.exists() or succeeds(_pip_install(words), env=_quiet_environment(), keep_open=lock)
+
+
+@functools.cache
+def _uv_settings() -> dict[str, str] | None:
+    """Return variables that tell uv what the user told pip; None if uv cannot be told all."""
+    listed = output_of([PYTHON, "-m", "pip", "config", "list"], _quiet_environment())
+    if listed is None:
+        return None
+    # A setting is that of the environment, else of the command, else of all commands.
+    found: dict[str, tuple[int, str]] = {}
+    for line in listed.splitlines():
+        place, _, setting = line.partition("=")[0].rpartition(".")
+        if setting in _WITHOUT_EFFECT or place not in _PLACES:
+            continue
+        value = str(ast.literal_eval(line.partition("=")[2]))
+        found[setting] = max(found.get(setting, (-1, "")), (_PLACES.index(place), value))
+    if not found.keys() <= _UV_VARIABLES.keys():
+        return None
+    settings = {"UV_INDEX_STRATEGY": "unsafe-best-match"}  # as pip: the best of all indexes
+    for setting, (_, value) in found.items():
+        separator = "," if setting == "find-links" else " "
+        settings[_UV_VARIABLES[setting]] = separator.join(value.split())
+    return settings
 
 
 def _requirements(group: str) -> list[str]:
