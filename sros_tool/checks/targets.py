@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -35,7 +36,8 @@ class Circumstances:
     ``vendors`` are the DDS vendors of the nodes, or ``zenoh``; () if they may use any.
     ``fleet`` has the robots that placeholders in policies stand for.  ``opened`` has the
     keystores that are already open, by path.  ``advisories`` are known vulnerabilities of DDS; None
-    for those that ship with sros.
+    for those that ship with sros.  ``sample`` are the enclaves of a keystore that are checked with
+    the keystore itself; None for all.
     """
 
     now: datetime
@@ -46,6 +48,7 @@ class Circumstances:
     vendors: tuple[str, ...] = ()
     fleet: Fleet | None = None
     advisories: tuple[Advisory, ...] | None = None
+    sample: Sequence[str] | None = None
     opened: dict[Path, Keystore] = field(default_factory=dict, repr=False, compare=False)
 
     def keystore(self, root: Path) -> Keystore:
@@ -111,4 +114,5 @@ def _keystore(root: Path, at: Circumstances, only: str | None) -> list[Finding]:
         distribution=at.distribution,
         vendors=at.vendors,
         only=None if only is None else (only,),
+        sample=at.sample,
     )

@@ -466,7 +466,8 @@ def complete_robot(ctx: click.Context, _parameter: click.Parameter, incomplete: 
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.reader import Keystore
 
-    words = ctx.params.get("words") or (ctx.params.get("root") or ctx.params.get("folder"),)
+    words = ctx.params.get("words") or ctx.params.get("sources")
+    words = words or (ctx.params.get("root") or ctx.params.get("folder"),)
     given = words[0] or os.environ.get(KEYSTORE_VARIABLE)
     fleet = None
     with suppress(SrosError):

@@ -26,6 +26,7 @@ from sros_tool.cli.common import (
     now,
     print_json,
     progress,
+    robot_option,
     save,
     verb,
 )
@@ -100,7 +101,6 @@ def _complete_focus(
 @fleets_option
 @click.option(
     "--focus",
-    "words",
     multiple=True,
     metavar="NAME...",
     help="Draw only the enclaves and names that can influence this topic, service, action "
@@ -126,6 +126,7 @@ def _complete_focus(
     help="Also draw the rights that every node needs, such as /rosout.",
 )
 @click.option("--graphviz", is_flag=True, help="Lay out the SVG with Graphviz.")
+@robot_option("Read this robot of a large keystore in full, also where it equals others.")
 @force_option
 @dry_run_option
 def view(
@@ -138,11 +139,12 @@ def view(
     template: str | None,
     hosts: tuple[str, ...],
     fleet_files: tuple[Path, ...],
-    words: tuple[str, ...],
+    focus: tuple[str, ...],
     hops: int | None,
     requirements: Path | None,
     everything: bool,
     graphviz: bool,
+    robots: tuple[str, ...],
     force: bool,
     dry_run: bool,
 ) -> None:
@@ -153,6 +155,10 @@ def view(
     --json`. Two policies are compared as before and after, a policy and a keystore for drift, and a
     Zenoh configuration with what it should allow. --observed compares the rights in SOURCE with
     those that are used. --focus shows who may use a name, and who can influence those enclaves.
+
+    In a keystore with more than 1,000 enclaves, only some of equal robots are read in full; of the
+    others, only the text of their permissions is compared, which the page says. --json, --focus,
+    --requirements, --observed and comparisons read all.
 
     The page is one file that needs no network. No format contains keys or paths of this machine.
 
@@ -172,7 +178,7 @@ def view(
     from sros_tool.report.sources import Drawing, draw
 
     check_one_format()
-    if hops and not words:
+    if hops and not focus:
         raise UsageError("--hops is for --focus only", "", "Add --focus NAME.")
     moment = now()
     written = _format("json" if as_json else form, output, graphviz)
@@ -186,9 +192,11 @@ def view(
         template=template,
         hosts=hosts,
         fleets=fleets_of(fleet_files),
-        focus=words,
+        focus=focus,
         requirements=requirements,
         checked=written in _WITH_FINDINGS,
+        sampled=written != "json",
+        robots=robots,
     )
     with progress("drawing"), _without_collection():
         picture, folding = draw(drawing)

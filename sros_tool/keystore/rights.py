@@ -103,19 +103,24 @@ class RightsSource:
 
 
 def load_rights(
-    path: Path | Keystore, fleet: Fleet | None = None, *, hidden: bool = False
+    path: Path | Keystore,
+    fleet: Fleet | None = None,
+    *,
+    hidden: bool = False,
+    only: Sequence[str] | None = None,
 ) -> RightsSource:
     """Return the rights that ``path`` gives; a policy with placeholders is expanded for ``fleet``.
 
     ``path`` is a policy file, ``permissions.p7s`` or ``permissions.xml``, an enclave folder, a
     keystore, or a Zenoh configuration such as ``router.json5``.  With ``hidden``, the enclaves of a
-    keystore in folders whose names begin with a dot are included.
+    keystore in folders whose names begin with a dot are included.  ``only`` are the enclaves of a
+    keystore that are read; None for all.
 
     Raises:
         DocumentError: ``path`` is anything else, or malformed.
     """
     if isinstance(path, Keystore):
-        return _keystore_rights(path, hidden=hidden)
+        return _keystore_rights(path, hidden=hidden, only=only)
     if path.is_dir():
         if is_keystore(path):
             return _keystore_rights(Keystore(path), hidden=hidden)
@@ -307,10 +312,12 @@ def _document_rights(path: Path, kind: str, file: Path) -> RightsSource:
     )
 
 
-def _keystore_rights(keystore: Keystore, *, hidden: bool) -> RightsSource:
+def _keystore_rights(
+    keystore: Keystore, *, hidden: bool, only: Sequence[str] | None = None
+) -> RightsSource:
     root, reader = keystore.root, _Reader(keystore.files)
     rights: set[Right] = set()
-    for name in enclave_names(root, hidden=hidden):
+    for name in enclave_names(root, hidden=hidden) if only is None else only:
         file = enclave_path(root, name) / PERMISSIONS_FILE
         try:
             found, scope = reader.permissions(file, name)

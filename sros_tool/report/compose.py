@@ -42,6 +42,7 @@ from sros_tool.report.picture import (
     Requirements,
     SourceTitle,
     Statement,
+    UnreadUnits,
     Validity,
     WireLevel,
 )
@@ -65,7 +66,7 @@ class PictureSource:
     of nodes; ``enclaves`` has the enclaves with data of their certificates; ``scope`` has the paths
     of the enclaves that the source describes, None for all.  ``protections`` are the protection
     levels that a policy states, and ``policy`` is that policy.  ``keystore`` is the keystore from
-    which the source was read.
+    which the source was read; ``unread`` are its units that were only compared with others.
     """
 
     origin: SourceTitle
@@ -79,6 +80,7 @@ class PictureSource:
     protections: tuple[StatedProtection, ...] = ()
     policy: Policy | None = None
     keystore: Keystore | None = None
+    unread: tuple[UnreadUnits, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,6 +228,7 @@ def _picture(
             sorted({validity for source in sources for validity in source.validities})
         ),
         findings=tuple(dict.fromkeys(finding for source in sources for finding in source.findings)),
+        unread=tuple(units for source in sources for units in source.unread),
     )
 
 

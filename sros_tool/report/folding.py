@@ -111,7 +111,7 @@ class Folding(NamedTuple):
         return replace(frame, title=whole if len(whole) <= _TITLE_LETTERS else short)
 
 
-class _Unit(NamedTuple):
+class DrawnUnit(NamedTuple):
     """A robot, a namespace or an enclave that can be equal to others of its ``family``.
 
     ``values`` are the words by which names name it: its name, and its namespace if that differs.
@@ -130,7 +130,7 @@ class _Unit(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Text:
+class UnitText:
     """A text, split where it has the name of a unit.
 
     A unit is stored as its number, and the number of the word in its ``values``.
@@ -155,7 +155,7 @@ class _Text:
         first, *rest = self.parts
         return first + "".join(value + part for value, part in zip(named, rest, strict=True))
 
-    def only(self, unit: int | None, word: Callable[[int, int], str]) -> _Text:
+    def only(self, unit: int | None, word: Callable[[int, int], str]) -> UnitText:
         """Return the text in which units other than ``unit`` are plain text."""
         parts, named = [self.parts[0]], []
         for named_unit, part in zip(self.named, self.parts[1:], strict=True):
@@ -164,53 +164,97 @@ class _Text:
                 parts.append(part)
             else:
                 parts[-1] += word(*named_unit) + part
-        return _Text(tuple(parts), tuple(named))
+        return UnitText(tuple(parts), tuple(named))
+
+
+class UnitNames:
+    """The names of units in texts, and the unit of each enclave.
+
+    ``of`` maps enclaves to the numbers of their units.  An enclave belongs to the unit whose name
+    is in its path, even if it is outside of the unit's namespace; it belongs to none if its path
+    has the names of several units.  A unit can be folded only if the path of each of its enclaves
+    has the unit's name.
+    """
+
+    def __init__(self, units: Sequence[DrawnUnit], paths: Iterable[str]) -> None:
+        """Find the words that stand for units, in the paths of all enclaves."""
+        number = Counter(value for unit in units for value in unit.values)
+        dropped: set[int] = set()
+        while True:
+            self.words = {
+                value: (n, position)
+                for n, unit in enumerate(units)
+                for position, value in enumerate(unit.values)
+                if number[value] == 1 and n not in dropped
+            }
+            self._texts: dict[str, UnitText] = {}
+            self.of: dict[str, int] = {
+                path: n
+                for n, unit in enumerate(units)
+                if n not in dropped
+                for path in unit.enclaves
+            }
+            unnamed = {n for path, n in self.of.items() if n not in self.text(path).units}
+            if not unnamed:
+                break
+            dropped |= unnamed
+        for path in paths:
+            if path not in self.of:
+                named_units = set(self.text(path).units)
+                if len(named_units) == 1:
+                    self.of[path] = named_units.pop()
+
+    def text(self, text: str) -> UnitText:
+        """Return a text split at the units that it names, as words or between underscores."""
+        split = self._texts.get(text)
+        if split is None:
+            split = self._texts[text] = self._read(text)
+        return split
+
+    def _read(self, text: str) -> UnitText:
+        parts, named = [""], []
+        end = 0
+        for match in _WORD.finditer(text):
+            parts[-1] += text[end : match.start()]
+            end = match.end()
+            pieces = match[0].split("_")
+            at = 0
+            while at < len(pieces):
+                parts[-1] += "_" if at else ""
+                value, size = self._longest(pieces, at)
+                if value:
+                    named.append(value)
+                    parts.append("")
+                else:
+                    parts[-1] += pieces[at]
+                at += size
+        parts[-1] += text[end:]
+        return UnitText(tuple(parts), tuple(named))
+
+    def _longest(self, pieces: Sequence[str], at: int) -> tuple[tuple[int, int] | None, int]:
+        """Return the unit with the longest name that begins at piece ``at``, and the name's length.
+
+        The unit is its number and the number of the word in its ``values``, or None; the length is
+        a number of pieces.
+        """
+        for size in range(min(len(pieces) - at, _MOST_PIECES), 0, -1):
+            unit = self.words.get("_".join(pieces[at : at + size]))
+            if unit:
+                return unit, size
+        return None, 1
 
 
 class _Draft:
     """The builder of a folding: first units, then classes of equal units, then the picture."""
 
     def __init__(self, picture: Picture, robots: Mapping[str, Robot]) -> None:
+        paths = [enclave.path for enclave in picture.enclaves]
         self._picture = picture
-        self._units = list(_robots(picture, robots) if robots else _guessed(picture))
+        self._units = units_of(paths, robots)
         self._names_of = {(name.kind, name.name): name for name in picture.names}
-        self._find_words()
-
-    def _find_words(self) -> None:
-        """Find where the names of units stand in texts, and the unit of each enclave.
-
-        A unit is a robot, or one of several namespaces that look alike; equal units can be folded:
-        they are drawn as one.
-
-        An enclave belongs to the unit whose name is in its path, even if it is outside of the
-        unit's namespace; it belongs to none if its path has the names of several units.  A unit can
-        be folded only if the path of each of its enclaves has the unit's name.
-        """
-        number = Counter(value for unit in self._units for value in unit.values)
-        dropped: set[int] = set()
-        while True:
-            self._words = {
-                value: (n, position)
-                for n, unit in enumerate(self._units)
-                for position, value in enumerate(unit.values)
-                if number[value] == 1 and n not in dropped
-            }
-            self._texts: dict[str, _Text] = {}
-            self._of: dict[str, int] = {
-                path: n
-                for n, unit in enumerate(self._units)
-                if n not in dropped
-                for path in unit.enclaves
-            }
-            unnamed = {n for path, n in self._of.items() if n not in self._text(path).units}
-            if not unnamed:
-                break
-            dropped |= unnamed
-        for enclave in self._picture.enclaves:
-            if enclave.path not in self._of:
-                named_units = set(self._text(enclave.path).units)
-                if len(named_units) == 1:
-                    self._of[enclave.path] = named_units.pop()
+        names = UnitNames(self._units, paths)
+        self._of, self._text = names.of, names.text
+        self._unread = {units.like: units.members for units in picture.unread}
 
     def folding(self) -> Folding:
         """Return the folding; its picture is unchanged if nothing can be folded."""
@@ -236,49 +280,10 @@ class _Draft:
 
     # ── what is seen of each unit ──────────────────────────────────────────────────────────
 
-    def _text(self, text: str) -> _Text:
-        split = self._texts.get(text)
-        if split is None:
-            split = self._texts[text] = self._read(text)
-        return split
-
-    def _read(self, text: str) -> _Text:
-        """Return a text split at the units that it names, as words or between underscores."""
-        parts, named = [""], []
-        end = 0
-        for match in _WORD.finditer(text):
-            parts[-1] += text[end : match.start()]
-            end = match.end()
-            pieces = match[0].split("_")
-            at = 0
-            while at < len(pieces):
-                parts[-1] += "_" if at else ""
-                value, size = self._longest(pieces, at)
-                if value:
-                    named.append(value)
-                    parts.append("")
-                else:
-                    parts[-1] += pieces[at]
-                at += size
-        parts[-1] += text[end:]
-        return _Text(tuple(parts), tuple(named))
-
-    def _longest(self, pieces: Sequence[str], at: int) -> tuple[tuple[int, int] | None, int]:
-        """Return the unit with the longest name that begins at piece ``at``, and the name's length.
-
-        The unit is its number and the number of the word in its ``values``, or None; the length is
-        a number of pieces.
-        """
-        for size in range(min(len(pieces) - at, _MOST_PIECES), 0, -1):
-            unit = self._words.get("_".join(pieces[at : at + size]))
-            if unit:
-                return unit, size
-        return None, 1
-
     def _word(self, unit: int, position: int) -> str:
         return self._units[unit].values[position]
 
-    def _owner(self, enclave: str) -> _Text:
+    def _owner(self, enclave: str) -> UnitText:
         """Return the path of an enclave, split only at the name of the enclave's own unit."""
         return self._text(enclave).only(self._of.get(enclave), self._word)
 
@@ -358,12 +363,13 @@ class _Draft:
         }
 
     def _by_name(self, unit: int) -> tuple[object, ...]:
-        """Return a sort key by which r2 comes before r10."""
-        parts = re.split(r"(\d+)", self._units[unit].name)
-        return tuple(
-            (len(part.lstrip("0")), part) if number % 2 else part
-            for number, part in enumerate(parts)
-        )
+        return name_order(self._units[unit].name)
+
+    def _members(self, units: Iterable[int]) -> tuple[str, ...]:
+        """Return the names of equal units, also of those that were not read in full."""
+        names = [self._units[unit].name for unit in units]
+        unread = (self._unread.get(name, ()) for name in names)
+        return tuple(sorted([*names, *chain.from_iterable(unread)], key=name_order))
 
     def _views(self) -> list[Counter[object]]:
         """Return the drawing of each unit, with equal names for other units of its family."""
@@ -409,7 +415,7 @@ class _Draft:
             EqualUnits(
                 self._label(members[0]),
                 self._units[members[0]].what,
-                tuple(self._units[n].name for n in members),
+                self._members(members),
             )
             for members in self._classes.values()
         )
@@ -442,7 +448,7 @@ class _Draft:
             self._enclaves[path] = tuple(self._each(text, self._inside[unit]))
         return path
 
-    def _each(self, text: _Text, colour: int) -> Iterator[str]:
+    def _each(self, text: UnitText, colour: int) -> Iterator[str]:
         """Yield the text once for each unit of a class, with that unit's name."""
         for unit in self._classes[colour]:
             yield text.fill(partial(self._instead, unit))
@@ -509,18 +515,18 @@ class _Draft:
 
         return several
 
-    def _named(self, kind: str, name: _Text) -> Iterable[str]:
+    def _named(self, kind: str, name: UnitText) -> Iterable[str]:
         """Yield the real names that a drawn name with labels stands for."""
-        if len(name.named) == 1:
+        if len(name.named) == 1 and name.units[0] in self._inside:
             return self._each(name, self._inside[name.units[0]])
         if self._alike is None:
             self._alike = defaultdict(list)
             for real in self._picture.names:
-                if len((text := self._text(real.name)).named) > 1:
+                if (text := self._text(real.name)).named:
                     self._alike[real.kind, self._form(text)].append(real.name)
         return self._alike[kind, self._form(name)]
 
-    def _form(self, text: _Text) -> object:
+    def _form(self, text: UnitText) -> object:
         return text.form, tuple(self._symbols[unit] for unit in text.units)
 
     def _folded_names(self, edges: Sequence[Edge]) -> Iterator[Name]:
@@ -538,7 +544,8 @@ class _Draft:
             elif self._is_drawn(unit):
                 note = "differs" if enclave.path in differing else ""
                 if unit in self._inside and self._units[unit].alone:
-                    note = f"{len(self._classes[self._inside[unit]])} equal enclaves"
+                    equal = self._members(self._classes[self._inside[unit]])
+                    note = f"{len(equal)} equal enclaves"
                 path, group = self._path(enclave.path), self._text(enclave.group).fill(self._label)
                 yield replace(enclave, path=path, group=group, note=note)
 
@@ -636,23 +643,36 @@ def _as_it_is(picture: Picture) -> Folding:
 # ── units ──────────────────────────────────────────────────────────────────────────────────
 
 
-def _robots(picture: Picture, robots: Mapping[str, Robot]) -> Iterator[_Unit]:
-    """Yield the robots of a fleet, with their enclaves in the picture."""
+def units_of(paths: Sequence[str], robots: Mapping[str, Robot]) -> list[DrawnUnit]:
+    """Return the units of enclaves: their ``robots``, else what looks alike by its paths."""
+    return list(_robots(paths, robots) if robots else _guessed(paths))
+
+
+def name_order(name: str) -> tuple[object, ...]:
+    """Return the sort key of a unit's name by which r2 comes before r10."""
+    parts = re.split(r"(\d+)", name)
+    return tuple(
+        (len(part.lstrip("0")), part) if number % 2 else part for number, part in enumerate(parts)
+    )
+
+
+def _robots(paths: Iterable[str], robots: Mapping[str, Robot]) -> Iterator[DrawnUnit]:
+    """Yield the robots of a fleet, with those of their enclaves that are in ``paths``."""
     enclaves: dict[str, list[str]] = defaultdict(list)
     named = {}
-    for enclave in picture.enclaves:
-        if robot := robots.get(enclave.path):
+    for path in paths:
+        if robot := robots.get(path):
             named[robot.name] = robot
-            enclaves[robot.name].append(enclave.path)
+            enclaves[robot.name].append(path)
     for name, robot in named.items():
         space = robot.namespace.rpartition("/")[2]
         values = (name, space) if space not in ("", name) else (name,)
-        yield _Unit(name, "robot", 0, tuple(enclaves[name]), values)
+        yield DrawnUnit(name, "robot", 0, tuple(enclaves[name]), values)
 
 
-def _guessed(picture: Picture) -> Iterator[_Unit]:
+def _guessed(paths: Iterable[str]) -> Iterator[DrawnUnit]:
     """Yield sibling namespaces or enclaves that contain nearly the same enclaves."""
-    waiting = [_by_first((enclave.path[1:], enclave.path) for enclave in picture.enclaves)]
+    waiting = [_by_first((path[1:], path) for path in paths)]
     family = 0
     while waiting:
         children = waiting.pop()
@@ -666,7 +686,7 @@ def _guessed(picture: Picture) -> Iterator[_Unit]:
             for name, below in sorted(children.items()):
                 if 2 * len(usual & below.keys()) >= max(len(usual), len(below)):
                     what = _ENCLAVE if below.keys() == {""} else "namespace"
-                    yield _Unit(name, what, family, tuple(sorted(below.values())), (name,))
+                    yield DrawnUnit(name, what, family, tuple(sorted(below.values())), (name,))
                     del children[name]
         waiting += [
             _by_first((rest, path) for rest, path in below.items() if rest)

@@ -48,6 +48,8 @@ def render_page(
     script, style = _asset("view.js"), _asset("view.css")
     origins = ", ".join(f"{origin.kind} {origin.title}" for origin in picture.origins)
     made = f"{origins}. Findings are as of {iso(now)[:10]}."
+    if unread := sum(units.enclaves for units in picture.unread):
+        made += f" {unread} enclaves were only compared: they have no findings and expiry here."
     return _document(
         f"{picture.title}: who may do what",
         Template(_asset("view.html")).substitute(title=escape(picture.title), made=escape(made)),

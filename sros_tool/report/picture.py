@@ -7,7 +7,7 @@ sources always give the same picture.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Annotated, NamedTuple
@@ -404,6 +404,19 @@ class EqualUnits(NamedTuple):
         return f"{first} … {last}: {len(self.members)} equal {self.what}s"
 
 
+class UnreadUnits(NamedTuple):
+    """Units of a large keystore of which only the text of their permissions was compared.
+
+    It is that of the unit ``like``, but for their names.  ``enclaves`` is the number of enclaves
+    of the ``members``.
+    """
+
+    what: str
+    members: tuple[str, ...]
+    enclaves: int
+    like: str
+
+
 class DifferentUnit(NamedTuple):
     """A unit that differs slightly from several equal units, whose label is ``usual``.
 
@@ -429,11 +442,16 @@ class DifferentUnit(NamedTuple):
         return f"{self.unit.strip('{}')} differs from {usual}: {', and '.join(parts)}"
 
 
+@shows(
+    *("title", "origins", "enclaves", "names", "edges", "overlay", "differences", "validities"),
+    *("findings", "focus", "requirements", "equal", "different"),
+)
 @dataclass(frozen=True, slots=True)
 class Picture:
     """The rights in a system, with protection, validity and findings.
 
-    With a ``focus``, the picture has only the names and enclaves that lead to it or from it.
+    With a ``focus``, the picture has only the names and enclaves that lead to it or from it.  It
+    lacks the enclaves of the units in ``unread``.
     """
 
     title: str
@@ -462,6 +480,7 @@ class Picture:
     """Robots, namespaces or enclaves that are equal except for their names, drawn as one."""
     different: tuple[DifferentUnit, ...] = ()
     """Units that differ slightly from equal ones."""
+    unread: tuple[UnreadUnits, ...] = ()
 
     @property
     def headlines(self) -> tuple[str, ...]:
@@ -471,7 +490,22 @@ class Picture:
         more = len(self.different) - _SAID
         different = [unit.sentence() for unit in self.different[:_SAID]]
         different += [f"{more} more differ"] if more > 0 else []
-        return (*(focus.sentence for focus in self.focus), *requirements, *equal, *different)
+        focus = (focus.sentence for focus in self.focus)
+        return (*focus, *requirements, *equal, *different, *self._unread_sentences())
+
+    def _unread_sentences(self) -> Iterator[str]:
+        if not self.unread:
+            return
+        members = [member for units in self.unread for member in units.members]
+        number, enclaves = len(members), sum(units.enclaves for units in self.unread)
+        likes = first_few([units.like for units in self.unread], _SHOWN)
+        yield (
+            f"{counted(number, self.unread[0].what)} with {counted(enclaves, 'enclave')} "
+            f"({first_few(members, _SAID)}) were only compared: the text of their permissions is "
+            f"that of {likes} but for their names. Their signatures, certificates, expiry and "
+            "findings, and rights of others to their names, are not here: --robot NAME reads one, "
+            "`sros check` checks all"
+        )
 
 
 @dataclass(frozen=True, slots=True, order=True)

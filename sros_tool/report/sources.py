@@ -57,7 +57,7 @@ from sros_tool.report.compose import (
     with_requirements,
 )
 from sros_tool.report.focus import focused
-from sros_tool.report.folding import Folding
+from sros_tool.report.folding import Folding, name_order, units_of
 from sros_tool.report.formats import render_mermaid
 from sros_tool.report.layout import scenes_of
 from sros_tool.report.picture import (
@@ -70,9 +70,11 @@ from sros_tool.report.picture import (
     SourceTitle,
     Validity,
 )
+from sros_tool.report.sampling import SampledKeystore, sample_of
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso
 from sros_tool.values import parse_json
+from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 
 if TYPE_CHECKING:
@@ -92,7 +94,8 @@ class Drawing:
     ``fleets`` has, for each source, the fleet whose robots fill in the placeholders; ``focus`` are
     names or paths of enclaves.  With ``checked``, the picture has the findings of ``sros check``;
     with a file of ``requirements``, also the rights that break a requirement.  Dates in permissions
-    are read in the time zone ``zone``.
+    are read in the time zone ``zone``.  With ``sampled``, of equal robots, namespaces or enclaves
+    in a large keystore only some are read in full, above all those named in ``robots``.
     """
 
     sources: Sequence[Path]
@@ -105,6 +108,8 @@ class Drawing:
     focus: Sequence[str] = ()
     requirements: Path | None = None
     checked: bool = False
+    sampled: bool = False
+    robots: Sequence[str] = ()
 
 
 def draw(drawing: Drawing) -> tuple[Picture, Folding]:
@@ -184,13 +189,16 @@ def _read(path: Path, fleet: Fleet | None, drawing: Drawing) -> PictureSource:
 
     A source that ``sros check`` cannot read has no findings.
     """
-    source = read_source(path, now=drawing.now, fleet=fleet)
+    sample = _sample(path, drawing)
+    source = read_source(path, now=drawing.now, fleet=fleet, sample=sample)
     if not drawing.checked:
         return source
     from sros_tool.checks.policies import policy_file_findings
     from sros_tool.checks.targets import Circumstances, path_findings
 
-    at = Circumstances(drawing.now, drawing.zone, fleet=fleet)
+    at = Circumstances(
+        drawing.now, drawing.zone, fleet=fleet, sample=sample.enclaves if sample else None
+    )
     if source.keystore:
         at.opened[path] = source.keystore
     try:
@@ -203,6 +211,33 @@ def _read(path: Path, fleet: Fleet | None, drawing: Drawing) -> PictureSource:
         findings = []
     pictured = [_pictured(finding, {finding.subject}) for finding in findings]
     return _with_findings(source, path, pictured)
+
+
+def _sample(path: Path, drawing: Drawing) -> SampledKeystore | None:
+    """Return the enclaves of a keystore to read in full; None for another source.
+
+    Raises:
+        UsageError: ``drawing`` wants a robot that is not there.
+    """
+    if not (path.is_dir() and is_keystore(path)):
+        if drawing.robots:
+            raise UsageError("--robot is for a keystore only", "", "Leave it out.")
+        return None
+    keystore = Keystore(path)
+    fleet = load_fleet(keystore)
+    robots = _robots_of(fleet, keystore.names) if fleet else {}
+    known = {unit.name for unit in units_of(keystore.names, robots)}
+    for name in drawing.robots:
+        if name not in known:
+            raise UsageError(
+                f"'{path}' has no enclaves of a robot {name!r}",
+                "",
+                f"It has {first_few(sorted(known, key=name_order), 5)}." if known else "",
+            )
+    whole = not drawing.sampled or drawing.focus or drawing.requirements or drawing.observed
+    if whole or len(drawing.sources) > 1:
+        return SampledKeystore(keystore, keystore.names)
+    return sample_of(keystore, robots, drawing.robots)
 
 
 def drawn_difference(
@@ -292,8 +327,11 @@ def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str,
         fleet = fleet.with_enclaves(FleetPolicy(written, fleet).patterns)
     if fleet is None:
         return {}
-    names = {right.enclave for right in source.rights}
-    return {name: robot for name in names if (robot := robot_of(fleet, name))}
+    return _robots_of(fleet, {right.enclave for right in source.rights})
+
+
+def _robots_of(fleet: Fleet, enclaves: Iterable[str]) -> dict[str, Robot]:
+    return {name: robot for name in enclaves if (robot := robot_of(fleet, name))}
 
 
 def _with_requirements(
@@ -361,11 +399,14 @@ def _finding_text(finding: Finding, about: str = "") -> str:
 # ── one source ─────────────────────────────────────────────────────────────────────────────
 
 
-def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> PictureSource:
+def read_source(
+    path: Path, *, now: datetime, fleet: Fleet | None = None, sample: SampledKeystore | None = None
+) -> PictureSource:
     """Read a policy, permissions, an enclave, a keystore or an observation at ``path``.
 
     An observation is a learned policy, or the output of ``sros generate_policy --json``.  Faults of
-    a keystore become findings.  ``fleet`` has the robots that fill in placeholders of a policy.
+    a keystore become findings.  ``fleet`` has the robots that fill in placeholders of a policy,
+    ``sample`` the enclaves of a keystore that are read; None for all.
 
     Raises:
         DocumentError: ``path`` is none of these.
@@ -373,17 +414,26 @@ def read_source(path: Path, *, now: datetime, fleet: Fleet | None = None) -> Pic
     data = read_bytes(path, "file") if path.is_file() else b""
     if data.lstrip()[:1] == b"{" and not is_zenoh(data, path):
         return _observation(path)
-    opened = Keystore(path) if path.is_dir() and is_keystore(path) else None
-    read = load_rights(opened or path, fleet)
+    if sample is None and path.is_dir() and is_keystore(path):
+        keystore = Keystore(path)
+        sample = SampledKeystore(keystore, keystore.names)
+    if sample:
+        read = load_rights(sample.keystore, only=sample.enclaves)
+        read = replace(read, rights=sample.rights(read.rights))
+    else:
+        read = load_rights(path, fleet)
     findings = tuple(PicturedFinding(note.id, "warning", note.text) for note in read.notes)
     source = PictureSource(
-        SourceTitle(_base_name(path), read.kind), read.rights, findings=findings, scope=read.scope
+        SourceTitle(_base_name(path), read.kind),
+        read.rights,
+        findings=findings,
+        scope=read.scope,
     )
     if read.policy:
         nodes, stated = _nodes(read.policy), read.protections or ()
         source = replace(source, nodes=nodes, protections=stated, policy=read.policy)
-    elif opened:
-        source = _with_keystore(source, opened, now)
+    elif sample:
+        source = _with_keystore(source, sample, now)
     elif read.kind == "enclave":
         source = _with_enclave(source, path, now)
     places = _places(path)
@@ -474,7 +524,8 @@ def _observation(path: Path) -> PictureSource:
 # ── keystores ──────────────────────────────────────────────────────────────────────────────
 
 
-def _with_keystore(source: PictureSource, keystore: Keystore, now: datetime) -> PictureSource:
+def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime) -> PictureSource:
+    keystore = sample.keystore
     findings = list(source.findings)
     governance = None
     try:
@@ -482,7 +533,7 @@ def _with_keystore(source: PictureSource, keystore: Keystore, now: datetime) -> 
     except SrosError as error:
         findings.append(PicturedFinding("view.no-governance", "error", str(error)))
     enclaves, validities = [], set()
-    for name in keystore.names:
+    for name in sample.enclaves:
         opened = keystore.enclave(name, now=now)
         evaluation = evaluated(name, keystore.folder(name), opened, at=now)
         enclaves.append(_described(name, evaluation.state, evaluation.problems))
@@ -494,6 +545,7 @@ def _with_keystore(source: PictureSource, keystore: Keystore, now: datetime) -> 
     return replace(
         source,
         keystore=keystore,
+        unread=sample.unread,
         enclaves=tuple(enclaves),
         governance=governance,
         validities=tuple(sorted(validities)),

@@ -341,8 +341,10 @@ def _mounted(key: str) -> str:
     In such a secret, files are links into ..data, which is a link to a folder next to it.
     """
     path = Path(key)
+    if not path.is_symlink():
+        return key
     data = path.with_name("..data")
-    if not (path.is_symlink() and data.is_symlink()):
+    if not data.is_symlink():
         return key
     inside = data.readlink()
     mounted = path.readlink() == Path("..data", path.name) and len(inside.parts) == 1

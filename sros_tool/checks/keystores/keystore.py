@@ -87,6 +87,7 @@ def keystore_findings(
     domain: int | None = None,
     policies: tuple[Policy, ...] = (),
     only: Sequence[str] | None = None,
+    sample: Sequence[str] | None = None,
     on_robot: bool = False,
     distribution: str = "",
     vendors: Sequence[str] = (),
@@ -100,6 +101,7 @@ def keystore_findings(
         domain: the ROS domain that its enclaves have to join.
         policies: policies with which its permissions are compared.
         only: the enclaves to check; None for all of them and the keystore itself.
+        sample: without ``only``, the enclaves to check with the keystore itself; None for all.
         on_robot: whether the keystore is on a robot, where it must not have a CA key.
         distribution: the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
         vendors: the DDS vendors of its nodes, or ``zenoh``; () if they may use any.
@@ -117,7 +119,8 @@ def keystore_findings(
         on_robot=on_robot,
         distribution=distribution,
     )
-    names = keystore.names if only is None else tuple(only)
+    checked = sample if only is None else only
+    names = keystore.names if checked is None else tuple(checked)
     wanted = wanted_rights(keystore)
     asked = asked_vendors(vendors)
     stated = {} if vendors else _stated(keystore, names)

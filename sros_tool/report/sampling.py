@@ -1,0 +1,167 @@
+"""Choose the enclaves of a large keystore that a picture reads in full.
+
+Reading an enclave as vendors do takes milliseconds, and equal units (robots, or namespaces and
+enclaves that look alike) are drawn as one anyway.  So of units whose signed permissions have the
+same text but for their names, only the first and the last are read; of the others, that text is
+compared, and nothing else of them is in the picture.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from sros_tool.errors import SrosError
+from sros_tool.fleet.robots import Robot
+from sros_tool.keystore.layout import PERMISSIONS_FILE
+from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.rights import load_rights
+from sros_tool.policy.rights import Right
+from sros_tool.report.folding import DrawnUnit, UnitNames, name_order, units_of
+from sros_tool.report.picture import UnreadUnits
+from sros_tool.xml import read_bytes
+
+_LARGE = 1000
+"""Number of enclaves up to which a picture reads all of them."""
+_BOUNDARY = re.compile(rb'(?i)multipart/signed[^\r\n]*boundary="([^"\r\n]+)"')
+_VALIDITY = re.compile(r"<not_(before|after)>[^<]*</not_\1>")
+_MARKS = "\x01\x02"
+"""Characters that stand for the name of a unit and its namespace; XML cannot have them."""
+
+
+class SampledKeystore(NamedTuple):
+    """The enclaves of a keystore to read in full, and the units of all others."""
+
+    keystore: Keystore
+    enclaves: tuple[str, ...]
+    unread: tuple[UnreadUnits, ...] = ()
+    names: UnitNames = UnitNames((), ())
+    left_out: frozenset[int] = frozenset()
+
+    def rights(self, rights: Collection[Right]) -> frozenset[Right]:
+        """Return the rights without those to names of units that are not read."""
+        if not self.left_out:
+            return frozenset(rights)
+        return frozenset(
+            right for right in rights if self.left_out.isdisjoint(self.names.text(right.name).units)
+        )
+
+
+def sample_of(
+    keystore: Keystore, robots: Mapping[str, Robot], wanted: Collection[str] = ()
+) -> SampledKeystore:
+    """Return the enclaves of a keystore to read in full: all of them, or a sample of equal units.
+
+    Args:
+        keystore: the keystore.
+        robots: the robots of its fleet, by enclave.
+        wanted: names of units that are read in any case.
+
+    Units that use names of other units are all read.  So is everything where names of units cannot
+    be told apart, or where too much is not alike.
+    """
+    paths = keystore.names
+    everything = SampledKeystore(keystore, paths)
+    if len(paths) <= _LARGE:
+        return everything
+    units = units_of(paths, robots)
+    names = UnitNames(units, paths)
+    if any(_is_ambiguous(word, names.words) for word in names.words):
+        return everything
+    enclaves: dict[int, list[str]] = defaultdict(list)
+    for path, number in names.of.items():
+        enclaves[number].append(path)
+    alike: dict[object, list[int]] = defaultdict(list)
+    for n in sorted(enclaves, key=lambda n: name_order(units[n].name)):
+        digest = _digest_of(keystore, enclaves[n], units[n], names)
+        alike[units[n].family, digest or n].append(n)
+    # Equal units name the same other ones, so it is enough to look at the first.
+    few = {
+        n: number
+        for number, (first, *more) in enumerate(alike.values())
+        if len(more) > 1 and _named(keystore, enclaves[first], names) <= {first}
+        for n in (first, *more)
+    }
+    others = [path for path in paths if names.of.get(path) not in few]
+    if len(others) > _LARGE:
+        return everything
+    named: dict[int, set[Right]] = defaultdict(set)
+    for right in load_rights(keystore, only=others).rights:
+        of_right = {*names.text(right.name).units}
+        for n in of_right & few.keys():
+            if len(of_right) > 1:
+                return everything
+            named[n].add(right._replace(name=_hidden(right.name, units[n], names)))
+    equal: dict[object, list[int]] = defaultdict(list)
+    for n, number in few.items():
+        equal[number, frozenset(named[n])].append(n)
+    unread, left_out = [], set()
+    for first, *more in equal.values():
+        if rest := [n for n in more[:-1] if units[n].name not in wanted]:
+            members = tuple(units[n].name for n in rest)
+            number = sum(len(enclaves[n]) for n in rest)
+            unread.append(UnreadUnits(units[first].what, members, number, units[first].name))
+            left_out |= {*rest}
+    chosen = tuple(path for path in paths if names.of.get(path) not in left_out)
+    return SampledKeystore(keystore, chosen, tuple(unread), names, frozenset(left_out))
+
+
+def _is_ambiguous(word: str, words: Collection[str]) -> bool:
+    """Return whether a part of a unit's word is the word of another unit, as of r1_2 and r1."""
+    pieces = word.split("_")
+    return any(
+        "_".join(pieces[begin:end]) in words
+        for begin in range(len(pieces))
+        for end in range(begin + 1, len(pieces) + 1)
+        if end - begin < len(pieces)
+    )
+
+
+def _digest_of(
+    keystore: Keystore, enclaves: Sequence[str], unit: DrawnUnit, names: UnitNames
+) -> str:
+    """Return a digest of the permissions of a unit without its name; "" if they are unusual."""
+    texts = {path: _signed_text(keystore, path) for path in enclaves}
+    hidden = [
+        hashlib.sha256(f"{_hidden(path, unit, names)}\n{_hidden(text, unit, names)}".encode())
+        for path, text in texts.items()
+        if text and not any(mark in text for mark in _MARKS)
+    ]
+    if len(hidden) < len(enclaves):
+        return ""
+    return hashlib.sha256(b"".join(sorted(each.digest() for each in hidden))).hexdigest()
+
+
+def _hidden(text: str, unit: DrawnUnit, names: UnitNames) -> str:
+    """Return a text with a mark in place of the unit's names, one for each of its ``values``."""
+    for word in sorted(unit.values, key=len, reverse=True):
+        if word in names.words:
+            # The word comes first, which makes the search fast.
+            name = re.escape(word)
+            alone = f"{name}(?<![A-Za-z0-9]{name})(?![A-Za-z0-9])"
+            text = re.sub(alone, _MARKS[names.words[word][1]], text)
+    return text
+
+
+def _named(keystore: Keystore, enclaves: Iterable[str], names: UnitNames) -> set[int]:
+    """Return the units whose names are in the permissions of enclaves."""
+    texts = (_signed_text(keystore, path) or "" for path in enclaves)
+    lines = {line for text in texts for line in text.splitlines()}
+    return {unit for line in lines for unit in names.text(line).units}
+
+
+def _signed_text(keystore: Keystore, path: str) -> str | None:
+    """Return the signed text of an enclave's permissions without dates; None for another form."""
+    try:
+        data = read_bytes(keystore.folder(path) / PERMISSIONS_FILE, "permissions document")
+        boundary = _BOUNDARY.search(data[:1000])
+    except SrosError:
+        return None
+    parts = data.split(b"--" + boundary[1]) if boundary else []
+    try:
+        return _VALIDITY.sub("", parts[1].decode()) if len(parts) == 4 else None
+    except ValueError:
+        return None
