@@ -513,8 +513,8 @@ def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
     at = f"line{'s' * (len(lines) > 1)} {some_names([str(line) for line in lines])}"
     return Cause(
         f"{_nodes(len(nodes))} lack the common part" if plural else "a node lacks the common part",
-        f"{some_names(nodes)} may not {'; '.join(what)}. A node does all this when it starts, and "
-        "exits if it is denied.",
+        f"{some_names(nodes)} may not {'; '.join(what)}. A node exits at its start if this is "
+        "denied.",
         f"{first} this line into {place} ({at}): {_INCLUDE}",
         len(lacking),
     )

@@ -540,7 +540,7 @@ def _protection_words(answer: Answer) -> Iterator[str]:
 def _change_lines(change: PolicyChange) -> Iterator[str]:
     from sros_tool.explain.answer import ADDITION
 
-    yield _row("change", "the smallest change of the policy that would allow it:")
+    yield _row("change", "in the policy:")
     for edit in change.edits:
         if edit.xml:
             group = edit.xml.partition(" ")[0].removeprefix("<")

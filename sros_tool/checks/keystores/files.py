@@ -173,13 +173,13 @@ CA_KEY_ON_ROBOT = FindingKind(
 HOME_OR_ROBOT = FindingKind(
     "keystore.home-or-robot",
     ERROR,
-    "a keystore with keys of CAs or of revoked enclaves, which must not be on a robot",
+    "a keystore with keys that must not be on a robot",
     "The keys belong where the keystore is kept. On a robot, an attacker who gets a CA key can "
     "create any enclave, with any rights. The files do not show which of the two this is.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "Where the keystore is kept, keep the keys: `sros check ROOT` checks it, and `sros verify` is "
-    "for robots. On a robot, put an export in its place (`sros distribute_key ROOT NAME TARGET` "
-    "where the keystore is kept); if others had access, replace the CA there (`sros rotate_ca`).",
+    "At home, keep the keys, and ask `sros check ROOT`. On a robot, put an export in place of this "
+    "folder (`sros distribute_key ROOT NAME TARGET` at home); if others had access, replace the "
+    "CAs (`sros rotate_ca`).",
 )
 UNREADABLE = FindingKind(
     "keystore.file-unreadable",
