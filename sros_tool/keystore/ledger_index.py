@@ -127,8 +127,8 @@ def _joined(names: Iterable[str]) -> bytes:
     return "\n".join(sorted(names)).encode("utf-8", "surrogatepass")
 
 
-def _split(names: bytes) -> set[str]:
-    return {name for name in names.decode("utf-8", "surrogatepass").split("\n") if name}
+def _split(names: bytes) -> list[str]:
+    return names.decode("utf-8", "surrogatepass").split("\n") if names else []
 
 
 def _terms(entry: IndexedEntry) -> Iterator[bytes]:
@@ -203,24 +203,21 @@ class LedgerIndex:
             raise IndexDamagedError(f"'{self._path}' lacks line {number}")
         return rows[0][0]
 
-    def names(self, parts: Iterable[str] = ()) -> set[str]:
-        """Return the enclaves whose last certificate in the ledger was not revoked.
+    def names(self, parts: Iterable[str] = ()) -> list[str]:
+        """Return the enclaves whose last certificate in the ledger was not revoked, unsorted.
 
         With ``parts``, only names with one of these texts in them are returned.
 
         Raises:
             IndexDamagedError: they are not what they were when the head was signed.
         """
-        names: set[str] = set()
-        texts = [part.encode("utf-8", "surrogatepass") for part in parts]
         there = dict(self._rows("SELECT bucket, names FROM buckets"))
-        for bucket in range(_BUCKETS):
-            data = self._checked(there.get(bucket, b""), 2 * bucket)
-            if not texts or any(text in data for text in texts):
-                names |= _split(data)
-        if texts:
-            return {name for name in names if any(part in name for part in parts)}
-        return names
+        buckets = [self._checked(there.get(i, b""), 2 * i) for i in range(_BUCKETS)]
+        if not parts:
+            return _split(b"\n".join(filter(None, buckets)))
+        texts = [part.encode("utf-8", "surrogatepass") for part in parts]
+        some = [data for data in buckets if any(text in data for text in texts)]
+        return [name for name in _split(b"\n".join(some)) if any(part in name for part in parts)]
 
     def bucket(self, bucket: int) -> tuple[bytes, bytes]:
         """Return the names and the postings in a bucket, verified.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -283,16 +284,18 @@ def _move_away(change: KeystoreChange, name: str) -> Entry:
             "Revoke the enclave in the keystore of that CA, or restore the right certificate.",
         )
     target = f"{REVOKED}/{certificate.serial_number:x}"
+    with os.scandir(transaction.root / folder) as entries:
+        is_link = {entry.name: entry.is_symlink() for entry in entries}
     for file in _FILES:
         path = f"{folder}/{file}"
-        source = transaction.root / path
         if name == "/" and file == "governance.p7s":
             continue  # the governance of the keystore is in the folder of the enclave /
-        if not source.is_symlink() and not source.exists():
+        if file not in is_link:
             continue
-        if not source.is_symlink():
+        if not is_link[file]:
             known = file == CERTIFICATE_FILE
-            data = change.keystore.read(source, file) if known else transaction.read(path)
+            place = transaction.root / path
+            data = change.keystore.read(place, file) if known else transaction.read(path)
             transaction.write(f"{target}/{file}", data, private=file == _PRIVATE)
         transaction.remove(path)
     return certificate_entry(change.now, "certificate", certificate, name)
