@@ -404,6 +404,28 @@ def test_a_weak_key_is_not_certified(home: Home) -> None:
         assert ("of the request of r1 is weak" in request.why) == (outcome == "refused")
 
 
+def test_a_certificate_that_was_replaced_after_the_backup(home: Home) -> None:
+    """Its enclave stays, and gets another one."""
+    backup = shutil.copytree(home.root, home.folder / "backup", symlinks=True)
+    home.run("renew", "ks", "/r1/base", "--revoke-old")
+    home.run("distribute_key", "ks", "--robot", "r1", "r1", "--force")
+    crl = (home.folder / "r1/enclaves/r1/base/crl.pem").read_text()
+    shutil.rmtree(home.root)
+    backup.rename(home.root)
+    home.send("r1", crl=crl)
+    assert "not in the ledger" in home.of("r1").why, "of its new certificate nothing is known"
+    home.send("r1", enclave="/r1/arm", crl=crl)
+    why = home.collect().not_signed
+    assert "r1 has a revocation list" in why and f"`sros renew {home.root} /r1/base`" in why
+    home.run("renew", "ks", "/r1/base")
+    found = home.collect()
+    assert not found.not_signed
+    assert [note.id for note in found.notes] == ["fleet.revocations-restored"]
+    crl_at_home = Keystore(home.root).revocation_list
+    assert crl_at_home and not crl_at_home.revokes(home.certificate("/r1/base").serial_number)
+    assert not home.collect().notes
+
+
 def test_the_verb_names_the_next_step(home: Home) -> None:
     """Only where robots are to get new files, and nothing published them."""
     crl, now = lose_revocations(home), datetime.now(UTC)

@@ -142,7 +142,7 @@ def restore_revocations(
     earlier certificate was replaced stay.
 
     Raises:
-        KeystoreError: as `revoke`.
+        KeystoreError: as `revoke`; or a present certificate was replaced after the backup.
     """
     change = KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run)
     with change:
@@ -164,6 +164,19 @@ def restore_revocations(
             for serial, entry in sorted(issued.items())
             if reasons[serial] != SUPERSEDED and has_enclave(root, entry.enclave)
         }
+        replaced = [
+            entry.enclave
+            for serial, entry in issued.items()
+            if reasons[serial] == SUPERSEDED
+            and has_enclave(root, entry.enclave)
+            and f"{change.keystore.certificate_of(entry.enclave).serial_number:x}" == serial
+        ]
+        if replaced:
+            names = " ".join(sorted(replaced))
+            raise KeystoreError(
+                "certificates were replaced after the backup, and are revoked: give their enclaves "
+                f"others first, with `sros renew {quote(str(root))} {names}`"
+            )
         _check_names(change, tuple(again))
         revocations = []
         for name, reason in again.items():
