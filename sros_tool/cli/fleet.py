@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, NamedTuple
@@ -649,10 +649,10 @@ def _rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str,
     if current and any(robot.state != "current" for group in alike.values() for robot in group):
         alike["current", "", "", ""] = current
     yield "robot", "state", "confirmed", "to do", "what"
-    fleet = sorted((robot.robot for robot in status.robots), key=_natural)
+    places = _places(status)
     for (state, to_do, what, _), group in alike.items():
         last = min(group, key=lambda robot: robot.received or compared.at)
-        names = _runs({robot.robot for robot in group}, fleet)
+        names = _runs((robot.robot for robot in group), places)
         yield names, state, _age(last, compared.at), to_do, what
 
 
@@ -661,19 +661,25 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part or 0), "") if part.isdigit() else (0, part) for part in _DIGITS.split(name)]
 
 
-def _runs(names: Collection[str], fleet: Sequence[str]) -> str:
-    """Return robots in words; ``fleet`` has all names, and tells which of them are neighbours."""
-    runs: list[list[str]] = [[]]
-    for name in fleet:
-        if name in names:
+def _places(status: FleetStatus) -> dict[str, int]:
+    """Map the robots of a fleet to their places in it, r2 before r10."""
+    names = sorted((robot.robot for robot in status.robots), key=_natural)
+    return {name: place for place, name in enumerate(names)}
+
+
+def _runs(names: Iterable[str], places: Mapping[str, int]) -> str:
+    """Return robots in words, of which neighbours in the fleet share some."""
+    runs: list[list[str]] = []
+    for name in sorted(names, key=places.__getitem__):
+        if runs and places[name] == places[runs[-1][-1]] + 1:
             runs[-1].append(name)
-        elif runs[-1]:
-            runs.append([])
+        else:
+            runs.append([name])
     words = []
     for run in runs:
         words += [f"{run[0]} to {run[-1]}"] if len(run) > _MOST_GROUPS else run
-    number = f" ({len(names)})" if len(names) > _MOST_GROUPS else ""
-    return first_few(words, _MOST_GROUPS) + number
+    number = sum(map(len, runs))
+    return first_few(words, _MOST_GROUPS) + (f" ({number})" if number > _MOST_GROUPS else "")
 
 
 _TO_DO = {
@@ -714,10 +720,9 @@ def _dds_counts(compared: ComparedFleet) -> Iterator[str]:
     """Yield the robots with an outdated DDS, and where the findings on the DDS of robots are."""
     status, outdated = compared.status, compared.outdated_dds
     if outdated:
-        fleet = sorted((robot.robot for robot in status.robots), key=_natural)
         yield (
             "a DDS with known vulnerabilities that a later release mends: "
-            f"{_runs(set(outdated), fleet)}; `sros fleet status {quote(str(status.keystore))} "
+            f"{_runs(outdated, _places(status))}; `sros fleet status {quote(str(status.keystore))} "
             f"--robot {outdated[0]}` says which to upgrade"
         )
     elif list(_dds_findings(compared)):
