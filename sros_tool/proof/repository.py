@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -30,6 +30,8 @@ _MOST_BYTES = 32 * 1024 * 1024
 _AT_ONCE = 64 * 1024 * 1024
 _MOST_DEPTH = 200
 _MOST_TAGS = 10
+_MOST_KNOWN = 1024
+_MOST_KNOWN_BYTES = 16 * 1024
 _WAIT = 60  # seconds
 _WAIT_FOR_SERVER = 600
 _SAFE = (
@@ -62,6 +64,9 @@ _HASH = re.compile(r"[0-9a-f]{40}(?:[0-9a-f]{24})?\Z")
 _ABBREVIATED = re.compile(r"[0-9a-fA-F]{4,64}\Z")
 _NO_REFERENCE = re.compile(r"[\x00-\x20\x7f*?\[\\~^:]|\A-|\A\Z")
 _EXPRESSION = re.compile(r"(?P<name>(?:[^~^@:]|@(?!\{))+|@)(?P<rest>.*)\Z", re.DOTALL)
+
+_known: dict[tuple[Path, str], tuple[str, bytes]] = {}
+"""Small commits and trees that were read and verified, by repository and id."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,7 +284,7 @@ class Repository:
             DocumentError: a tree is missing or malformed, or has a name that no file system allows.
         """
         wanted = list(dict.fromkeys(ids))
-        trees = self._all("tree", wanted)
+        trees = _of_kind("tree", wanted, self._objects(wanted))
         return {each: _entries(data, len(each) // 2) for each, data in trees.items()}
 
     def contents(self, ids: Iterable[str]) -> dict[str, bytes]:
@@ -288,7 +293,8 @@ class Repository:
         Raises:
             DocumentError: a file is missing, damaged, or larger than `_MOST_BYTES`.
         """
-        return self._all("blob", list(dict.fromkeys(ids)))
+        wanted = list(dict.fromkeys(ids))
+        return _of_kind("blob", wanted, self._objects(wanted))
 
     def sizes(self, ids: Iterable[str]) -> dict[str, int]:
         """Return the sizes of objects in bytes, by id; missing objects are left out."""
@@ -334,11 +340,11 @@ class Repository:
         room = _AT_ONCE
         for each, size in sizes.items():
             if part and size > room:
-                yield self.contents(part)
+                yield _of_kind("blob", part, self._read(part, sizes))
                 part, room = [], _AT_ONCE
             part.append(each)
             room -= size
-        yield self.contents(part)
+        yield _of_kind("blob", part, self._read(part, sizes))
 
     def content(self, digits: str) -> bytes:
         """Return the content of one file, by its id; repeated calls use a cache.
@@ -348,21 +354,6 @@ class Repository:
         """
         return _content(self, digits)
 
-    def _all(self, kind: str, ids: Sequence[str]) -> dict[str, bytes]:
-        objects = self._objects(ids)
-        for object_id in ids:
-            if object_id not in objects:
-                raise DocumentError(
-                    f"git cannot read it: the object {object_id} is not in the repository",
-                    "",
-                    "Fetch all of the commit: no partial clone (`git fetch --refetch`).",
-                )
-            if objects[object_id][0] != kind:
-                raise DocumentError(
-                    f"the object {object_id} is no {kind}, but a {objects[object_id][0]}"
-                )
-        return {object_id: objects[object_id][1] for object_id in ids}
-
     def _objects(self, ids: Sequence[str]) -> dict[str, tuple[str, bytes]]:
         """Return type and content of objects, by id; missing objects are left out.
 
@@ -371,8 +362,17 @@ class Repository:
         Raises:
             DocumentError: an object is damaged, or larger than `_MOST_BYTES`.
         """
-        for each, size in self.sizes(ids).items():
-            if size > _MOST_BYTES:
+        known = {each: _known.get((self.folder, each)) for each in ids}
+        objects = {each: value for each, value in known.items() if value}
+        unknown = [each for each in ids if each not in objects]
+        if unknown:
+            objects |= self._read(unknown, self.sizes(unknown))
+        return objects
+
+    def _read(self, ids: Sequence[str], sizes: Mapping[str, int]) -> dict[str, tuple[str, bytes]]:
+        """Return type and content of objects as git reads them; see `_objects`."""
+        for each in ids:
+            if sizes.get(each, 0) > _MOST_BYTES:
                 raise DocumentError(f"the object {each} is larger than {_MOST_BYTES} bytes")
         asked = "".join(f"{object_id}\n" for object_id in ids).encode()
         data = self._git(["cat-file", "--batch"], stdin=asked)
@@ -395,6 +395,10 @@ class Repository:
                     "Clone the repository again.",
                 )
             objects[object_id] = words[1], content
+            if words[1] != "blob" and len(content) <= _MOST_KNOWN_BYTES:
+                if len(_known) >= _MOST_KNOWN:
+                    _known.clear()
+                _known[self.folder, object_id] = objects[object_id]
         return objects
 
     # ── fetching ───────────────────────────────────────────────────────────────────────────
@@ -519,6 +523,28 @@ def _folder(repository: Repository, digits: str) -> dict[str, TreeEntry]:
 @lru_cache(maxsize=256)
 def _content(repository: Repository, digits: str) -> bytes:
     return repository.contents([digits])[digits]
+
+
+def _of_kind(
+    kind: str, ids: Sequence[str], objects: Mapping[str, tuple[str, bytes]]
+) -> dict[str, bytes]:
+    """Return the contents of objects, by id.
+
+    Raises:
+        DocumentError: an object is missing, or of another kind.
+    """
+    for object_id in ids:
+        if object_id not in objects:
+            raise DocumentError(
+                f"git cannot read it: the object {object_id} is not in the repository",
+                "",
+                "Fetch all of the commit: no partial clone (`git fetch --refetch`).",
+            )
+        if objects[object_id][0] != kind:
+            raise DocumentError(
+                f"the object {object_id} is no {kind}, but a {objects[object_id][0]}"
+            )
+    return {object_id: objects[object_id][1] for object_id in ids}
 
 
 def walk(
