@@ -259,7 +259,8 @@ def fleet(folder: Path, keystore: Path) -> Iterator[Fleet]:
     }
     words = " ".join(f"-o {key}={value}" for key, value in options.items())
     (folder / "ansible.cfg").write_text(
-        "[defaults]\nforks = 20\ninternal_poll_interval = 0.05\ntimeout = 60\nretry_files_enabled = false\nnocows = true\n"
+        "[defaults]\nforks = 20\ninternal_poll_interval = 0.05\ntimeout = 60\n"
+        "retry_files_enabled = false\nnocows = true\n"
         f"[ssh_connection]\npipelining = true\nssh_args = -F none {words}\n"
         f"control_path_dir = {folder}/cp\n"
     )
