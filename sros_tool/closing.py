@@ -9,6 +9,7 @@ denies the process what its enclave may not do.
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -21,8 +22,15 @@ from sros_tool.graph.observation import PUBLISH, SUBSCRIBE, Observation, Observe
 from sros_tool.policy.model import RIGHTS, Policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.runtime.environment import node_argument, render_environment
-from sros_tool.runtime.processes import Process, program_of, service_of
+from sros_tool.runtime.processes import (
+    SERVICE_NAME,
+    Process,
+    launch_verb,
+    process_origin,
+    program_of,
+)
 from sros_tool.runtime.units import unit_instance
+from sros_tool.runtime.variables import ENABLE, KEYSTORE, STRATEGY
 from sros_tool.values import DryRun, FileChanges, Words, as_plain, shows
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
@@ -52,10 +60,28 @@ class ClosedProcess(NamedTuple):
     known_by: Annotated[str, Words(("process id", "node name", "program", "elimination"))]
     """How sros knows that this process has the nodes of the enclave."""
 
-    def secured_command(self, export: Path) -> str:
-        """Return the shell command that starts the process in its enclave."""
-        words = ("sros", "run", str(export), self.enclave, "--", *self.command)
-        return f"cd {shlex.quote(self.folder)} && {shlex.join(words)}"
+    launch: Sequence[str] = ()
+    """The command of the `ros2 launch` that started it; empty for a process of its own."""
+
+    @property
+    def open_command(self) -> str:
+        """The shell command that starts the process as it was started."""
+        return f"cd {shlex.quote(self.folder)} && {shlex.join(self.launch or self.command)}"
+
+    def secured_command(self, folder: Path) -> str:
+        """Return the shell command that starts the process, or its launch, in its enclave."""
+        run = ("sros", "run", str(folder / "export"))
+        if not self.launch:
+            words = shlex.join((*run, self.enclave, "--", *self.command))
+        else:
+            prefix = shlex.join((*run, "--policy", str(folder / "policy.xml"), "--"))
+            after = launch_verb(tuple(self.launch)) + 1
+            words = shlex.join(
+                (*self.launch[:after], "--launch-prefix", prefix, *self.launch[after:])
+            )
+            # A node to which the launch file gives a prefix of its own does not start.
+            words = f"{ENABLE}=true {STRATEGY}=Enforce {KEYSTORE}= {words}"
+        return f"cd {shlex.quote(self.folder)} && {words}"
 
 
 class ObservedProcesses(NamedTuple):
@@ -70,10 +96,13 @@ class ObservedProcesses(NamedTuple):
     elsewhere: Sequence[str] = ()
     """Enclaves of nodes that no process of this machine is known to have."""
 
-    @property
-    def by_hand(self) -> Sequence[ClosedProcess]:
-        """The processes that no unit of systemd starts."""
-        return [process for process in self.processes if not process.unit]
+    def by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
+        """Map the shell commands for what no unit of systemd starts alone to its processes."""
+        commands: dict[str, list[ClosedProcess]] = {}
+        for process in self.processes:
+            if not process.unit:
+                commands.setdefault(process.secured_command(folder), []).append(process)
+        return commands
 
 
 class CloseStep(NamedTuple):
@@ -136,8 +165,8 @@ def assign(
         for process in running
         if process.domain == str(domain) and not process.network and not process.is_daemon
     }
-    services = {pid: service_of(pid) for pid in left}
-    units = Counter(unit for unit, _ in services.values())
+    origins = {pid: process_origin(pid) for pid in left}
+    units = Counter(origin.unit for origin in origins.values())
     by_enclave: dict[str, list[ObservedNode]] = {}
     for node in nodes:
         by_enclave.setdefault(node.enclaves[0], []).append(node)
@@ -157,12 +186,10 @@ def assign(
                 continue  # it is not clear which of them
             for process in processes:
                 del left[process.pid]
-                unit, folder = services[process.pid]
+                unit, folder, launch = origins[process.pid]
                 alone = unit if units[unit] == 1 else ""
-                command, user = process.command, process.user
-                assigned.append(
-                    ClosedProcess(enclave, process.pid, command, folder, user, alone, known_by)
-                )
+                start = enclave, process.pid, process.command, folder, process.user
+                assigned.append(ClosedProcess(*start, alone, known_by, launch))
     return ObservedProcesses(
         domain,
         sorted(assigned),
@@ -204,8 +231,11 @@ def read_processes(path: Path) -> ObservedProcesses:
     """
     try:
         value = json.loads(read_bytes(path, "list of processes"))
-        value["processes"] = [ClosedProcess(**process) for process in value["processes"]]
-        return ObservedProcesses(**value)
+        processes = [ClosedProcess(**process) for process in value["processes"]]
+        for process in processes:
+            if process.unit and not re.fullmatch(SERVICE_NAME, process.unit, re.A):
+                raise ValueError(f"{process.unit!r} is no service")
+        return ObservedProcesses(**value)._replace(processes=processes)
     except (ValueError, TypeError, KeyError) as error:
         raise DocumentError(
             f"'{path}' is no list of processes", f"{error}", "Remove it, to watch the robot again."
@@ -226,32 +256,24 @@ def mark(folder: Path) -> str:
 
 
 def start_files(
-    folder: Path,
-    export: Path,
-    processes: Sequence[ClosedProcess],
-    variables: Mapping[str, Mapping[str, str]],
+    folder: Path, observed: ObservedProcesses, variables: Mapping[str, Mapping[str, str]]
 ) -> dict[str, str]:
     """Map the paths of the files that say how to start each process secured to their content.
 
-    ``variables`` maps enclaves to their environment.
+    ``folder`` is absolute, and ``variables`` maps enclaves to their environment.
     """
     files = {
         f"{unit_instance(enclave)}.env": render_environment(of_enclave, "docker")
         for enclave, of_enclave in variables.items()
     }
-    by_hand = [
-        "# Stop each of these processes, and start it so (in the environment that it has now).",
-        "# Of a launch file: ros2 launch --launch-prefix "
-        + shlex.quote(f"sros run {export} --policy {folder}/policy.xml --")
-        + " PACKAGE FILE",
-    ]
-    for process in processes:
+    for process in observed.processes:
         if process.unit:
             text = render_environment(variables[process.enclave], "systemd")
             files[f"units/{process.unit}.d/{DROP_IN}"] = f"{mark(folder)}[Service]\n{text}"
-        else:
-            by_hand += ["", f"# {process.enclave}", process.secured_command(export)]
-    return {**files, "commands.sh": "".join(f"{line}\n" for line in by_hand)}
+    lines = ["# Stop these processes, and start them so, in the environment that they have now."]
+    for command, processes in observed.by_hand(folder).items():
+        lines += ["", f"# {', '.join(process.enclave for process in processes)}", command]
+    return {**files, "commands.sh": "".join(f"{line}\n" for line in lines)}
 
 
 # ── who may do what ─────────────────────────────────────────────────────────────────────────

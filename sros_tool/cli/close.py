@@ -12,6 +12,7 @@ import time
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -31,7 +32,7 @@ from sros_tool.cli.common import (
 from sros_tool.errors import DocumentError, SrosError, UnavailableError, UsageError
 from sros_tool.terminal import echo
 from sros_tool.values import FileChange
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import counted, enumerated, first_few
 
 if TYPE_CHECKING:
     from sros_tool.closing import CloseStep, ObservedProcesses, Proof
@@ -204,7 +205,7 @@ def close(
             problems = _problems(at, observed, steps, partial=partial or not applies)
     if applies and not problems:
         changes += _apply(at, observed, dry_run=dry_run)
-    if not dry_run and not problems and (proves or (applies and not observed.by_hand)):
+    if not dry_run and not problems and (proves or (applies and not observed.by_hand(folder))):
         proofs = _proofs(at, observed, _START_SECONDS if proves else _RESTART_SECONDS)
     holds = bool(proofs) and all(proof.holds or (partial and not proof.fails) for proof in proofs)
     if as_json:
@@ -314,7 +315,7 @@ def _write_starts(at: _Places, observed: ObservedProcesses) -> list[FileChange]:
         process.enclave: enclave_environment(at.export, process.enclave, domain).variables
         for process in observed.processes
     }
-    files = start_files(at.folder.absolute(), at.export.absolute(), observed.processes, variables)
+    files = start_files(at.folder.absolute(), observed, variables)
     changes = unit_changes(at.start, files, force=True)
     write_units(at.start, files, changes)
     return [FileChange(action, str(at.start / path)) for path, action in changes.items()]
@@ -404,8 +405,8 @@ def _undo(at: _Places, observed: ObservedProcesses, *, dry_run: bool) -> list[Fi
     units = {process.unit for process in observed.processes if process.unit}
     units |= {path.parent.name.removesuffix(".d") for path in drop_ins}
     _restart(sorted(units), dry_run=dry_run)
-    for process in observed.by_hand:
-        command = f"cd {shlex.quote(process.folder)} && {shlex.join(process.command)}"
+    by_hand = chain.from_iterable(observed.by_hand(at.folder).values())
+    for command in dict.fromkeys(process.open_command for process in by_hand):
         echo(f"by hand, restart it open: {command}", err=True)
     return [FileChange("remove", str(path)) for path in drop_ins]
 
@@ -548,7 +549,8 @@ def _show(at: _Places, observed: ObservedProcesses, denied: Sequence[str]) -> No
         echo(f"  {line}")
     echo(f"how each process is restarted secured (all of it: {at.start}):")
     for process in observed.processes:
-        how = f"--apply restarts {process.unit}" if process.unit else "by hand"
+        how = "by its launch, by hand" if process.launch else "by hand"
+        how = f"--apply restarts {process.unit}" if process.unit else how
         echo(f"  {process.enclave}: process {process.pid}, known by its {process.known_by}: {how}")
     for text in observed.unknown:
         echo(f"looks wrong: no node is known of {text}")
@@ -581,14 +583,16 @@ def _show_end(
         again = f"ask again with sros close {folder} --proof, or go back with --undo"
         echo(f"this is not proved; {again}", err=True)
     elif problems and applies:
-        echo("nothing was closed", err=True)
+        echo("nothing was closed; mend this, and run it again", err=True)
     elif applies:
-        for process in observed.by_hand:
-            echo(f"stop process {process.pid}, and start it by:")
-            echo(f"  {process.secured_command(at.export.absolute())}")
+        for command, processes in observed.by_hand(at.folder.absolute()).items():
+            pids = enumerated([str(process.pid) for process in processes])
+            echo(f"stop process {pids}, and start it by:")
+            echo(f"  {command}")
         echo(f"then: sros close {folder} --proof", err=True)
     else:
-        echo(f"nothing is closed yet; next: sros close {folder} --apply", err=True)
+        following = "mend this, and run it again" if problems else f"sros close {folder} --apply"
+        echo(f"nothing is closed yet; next: {following}", err=True)
 
 
 _ANSWERS = {True: "yes", False: "no", None: "not asked"}

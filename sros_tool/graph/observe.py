@@ -36,6 +36,8 @@ from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, mak
 from sros_tool.pki.certificates import IDENTITY_DIGITS
 
 _LOG = logging.getLogger(__name__)
+_NO_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+"""Fast DDS cannot write to the shared memory of another user, and nodes would have no names."""
 _PERIOD_SECONDS = 0.1
 """Time between two readings of the graph; a node that runs for a second is read several times."""
 _START_SECONDS = 30.0
@@ -74,7 +76,7 @@ class RosGraph:
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         _require_rclpy()
-        self._environment = {**os.environ, **(environment or {})}
+        self._environment = {**_NO_SHARED_MEMORY, **os.environ, **(environment or {})}
         self.rmw = ""
 
     def __enter__(self) -> Self:

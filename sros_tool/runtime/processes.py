@@ -467,21 +467,49 @@ _LIBRARY_FOLDERS = (
 )
 
 
-def service_of(pid: int, proc: Path = Path("/proc")) -> tuple[str, str]:
-    """Return the system service of systemd that a process belongs to, and its working directory.
+class ProcessOrigin(NamedTuple):
+    """How a process was started: each part is empty if it has none, has ended, or hides it.
 
-    Either is "" if the process has none, has ended, or hides it.
+    ``unit`` is its system service of systemd, ``folder`` its working directory, and ``launch`` the
+    command of the ``ros2 launch`` that started it, or that it is.
     """
+
+    unit: str = ""
+    folder: str = ""
+    launch: tuple[str, ...] = ()
+
+
+def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
+    """Return how a process was started."""
     unit = folder = ""
     with suppress(OSError):
         text = (proc / str(pid) / "cgroup").read_text(errors="surrogateescape")
         unit = service[1] if (service := _SERVICE.search(text)) else ""
         folder = str((proc / str(pid) / "cwd").readlink())
-    return unit, folder
+    with suppress(OSError, IndexError, ValueError):
+        while pid > 1:
+            handle = os.open(proc / str(pid), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            try:
+                command, pid = tuple(_words(handle, "cmdline")), _stat(handle).parent
+            finally:
+                os.close(handle)
+            if launch_verb(command):
+                return ProcessOrigin(unit, folder, command)
+    return ProcessOrigin(unit, folder)
 
 
+def launch_verb(command: tuple[str, ...]) -> int:
+    """Return the index of the word ``launch`` in a command of ``ros2 launch``, else 0."""
+    for index in (1, 2):
+        if command[index : index + 1] == ("launch",) and Path(command[index - 1]).name == "ros2":
+            return index
+    return 0
+
+
+SERVICE_NAME = r"\w[\w:.@\\-]*\.service"
+"""The name of a service of systemd, as a regular expression."""
 _SERVICE = re.compile(
-    r"^(?:0:|\d+:name=systemd):/system\.slice/(?:.*/)?([\w:.@\\-]+\.service)$", re.M | re.A
+    r"^(?:0:|\d+:name=systemd):/system\.slice/(?:.*/)?(" + SERVICE_NAME + r")$", re.M | re.A
 )
 """A line of /proc/PID/cgroup, of version 2 or 1 (cgroups(7)); not for users' own services."""
 

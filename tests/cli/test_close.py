@@ -19,11 +19,13 @@ from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.processes import (
     FileReader,
     Process,
+    ProcessOrigin,
     ProcessRoot,
     ProcessTable,
     RunningProcesses,
     UnseenProcess,
-    service_of,
+    launch_verb,
+    process_origin,
     with_files,
 )
 from tests.cli.test_json import Seen
@@ -67,6 +69,7 @@ class Robot:
     more: tuple[Process, ...] = ()
     unseen: tuple[UnseenProcess, ...] = ()
     by_hand: set[str] = field(default_factory=set)
+    launch: tuple[str, ...] = ()
     nodes: tuple[Any, ...] = (TALKER, LISTENER)
     remaining: tuple[Any, ...] = (TALKER, LISTENER)
     """What an observer with an enclave sees."""
@@ -131,8 +134,8 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(ProcessTable, "look", lambda table, now: robot.look(table, now))
     units = {PID[enclave]: enclave for enclave in PID}
     monkeypatch.setattr(
-        "sros_tool.closing.service_of",
-        lambda pid: (robot.units.get(units.get(pid, ""), ""), "/opt"),
+        "sros_tool.closing.process_origin",
+        lambda pid: ProcessOrigin(robot.units.get(units.get(pid, ""), ""), "/opt", robot.launch),
     )
     monkeypatch.setattr(close, "_SYSTEMD", tmp_path / "systemd")
     monkeypatch.setattr(close, "_RESTART_SECONDS", 0.1)
@@ -381,8 +384,10 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     robot.nodes = (TALKER, LISTENER)
     robot.close()
     assert "was watched in domain 0, not 7" in robot.close("--domain", "7", status=2).err
-    (robot.folder / "robot/processes.json").write_text("{}")
-    assert "is no list of processes" in robot.close(status=2).err
+    file = robot.folder / "robot/processes.json"
+    for wrong in (file.read_text().replace('"unit": ""', '"unit": "../x.service"'), "{}"):
+        file.write_text(wrong)
+        assert "is no list of processes" in robot.close(status=2).err
 
 
 def test_a_dry_run_changes_nothing(robot: Robot) -> None:
@@ -469,9 +474,42 @@ def test_the_enclave_of_a_process(
         ("0::/\n", ""),
     ],
 )
-def test_the_service_of_a_process(tmp_path: Path, text: str, unit: str) -> None:
-    (tmp_path / "7").mkdir()
-    (tmp_path / "7/cgroup").write_text(text)
-    (tmp_path / "7/cwd").symlink_to("/opt")
-    assert service_of(7, tmp_path) == (unit, "/opt")
-    assert service_of(8, tmp_path) == ("", "")
+def test_the_unit_of_a_process(tmp_path: Path, text: str, unit: str) -> None:
+    made_up(tmp_path, 7, "/opt/talker", parent=1, cgroup=text)
+    assert process_origin(7, tmp_path) == ProcessOrigin(unit, "/opt")
+    assert process_origin(8, tmp_path) == ProcessOrigin()
+
+
+def made_up(proc: Path, pid: int, *command: str, parent: int, cgroup: str = "0::/\n") -> None:
+    folder = proc / str(pid)
+    folder.mkdir()
+    (folder / "cgroup").write_text(cgroup)
+    (folder / "cwd").symlink_to("/opt")
+    (folder / "cmdline").write_text("".join(f"{word}\0" for word in command))
+    (folder / "stat").write_text(f"{pid} (x) S {parent} " + "0 " * 30)
+
+
+LAUNCH = ("/usr/bin/python3", "/opt/ros/jazzy/bin/ros2", "launch", "my_robot", "all.py", "a:=b c")
+
+
+def test_a_process_that_was_launched_is_launched_secured(tmp_path: Path, robot: Robot) -> None:
+    made_up(tmp_path, 7, *LAUNCH, parent=1)
+    made_up(tmp_path, 8, "/bin/sh", "-c", "talker", parent=7)
+    made_up(tmp_path, 9, "/opt/talker", parent=8)
+    assert process_origin(9, tmp_path) == process_origin(7, tmp_path) == ("", "/opt", LAUNCH)
+    assert launch_verb(("ros2", "launch")) == 1
+    assert not any(map(launch_verb, [("ros2", "run", "launch"), ("launch",), ()]))
+
+    robot.launch = LAUNCH
+    robot.close()
+    place = robot.folder / "robot"
+    command = (
+        "cd /opt && ROS_SECURITY_ENABLE=true ROS_SECURITY_STRATEGY=Enforce ROS_SECURITY_KEYSTORE= "
+        "/usr/bin/python3 /opt/ros/jazzy/bin/ros2 launch --launch-prefix 'sros run "
+        f"{place}/export --policy {place}/policy.xml --' my_robot all.py 'a:=b c'\n"
+    )
+    said = robot.close("--apply", status=1).out
+    assert f"stop process 4712 and 4711, and start it by:\n  {command}" in said
+    assert (place / "start/commands.sh").read_text().endswith(f"\n# /listener, /talker\n{command}")
+    undone = robot.close("--undo").err
+    assert undone.count("restart it open: cd /opt && /usr/bin/python3 /opt/ros/jazzy/bin/ros2") == 1

@@ -3,9 +3,9 @@
 $FAKE_GRAPH describes the graph, or names a failure.
 
 JSON: ``{"nodes": [[enclave, namespace, name, participant, ["publish topic", ...]]...]}``, or
-``{"fails": "import" | "init" | "node" | "crash", "says": TEXT}``.  ``secured`` may have another
-graph, which an observer with an enclave sees; others see no node as soon as the file ``until`` is
-there.
+``{"fails": "import" | "init" | "node" | "crash", "says": TEXT}``.  ``rmw`` may name variables
+of the environment.  ``secured`` may have the graph that an observer with an enclave sees; others
+see no node as soon as the file ``until`` is there.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def create_node(name: str, **_: Any) -> Node:
 
 
 def get_rmw_implementation_identifier() -> str:
-    return str(GRAPH.get("rmw", "rmw_fake"))
+    return os.path.expandvars(str(GRAPH.get("rmw", "rmw_fake")))
 
 
 class Node:

@@ -30,6 +30,7 @@ TWINS = (
     ("/one", "/", "twin", "01", ["publish rt/x"]),
     ("/two", "/", "twin", "02", ["publish rt/y"]),
 )
+TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
 SHORT = ("robot.xml", "--spin-time", "0.6")
 
 
@@ -174,6 +175,14 @@ def test_a_failure_is_one_paragraph(
     assert ended.err.startswith("Unable to generate policy: ")
     assert what in ended.err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("chosen", "used"), [({}, "UDPv4"), ({TRANSPORTS: "SHM"}, "SHM")])
+def test_an_observer_needs_no_memory_of_other_users(
+    program: Program, chosen: dict[str, str], used: str
+) -> None:
+    """Fast DDS cannot write to it, and the nodes of a user would have no names for root."""
+    assert f"with {used}." in program(graph(rmw=f"${TRANSPORTS}"), *SHORT, **chosen).err
 
 
 def test_a_watch_tells_what_is_new(program: Program) -> None:
