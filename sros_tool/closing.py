@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Annotated, NamedTuple
 
 from sros_tool.errors import DocumentError
+from sros_tool.explain.audit import DeniedRight
 from sros_tool.graph.learn import common_parts, stable_name
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE, Observation, ObservedNode
 from sros_tool.policy.model import RIGHTS, Policy
@@ -95,6 +96,14 @@ class ObservedProcesses(NamedTuple):
     """Processes on this machine whose nodes are not known; they are not closed."""
     elsewhere: Sequence[str] = ()
     """Enclaves of nodes that no process of this machine is known to have."""
+
+    def within(self, policy: Policy) -> ObservedProcesses:
+        """Return a copy without enclaves that the policy does not have any more."""
+        names = {enclave.path for enclave in policy.enclaves}
+        return self._replace(
+            processes=[process for process in self.processes if process.enclave in names],
+            elsewhere=[enclave for enclave in self.elsewhere if enclave in names],
+        )
 
     def by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
         """Map the shell commands for what no unit of systemd starts alone to its processes."""
@@ -317,9 +326,17 @@ def _users(of_name: Mapping[str, Sequence[str]], right: str) -> str:
 # ── the proof ───────────────────────────────────────────────────────────────────────────────
 
 
-def lost_endpoints(before: Observation, now: Observation) -> list[str]:
-    """Return what nodes did before and do not do now, as text."""
-    return sorted({*_endpoints(before.nodes)} - {*_endpoints(now.nodes)})
+def lost_endpoints(
+    before: Observation, now: Observation, denied: Iterable[DeniedRight]
+) -> list[str]:
+    """Return what nodes did before, are not ``denied``, and do not do now, as text."""
+    expected = {*_endpoints(before.nodes)} - {
+        f"{node} {way} {topic}"
+        for right in denied
+        for node in right.nodes
+        for topic, way in right.endpoints
+    }
+    return sorted(expected - {*_endpoints(now.nodes)})
 
 
 def _endpoints(nodes: Iterable[ObservedNode]) -> Iterator[str]:

@@ -36,6 +36,7 @@ from sros_tool.wording import counted, enumerated, first_few
 
 if TYPE_CHECKING:
     from sros_tool.closing import CloseStep, ObservedProcesses, Proof
+    from sros_tool.explain.audit import DeniedRight
     from sros_tool.graph.observation import Observation
     from sros_tool.runtime.processes import RunningProcesses
 
@@ -167,6 +168,7 @@ def close(
     something is found, is left to do by hand, or does not hold; 2 if it could not be done.
     """
     from sros_tool.closing import CloseStep, Closing, ObservedProcesses, read_processes
+    from sros_tool.policy.document import read_policy
 
     if sum((applies, proves, undoes)) > 1:
         raise UsageError("--apply, --proof and --undo exclude each other", "", "Choose one.")
@@ -177,6 +179,8 @@ def close(
         name = shlex.quote(str(folder))
         raise UsageError(f"'{folder}' has no watched robot", "", f"Run `sros close {name}` first.")
     known = read_processes(at.processes) if at.processes.exists() else None
+    if known and at.policy.exists() and not undoes:
+        known = known.within(read_policy(at.policy))
     observed = known or ObservedProcesses(_domain(domain_text))
     if domain_text is not None and observed.domain != _domain(domain_text):
         raise UsageError(
@@ -199,9 +203,9 @@ def close(
             state = "kept" if is_kept else "open" if dry_run else _do(at, step)
             steps.append(CloseStep(step.command, state))
         if not dry_run:
-            observed = read_processes(at.processes)
+            observed = read_processes(at.processes).within(read_policy(at.policy))
             changes = _write_starts(at, observed)
-            denied = _denied(at, observed.domain)
+            denied = [str(right) for right in _denied(at, observed.domain)]
             problems = _problems(at, observed, steps, partial=partial or not applies)
     if applies and not problems:
         changes += _apply(at, observed, dry_run=dry_run)
@@ -294,11 +298,15 @@ def _keep_processes(at: _Places, step: _Step, document: str) -> None:
 
 
 def _observation(at: _Places) -> Observation:
-    from sros_tool.graph.observation import from_json
+    """Return the nodes that were observed, without those of enclaves that the policy lacks."""
+    from sros_tool.graph.observation import from_json, make_observation
+    from sros_tool.policy.document import read_policy
     from sros_tool.xml import read_bytes
 
+    names = {enclave.path for enclave in read_policy(at.policy).enclaves}
     try:
-        return from_json(json.loads(read_bytes(at.observed, "observation")))
+        nodes = from_json(json.loads(read_bytes(at.observed, "observation"))).nodes
+        return make_observation(node for node in nodes if names.issuperset(node.enclaves))
     except (ValueError, TypeError, KeyError) as error:
         raise DocumentError(
             f"'{at.observed}' is no observation", f"{error}", "Watch the robot again: --for 1m."
@@ -321,7 +329,7 @@ def _write_starts(at: _Places, observed: ObservedProcesses) -> list[FileChange]:
     return [FileChange(action, str(at.start / path)) for path, action in changes.items()]
 
 
-def _denied(at: _Places, domain: int) -> list[str]:
+def _denied(at: _Places, domain: int) -> Sequence[DeniedRight]:
     """Return what the keystore denies to the nodes as they were observed."""
     from sros_tool.explain.audit import audit, audited_enclaves
     from sros_tool.keystore.participant import JoinContext
@@ -330,14 +338,22 @@ def _denied(at: _Places, domain: int) -> list[str]:
     context = JoinContext(domain, now(), local_zone(os.environ))
     vendor = chosen_vendor(None, None, os.environ)[0]
     audited = audit(_observation(at), audited_enclaves(at.keystore, vendor, context), _OBSERVER)
-    return [str(right) for right in audited.denied]
+    return audited.denied
 
 
 def _problems(
     at: _Places, observed: ObservedProcesses, steps: Sequence[CloseStep], *, partial: bool
 ) -> list[str]:
     """Return what keeps the robot from running closed, with what to do."""
+    from sros_tool.keystore.layout import list_enclaves
+    from sros_tool.policy.document import read_policy
+
     problems = [f"findings of `{step.command}`" for step in steps if step.state == "findings"]
+    policy = read_policy(at.policy)
+    for name in list_enclaves(at.keystore):
+        if name != _OBSERVER and not policy.enclave(name):
+            revoke = f"sros revoke {shlex.quote(str(at.keystore))} {name}"
+            problems.append(f"the policy does not have {name}, and the keystore does: {revoke}")
     owner = at.export.stat().st_uid
     for user in sorted({process.user for process in observed.processes} - {owner}):
         problems.append(
@@ -499,17 +515,18 @@ def _proof_of_talk(at: _Places, before: Observation, domain: int) -> Proof:
     claim, export = "everything that talked still talks", str(at.export)
     words = ("audit", export, "--keystore", export, "--enclave", _OBSERVER)
     step = _Step((*words, "--domain", str(domain), "--json"))
-    reason = ""
+    reason, denied = "", _denied(at, domain)
     for _ in range(_TRIES):  # nodes may still be starting
         try:
             status, output = _run(step)
         except UnavailableError as error:
             return Proof(claim, None, f"{error}")
         value = json.loads(output)
-        lost = lost_endpoints(before, from_json(value))
+        lost = lost_endpoints(before, from_json(value), denied)
         if not (status or lost):
             number = f"{counted(len(before.nodes), 'node')} with {before.endpoint_count} endpoints"
-            return Proof(claim, True, f"{number} as before, and nothing is denied")
+            but = f", but for {counted(len(denied), 'right')} that the policy denies now"
+            return Proof(claim, True, f"{number} as before{but if denied else ''}")
         reason = f"gone: {first_few(lost, 3)}" if lost else "not all is allowed, or was judged"
     return Proof(claim, False, f"{reason}; see `{step.command.removesuffix(' --json')}`")
 
