@@ -156,7 +156,8 @@ def fetch_release(
     if problem := name_problem(robot):
         raise UsageError(f"{robot!r} is not the name of a robot", problem)
     try:
-        with _transport(source, client_certificate, tls_ca) as transport:
+        transport = _transport(source, client_certificate, tls_ca)
+        with transport.connection:
             updater = _updater(state, transport, now)
             target = updater.get_targetinfo(release_target(robot))
             number = _number(target, source, robot)

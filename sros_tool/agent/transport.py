@@ -1,7 +1,8 @@
 """How files of a publishing folder get to the robot: by https, http, or from a folder.
 
-Both classes are what `tuf` fetches with.  They allow neither endless nor slow answers, follow no
-redirect and no link, and leave it to `tuf` to verify what comes.
+Both classes are what `tuf` fetches with, while their ``connection`` is entered.  They allow neither
+endless nor slow answers, follow no redirect and no link, and leave it to `tuf` to verify what
+comes.
 """
 
 from __future__ import annotations
@@ -10,9 +11,8 @@ import errno
 import http.client
 import ssl
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 from urllib.parse import urlsplit
 
 from tuf.api.exceptions import (
@@ -34,22 +34,12 @@ class FolderTransport(FetcherInterface):
     """Reads the files of a publishing folder in a folder of this machine, such as a USB stick."""
 
     base = "folder:"
+    connection = nullcontext()
 
     def __init__(self, folder: Path, *, most: int) -> None:
         """Read from ``folder``, files of at most ``most`` bytes each."""
         self._folder = folder
         self._most = most
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Leave the folder, which is closed after each file."""
 
     def _fetch(self, url: str) -> Iterator[bytes]:
         path = url.removeprefix(f"{self.base}/")
@@ -74,7 +64,7 @@ class FolderTransport(FetcherInterface):
 class HttpTransport(FetcherInterface):
     """Gets the files of a publishing folder from a web server, over one connection.
 
-    A context manager: what still goes on after some minutes is cut off.
+    Its ``connection`` has to be entered: what still goes on after some minutes is cut off.
     """
 
     def __init__(
@@ -120,19 +110,7 @@ class HttpTransport(FetcherInterface):
         context = ssl.create_default_context(cafile=tls_ca) if secure else None
         if context and certificate:
             context.load_cert_chain(*certificate)
-        self._connection = GuardedConnection(parts.hostname, port, context)
-
-    def __enter__(self) -> Self:
-        self._connection.__enter__()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._connection.__exit__(kind, error, trace)
+        self.connection = GuardedConnection(parts.hostname, port, context)
 
     def _fetch(self, url: str) -> Iterator[bytes]:
         path = f"{self._path}{url.removeprefix(self.base)}"
@@ -145,29 +123,29 @@ class HttpTransport(FetcherInterface):
             while block := response.read1(_BLOCK):
                 yield block
         except (OSError, http.client.HTTPException) as error:
-            if self._connection.is_cut_off:
+            if self.connection.is_cut_off:
                 raise SlowRetrievalError(f"{path} takes too long") from error
             raise DownloadError(_clause(error)) from error
         finally:
             if response is None or not response.isclosed():
-                self._connection.end()
-        if self._connection.is_cut_off:  # the end may be that of the connection alone
+                self.connection.end()
+        if self.connection.is_cut_off:  # the end may be that of the connection alone
             raise SlowRetrievalError(f"{path} takes too long")
 
     def _answer(self, path: str) -> http.client.HTTPResponse:
         """Send the request; once more if the server has closed the kept connection meanwhile."""
-        kept = self._connection.sock is not None
+        kept = self.connection.sock is not None
         try:
             return self._request(path)
         except (ConnectionError, http.client.RemoteDisconnected):
-            if not kept or self._connection.is_cut_off:
+            if not kept or self.connection.is_cut_off:
                 raise
-        self._connection.close()
+        self.connection.close()
         return self._request(path)
 
     def _request(self, path: str) -> http.client.HTTPResponse:
-        self._connection.request("GET", path, headers={"User-Agent": "sros"})
-        return self._connection.getresponse()
+        self.connection.request("GET", path, headers={"User-Agent": "sros"})
+        return self.connection.getresponse()
 
 
 def _clause(error: Exception) -> str:

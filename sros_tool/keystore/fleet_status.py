@@ -728,6 +728,11 @@ def fleet_metrics(
     """
     place = {"keystore": str(status.keystore.absolute())}
     robots = [({**place, "robot": robot.robot}, robot) for robot in status.robots]
+
+    def of_robots(number: Callable[[RobotStatus], int | None]) -> tuple[Sample, ...]:
+        numbers = ((number(robot), labels) for labels, robot in robots)
+        return tuple(Sample(value, labels) for value, labels in numbers if value is not None)
+
     return (
         Metric(
             "sros_fleet_compared_timestamp_seconds",
@@ -749,11 +754,7 @@ def fleet_metrics(
         Metric(
             "sros_fleet_confirmed_timestamp_seconds",
             "When the last confirmation of a robot was received, in seconds since 1970.",
-            tuple(
-                Sample(int(robot.received.timestamp()), labels)
-                for labels, robot in robots
-                if robot.received
-            ),
+            of_robots(lambda robot: int(robot.received.timestamp()) if robot.received else None),
         ),
         Metric(
             "sros_fleet_expiry_timestamp_seconds",
@@ -769,46 +770,34 @@ def fleet_metrics(
             "sros_fleet_restarts_due",
             "Number of enclaves whose processes may still run with earlier files, for robots that "
             "say it.",
-            tuple(
-                Sample(len(robot.restart), labels)
-                for labels, robot in robots
-                if robot.restart is not None
-            ),
+            of_robots(lambda robot: None if robot.restart is None else len(robot.restart)),
         ),
         Metric(
             "sros_fleet_revocation_list_in_force",
             "Whether the present revocation list is in force on a robot (1) or not (0).",
-            tuple(
-                Sample(int(robot.crl_in_force), labels)
-                for labels, robot in robots
-                if robot.crl_in_force is not None
+            of_robots(
+                lambda robot: None if robot.crl_in_force is None else int(robot.crl_in_force)
             ),
         ),
         Metric(
             "sros_fleet_release",
             "Number of the release that a robot installed last, for robots that fetch.",
-            tuple(
-                Sample(robot.release, labels)
-                for labels, robot in robots
-                if robot.release is not None
-            ),
+            of_robots(lambda robot: robot.release),
         ),
         Metric(
             "sros_fleet_published_release",
             "Number of the release that was published last for a robot.",
-            tuple(
-                Sample(robot.published, labels)
-                for labels, robot in robots
-                if robot.published is not None
-            ),
+            of_robots(lambda robot: robot.published),
         ),
         Metric(
             "sros_fleet_clock_ahead_seconds",
             "How far the clock of a robot was ahead when its confirmation was received.",
-            tuple(
-                Sample(int((robot.clock - robot.received).total_seconds()), labels)
-                for labels, robot in robots
-                if robot.clock and robot.received
+            of_robots(
+                lambda robot: (
+                    int((robot.clock - robot.received).total_seconds())
+                    if robot.clock and robot.received
+                    else None
+                )
             ),
         ),
         Metric(
