@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta, tzinfo
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,6 +40,7 @@ from sros_tool.agent.running import (
 from sros_tool.agent.settings import AgentSettings, agent_folder
 from sros_tool.agent.state import read_seal, read_state, write_seal, write_state
 from sros_tool.errors import SrosError
+from sros_tool.files import remove_file, replace_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     LONGEST_LIST,
@@ -69,12 +70,16 @@ from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, open_enclave
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import validity_of
-from sros_tool.pki.crl import list_number
+from sros_tool.pki.crl import list_number, load_crl
 from sros_tool.pki.token import Secrets
 from sros_tool.runtime.processes import RunningProcesses, boot_id
 from sros_tool.validity import elapsed, iso
+from sros_tool.xml import read_bytes
 
 _TOLERANCE = timedelta(minutes=2)
+_REPLACED_LIST = "replaced.crl.pem"
+_REPLACED_FOR = timedelta(days=30)
+"""How long a revocation list that a release replaced is sent to home, if it revoked more."""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -298,6 +303,12 @@ class _Round:
             return Installation()
         names = tuple({*release.enclaves(), *search_enclaves(self._folder)[0]})
         keys = waiting_keys(self._folder, names)
+        replaced = self._revocation_list(names)
+
+        def before(ran: Sequence[str]) -> None:
+            self._keep_replaced_list(replaced)
+            self._record_due(ran)
+
         try:
             installation = install_release(
                 self._folder,
@@ -307,7 +318,7 @@ class _Round:
                 installed=state.accepted,
                 pinned=frozenset(settings.authorities),
                 new_keys=keys,
-                before=self._record_due,
+                before=before,
             )
         except SrosError as error:
             self._problems.append(_sentence(error))
@@ -332,6 +343,7 @@ class _Round:
         )
         self._save()
         self._is_in_step = not installation.kept
+        self._drop_replaced_list(names)
         drop_installed_keys(self._folder, keys)
         return installation
 
@@ -447,7 +459,7 @@ class _Round:
             clock=clock,
             problems=_short(self._problems),
             requests=asked.requests,
-            crl=None if self._is_in_step else self._revocation_list(names),
+            crl=self._list_for_home(names),
         )
         message = self._signed(confirmation, (asked.signer,) if asked.signer else names)
         if not message:
@@ -467,6 +479,36 @@ class _Round:
         if arrived:
             self._state = replace(self._state, sent=now)
         return arrived
+
+    def _list_for_home(self, names: Iterable[str]) -> str | None:
+        """Return the revocation list that home perhaps does not know any more; None if it does."""
+        return self._replaced_list() if self._is_in_step else self._revocation_list(names)
+
+    def _replaced_list(self) -> str | None:
+        """Return the list that a release replaced by one that revokes less; None if none did."""
+        with suppress(SrosError, OSError):
+            path = agent_folder(self._folder) / _REPLACED_LIST
+            since = datetime.fromtimestamp(path.stat().st_mtime, UTC)
+            if abs(self._machine.now - since) < _REPLACED_FOR:
+                return read_bytes(path, "revocation list", most=LONGEST_LIST).decode()
+        return None
+
+    def _keep_replaced_list(self, text: str | None) -> None:
+        """Keep the present revocation list, before a release may replace it by one that lacks some.
+
+        Home leaves out what has expired; but a home that was restored from a backup may have
+        forgotten it.
+        """
+        if text and not self._replaced_list():
+            path = agent_folder(self._folder) / _REPLACED_LIST
+            self._attempt(lambda: replace_file(path, text.encode()))
+
+    def _drop_replaced_list(self, names: Iterable[str]) -> None:
+        """Remove the list that was kept, if the present one revokes the same certificates."""
+        kept, present = self._replaced_list(), self._revocation_list(names)
+        if kept and present and _revoked(kept) <= _revoked(present):
+            with suppress(OSError):
+                remove_file(agent_folder(self._folder) / _REPLACED_LIST)
 
     def _revocation_list(self, names: Iterable[str]) -> str | None:
         """Return the newest revocation list of these enclaves as PEM; None without one."""
@@ -540,6 +582,13 @@ class _Opened(NamedTuple):
         with suppress(SrosError):
             return self.state.grant.validity.not_after if self.state.grant else None
         return None
+
+
+def _revoked(text: str) -> frozenset[int]:
+    """Return the serial numbers in a revocation list (PEM); none if it cannot be read."""
+    with suppress(SrosError):
+        return frozenset(entry.serial for entry in load_crl(text.encode(), "here").revoked)
+    return frozenset()
 
 
 def _expiry(enclave: _Opened | None) -> EnclaveExpiry:

@@ -38,6 +38,8 @@ from sros_tool.keystore.layout import CRL_FILE, REQUIRED_FILES
 from sros_tool.keystore.reader import read_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificates, load_request, validity_of
+from sros_tool.pki.crl import load_crl, sign_crl
+from sros_tool.pki.keys import load_key
 from sros_tool.runtime.processes import (
     LoadedFile,
     Process,
@@ -46,7 +48,7 @@ from sros_tool.runtime.processes import (
     UnseenProcess,
 )
 from sros_tool.validity import BACKDATE, Window
-from tests.agent.releases import NAMES, Home, moment
+from tests.agent.releases import NAMES, Home, files_of, moment, release_of
 from tests.agent.test_install import content, has
 from tests.keystore.test_transaction import DIED, in_child, run_out_of_space
 from tests.support.children import some_steps
@@ -281,6 +283,38 @@ def test_a_revocation_list_that_home_may_have_lost_is_sent(home: Home, r1: Robot
         assert r1.message().crl == mine
     r1.release = home.release(home.revoked.files, 12)
     r1.round()
+    assert r1.message().crl is None
+
+
+def test_a_revocation_list_that_is_replaced_by_one_that_revokes_less_is_sent(
+    home: Home, r1: Robot, tmp_path: Path
+) -> None:
+    """As by a home that was restored from a backup, and has revoked something else since."""
+    r1.release = home.revoked
+    r1.round()
+    mine = (r1.folder / "enclaves/r1/a" / CRL_FILE).read_text()
+    root = Path(shutil.copytree(home.root, tmp_path / "home", symlinks=True))
+    sros("crl", root, "--refresh").ok()
+    r1.release = release_of(files_of(root), 4, home.authority)
+    r1.round()
+    assert r1.message().crl is None, "the new list has the same entries"
+    number = load_crl(mine.encode(), "it").number
+    before = (r1.folder / "enclaves/r1/a" / CRL_FILE).read_text()
+    for later in (5, 6):
+        other = sign_crl(
+            read_certificate(root / "public/identity_ca.cert.pem"),
+            load_key((root / "private/identity_ca.key.pem").read_bytes(), "it"),
+            (),
+            number=number + later,
+            this_update=moment() - timedelta(hours=1),
+            next_update=moment() + timedelta(days=90),
+        )
+        lists = {path: other for path in home.revoked.files if path.endswith(CRL_FILE)}
+        r1.release = home.release({**home.revoked.files, **lists}, later)
+        for _ in range(2):
+            assert not r1.round().problems
+            assert r1.message().crl == before, "also after further releases"
+    r1.round(moment() + timedelta(days=40))
     assert r1.message().crl is None
 
 
