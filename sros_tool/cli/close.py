@@ -72,6 +72,11 @@ class _Places:
         self.start, self.page = folder / "start", folder / "rights.html"
         self.observed, self.processes = folder / "observed.json", folder / "processes.json"
 
+    @property
+    def rights(self) -> Path:
+        """The keystore, or the policy if the keystore was brought to another machine."""
+        return self.keystore if self.keystore.exists() else self.policy
+
     def steps(self, domain: int, duration: str | None) -> list[_Step]:
         """Return the steps; with a ``duration``, the robot is watched even if it was before."""
         policy, keystore, needed = str(self.policy), str(self.keystore), str(self.requirements)
@@ -188,6 +193,12 @@ def close(
             "",
             "Close each domain into a folder of its own.",
         )
+    if at.export.exists() and not (at.keystore.exists() or proves or undoes):
+        raise UsageError(
+            f"the keystore '{at.keystore}' is not there, and '{at.export}' comes from it",
+            "A new keystore would have other CAs.",
+            "Bring it back to change the robot; --proof and --undo need only the export.",
+        )
     steps: list[CloseStep] = []
     denied: list[str] = []
     problems: list[str] = []
@@ -246,10 +257,11 @@ def _do(at: _Places, step: _Step) -> str:
         replace_file(step.into, output.encode())
     elif not step.into:
         lines = output.splitlines()
-        shown = lines if status or len(lines) <= _MOST_LINES else lines[: _MOST_LINES - 1]
-        for line in shown:
+        few = len(lines) if status or len(lines) <= _MOST_LINES else _MOST_LINES - 1
+        notes = [line for line in lines[few:] if line.startswith("note ")]
+        for line in (*lines[:few], *notes):
             echo(line, err=True)
-        if more := len(lines) - len(shown):
+        if more := len(lines) - few - len(notes):
             echo(f"... and {more} more lines", err=True)
     if watches:
         _keep_processes(at, step, output)
@@ -337,7 +349,7 @@ def _denied(at: _Places, domain: int) -> Sequence[DeniedRight]:
 
     context = JoinContext(domain, now(), local_zone(os.environ))
     vendor = chosen_vendor(None, None, os.environ)[0]
-    audited = audit(_observation(at), audited_enclaves(at.keystore, vendor, context), _OBSERVER)
+    audited = audit(_observation(at), audited_enclaves(at.rights, vendor, context), _OBSERVER)
     return audited.denied
 
 
@@ -512,23 +524,31 @@ def _proof_of_talk(at: _Places, before: Observation, domain: int) -> Proof:
     from sros_tool.closing import Proof, lost_endpoints
     from sros_tool.graph.observation import from_json
 
-    claim, export = "everything that talked still talks", str(at.export)
-    words = ("audit", export, "--keystore", export, "--enclave", _OBSERVER)
+    claim, denied = "everything that talked still talks", _denied(at, domain)
+    words = ("audit", str(at.rights), "--keystore", str(at.export), "--enclave", _OBSERVER)
     step = _Step((*words, "--domain", str(domain), "--json"))
-    reason, denied = "", _denied(at, domain)
+    echo(f"$ {step.command}", err=True)
     for _ in range(_TRIES):  # nodes may still be starting
         try:
-            status, output = _run(step)
+            with redirect_stderr(io.StringIO()):  # JSON says it all
+                status, output = _run(step)
         except UnavailableError as error:
             return Proof(claim, None, f"{error}")
         value = json.loads(output)
-        lost = lost_endpoints(before, from_json(value), denied)
-        if not (status or lost):
+        wrong = {
+            "gone": lost_endpoints(before, from_json(value), denied),
+            "denied": [f"{right['enclave']} {right['name']}" for right in value["denied"]],
+            "refused": [refused["enclave"] for refused in value["refused"]],
+            "not seen": [unseen["node"] or unseen["enclave"] for unseen in value["unseen"]],
+            "not judged": value["unjudged"],
+            "not done": ["the ROS graph kept changing"] if status else [],
+        }
+        reason = next((f"{why}: {first_few(of, 3)}" for why, of in wrong.items() if of), "")
+        if not reason:
             number = f"{counted(len(before.nodes), 'node')} with {before.endpoint_count} endpoints"
             but = f", but for {counted(len(denied), 'right')} that the policy denies now"
             return Proof(claim, True, f"{number} as before{but if denied else ''}")
-        reason = f"gone: {first_few(lost, 3)}" if lost else "not all is allowed, or was judged"
-    return Proof(claim, False, f"{reason}; see `{step.command.removesuffix(' --json')}`")
+    return Proof(claim, False, reason)
 
 
 def _proof_of_silence(at: _Places, before: Observation, domain: int) -> Proof:

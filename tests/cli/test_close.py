@@ -216,6 +216,7 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     )
     assert robot.restarts == []
     sros(*revoke.split()[1:], cwd=robot.folder).ok()
+    robot.remaining = (TALKER,)
     ended = robot.close("--apply", status=1)
     assert robot.restarts == ["daemon-reload", "restart talker.service"]
     assert "no: every process runs in its enclave: process 4712 (run): in domain 0" in ended.out
@@ -235,6 +236,10 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     assert "the robot is closed; bring robot/keystore to another machine" in closed.err
     robot.close("--apply")
     assert len(robot.restarts) == 2  # they run in their enclaves already
+    (robot.folder / "robot/keystore").rename(robot.folder / "home")
+    assert "yes: everything that talked still talks: 2 nodes" in robot.close("--proof").out
+    assert "A new keystore would have other CAs." in robot.close("--apply", status=2).err
+    (robot.folder / "home").rename(robot.folder / "robot/keystore")
     undone = robot.close("--undo")
     assert [*robot.folder.glob("systemd/*.d/*")] == []
     assert robot.restarts[2:] == ["daemon-reload", "restart listener.service talker.service"]
@@ -271,6 +276,11 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     robot.remaining = (TALKER,)
     assert (
         "no: everything that talked still talks: gone: /listener "
+        in robot.close("--proof", status=1).out
+    )
+    robot.remaining = (TALKER, LISTENER, ros_node("guest", "05"))
+    assert (
+        "no: everything that talked still talks: denied: /guest "
         in robot.close("--proof", status=1).out
     )
     robot.remaining = (TALKER, LISTENER)
