@@ -1,7 +1,7 @@
 """A plugin with which pytest runs tests in several processes, forked when all are collected.
 
-A process takes one file of tests after the other.  So every file is imported once, every test
-collected once, and what the tests of a file share is made once.
+A process takes one file of tests after the other, or all files with the same ``TAKEN_TOGETHER``.
+So every file is imported once, every test collected once, and what their tests share is made once.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import os
 import signal
 import traceback
 from collections.abc import Iterator, Sequence
-from itertools import groupby
 from multiprocessing.connection import Connection, Pipe, wait
 from types import TracebackType
 from typing import Self
@@ -54,8 +53,10 @@ class _Processes:
 
     def __init__(self, session: pytest.Session, number: int) -> None:
         self._session = session
-        groups = groupby(session.items, key=lambda item: item.path)
-        self._files = [list(items) for _, items in groups]
+        files: dict[object, list[pytest.Item]] = {}
+        for item in session.items:
+            files.setdefault(_file(item), []).append(item)
+        self._files = list(files.values())
         self._number = min(number, len(self._files))
         self._pids: dict[Connection, int] = {}
 
@@ -112,6 +113,12 @@ class _Processes:
         for pid in self._pids.values():  # after an error
             os.kill(pid, signal.SIGTERM)
             os.waitpid(pid, 0)
+
+
+def _file(item: pytest.Item) -> object:
+    """Return what is equal for tests that one process takes: those of a file, or with a browser."""
+    browsing = getattr(item.getparent(pytest.Module), "obj", None)
+    return getattr(browsing, "TAKEN_TOGETHER", item.path)
 
 
 def _status_text(status: int) -> str:

@@ -18,6 +18,7 @@ from datetime import datetime
 from enum import Enum
 from functools import cache, cached_property
 from importlib import import_module
+from itertools import pairwise
 from pathlib import PurePath
 from typing import (
     Annotated,
@@ -472,7 +473,7 @@ def _names_for_type_checks(module: str) -> dict[str, Any]:
     names: dict[str, Any] = {}
     if module.partition(".")[0] not in ("sros_tool", "tests"):
         return names
-    for node in ast.parse(inspect.getsource(sys.modules[module])).body:
+    for node in _tree(module).body:
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             exec(compile(ast.Module(node.body, []), module, "exec"), names)  # noqa: S102
     return names
@@ -495,15 +496,29 @@ def _description(kind: type, name: str, declared: Any) -> str:
 
 
 @cache
+def _tree(module: str) -> ast.Module:
+    return ast.parse(inspect.getsource(sys.modules[module]))
+
+
+@cache
+def _classes(module: str) -> dict[str, ast.stmt]:
+    """Return the classes of a module, by their names in it."""
+    return {node.name: node for node in _tree(module).body if isinstance(node, ast.ClassDef)}
+
+
+@cache
 def docstrings_of_fields(kind: type) -> dict[str, str]:
     """Return the strings after the fields of a class, or the members of an enumeration."""
     if kind.__module__.partition(".")[0] not in ("sros_tool", "tests"):
         return {}
-    (body,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
-    assert isinstance(body, ast.ClassDef)
+    written = _classes(kind.__module__).get(kind.__qualname__)
+    if written is None:  # in a function
+        (written,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    assert isinstance(written, ast.ClassDef)
+    body = written.body
     return {
         target.id: after.value.value
-        for field, after in zip(body.body, body.body[1:], strict=False)
+        for field, after in pairwise(body)
         if isinstance(field, ast.AnnAssign | ast.Assign)
         for target in (field.targets if isinstance(field, ast.Assign) else [field.target])
         if isinstance(target, ast.Name)

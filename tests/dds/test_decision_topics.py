@@ -10,6 +10,7 @@ from sros_tool.dds.decision.answers import AccessVerb, Refusal
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from tests.dds.drawn_documents import documents
 from tests.support.children import LONG
+from tests.support.long_form import some
 
 TOPICS = (
     "rt/a", "rt/b", "rt/ab", "rt/a/b", "rt/c", "rq/aRequest", "rt/]", "rt/-", "rt/]b", "a", "rt/",
@@ -18,7 +19,7 @@ TOPICS = (
 VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 
 
-@pytest.mark.parametrize("vendor", [*MEASURED, Vendor.STANDARD])
+@pytest.mark.parametrize("vendor", some([*MEASURED, Vendor.STANDARD], 4))
 def test_a_topic_is_in_the_set_if_it_is_allowed(vendor: Vendor) -> None:
     seen: Counter[bool] = Counter()
     for case in documents(11, 4000 if LONG else 250):

@@ -183,7 +183,7 @@ def test_keys_that_are_made_on_the_robot(three: Fleet) -> None:
     assert restarts(three) == [[], [], []]
 
 
-@sometimes("what follows a revocation", 1 / 2)
+@sometimes("what follows a revocation")
 def test_revocation(three: Fleet) -> None:
     """All others get the list, once; the revoked robot is left alone."""
     done = three.play("revoke", sros_revoke=["r3"])

@@ -19,6 +19,9 @@ CHECKOUT = Path(__file__).parents[2]
 PLAYBOOK = shutil.which("ansible-playbook", path=str(Path(sys.executable).parent))
 pytestmark = pytest.mark.skipif(not PLAYBOOK, reason="not here: ansible-playbook")
 
+PART = 1 / 8
+"""Of the runs in which a hostile robot answers, for each kind of answer."""
+
 CONFIRMATION = {"format": 1, "robot": "r1", "time": "2026-01-01T00:00:00Z", "files": {}}
 INSTALLED: dict[str, Any] = {
     "changed": False,
@@ -117,7 +120,7 @@ def enclaves(keystore: Path) -> list[str]:
     return list(json.loads(sros("list_enclaves", keystore, "--json").ok().out)["enclaves"])
 
 
-@sometimes("nobody revoked is an error")
+@sometimes("nobody revoked is an error", PART)
 @pytest.mark.parametrize(
     ("revoke", "said"),
     [
@@ -139,7 +142,7 @@ def test_nobody_revoked_is_an_error(tmp_path: Path, revoke: object, said: str) -
     assert enclaves(keystore) == ["/dispatcher", "/r1/a"]
 
 
-@sometimes("robots lie in many ways")
+@sometimes("robots lie in many ways", PART)
 def test_robots_that_lie_in_many_ways(tmp_path: Path) -> None:
     """Facts do not choose who is revoked, and nothing reaches the terminal or the inventory raw."""
     keystore = fleet_keystore(tmp_path, 8)
@@ -249,7 +252,7 @@ def test_facts_of_a_robot_choose_no_command_and_no_keys(tmp_path: Path) -> None:
     assert "r2" not in commands
 
 
-@sometimes("a revoked robot gets no certificate for another key")
+@sometimes("a revoked robot gets no certificate for another key", PART)
 def test_a_revoked_robot_gets_no_certificate_for_another_key(tmp_path: Path) -> None:
     """Nor does one that answers only when one of its enclaves is revoked."""
     keystore = fleet_keystore(tmp_path, 3)
@@ -281,7 +284,7 @@ def test_a_revoked_robot_gets_no_certificate_for_another_key(tmp_path: Path) -> 
     assert "Left out, because of what they answered (see above): r3." in " ".join(text.split())
 
 
-@sometimes("a status is green only if all were asked and verify")
+@sometimes("a status is green only if all were asked and verify", PART)
 def test_a_status_is_green_only_if_all_were_asked_and_verify(tmp_path: Path) -> None:
     keystore = fleet_keystore(tmp_path, 3)
     broken = {"verification": {"ok": False, "problems": ["/r1/a: key.pem: not the key"]}}
@@ -299,7 +302,7 @@ def test_a_status_is_green_only_if_all_were_asked_and_verify(tmp_path: Path) -> 
     assert "r3 :" in text and "failed=1" in text, text
 
 
-@sometimes("a status with missing files is no success")
+@sometimes("a status with missing files is no success", PART)
 def test_a_status_with_missing_files_is_no_success(tmp_path: Path) -> None:
     keystore = fleet_keystore(tmp_path, 1)
     python = hostile(tmp_path, "r1", {"reach": {"reached": True}, "enclaves": INSTALLED})
@@ -310,7 +313,7 @@ def test_a_status_with_missing_files_is_no_success(tmp_path: Path) -> None:
     assert "failed=1" in text, text
 
 
-@sometimes("a rotation goes on without a revoked robot")
+@sometimes("a rotation goes on without a revoked robot", PART)
 def test_a_rotation_goes_on_without_a_revoked_robot(tmp_path: Path) -> None:
     keystore = fleet_keystore(tmp_path, 2)
     sros("revoke", keystore, "--robot", "r2").ok()
@@ -327,7 +330,7 @@ def test_a_rotation_goes_on_without_a_revoked_robot(tmp_path: Path) -> None:
     assert "failed=1" not in text and "ok: [r1]" in text.partition("Restart and confirm")[2], text
 
 
-@sometimes("no robot meant is an error")
+@sometimes("no robot meant is an error", PART)
 def test_no_robot_meant_is_an_error(tmp_path: Path) -> None:
     own = {"sros_keystore": str(fleet_keystore(tmp_path, 1)), "sros_hosts": "r*9"}
     program = [sys.executable, "-m", "sros_tool"]
@@ -335,7 +338,7 @@ def test_no_robot_meant_is_an_error(tmp_path: Path) -> None:
     assert "No robot of the inventory is meant by r*9 in sros_hosts" in text, text
 
 
-@sometimes("a name that means nobody stops a rotation")
+@sometimes("a name that means nobody stops a rotation", PART)
 def test_a_name_that_means_nobody_stops_a_rotation(tmp_path: Path) -> None:
     """Otherwise all stages are taken, and no robot has the files of one."""
     own = {"sros_keystore": "/nowhere", "sros_hosts": "r1:!r99", "sros_replace_ca": "0" * 64}
@@ -344,7 +347,7 @@ def test_a_name_that_means_nobody_stops_a_rotation(tmp_path: Path) -> None:
     assert "Look which CA issues" not in text, text
 
 
-@sometimes("no two hosts get the keys of one robot")
+@sometimes("no two hosts get the keys of one robot", PART)
 def test_no_two_hosts_get_the_keys_of_one_robot(tmp_path: Path) -> None:
     own = {"sros_keystore": "/nowhere", "sros_robot": "r1"}
     text = " ".join(play(tmp_path, "deliver", {"r1": {}, "r2": {}}, **own).split())
@@ -352,7 +355,7 @@ def test_no_two_hosts_get_the_keys_of_one_robot(tmp_path: Path) -> None:
     assert "Install and verify" not in text, text
 
 
-@sometimes("a robot names only enclaves to restart")
+@sometimes("a robot names only enclaves to restart", PART)
 def test_a_robot_names_only_enclaves_to_restart(tmp_path: Path) -> None:
     """Its operator is told to restart them, in a sentence that is not the robot's."""
     keystore = fleet_keystore(tmp_path, 1)
@@ -374,7 +377,7 @@ def test_a_robot_names_only_enclaves_to_restart(tmp_path: Path) -> None:
     assert "a repair" not in text, text
 
 
-@sometimes("a revocation is not done while a robot has another valid key")
+@sometimes("a revocation is not done while a robot has another valid key", PART)
 def test_a_revocation_is_not_done_while_a_robot_has_another_valid_key(tmp_path: Path) -> None:
     """One robot in each batch fails, and the host of the office has files of all others."""
     keystore = fleet_keystore(tmp_path, 4)
@@ -395,7 +398,7 @@ def test_a_revocation_is_not_done_while_a_robot_has_another_valid_key(tmp_path: 
     assert "ok: [r4]" in text.partition("Install and verify the enclaves]")[2], text
 
 
-@sometimes("bad requests of robots get no certificate and stop no other")
+@sometimes("bad requests of robots get no certificate and stop no other", PART)
 def test_bad_requests_of_robots_get_no_certificate_and_stop_no_other(tmp_path: Path) -> None:
     """A request says which enclave it is for, and who made it can choose that."""
     keystore = tmp_path / "keystore"
@@ -439,7 +442,7 @@ def test_bad_requests_of_robots_get_no_certificate_and_stop_no_other(tmp_path: P
     assert "ok: [r2]" in delivered, text
 
 
-@sometimes("a limit that leaves out the home is refused")
+@sometimes("a limit that leaves out the home is refused", PART)
 def test_a_limit_that_leaves_out_the_home_is_refused(tmp_path: Path) -> None:
     """Otherwise a play would revoke nothing and say that all is well."""
     robot = {

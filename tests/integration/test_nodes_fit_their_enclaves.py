@@ -329,7 +329,7 @@ def is_of_every_node(name: str, *, managed: bool) -> bool:
     ],
 )
 def test_the_nodes_of_a_shipped_policy_are_denied_nothing(system: str, keystore: Path) -> None:
-    enclaves = some(read_policy(policies_dir() / f"{system}.xml").enclaves, 4)
+    enclaves = some(read_policy(policies_dir() / f"{system}.xml").enclaves, 2)
     processes = {each.path: nodes_of(each) for each in enclaves}
     seen = look(230, processes)
     for enclave in enclaves:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 pytest_plugins = ["tests.report.browsing"]
 
+TAKEN_TOGETHER = "a browser"
+
 ASSETS = WEB.parent / "sros_tool" / "report" / "assets"
 
 

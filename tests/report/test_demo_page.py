@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 pytest_plugins = ["tests.report.browsing"]
 
+TAKEN_TOGETHER = "a browser"
+
 
 def row(name: str, **values: Any) -> dict[str, Any]:
     given = {

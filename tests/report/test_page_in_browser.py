@@ -33,11 +33,14 @@ from tests.report.pictures import (
     new_page,
 )
 from tests.support.harness import policy_text, sros
+from tests.support.long_form import some
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 pytest_plugins = ["tests.report.browsing"]
+
+TAKEN_TOGETHER = "a browser"
 
 pytestmark = pytest.mark.browser
 PRODUCTION = templates_dir() / "production.toml"
@@ -190,7 +193,7 @@ def distances(network: Network, name: str, upstream: bool) -> dict[str, int]:
     return found
 
 
-@pytest.mark.parametrize("open_to_all", ["nothing", "some names", "writing"])
+@pytest.mark.parametrize("open_to_all", some(["nothing", "some names", "writing"], 1))
 def test_the_flow_agrees_with_the_one_that_explain_follows(
     browser: Browser,
     robot_page: Path,
