@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, settings, strategies
 
 from sros_tool.pki import keys
 from tests.support.children import LONG
@@ -80,8 +80,13 @@ def pytest_report_header() -> str:
 gc.disable()
 
 
-def pytest_collection_finish() -> None:
-    """Take what stays until the end from the garbage collector, which looked at it every time."""
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Take what stays until the end from the garbage collector, which looked at it every time.
+
+    What Hypothesis knows of characters is computed here, before the tests run in processes.
+    """
+    if any(item.get_closest_marker("hypothesis") for item in session.items):
+        strategies.text().validate()
     gc.collect()
     gc.freeze()
     gc.enable()

@@ -140,7 +140,8 @@ def _certificate_alone(robot: Path) -> None:
 
 def _link_for_a_folder(robot: Path) -> None:
     robot.mkdir()
-    (robot / "enclaves").symlink_to("/tmp")
+    robot.with_name("elsewhere").mkdir()
+    (robot / "enclaves").symlink_to("../elsewhere")
 
 
 BAD_PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
