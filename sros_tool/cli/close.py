@@ -6,6 +6,7 @@ import io
 import json
 import os
 import shlex
+import stat
 import subprocess
 import sys
 import time
@@ -148,12 +149,12 @@ def close(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Close the robot that runs open on this machine, step by step, by what it makes in FOLDER.
+    """Close the robot that runs open on this machine, step by step.
 
-    Watches the robot on DDS, and writes its policy, requirements that hold now, a production
-    keystore with an enclave for each process, an export of them without CA keys, and how each
-    process is started secured. Each step is a verb, which is shown. What is there is kept: edit
-    policy.xml and requirements.toml, and run it again.
+    Watches the robot on DDS, and writes into FOLDER its policy, requirements that hold now, a
+    production keystore with an enclave for each process, an export of them without CA keys, and how
+    each process is started secured. Each step is a verb, which is shown. What is there is kept:
+    edit policy.xml and requirements.toml, and run it again.
 
     Nothing is closed before --apply, which restarts the processes that are units of systemd, and
     shows the commands for all others. --proof, which --apply does by itself if nothing is left to
@@ -366,7 +367,11 @@ def _problems(
         if name != _OBSERVER and not policy.enclave(name):
             revoke = f"sros revoke {shlex.quote(str(at.keystore))} {name}"
             problems.append(f"the policy does not have {name}, and the keystore does: {revoke}")
-    owner = at.export.stat().st_uid
+    owner, export = at.export.stat().st_uid, at.export.absolute()
+    for user in sorted({process.user for process in observed.processes} - {0}):
+        closed = [path for path in export.parents if not _may_enter(user, path.stat())]
+        if closed:
+            problems.append(f"user {user}, who runs processes, cannot enter '{closed[-1]}'")
     for user in sorted({process.user for process in observed.processes} - {owner}):
         problems.append(
             f"processes run as user {user}, and only user {owner} can read the enclaves: "
@@ -375,6 +380,10 @@ def _problems(
     if (observed.unknown or observed.elsewhere) and not partial:
         problems.append("some processes or nodes would not be heard any more (accept: --partial)")
     return problems
+
+
+def _may_enter(user: int, folder: os.stat_result) -> bool:
+    return bool(folder.st_mode & (stat.S_IXUSR if folder.st_uid == user else 0o011))
 
 
 # ── applying ────────────────────────────────────────────────────────────────────────────────

@@ -138,8 +138,9 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         lambda pid: ProcessOrigin(robot.units.get(units.get(pid, ""), ""), "/opt", robot.launch),
     )
     monkeypatch.setattr(close, "_SYSTEMD", tmp_path / "systemd")
-    monkeypatch.setattr(close, "_RESTART_SECONDS", 0.1)
-    monkeypatch.setattr(close, "_START_SECONDS", 0.1)
+    for number in ("_RESTART_SECONDS", "_START_SECONDS"):
+        monkeypatch.setattr(close, number, 0.1)
+    monkeypatch.setattr(close, "_TRIES", 1)
     for name in ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", "ROS_SECURITY_ENABLE"):
         monkeypatch.delenv(name, raising=False)
     (tmp_path / "systemd").mkdir()
@@ -387,7 +388,10 @@ def test_processes_of_another_user_need_the_files(
     monkeypatch.setattr(
         robot, "process", lambda enclave, **more: replace(of_root(enclave, **more), user=1234)
     )
-    assert "chown -R 1234 robot/export" in robot.close(status=1).out
+    (robot.folder / "robot").mkdir(mode=0o700)
+    said = robot.close(status=1).out
+    assert "chown -R 1234 robot/export" in said
+    assert "looks wrong: user 1234, who runs processes, cannot enter '/" in said
     robot.close("--apply", status=1)
     assert robot.restarts == []
 
