@@ -299,10 +299,10 @@ def crl(
     if as_json:
         from sros_tool.keystore.lifecycle.shown import shown_lists
 
-        enclaves = _names(keystore)
+        enclaves = _names(keystore, lists)
         print_json(shown_lists(root, lists, result, enclaves, expires_soon=soon, dry_run=dry_run))
     elif lists:
-        for line in _list_lines(lists, _names(keystore)):
+        for line in _list_lines(lists, _names(keystore, lists)):
             echo(line)
     else:
         echo("nothing was ever revoked", err=True)
@@ -323,9 +323,11 @@ def _given_list(path: Path | None) -> bytes:
     return read_bytes(path, "revocation list") if path else b""
 
 
-def _names(keystore: Keystore) -> dict[str, str]:
-    """Map the serial numbers of certificates to their enclaves, as the ledger has them."""
-    return {entry.serial: entry.enclave for entry in keystore.ledger.entries if entry.serial}
+def _names(keystore: Keystore, lists: Sequence[RevocationList]) -> dict[str, str]:
+    """Map the serial numbers in ``lists`` to their enclaves, as the ledger has them."""
+    serials = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
+    ledger = keystore.ledger_file.with_values("serial", serials)
+    return {entry.serial: entry.enclave for entry in ledger.entries if entry.serial}
 
 
 def _list_lines(lists: Sequence[RevocationList], names: Mapping[str, str]) -> Iterator[str]:

@@ -618,7 +618,7 @@ class _Run:
         ``found`` are the robots that seemed changed before the keystore was locked.
         """
         changed = self.changed(found)
-        number = max(change.ledger.next_number(), self._number + 1)
+        number = max(change.keystore.ledger_file.next_number(), self._number + 1)
         authority = None if self._dry_run or not changed else change.permissions
 
         def work(part: Sequence[_Changed]) -> list[_Made]:
