@@ -831,13 +831,10 @@ def _too_large(path: Path) -> KeystoreError:
     return KeystoreError(
         f"the ledger '{path}' is too large",
         f"It has more than {_MOST_BYTES // 1024**2} MiB or {_MOST_LINES} lines.",
-        f"If it belongs to this keystore, move {LEDGER}, its parts and {LEDGER_HEAD} to an archive, "
-        "state "
-        f"all rights again with `sros generate_artifacts -k {quote(str(root))} -p POLICY_FILE`, "
-        "and replace "
-        f"the CAs with `sros rotate_ca {quote(str(root))} --next`, so that nothing that the new "
-        "ledger lacks "
-        "is valid. Otherwise restore it from a backup.",
+        f"If it belongs to this keystore, move {LEDGER}, its parts and {LEDGER_HEAD} to an "
+        f"archive, state all rights again with `sros generate_artifacts -k {quote(str(root))} -p "
+        f"POLICY_FILE`, and replace the CAs with `sros rotate_ca {quote(str(root))} --next`, so "
+        "that nothing that the new ledger lacks is valid. Otherwise restore it from a backup.",
     )
 
 
