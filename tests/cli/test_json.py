@@ -37,7 +37,7 @@ from tests.cli.test_audit import FINE, LOUD, POLICY, SHORT
 from tests.demo.test_demo_result import CLOSED, OLD, OPEN, TWIN, result
 from tests.graph.fake_graph import Beside, graph
 from tests.support.harness import Ended, snapshot, sros
-from tests.support.long_form import drawn
+from tests.support.long_form import drawn, some
 from tests.support.verbs import COMMANDS
 from tools.json_page import SCHEMAS, SHARED, page
 
@@ -330,7 +330,9 @@ DRY_RUNS = [
 ]
 
 
-@pytest.mark.parametrize(("verb", "case"), DRY_RUNS, ids=[verb for verb, _ in DRY_RUNS])
+@pytest.mark.parametrize(
+    ("verb", "case"), [pytest.param(*each, id=each[0]) for each in some(DRY_RUNS, 15)]
+)
 def test_a_dry_run_says_what_would_be_done(
     verb: str, case: Case, made_folder: Path, tmp_path: Path
 ) -> None:
@@ -411,7 +413,7 @@ def test_a_path_that_no_json_holds_is_not_in_an_environment(
 # ── errors, and standard output that is an archive ─────────────────────────────────────────
 
 
-@pytest.mark.parametrize("verb", sorted({*VERBS} - {*WITHOUT_JSON, "env"}))
+@pytest.mark.parametrize("verb", some(sorted({*VERBS} - {*WITHOUT_JSON, "env"}), 15))
 def test_an_error_prints_no_json(verb: str, made_folder: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(made_folder, tmp_path / "made", symlinks=True))
     text = sros(*verb.split(), *ERRORS[verb].split(), cwd=folder)

@@ -188,7 +188,7 @@ ROOTS = {
 }
 
 
-@pytest.mark.parametrize("name", some([*ROOTS], 4))
+@pytest.mark.parametrize("name", some([*ROOTS], 2))
 def test_root_with_any_name(name: str, tmp_path: Path) -> None:
     (tmp_path / "x").mkdir()
     root = ROOTS[name]

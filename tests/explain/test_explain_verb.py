@@ -19,6 +19,7 @@ from sros_tool.policy.rights import policy_rights
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
 from tests.support.harness import Ended, policy_text, publish, sros, with_includes
+from tests.support.long_form import some
 
 POLICY = policies_dir() / "talker_listener.xml"
 HERE = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", "TZ": "UTC"}
@@ -653,17 +654,20 @@ def test_reach(whole: Path) -> None:
 
 @pytest.mark.parametrize(
     ("line", "offered"),
-    [
-        ("{ks} /", [ENCLAVE, OTHER]),
-        ("{ks} /a p", ["publish"]),
-        ("{ks} /a publish /cha", ["/chatter"]),
-        ("{ks} /a execute /", []),
-        ("/a s", ["subscribe", "serve"]),
-        ("--keystore {ks} /talker_listener/t", [ENCLAVE]),
-        ("--reach /talker_listener/l", [OTHER]),
-        ("{ks} --reach /talker_listener/l", [OTHER]),
-        ("{ks} --who s", ["subscribe", "serve"]),
-    ],
+    some(
+        [
+            ("{ks} /", [ENCLAVE, OTHER]),
+            ("{ks} /a p", ["publish"]),
+            ("{ks} /a publish /cha", ["/chatter"]),
+            ("{ks} /a execute /", []),
+            ("/a s", ["subscribe", "serve"]),
+            ("--keystore {ks} /talker_listener/t", [ENCLAVE]),
+            ("--reach /talker_listener/l", [OTHER]),
+            ("{ks} --reach /talker_listener/l", [OTHER]),
+            ("{ks} --who s", ["subscribe", "serve"]),
+        ],
+        3,
+    ),
 )
 def test_completion(line: str, offered: list[str], whole: Path) -> None:
     words = f"sros explain {line.format(ks=whole)}"

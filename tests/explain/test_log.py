@@ -148,7 +148,7 @@ def test_the_true_cause_is_found_in_the_enclave(breakage: str, log: Path, keysto
     assert "Traceback" not in broken.err
 
 
-@pytest.mark.parametrize("breakage", some([*BREAKAGES], 8))
+@pytest.mark.parametrize("breakage", some([*BREAKAGES], 4))
 def test_the_remedy_runs_and_mends_it(breakage: str, keystore: Path) -> None:
     BREAKAGES[breakage](Enclave(keystore))
     asked = ("explain", keystore, ENCLAVE, "--log", log_of(FAST_14, breakage), "--domain", "0")
