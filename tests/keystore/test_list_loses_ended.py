@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from sros_tool.keystore.describe import HistoryStatus, history
 from sros_tool.keystore.layout import LEDGER, enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
@@ -36,11 +38,23 @@ def made(root: Path) -> tuple[Path, int]:
     return root, serial
 
 
-@pytest.mark.parametrize("ledger", [True, False])
-def test_it_stays_until_it_was_on_a_list_after_its_end(ledger: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("told_by", ["revocation", "certificate", "folder"])
+def test_it_stays_until_it_was_on_a_list_after_its_end(
+    told_by: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if told_by == "certificate":  # as version 0.2 recorded a revocation, without the expiry
+        revocations = RevocationListSigner.revocations
+        monkeypatch.setattr(
+            RevocationListSigner,
+            "revocations",
+            lambda *given: [entry._replace(not_after="") for entry in revocations(*given)],
+        )
     root, serial = made(tmp_path / "ks")
-    if not ledger:  # as ros2/sros2 leaves it; then the certificate that was put away tells
+    # As ros2/sros2 leaves it, the certificate that was put away tells; else only the ledger does.
+    if told_by == "folder":
         (root / LEDGER).unlink()
+    else:
+        shutil.rmtree(root / "revoked")
     for days, there in ((50, True), (99, True), (110, True), (120, False), (130, False)):
         refresh_crl(root, now=NOW + days * DAY)
         assert (serial in listed(root)) is there, days

@@ -198,14 +198,8 @@ def test_death_at_every_step_of_sealing(
     assert len(done) == 2
 
 
-def test_a_damaged_index_is_made_again_at_once(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also one that is damaged where its state does not show it."""
-    import sqlite3
-    from contextlib import closing
-
-    revoke(root, ["/b"], now=NOW)
+def count_whole(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Note each question for which all lines are read, because no index answers it."""
     whole: list[str] = []
     lines = LedgerFile._lines
 
@@ -214,6 +208,18 @@ def test_a_damaged_index_is_made_again_at_once(
         return lines(file, *given)
 
     monkeypatch.setattr(LedgerFile, "_lines", read_all)
+    return whole
+
+
+def test_a_damaged_index_is_made_again_at_once(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also one that is damaged where its state does not show it."""
+    import sqlite3
+    from contextlib import closing
+
+    revoke(root, ["/b"], now=NOW)
+    whole = count_whole(monkeypatch)
     for statement in (
         "UPDATE buckets SET names = x'00'",
         "UPDATE buckets SET postings = x''",
@@ -256,10 +262,18 @@ def test_an_index_of_another_version_is_made_again_first(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The head states a root that this version never makes; the chain proves the lines."""
-    monkeypatch.setattr(
-        ledger_module._Head, "index_root", property(lambda _: "0" * 64), raising=False
-    )
-    renew(root, ["/a"], now=NOW)
+    whole = count_whole(monkeypatch)
+    assert Keystore(root).ledger.gaps == ()
+    assert whole == ["all"]
+    monkeypatch.setattr(ledger_module._Head, "index_root", property(lambda _: "0" * 64))
+    create_enclaves(root, ["/spare"], now=NOW)
+    assert whole == ["all"]
     monkeypatch.undo()
-    monkeypatch.setattr(ledger_module, "_INDEXED_FROM", 1)
     assert is_indexed(root)
+    # A line that was changed is not in the new index: there is none, and the fault is recorded.
+    part = root / ledger_part(3)
+    part.write_bytes(part.read_bytes().replace(b'"/spare"', b'"/other"', 1))
+    (root / LEDGER_INDEX).unlink()
+    create_enclaves(root, ["/more"], now=NOW)
+    assert not is_indexed(root)
+    assert any("changed" in gap for gap in Keystore(root).ledger.gaps)
