@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import timedelta
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, NamedTuple
@@ -589,7 +590,7 @@ def _status(
 _WORDS = {
     "none": "no enclave",
     "restart": "restart due",
-    "missing": "files missing",
+    "missing": "lacking files",
     "broken": "broken in the keystore",
     "never": "never confirmed",
     "unknown": "unknown files",
@@ -597,6 +598,8 @@ _WORDS = {
 }
 """State of a file or robot → its words in the output, if they differ from the state's name."""
 _DIGITS = re.compile(r"(\d+)")
+_SILENCE = timedelta(minutes=30)
+"""From when a robot that fetches, every five minutes unless it is told otherwise, is silent."""
 _MOST_LINES, _MOST_GROUPS = 50, 3
 """Maximum number of listed files of a robot, and of listed groups or unrecorded enclaves."""
 
@@ -612,6 +615,9 @@ def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) ->
     if status.stage != "complete":
         behind = sum(robot.stage != status.stage for robot in status.robots if robot.enclaves)
         yield f"CA rotation: {status.stage}; {counted(behind, 'robot')} not there yet"
+    lists = [robot.crl_in_force for robot in status.robots if robot.crl_in_force is not None]
+    if not all(lists):
+        yield f"the revocation list is in force on {sum(lists)} of {counted(len(lists), 'robot')}"
     if status.unassigned:
         whom = "it" if status.unassigned == 1 else "them"
         yield f"{counted(status.unassigned, 'enclave')} of no robot: nothing is known of {whom}"
@@ -634,14 +640,14 @@ def _rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str,
     Unless ``robots`` are named, those of which the same is to be said share a row, and the last row
     has those that are current.
     """
-    status = compared.status
+    status, places = compared.status, _places(compared.status)
     alike: dict[tuple[str, ...], list[RobotStatus]] = {}
     current: list[RobotStatus] = []
-    for robot in status.robots:
+    for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
         if robots or robot.state not in ("current", "none") or robot.notes or robot.problems:
-            what = "; ".join(_summary(robot, status.stage))
-            row = (_word(robot.state), _to_do(robot), what, robot.robot if robots else "")
-            alike.setdefault(row, []).append(robot)
+            what = _unnamed("; ".join(_summary(robot, status.stage)), robot.robot)
+            row = (_word(robot.state), _to_do(robot, compared.at), what)
+            alike.setdefault((*row, robot.robot if robots else ""), []).append(robot)
         elif robot.state == "current":
             current.append(robot)
     if not alike:
@@ -649,11 +655,20 @@ def _rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str,
     if current and any(robot.state != "current" for group in alike.values() for robot in group):
         alike["current", "", "", ""] = current
     yield "robot", "state", "confirmed", "to do", "what"
-    places = _places(status)
     for (state, to_do, what, _), group in alike.items():
         last = min(group, key=lambda robot: robot.received or compared.at)
         names = _runs((robot.robot for robot in group), places)
-        yield names, state, _age(last, compared.at), to_do, what
+        text = what.replace(_ROBOT, group[0].robot) if len(group) == 1 else what
+        yield names, state, _age(last, compared.at), to_do, text
+
+
+_ROBOT = "{robot}"
+"""Stands for the name of each robot that shares a row, as in policies."""
+
+
+def _unnamed(text: str, robot: str) -> str:
+    """Return a text with `_ROBOT` in place of the robot's name in paths."""
+    return re.sub(rf"(?<=/){re.escape(robot)}(?=[/\s,;.:]|$)", _ROBOT, text)
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -679,7 +694,8 @@ def _runs(names: Iterable[str], places: Mapping[str, int]) -> str:
     for run in runs:
         words += [f"{run[0]} to {run[-1]}"] if len(run) > _MOST_GROUPS else run
     number = sum(map(len, runs))
-    return first_few(words, _MOST_GROUPS) + (f" ({number})" if number > _MOST_GROUPS else "")
+    shown = ", ".join(words[:_MOST_GROUPS]) + (", ..." if len(words) > _MOST_GROUPS else "")
+    return f"{shown} ({number} robots)" if number > _MOST_GROUPS else shown
 
 
 _TO_DO = {
@@ -693,17 +709,20 @@ _TO_DO = {
 """State of a robot → what is to be done, if the state alone tells it."""
 
 
-def _to_do(robot: RobotStatus) -> str:
+def _to_do(robot: RobotStatus, at: datetime) -> str:
     """Return what is to be done with a robot, in few words; "" if nothing is."""
     if robot.state == "revoked" and not robot.enclaves:
-        return "take it out"
+        return "take it out of the fleet file"
     if robot.state in ("current", "none"):
         return "see what" if robot.problems else ""
     if robot.state in _TO_DO:
         return _TO_DO[robot.state]
     if not robot.fetches:
         return "deliver"
-    return "publish" if (robot.published or 0) == (robot.release or 0) else "wait: it fetches"
+    if (robot.published or 0) == (robot.release or 0):
+        return "publish"
+    is_silent = robot.received is None or at - robot.received > _SILENCE
+    return "see whether it is on" if is_silent else "wait: it fetches"
 
 
 def _dds_findings(compared: ComparedFleet) -> Iterator[str]:
@@ -721,9 +740,8 @@ def _dds_counts(compared: ComparedFleet) -> Iterator[str]:
     status, outdated = compared.status, compared.outdated_dds
     if outdated:
         yield (
-            "a DDS with known vulnerabilities that a later release mends: "
-            f"{_runs(outdated, _places(status))}; `sros fleet status {quote(str(status.keystore))} "
-            f"--robot {outdated[0]}` says which to upgrade"
+            f"a DDS to upgrade, for known vulnerabilities: {_runs(outdated, _places(status))}; "
+            f"which: `sros fleet status {quote(str(status.keystore))} --robot {outdated[0]}`"
         )
     elif list(_dds_findings(compared)):
         severities = Counter(finding.severity.word for finding in compared.findings)
@@ -761,8 +779,6 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
         yield f"processes of {first_few(robot.restart, _MOST_GROUPS)} may run with earlier files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"CA files of the stage {robot.stage}"
-    if robot.crl_in_force is False and robot.received:
-        yield "the revocation list is not in force"
     yield from robot.notes
     yield from (robot.problems or ())[:_MOST_GROUPS]
 

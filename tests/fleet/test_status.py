@@ -227,7 +227,7 @@ def test_a_robot_that_was_revoked(field: Field) -> None:
     said = field.run("fleet", "status", "ks").out
     assert (
         "3 robots: 2 current, 1 revoked" in said
-        and "r3      revoked  -          take it out" in said
+        and "r3      revoked  -          take it out of the fleet file" in said
     )
     revoked = {name: each["revoked"] for name, each in field.status()["robots"].items()}
     assert revoked == {"r1": [], "r2": [], "r3": ["/r3/base"]}
@@ -392,7 +392,8 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     assert in_force() == [None, None, None], "nothing was revoked yet"
     field.run("revoke", "ks", "/dispatcher")
     assert in_force() == [False, False, False]
-    assert "the revocation list is not in force" in field.run("fleet", "status", "ks", status=1).out
+    said = field.run("fleet", "status", "ks", status=1).out
+    assert "\nthe revocation list is in force on 0 of 3 robots\n" in said
     field.deliver("r1", "r2")
     field.send("r2", running={"/r2/base": RunningFiles.EARLIER, "/r9/base": RunningFiles.EARLIER})
     assert in_force() == [True, False, False]
@@ -501,11 +502,37 @@ def test_fifty_robots_of_which_the_same_is_to_be_said_share_a_line(field: Field)
     assert lines[0] == "50 robots: 3 current, 1 earlier, 46 never confirmed"
     assert [re.split("  +", line)[:4] for line in lines[3:7]] == [
         ["r1", "earlier", re.split("  +", lines[3])[2], "deliver"],
-        ["r4 to r19, r21 to r50 (46)", "never confirmed", "-", "deliver"],
+        ["r4 to r19, r21 to r50 (46 robots)", "never confirmed", "-", "deliver"],
         ["r2, r3, r20", "current", re.split("  +", lines[5])[2]],
     ]
     found = field.status()["robots"]
     assert len(found) == 50 and found["r50"]["state"] == "never"
+
+
+def test_robots_that_differ_in_their_names_share_a_line(field: Field) -> None:
+    field.deliver(*ROBOTS)
+    for robot in ("r1", "r2"):
+        field.send(robot, running={f"/{robot}/base": RunningFiles.EARLIER})
+    rows = field.run("fleet", "status", "ks", status=1).out.splitlines()[3:]
+    columns = [re.split("  +", row) for row in rows]
+    text = "processes of /{robot}/base may run with earlier files"
+    assert [row[:2] + row[3:] for row in columns] == [
+        ["r1, r2", "restart due", "restart", text],
+        ["r3", "current"],
+    ]
+    field.send("r2", running={"/r2/base": RunningFiles.CURRENT})
+    assert "processes of /r1/base may run" in field.run("fleet", "status", "ks", status=1).out
+
+
+def test_a_robot_that_does_not_fetch_what_is_published_may_be_off(field: Field) -> None:
+    field.deliver(*ROBOTS)
+    for robot in ROBOTS:
+        field.send(robot, release=1)
+    field.run("renew", "ks", "--all")
+    field.run("fleet", "publish", "ks", "pub")
+    field.age("r3", timedelta(minutes=31))
+    rows = field.run("fleet", "status", "ks", status=1).out
+    assert rows.count("wait: it fetches") == 1 and rows.count("see whether it is on") == 1, rows
 
 
 def test_the_module_on_the_robot_confirms_the_same(field: Field) -> None:
@@ -557,7 +584,7 @@ def test_the_dds_of_a_robot(
     libraries = [library] if library else []
     field.confirm("r1", dds={"libraries": libraries, "unseen": unseen})
     ended = field.run("fleet", "status", "ks", status=1 if outdated else 0)
-    more = "a later release mends: r1; " if outdated else "on the DDS of robots: 1 "
+    more = "for known vulnerabilities: r1; " if outdated else "on the DDS of robots: 1 "
     assert (
         "3 robots: 3 current" in ended.out
         and more in ended.out

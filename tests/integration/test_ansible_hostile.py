@@ -309,7 +309,7 @@ def test_a_status_with_missing_files_is_no_success(tmp_path: Path) -> None:
     hosts = {"r1": {"ansible_connection": "local", "ansible_python_interpreter": str(python)}}
     own: dict[str, Any] = {"sros_program": [sys.executable, "-m", "sros_tool"]}
     text = play(tmp_path, "status", hosts, **own, sros_keystore=str(keystore))
-    assert "1 robot: 1 files missing" in text and "Not every robot has what an export" in text, text
+    assert "1 robot: 1 lacking files" in text and "Not every robot has what an export" in text, text
     assert "failed=1" in text, text
 
 
