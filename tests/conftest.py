@@ -89,6 +89,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
         strategies.text().validate()
     gc.collect()
     gc.freeze()
+    gc.set_threshold(100_000, 20, 20)  # hardly anything that a test makes is garbage in a circle
     gc.enable()
 
 

@@ -30,7 +30,7 @@ from tests.support.code_host import (
     policy,
 )
 from tests.support.harness import sros
-from tests.support.long_form import sometimes
+from tests.support.long_form import some, sometimes
 
 ALL = {"policy": POLICY, "requirements": REQUIRED}
 MARKS_OF_JOBS: list[str] = []
@@ -94,18 +94,21 @@ def test_the_action_on_pull_requests(origin: Origin, tmp_path: Path) -> None:
     assert POLICY in {e["artifactLocation"]["uri"] for e in places}
     assert str(tmp_path) not in said
 
-    words = {**ALL, "requirements": ""}
-    clone = origin.clone(tmp_path / "allowed", "merged/wider")
-    status, said, _ = run_action(origin, clone, **words)
-    assert status == 1, "new access alone is enough"
-    assert "no requirements are named" in said
-    status, said, _ = run_action(origin, clone, **words, new_access="allow")
-    assert status == 0, said
-    assert "/web ALLOW publish topic /cmd_vel" in said
-    assert "new access does not fail the review, as asked" in said
 
-    status, said, _ = run_action(origin, origin.clone(tmp_path / "broken", "merged/broken"), **ALL)
-    assert status != 0, said
+@pytest.mark.parametrize("case", some(["new access", "new access is allowed", "broken"], 1))
+def test_what_decides_the_status_of_the_action(case: str, origin: Origin, tmp_path: Path) -> None:
+    branch = "merged/broken" if case == "broken" else "merged/wider"
+    words = {**ALL, "requirements": ""} if case != "broken" else ALL
+    if case == "new access is allowed":
+        words["new_access"] = "allow"
+    status, said, _ = run_action(origin, origin.clone(tmp_path / "clone", branch), **words)
+    assert (status == 0) is (case == "new access is allowed"), said
+    if case == "new access":
+        assert status == 1, "new access alone is enough"
+        assert "no requirements are named" in said
+    elif case == "new access is allowed":
+        assert "/web ALLOW publish topic /cmd_vel" in said
+        assert "new access does not fail the review, as asked" in said
 
 
 @sometimes("requirements that a pull request drops")
