@@ -242,6 +242,9 @@ def read_processes(path: Path) -> ObservedProcesses:
         value = json.loads(read_bytes(path, "list of processes"))
         processes = [ClosedProcess(**process) for process in value["processes"]]
         for process in processes:
+            texts = (process.enclave, process.folder, *process.command, *process.launch)
+            if not all(isinstance(text, str) for text in texts):
+                raise ValueError(f"{texts} are not all text")
             if process.unit and not re.fullmatch(SERVICE_NAME, process.unit, re.A):
                 raise ValueError(f"{process.unit!r} is no service")
         return ObservedProcesses(**value)._replace(processes=processes)

@@ -181,6 +181,7 @@ def close(
     if duration and (applies or proves or undoes):
         raise UsageError("--for is for watching an open robot", "", "Leave it out.")
     at = _Places(folder)
+    _check_own(at)
     if (applies or proves or undoes) and not at.processes.exists():
         name = shlex.quote(str(folder))
         raise UsageError(f"'{folder}' has no watched robot", "", f"Run `sros close {name}` first.")
@@ -239,6 +240,29 @@ def _domain(text: str | None) -> int:
     from sros_tool.runtime.variables import DOMAIN, domain_of
 
     return domain_of(os.environ if text is None else {DOMAIN: text})
+
+
+def _check_own(at: _Places) -> None:
+    """Raise `SrosError` if others can change what is in the folder: it says what systemd starts.
+
+    Whoever runs sros by sudo is trusted, as root is.
+    """
+    from sros_tool.owners import other_writers, replaceable_on_the_way
+
+    sudo = os.environ.get("SUDO_UID", "") if os.geteuid() == 0 else ""
+    trusted = frozenset({0, os.geteuid(), *([int(sudo)] if sudo.isdecimal() else [])})
+    files = (at.policy, at.observed, at.processes)
+    for path in (at.folder, at.start, at.start / "units", *files):
+        if path.exists() and (why := other_writers(path.stat(), trusted)):
+            ways = [(path, why)]
+        else:
+            ways = [*replaceable_on_the_way(path, trusted)]
+        for step, why in ways:
+            raise SrosError(
+                f"others can change '{path}'",
+                f"'{step}': {why}.",
+                "Close the robot into a folder that only you and root can change.",
+            )
 
 
 # ── preparing ───────────────────────────────────────────────────────────────────────────────
@@ -435,11 +459,18 @@ def _undo(at: _Places, observed: ObservedProcesses, *, dry_run: bool) -> list[Fi
         for path in sorted(_SYSTEMD.glob(f"*.d/{DROP_IN}"))
         if read_bytes(path, "unit").startswith(mark(at.folder.absolute()).encode())
     ]
+    units = {process.unit for process in observed.processes if process.unit}
+    for path in (_SYSTEMD / f"{unit}.d/{DROP_IN}" for unit in sorted(units)):
+        if path not in drop_ins and os.path.lexists(path):
+            raise SrosError(
+                f"'{path}' is not the drop-in of this folder",
+                "Its first line names another folder, or was changed. Nothing was undone.",
+                "Use the folder that it names, as it was written, or remove the drop-in.",
+            )
     for path in drop_ins:
         echo(f"{'would remove' if dry_run else 'removed'} {path}", err=True)
         if not dry_run:
             remove_file(path)
-    units = {process.unit for process in observed.processes if process.unit}
     units |= {path.parent.name.removesuffix(".d") for path in drop_ins}
     _restart(sorted(units), dry_run=dry_run)
     by_hand = chain.from_iterable(observed.by_hand(at.folder).values())

@@ -224,6 +224,24 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     assert "yes: everything that talked still talks: 1 node with 18 endpoints" in ended.out
 
 
+def refuse_undo_of_others(robot: Robot) -> None:
+    """A folder that others can change, and a drop-in of another folder, undo nothing."""
+    for name in ("", "start/units", "processes.json"):
+        path = robot.folder / "robot" / name
+        mode = path.stat().st_mode
+        path.chmod(0o777)
+        undone = robot.close("--undo", status=2)
+        assert f"others can change '{Path('robot') / name}'. " in undone.err
+        path.chmod(mode)
+    drop_in = robot.folder / "systemd/talker.service.d/sros-close.conf"
+    text = drop_in.read_text()
+    drop_in.write_text(text.replace("/robot`", "/moved`", 1))
+    undone = robot.close("--undo", status=2)
+    assert "is not the drop-in of this folder" in undone.err
+    drop_in.write_text(text)
+    assert len(robot.restarts) == 2
+
+
 def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     robot.units = UNITS
     robot.close()
@@ -241,6 +259,7 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     assert "yes: everything that talked still talks: 2 nodes" in robot.close("--proof").out
     assert "A new keystore would have other CAs." in robot.close("--apply", status=2).err
     (robot.folder / "home").rename(robot.folder / "robot/keystore")
+    refuse_undo_of_others(robot)
     undone = robot.close("--undo")
     assert [*robot.folder.glob("systemd/*.d/*")] == []
     assert robot.restarts[2:] == ["daemon-reload", "restart listener.service talker.service"]
@@ -422,7 +441,9 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     robot.close()
     assert "was watched in domain 0, not 7" in robot.close("--domain", "7", status=2).err
     file = robot.folder / "robot/processes.json"
-    for wrong in (file.read_text().replace('"unit": ""', '"unit": "../x.service"'), "{}"):
+    text = file.read_text()
+    other_unit = text.replace('"unit": ""', '"unit": "../x.service"')
+    for wrong in (other_unit, text.replace('"enclave": "/talker"', '"enclave": 5'), "{}"):
         file.write_text(wrong)
         assert "is no list of processes" in robot.close(status=2).err
 
