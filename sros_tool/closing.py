@@ -40,7 +40,7 @@ _FAST_DDS = "010f"
 """The first two bytes of a participant of Fast DDS: its vendor id (RTPS 2.3, 9.4.5.1)."""
 _NODE_PARTS = ("common/node.xml", "common/rclcpp_node.xml", "common/rclpy_node.xml")
 _MOST_LINES, _MOST_NAMES = 20, 3
-DROP_IN = "sros-close.conf"
+DROP_IN, COMMANDS = "sros-close.conf", "commands.txt"
 
 
 class ClosedProcess(NamedTuple):
@@ -282,10 +282,13 @@ def start_files(
         if process.unit:
             text = render_environment(variables[process.enclave], "systemd")
             files[f"units/{process.unit}.d/{DROP_IN}"] = f"{mark(folder)}[Service]\n{text}"
-    lines = ["# Stop these processes, and start them so, in the environment that they have now."]
+    lines = [
+        "# No script: stop all of these processes (secured and open ones do not hear each other),",
+        "# and start each by its command, where it is started now: a start script, a terminal.",
+    ]
     for command, processes in observed.by_hand(folder).items():
         lines += ["", f"# {', '.join(process.enclave for process in processes)}", command]
-    return {**files, "commands.sh": "".join(f"{line}\n" for line in lines)}
+    return {**files, COMMANDS: "".join(f"{line}\n" for line in lines)}
 
 
 # ── who may do what ─────────────────────────────────────────────────────────────────────────

@@ -72,6 +72,8 @@ class _Places:
         self.keystore, self.export = folder / "keystore", folder / "export"
         self.start, self.page = folder / "start", folder / "rights.html"
         self.observed, self.processes = folder / "observed.json", folder / "processes.json"
+        self.lacks = ""
+        """What the policy lacks of what was seen now, as a sentence."""
 
     @property
     def rights(self) -> Path:
@@ -232,7 +234,7 @@ def close(
             _show(at, observed, denied)
         _show_end(at, observed, problems, proofs, applies=applies, holds=holds)
     if dry_run or undoes:
-        return 0
+        return int(undoes and not dry_run and bool(observed.by_hand(folder)))
     return int(bool(problems) or ((applies or proves) and not holds))
 
 
@@ -324,8 +326,10 @@ def _keep_processes(at: _Places, step: _Step, document: str) -> None:
     added = json.loads(document)["added"] if "--dry-run" in step.words else ()
     if added:
         command = f"sros generate_policy {shlex.quote(str(at.policy))} --enclave-per-node"
-        lacks = f"lacks {counted(len(added), 'right')} seen now; add them: {command}"
-        echo(f"'{at.policy}' stays as it is, and {lacks}", err=True)
+        at.lacks = (
+            f"'{at.policy}' stays as it is, and lacks {counted(len(added), 'right')} seen now; "
+            f"if they are right, add them and run it again: {command}"
+        )
     nodes = [node for node in _observation(at).nodes if not is_tool(node)]
     domain = int(step.words[step.words.index("--domain") + 1])
     observed = assign(nodes, ProcessTable().look(now()).processes, domain)
@@ -511,7 +515,9 @@ def _proofs(at: _Places, observed: ObservedProcesses, patience: float) -> list[P
         if not missing:
             break
         if time.monotonic() > end:
-            return [Proof(_CLAIM, False, f"not in {first_few(missing, 3)}")]
+            named = first_few(missing, 5)
+            reason = f"none with the present files of {named}; start it as {at.start} says"
+            return [Proof(_CLAIM, False, reason)]
         time.sleep(0.2)
     before = _observation(at)
     return [
@@ -647,6 +653,8 @@ def _show_end(
     holds: bool,
 ) -> None:
     """Print problems and proofs, and what to do next."""
+    from sros_tool.closing import COMMANDS
+
     folder = shlex.quote(str(at.folder))
     for proof in proofs:
         echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}")
@@ -667,9 +675,16 @@ def _show_end(
             echo(f"stop process {pids}, and start it by:")
             echo(f"  {command}")
         echo(f"then: sros close {folder} --proof", err=True)
+    elif at.lacks:
+        echo(f"nothing is closed yet; {at.lacks}", err=True)
+    elif problems:
+        echo("nothing is closed yet; next: mend this, and run it again", err=True)
+    elif any(process.unit for process in observed.processes):
+        echo(f"nothing is closed yet; next: sros close {folder} --apply", err=True)
     else:
-        following = "mend this, and run it again" if problems else f"sros close {folder} --apply"
-        echo(f"nothing is closed yet; next: {following}", err=True)
+        how = f"start each process as {at.start / COMMANDS} says"
+        echo(f"nothing is closed yet; next: stop the robot, {how}, and ask", err=True)
+        echo(f"sros close {folder} --proof", err=True)
 
 
 _ANSWERS = {True: "yes", False: "no", None: "not asked"}

@@ -177,7 +177,7 @@ def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
     assert "  topic /chatter: /talker -> /listener\n" in ended.out
     assert "/talker: process 4711, known by its process id: --apply restarts talker.s" in ended.out
     assert "/listener: process 4712, known by its process id: by hand\n" in ended.out
-    commands = (robot.folder / "robot/start/commands.sh").read_text()
+    commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert f"\ncd /opt && sros run {export} /listener -- /opt/run listener\n" in commands
     assert "/talker --" not in commands
     drop_in = robot.folder / "robot/start/units/talker.service.d/sros-close.conf"
@@ -197,7 +197,8 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert "/listener subscribe topic /chatter (/listener)" in ended.out
     again = robot.close("--for", "1s")
     assert policy.read_text() == changed
-    assert "stays as it is, and lacks 1 right seen now; add them: sros generate_pol" in again.err
+    assert "nothing is closed yet; " in again.err.splitlines()[-1]
+    assert "stays as it is, and lacks 1 right seen now; if they are right, add" in again.err
     robot.remaining = (TALKER, ros_node("listener", "04"))
     said = robot.close("--apply").out
     assert "36 endpoints as before, but for 1 right that the policy denies now\n" in said
@@ -275,12 +276,15 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     assert "stop process 4711, and start it by:\n  cd /opt && sros run " in ended.out
     assert ended.err.endswith("then: sros close robot --proof\n")
     assert (
-        "no: every process runs in its enclave: not in /listener, /talker\n"
+        "no: every process runs in its enclave: none with the present files of /listener, /talker; "
         in robot.close("--proof", status=1).out
     )
     robot.by_hand = {"/talker", "/listener"}
     robot.close("--proof")
-    assert "by hand, restart it open: cd /opt && /opt/run talker\n" in robot.close("--undo").err
+    assert (
+        "by hand, restart it open: cd /opt && /opt/run talker\n"
+        in robot.close("--undo", status=1).err
+    )
 
 
 def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
@@ -568,6 +572,6 @@ def test_a_process_that_was_launched_is_launched_secured(tmp_path: Path, robot: 
     )
     said = robot.close("--apply", status=1).out
     assert f"stop process 4712 and 4711, and start it by:\n  {command}" in said
-    assert (place / "start/commands.sh").read_text().endswith(f"\n# /listener, /talker\n{command}")
-    undone = robot.close("--undo").err
+    assert (place / "start/commands.txt").read_text().endswith(f"\n# /listener, /talker\n{command}")
+    undone = robot.close("--undo", status=1).err
     assert undone.count("restart it open: cd /opt && /usr/bin/python3 /opt/ros/jazzy/bin/ros2") == 1
