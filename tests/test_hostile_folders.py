@@ -15,10 +15,11 @@ import shutil
 import stat
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -664,8 +665,17 @@ def test_revoking_copies_no_file_that_a_link_leads_to_meanwhile(
     key = keystore / "enclaves/a/key.pem"
     key.unlink()
     key.symlink_to(outside / "shadow")
+    scandir = os.scandir
+
+    def before(path: Path) -> Any:
+        """Show the enclave's folder as it was a moment before: with files, and no link."""
+        if path != key.parent:
+            return scandir(path)
+        entries = [SimpleNamespace(name=e.name, is_symlink=lambda: False) for e in scandir(path)]
+        return nullcontext(entries)
+
     with monkeypatch.context() as patched:
-        patched.setattr(Path, "is_symlink", lambda _self: False)  # as it was a moment before
+        patched.setattr(os, "scandir", before)
         with pytest.raises(KeystoreError, match="is a link out of"):
             revoke(keystore, ["/a"], now=NOW)
     assert not (keystore / "revoked").exists()
