@@ -95,7 +95,8 @@ class ObservedProcesses(NamedTuple):
     unknown: Sequence[str] = ()
     """Processes on this machine whose nodes are not known; they are not closed."""
     elsewhere: Sequence[str] = ()
-    """Enclaves of nodes that no process of this machine is known to have."""
+    """Enclaves with nodes that no process of this machine is known to have: also if another process
+    has nodes of the same names."""
 
     def within(self, policy: Policy) -> ObservedProcesses:
         """Return a copy without enclaves that the policy does not have any more."""
@@ -203,8 +204,19 @@ def assign(
         domain,
         sorted(assigned),
         [f"{process.label}: {shlex.join(process.command)}" for process in left.values()],
-        sorted(by_enclave.keys() - {process.enclave for process in assigned}),
+        sorted(
+            enclave
+            for enclave, of_enclave in by_enclave.items()
+            if len({_process_of(node) for node in of_enclave})
+            > sum(process.enclave == enclave for process in assigned)
+        ),
     )
+
+
+def _process_of(node: ObservedNode) -> str:
+    """Return what the participants of a process have in common: Fast DDS shows host and id."""
+    is_fast = node.participant.startswith(_FAST_DDS)
+    return node.participant[:12] if is_fast else node.participant
 
 
 def _shows_its_id(process: Process, node: ObservedNode) -> bool:

@@ -638,7 +638,7 @@ def _show(at: _Places, observed: ObservedProcesses, denied: Sequence[str]) -> No
     for text in observed.unknown:
         echo(f"looks wrong: no node is known of {text}")
     for enclave in observed.elsewhere:
-        echo(f"looks wrong: no process of this machine is known to have the nodes of {enclave}")
+        echo(f"looks wrong: nodes of {enclave} are of no known process of this machine")
     for right in denied:
         echo(f"looks wrong: seen, and denied from now on: {right}")
 

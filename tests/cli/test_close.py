@@ -526,6 +526,16 @@ def test_the_enclave_of_a_process(
     assert set(observed.elsewhere) == {each.enclaves[0] for each in nodes} - known.keys()
 
 
+def test_nodes_of_the_same_name_elsewhere_are_told() -> None:
+    own, same = node("a", "010f7f01a53001"), node("a", "010f7f01a53002")
+    talker = process(0x30A5, "/opt/a")
+    assert assign([own, same], [talker], 0).elsewhere == []
+    for other in (node("a", "010f7f02a530"), node("a", "010f7f01ffff"), node("a", "0110aa")):
+        observed = assign([own, other], [talker], 0)
+        assert [each.pid for each in observed.processes] == [talker.pid]
+        assert observed.elsewhere == ["/a"]
+
+
 @pytest.mark.parametrize(
     ("text", "unit"),
     [
