@@ -319,7 +319,8 @@ def _created_lines(result: Creation) -> Iterator[str]:
 
 
 def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
-    """Yield hints for standard error: how to export new enclaves, and unchanged enclaves."""
+    """Yield hints for standard error: how enclaves get to robots, and unchanged enclaves."""
+    from sros_tool.keystore.fleet import publish_command
     from sros_tool.keystore.layout import FLEET
 
     if len(result.created) > _MANY_CREATED and not (as_json or result.dry_run):
@@ -328,6 +329,9 @@ def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
             f"created {len(result.created)} enclaves; to send them: `sros distribute_key "
             f"{quote(str(result.root))} {whose} FOLDER`"
         )
+    published = "" if as_json or result.dry_run else publish_command(result.root)
+    if published and (result.changed or result.completed):
+        yield f"robots that fetch get the change by {published}"
     if result.kept:
         yield f"unchanged: {counted(len(result.kept), 'enclave')}: {shown_names(result.kept)}"
 

@@ -37,7 +37,8 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction import recovery
 from sros_tool.pki.crl import load_crl
 from tests.agent.published import DAY, Home
-from tests.support.harness import snapshot, sros
+from tests.support.harness import policy_text, snapshot, sros
+from tests.support.harness import publish as allow_publish
 
 
 def archives(publisher: Home) -> dict[str, bytes]:
@@ -212,6 +213,7 @@ NEXT_STEPS = (
     ("renew", "ks", "/r1/base", "--revoke-old"),
     ("renew", "ks", "/r1/base"),
     ("update_keystore", "ks", "--domain", "1", "--allow-looser"),
+    ("generate_artifacts", "-k", "ks", "-p", "more.xml", "--fleet", "fleet.toml"),
     ("revoke", "ks", "/r5/base"),
     ("rotate_ca", "ks", "--next"),
     ("rotate_ca", "ks", "--status"),
@@ -223,12 +225,16 @@ def test_next_steps_name_publishing_where_the_keystore_publishes(publisher: Home
     exports = publisher.folder / "exports"
     shutil.copytree(publisher.root, exports / "ks", symlinks=True)
     (exports / "ks/fleet_root.json").unlink()
+    shutil.copy(publisher.folder / "fleet.toml", exports)
+    for folder in (publisher.folder, exports):
+        (folder / "more.xml").write_text(policy_text({"/{robot}/base": allow_publish("x", "y")}))
     for words in NEXT_STEPS:
         done = sros(*words, cwd=publisher.folder)
         assert "`sros fleet publish ks PUB`" in done.err + done.out, (words, done)
         other = sros(*words, cwd=exports)
         assert done.status == other.status
-        assert "fleet publish" not in other.err + other.out and "export" in other.err + other.out
+        assert "fleet publish" not in other.err + other.out
+        assert "export" in other.err + other.out or "generate_artifacts" in words
 
 
 def test_the_ledger_has_what_was_published(publisher: Home) -> None:
