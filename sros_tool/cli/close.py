@@ -427,7 +427,10 @@ def _apply(at: _Places, observed: ObservedProcesses, *, dry_run: bool) -> list[F
     units = {process.enclave: process.unit for process in observed.processes if process.unit}
     paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(units.values())]
     files = {path: read_bytes(at.start / "units" / path, "unit").decode() for path in paths}
+    _own_drop_ins(at, observed)
     changes = unit_changes(_SYSTEMD, files, force=True)
+    for path, action in changes.items():
+        echo(f"{'would ' if dry_run else ''}{action} {_SYSTEMD / path}", err=True)
     if not dry_run:
         write_units(_SYSTEMD, files, changes)
     closed = _in_their_enclaves(at, observed, ProcessTable().look(now()))
@@ -452,10 +455,9 @@ def _restart(units: Sequence[str], *, dry_run: bool) -> None:
             )
 
 
-def _undo(at: _Places, observed: ObservedProcesses, *, dry_run: bool) -> list[FileChange]:
-    """Remove the drop-ins of this folder, restart their units, and show what to do by hand."""
+def _own_drop_ins(at: _Places, observed: ObservedProcesses) -> list[Path]:
+    """Return the drop-ins of this folder; raise `SrosError` if a unit has that of another one."""
     from sros_tool.closing import DROP_IN, mark
-    from sros_tool.files import remove_file
     from sros_tool.xml import read_bytes
 
     drop_ins = [
@@ -468,9 +470,18 @@ def _undo(at: _Places, observed: ObservedProcesses, *, dry_run: bool) -> list[Fi
         if path not in drop_ins and os.path.lexists(path):
             raise SrosError(
                 f"'{path}' is not the drop-in of this folder",
-                "Its first line names another folder, or was changed. Nothing was undone.",
+                "Its first line names another folder, or was changed. Nothing was changed.",
                 "Use the folder that it names, as it was written, or remove the drop-in.",
             )
+    return drop_ins
+
+
+def _undo(at: _Places, observed: ObservedProcesses, *, dry_run: bool) -> list[FileChange]:
+    """Remove the drop-ins of this folder, restart their units, and show what to do by hand."""
+    from sros_tool.files import remove_file
+
+    drop_ins = _own_drop_ins(at, observed)
+    units = {process.unit for process in observed.processes if process.unit}
     for path in drop_ins:
         echo(f"{'would remove' if dry_run else 'removed'} {path}", err=True)
         if not dry_run:

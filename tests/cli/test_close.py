@@ -237,8 +237,10 @@ def refuse_undo_of_others(robot: Robot) -> None:
     drop_in = robot.folder / "systemd/talker.service.d/sros-close.conf"
     text = drop_in.read_text()
     drop_in.write_text(text.replace("/robot`", "/moved`", 1))
-    undone = robot.close("--undo", status=2)
-    assert "is not the drop-in of this folder" in undone.err
+    for words in ("--undo", "--apply"):
+        assert "is not the drop-in of this folder" in robot.close(words, status=2).err
+    drop_in.write_text(f"{text}Environment=MINE=1\n")
+    assert f"would replace {drop_in}" in robot.close("--apply", "--dry-run").err
     drop_in.write_text(text)
     assert len(robot.restarts) == 2
 

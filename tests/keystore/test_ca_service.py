@@ -187,6 +187,7 @@ def test_another_certificate_than_was_asked_for_is_refused(
         ("echo the quota is used up >&2; exit 3", "ended with status 3: the quota is used up"),
         ("exit 1", "`sros-issuer-test` ended with status 1. Nothing was changed"),
         ("yes", "wrote more than 65536 bytes"),
+        ("yes | head -c 3000000 >&2; echo last >&2; exit 4", "status 4: y y .* y last. Nothing"),
         ("setsid sleep 1 & sleep 100", "did not end within 0.3 seconds"),
     ],
 )

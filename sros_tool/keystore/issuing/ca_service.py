@@ -20,7 +20,6 @@ import signal
 import subprocess
 import tempfile
 import time
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -48,6 +47,8 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}", re.ASCII)
 _MOST_BYTES = 64 * 1024
 _MOST_SAID = 500
 _SECONDS = 60
+_LOOK = 0.02
+"""Seconds between two looks at whether a program that closed its output has ended."""
 _AHEAD = timedelta(hours=1)
 """How much later than the change of the keystore began a certificate may become valid.
 
@@ -134,7 +135,7 @@ class CaService:
             "SROS_NOT_AFTER": iso(asked.validity.not_after),
             "SROS_KEYSTORE": str(self.root.absolute()),
         }
-        with tempfile.TemporaryFile() as errors, tempfile.TemporaryFile() as request:
+        with tempfile.TemporaryFile() as request:
             request.write(asked.request)
             request.seek(0)
             try:
@@ -142,16 +143,15 @@ class CaService:
                     [program],
                     stdin=request,
                     stdout=subprocess.PIPE,
-                    stderr=errors,
+                    stderr=subprocess.PIPE,
                     env=os.environ | told,
                     start_new_session=True,
                 )
             except OSError as error:
                 why = f"`{self.program}` cannot be started: {error.strerror}"
                 raise self._error(asked, why) from error
-            answer = _bounded_output(process)
-            errors.seek(max(0, errors.seek(0, os.SEEK_END) - _MOST_SAID))
-            said = " ".join(errors.read(_MOST_SAID).decode(errors="replace").split())
+            answer, errors = _bounded_output(process)
+        said = " ".join(errors.decode(errors="replace").split())
         if answer is None:
             raise self._error(asked, f"`{self.program}` did not end within {_SECONDS} seconds")
         if len(answer) > _MOST_BYTES:
@@ -168,29 +168,36 @@ class CaService:
         )
 
 
-def _bounded_output(process: subprocess.Popen[bytes]) -> bytes | None:
-    """Return the output of a program, up to a little too much; None if it does not end in time.
+def _bounded_output(process: subprocess.Popen[bytes]) -> tuple[bytes | None, bytes]:
+    """Return the output of a program, up to a little too much, and the end of its errors.
 
-    The program is ended in both cases, with what it started.
+    The output is None if the program does not end in time.  In both cases it is ended, with what it
+    started.
     """
-    end, answer, ended = time.monotonic() + _SECONDS, b"", False
-    assert process.stdout
-    with process.stdout as output, suppress(subprocess.TimeoutExpired):
+    end, answer, errors, ended = time.monotonic() + _SECONDS, b"", b"", False
+    assert process.stdout and process.stderr
+    with process.stdout as output, process.stderr as said:
         ready = select.poll()
         ready.register(output)
+        ready.register(said)
+        answers = True
         try:
-            while len(answer) <= _MOST_BYTES and ready.poll(_left(end) * 1000):
-                part = os.read(output.fileno(), _MOST_BYTES)
-                answer += part
-                if not part:
-                    process.wait(_left(end))
-                    ended = True
-                    break
+            while len(answer) <= _MOST_BYTES and _left(end) and not ended:
+                for file, _ in ready.poll(_LOOK * 1000):
+                    part = os.read(file, _MOST_BYTES)
+                    if not part:
+                        ready.unregister(file)
+                        answers = answers and file != output.fileno()
+                    elif file == output.fileno():
+                        answer += part
+                    else:
+                        errors = (errors + part)[-_MOST_SAID:]
+                ended = not answers and process.poll() is not None
         finally:
             if not ended:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
-    return answer if ended or len(answer) > _MOST_BYTES else None
+    return answer if ended or len(answer) > _MOST_BYTES else None, errors
 
 
 def _left(end: float) -> float:
