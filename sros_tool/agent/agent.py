@@ -77,6 +77,7 @@ from sros_tool.validity import elapsed, iso
 from sros_tool.xml import read_bytes
 
 _TOLERANCE = timedelta(minutes=2)
+_LOOK_SECONDS = 0.2
 _REPLACED_LIST = "replaced.crl.pem"
 _REPLACED_FOR = timedelta(days=30)
 """How long a revocation list that a release replaced is sent to home, if it revoked more."""
@@ -119,6 +120,8 @@ class Machine:
     fetch: Callable[..., Release | None] = fetch_release
     clock: Callable[[], RobotClock] = kernel_clock
     boot: Callable[[], str] = boot_id
+    patience: float = 10.0
+    """Most seconds to wait until the processes of restarted units are seen."""
     restarted: bool = False
     """Whether somebody says that all processes were restarted since the last round."""
 
@@ -162,9 +165,10 @@ class _Round:
         if clock is not RobotClock.BEHIND:  # what is wrong is seen on a clock that is right
             self._note_unusable(opened)
         self._note_due(installation.changed, names)
+        restarted: Sequence[str] = ()
         if clock is not RobotClock.BEHIND:  # nodes would not accept their certificates
-            self._restart(names, opened)
-        seen = self._look(names)
+            restarted = self._restart(names, opened)
+        seen = self._look_after(restarted, names)
         self._problems += [f"{problem}." for problem in seen.problems]
         due = still_due(self._state.due, seen)
         unseen = tuple(name for name in due if seen.states[name] is RunningFiles.NOT_SEEN)
@@ -395,22 +399,35 @@ class _Round:
             if enclave.problem:
                 self._problems.append(f"{name} could not start: {enclave.problem}.")
 
-    def _restart(self, names: Iterable[str], opened: Mapping[str, _Opened]) -> None:
+    def _restart(self, names: Iterable[str], opened: Mapping[str, _Opened]) -> Sequence[str]:
+        """Restart the units of enclaves that are due; return the enclaves of those that did."""
         settings, machine = self._settings, self._machine
         if not settings.restart or not self._state.due:
-            return
+            return ()
         # Only processes that were seen with earlier files, or may have them.
         seen = self._look(names)
         routers = [
             name for name in names if (enclave_path(self._folder, name) / ROUTER_FILE).exists()
         ]
-        self._problems += restart_units(
+        done = restart_units(
             settings,
             still_due(self._state.due, seen),
             routers=routers,
             unusable={name: enclave.problem for name, enclave in opened.items() if enclave.problem},
             systemd=machine.systemd or Systemd(settings.systemctl),
         )
+        self._problems += done.problems
+        return done.enclaves
+
+    def _look_after(self, restarted: Sequence[str], names: Iterable[str]) -> EnclaveProcesses:
+        """Look at the processes, until those of restarted units have loaded their files."""
+        end = time.monotonic() + self._machine.patience
+        while True:
+            seen = self._look(names)
+            starting = (seen.states.get(name) is RunningFiles.NOT_SEEN for name in restarted)
+            if not any(starting) or time.monotonic() > end:
+                return seen
+            time.sleep(_LOOK_SECONDS)
 
     def _look(self, names: Iterable[str]) -> EnclaveProcesses:
         """Look at the processes at the present time, which is later than the begin of the round."""

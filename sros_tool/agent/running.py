@@ -219,6 +219,13 @@ def _due_units(
     yield from sorted(units, key=lambda unit: not first & set(unit[1]))
 
 
+class Restarts(NamedTuple):
+    """The enclaves whose units were restarted, and sentences on units that were not."""
+
+    enclaves: Sequence[str] = ()
+    problems: Sequence[str] = ()
+
+
 def restart_units(
     settings: AgentSettings,
     due: Sequence[str],
@@ -226,14 +233,16 @@ def restart_units(
     routers: Iterable[str],
     unusable: Mapping[str, str],
     systemd: Systemd,
-) -> Iterator[str]:
-    """Restart the units of enclaves, one after the other; yield sentences on those that do not.
+) -> Restarts:
+    """Restart the units of enclaves, one after the other.
 
     A unit of an enclave in ``unusable``, which maps names to reasons, is left running: it would not
     start again.
     """
+    restarted: list[str] = []
+    problems: list[str] = []
     if not due or not settings.restart:
-        return
+        return Restarts()
     if settings.restart_if:
         try:
             allowed = subprocess.run(
@@ -244,20 +253,24 @@ def restart_units(
                 stderr=subprocess.DEVNULL,
             )
         except (OSError, subprocess.SubprocessError) as error:
-            yield f"Whether units may restart could not be asked: {plain(str(error), 120)}."
-            return
+            why = plain(str(error), 120)
+            return Restarts((), (f"Whether units may restart could not be asked: {why}.",))
         if allowed.returncode:
-            return
+            return Restarts()
     try:
         active = systemd.active()
     except UnavailableError as error:
         active = frozenset()
-        yield str(error)
+        problems.append(str(error))
     for unit, enclaves in _due_units(settings, due, routers, active):
         if broken := [name for name in enclaves if name in unusable]:
-            yield f"{unit} is not restarted: {broken[0]} could not start: {unusable[broken[0]]}."
+            why = f"{broken[0]} could not start: {unusable[broken[0]]}"
+            problems.append(f"{unit} is not restarted: {why}.")
             continue
         try:
             systemd.restart(unit)
         except UnavailableError as error:
-            yield str(error)
+            problems.append(str(error))
+        else:
+            restarted += enclaves
+    return Restarts(tuple(restarted), tuple(problems))

@@ -69,6 +69,9 @@ class Robot:
     boot: str = "first"
     restarted: bool = False
     settings: AgentSettings = field(init=False)
+    patience: float = 0.0
+    starting: int = 0
+    """Number of looks after a restart that do not see the processes yet."""
     looked: list[datetime] = field(default_factory=list)
     """The time of each look at the processes."""
     asked: list[int] = field(default_factory=list)
@@ -96,6 +99,7 @@ class Robot:
             clock=lambda: self.clock,
             boot=lambda: self.boot,
             restarted=self.restarted,
+            patience=self.patience,
         )
         return run_round(self.folder, self.settings, machine)
 
@@ -109,8 +113,11 @@ class Robot:
 
     def running(self, now: datetime) -> RunningProcesses:
         self.looked.append(now)
+        started = self.started
+        if self.systemctl and self.starting:
+            self.starting, started = self.starting - 1, {}
         unseen = (UnseenProcess(9, ("x",), "it is closed", speaks=False),) if self.unseen else ()
-        return RunningProcesses(tuple(map(self.process, self.started)), unseen)
+        return RunningProcesses(tuple(map(self.process, started)), unseen)
 
     def process(self, name: str) -> Process:
         place = self.folder / f"enclaves{name}"
@@ -474,6 +481,19 @@ def test_units_restart_in_their_order(home: Home, r1: Robot) -> None:
     assert any("bad.service" in problem for problem in done.problems)
     r1.round()
     assert r1.systemctl == ["a.service", "sros@r1-b.service"], "what is done is not done again"
+
+
+@pytest.mark.parametrize("patience", [0.0, 60.0])
+def test_a_round_waits_until_restarted_processes_are_seen(
+    patience: float, home: Home, r1: Robot
+) -> None:
+    r1.settings = replace(r1.settings, restart=True, units=(Unit("a.service", ("/r1/a",)),))
+    r1.round()
+    r1.started = {name: moment() - timedelta(hours=1) for name in ("/r1/a", "/r1/b")}
+    r1.release, r1.unseen, r1.starting, r1.patience = home.revoked, True, 2, patience
+    done = r1.round()
+    assert len(r1.systemctl) == 2
+    assert done.restart == (("/r1/c",) if patience else NAMES), "nobody restarted /r1/c"
 
 
 def test_no_unit_restarts_that_could_not_start_or_must_not(home: Home, r1: Robot) -> None:
