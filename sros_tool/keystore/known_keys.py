@@ -58,6 +58,13 @@ class KnownKeys:
             entry.key: f"certificate {entry.serial} of {entry.subject}" for entry in recorded
         }
         serials = {entry.serial for entry in recorded}
+        # An earlier ledger that was put back has certificates that only the lists revoke.
+        listed = {f"{serial:x}" for serial in self._revoked_serials} - serials
+        if listed:
+            for entry in self._keystore.ledger_file.with_values("serial", listed).entries:
+                if entry.what == "certificate" and entry.key and entry.serial in listed:
+                    text = f"certificate {entry.serial} of {entry.subject}"
+                    descriptions.setdefault(entry.key, text)
         indexed = self._keystore.ledger_file.is_indexed
         known = serials if indexed else ()  # the ledger has them
         for path in revoked_certificates(self._keystore.root, known):

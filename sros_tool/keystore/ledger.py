@@ -648,6 +648,15 @@ def _not_as_sealed(root: Path, sealed: Entry) -> KeystoreError:
     )
 
 
+def _later_part(root: Path, number: int) -> KeystoreError:
+    return KeystoreError(
+        f"'{root / ledger_part(number)}' is a later part of the ledger than {LEDGER}",
+        "An earlier ledger was put back, which lacks what the keystore issued and revoked since.",
+        f"Restore {LEDGER}, its parts and {LEDGER_HEAD} from the latest backup; or, if they are "
+        "lost, move the later parts to an archive.",
+    )
+
+
 def _entry_at(posting: Posting, index: LedgerIndex, last: BinaryIO) -> Entry:
     """Return the entry to which a posting leads, in the index or the last part of the ledger.
 
@@ -974,14 +983,18 @@ def append(
             digest.update(block)
             yield block
 
+    if os.path.lexists(transaction.root / ledger_part(number + 1)):
+        raise _later_part(transaction.root, number + 1)
     transaction.write_parts(ledger_part(number) if is_part else LEDGER, content())
     for _ in links:  # of a dry run, which writes nothing
         pass
     if index and seals:
         index.seal(ledger_part(number))
         links.add(Entry(iso(now), SEALED, sha256=digest.hexdigest(), number=number))
-        transaction.write_parts(ledger_part(number + 1), links)
-        transaction.link(LEDGER, ledger_part(number + 1))
+        number += 1
+        transaction.write_parts(ledger_part(number), links)
+    if is_part and transaction.target_after(LEDGER) != ledger_part(number):
+        transaction.link(LEDGER, ledger_part(number))
     lines = present.ledger.lines + links.count
     head = f"lines {lines}\nsha256 {links.previous}\n"
     root = ""

@@ -329,6 +329,7 @@ class IndexUpdate:
                 self._make(root)
                 return
             _check_file(root / LEDGER_INDEX)
+            _remove_journals(root, LEDGER_INDEX)
             with closing(_connect(root / LEDGER_INDEX, "rw")) as connection:
                 self._write(root, connection)
         except (OSError, sqlite3.Error, ValueError, SrosError):
@@ -343,6 +344,7 @@ class IndexUpdate:
         with Folder(root) as folder:
             folder.unlink(_NEW, missing_ok=True)
             folder.write(_NEW, b"", 0o600)
+            _remove_journals(root, _NEW)
             with closing(_connect(root / _NEW, "rw", is_new=True)) as connection:
                 self._write(root, connection)
             folder.replace(_NEW, LEDGER_INDEX)
@@ -371,6 +373,18 @@ def _is_own(root: Path) -> bool:
     """Return whether ``root`` belongs to this user, and nobody else can write to it."""
     state = root.stat()
     return state.st_uid == os.geteuid() and not state.st_mode & 0o022
+
+
+def _remove_journals(root: Path, name: str) -> None:
+    """Remove the files that SQLite would read next to an index; this version writes none.
+
+    A journal names files that SQLite removes, and a link would lead it to another file.
+    """
+    from sros_tool.folders import Folder
+
+    with Folder(root) as folder:
+        for end in ("-journal", "-wal", "-shm"):
+            folder.unlink(f"{name}{end}", missing_ok=True)
 
 
 def _check_file(path: Path) -> None:

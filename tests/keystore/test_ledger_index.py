@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import sqlite3
+import struct
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -67,6 +68,27 @@ def test_an_index_answers_as_the_whole_ledger_does(root: Path) -> None:
     check_answers(root)
     with pytest.raises(KeystoreError, match="was revoked"):
         sign_request(root, make_request(generate_key(), "/b"), now=NOW)
+
+
+def test_files_that_sqlite_looks_for_next_to_an_index_lead_nowhere(
+    root: Path, tmp_path: Path
+) -> None:
+    """A journal that names another one would have SQLite remove the file with that name."""
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    name, magic = str(victim).encode(), bytes.fromhex("d9d505f920a163d7")
+    size = (root / LEDGER_INDEX).stat().st_size
+    head = magic + struct.pack(">IIIII", 0, 0, size // 4096, 512, 4096)
+    tail = struct.pack(">I", 0x40000000 // 4096 + 1) + name
+    tail += struct.pack(">II", len(name), sum(name)) + magic
+    journal = root / f"{LEDGER_INDEX}-journal"
+    journal.write_bytes(head.ljust(512, b"\0") + tail)
+    for end in ("-wal", "-shm"):
+        (root / f"{LEDGER_INDEX}{end}").symlink_to(victim)
+    renew(root, ["/a"], now=NOW)
+    assert victim.read_text() == "precious"
+    assert not list(root.glob(f"{LEDGER_INDEX}-*"))
+    assert is_indexed(root)
 
 
 def test_a_second_revocation_reaches_the_others_and_reads_none_of_them(

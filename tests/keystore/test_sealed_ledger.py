@@ -19,7 +19,7 @@ from sros_tool.errors import KeystoreError
 from sros_tool.keystore import ledger as ledger_module
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.describe import history
-from sros_tool.keystore.layout import LEDGER, LEDGER_INDEX, ledger_part
+from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, LEDGER_INDEX, ledger_part
 from sros_tool.keystore.ledger import LedgerFile
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
@@ -256,6 +256,56 @@ def test_a_link_elsewhere_is_not_followed(root: Path, tmp_path: Path) -> None:
     (root / LEDGER).unlink()
     (root / LEDGER).symlink_to(ledger_part(3))
     renew(root, ["/a"], now=NOW)
+
+
+def test_a_last_part_with_another_name_loses_no_line(root: Path) -> None:
+    (root / ledger_part(3)).rename(root / ledger_part(9))
+    (root / LEDGER).unlink()
+    (root / LEDGER).symlink_to(ledger_part(9))
+    revoke(root, ["/b"], now=NOW)
+    assert os.readlink(root / LEDGER) == ledger_part(3)
+    ledger = Keystore(root).ledger
+    assert ledger.gaps == ()
+    assert [entry.enclave for entry in ledger.entries if entry.what == "revocation"][:1] == ["/b"]
+    check_answers(root)
+
+
+def put_ledger_back(root: Path, earlier: Path) -> None:
+    """Put the ledger of the copy ``earlier`` back, and forget the files of revoked enclaves."""
+    for name in (LEDGER_HEAD, LEDGER_INDEX, ledger_part(3)):
+        shutil.copy(earlier / name, root / name)
+    (root / LEDGER).unlink()
+    (root / LEDGER).symlink_to(ledger_part(3))
+    shutil.rmtree(root / "revoked")
+
+
+def test_what_an_earlier_ledger_lacks_is_not_forgotten(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The revocation list knows the certificate, and later parts are not written over."""
+    key = load_key((root / "enclaves/b/key.pem").read_bytes(), "of the test")
+    earlier = Path(shutil.copytree(root, tmp_path / "earlier", symlinks=True))
+    revoke(root, ["/b"], now=NOW)
+    put_ledger_back(root, earlier)
+    with pytest.raises(KeystoreError, match="was revoked"):
+        sign_request(root, make_request(key, "/other"), now=NOW)
+    sign_request(root, make_request(generate_key(), "/other"), now=NOW)
+
+    earlier = Path(shutil.copytree(root, tmp_path / "later", symlinks=True))
+    monkeypatch.setattr(ledger_module, "_SEALED_FROM", 1)
+    create_enclaves(root, ["/c"], now=NOW)
+    revoke(root, ["/c"], now=NOW)
+    assert len(parts(root)) == 5
+    put_ledger_back(root, earlier)
+    before = snapshot(root)
+    for sealed_from in (1, 1 << 30):
+        monkeypatch.setattr(ledger_module, "_SEALED_FROM", sealed_from)
+        with pytest.raises(KeystoreError, match=f"{ledger_part(4)}' is a later part"):
+            create_enclaves(root, ["/d"], now=NOW)
+    assert snapshot(root) == before
+    for number in (4, 5):
+        (root / ledger_part(number)).unlink()
+    create_enclaves(root, ["/d"], now=NOW)
 
 
 def test_an_index_of_another_version_is_made_again_first(
