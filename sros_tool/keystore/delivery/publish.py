@@ -22,7 +22,7 @@ from cryptography import x509
 from cryptography.x509.oid import ExtensionOID
 
 from sros_tool import __version__
-from sros_tool.errors import KeystoreError, Note, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.files import remove_file, staged_file
 from sros_tool.folders import Folder, make_folders
 from sros_tool.keystore.delivery.archive import listed_digests
@@ -538,22 +538,23 @@ class _Run:
         """
         forgotten = ForgottenLists(self.keystore)
         problem = ""
-        by_number = sorted(self._there.items(), key=lambda robot: robot[1].number, reverse=True)
-        for robot, there in by_number:
+        # Only these have the last list: others may have been refused since, and still have earlier.
+        last = (robot for robot in self._there.items() if robot[1].number == self._number)
+        for robot, there in last:
             try:
-                with Folder(self._folder) as folder:
-                    data = folder.read(there.path(robot), most=there.length)
+                if not (data := self._read(robot, there)):
+                    raise DocumentError(f"the archive of {robot} is missing or damaged")
                 files = read_release(data).files
-            except (SrosError, OSError) as error:
-                problem = problem or str(error)
+            except SrosError as error:
+                problem = problem or f"{error.what[:1].upper()}{error.what[1:]}."
                 continue
             for path, content in files.items():
                 if path.endswith(f"/{CRL_FILE}"):
                     forgotten.add(content)
-            break  # the last release has the last list
+            break
         else:
             raise KeystoreError(
-                f"no release in '{self._folder}' can be read",
+                f"no last release in '{self._folder}' can be read",
                 f"{problem} So it cannot be told which revocations the keystore lacks.",
                 "Restore the folder, or repeat the revocations, and publish in another folder.",
             )
@@ -604,11 +605,15 @@ class _Run:
 
     def _has(self, robot: str, release: PublishedRelease) -> bool:
         """Return whether the folder has the archive of a release, undamaged."""
+        return bool(self._read(robot, release))
+
+    def _read(self, robot: str, release: PublishedRelease) -> bytes:
+        """Return the archive of a release; empty if it is missing or damaged."""
         try:
             data = read_bytes(self._folder / release.path(robot), "archive", most=release.length)
         except SrosError:
-            return False
-        return hashlib.sha256(data).hexdigest() == release.sha256
+            return b""
+        return data if hashlib.sha256(data).hexdigest() == release.sha256 else b""
 
     # ── their releases ─────────────────────────────────────────────────────────────────────
 

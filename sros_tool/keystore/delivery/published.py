@@ -112,7 +112,7 @@ def read_published(keystore: Keystore) -> Published:
             {name: int(version) for name, version in value["versions"].items()},
             {path: parse_iso(time) for path, time in value["superseded"].items()},
         )
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise DocumentError(
             f"'{keystore.root / PUBLISHED}' is damaged",
             "",
