@@ -89,17 +89,19 @@ class KnownKeys:
     def revoked_before(self, names: Collection[str]) -> set[str]:
         """Return those of ``names`` whose last certificate was revoked, and not superseded.
 
-        If the ledger was lost, these are the enclaves in the folder ``revoked`` whose certificate a
-        revocation list names.
+        Where the ledger lacks it, a revocation list that names the certificate decides; if the
+        ledger was lost, for the certificates in the folder ``revoked``.
         """
-        files = revoked_certificates(self._keystore.root)
-        if not files and all(entry.reason == SUPERSEDED for entry in self._revocations):
+        if not self._revoked_serials:
             return set()
+        files = revoked_certificates(self._keystore.root)
         enclaves, recorded = set(), {entry.serial for entry in self._revocations}
         for entry in self._keystore.ledger_file.with_values("enclave", names).entries:
             recorded.add(entry.serial)
             if entry.what == "certificate":
                 enclaves.discard(entry.enclave)
+                if entry.serial and int(entry.serial, 16) in self._revoked_serials:
+                    enclaves.add(entry.enclave)
             elif entry.what == "revocation" and entry.reason != SUPERSEDED:
                 enclaves.add(entry.enclave)
         for path in files:
@@ -109,6 +111,15 @@ class KnownKeys:
                     if certificate.serial_number in self._revoked_serials:
                         enclaves.add(common_name_of(certificate.subject))
         return enclaves.intersection(names)
+
+    def lack_notes(self) -> Iterator[Note]:
+        """Yield a note if the ledger may lack keys that were revoked."""
+        if gaps := self._keystore.ledger_with("what", "revocation").gaps:
+            yield Note(
+                "ledger.may-lack-revocations",
+                f"The ledger of '{self._keystore.root}' may lack revocations: {'; '.join(gaps)}. "
+                "A key that was revoked may be certified again.",
+            )
 
     def revoked_before_notes(self, names: Iterable[str]) -> Iterator[Note]:
         """Yield a note for each new enclave in ``names`` that was revoked before."""

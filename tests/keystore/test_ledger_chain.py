@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import KeystoreError
+from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
@@ -21,8 +22,8 @@ from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import load_certificate
-from sros_tool.pki.keys import load_key
+from sros_tool.pki.certificates import load_certificate, make_request
+from sros_tool.pki.keys import generate_key, load_key
 from tests.support.children import run
 from tests.support.harness import certificate, policy_text, publish, sros
 
@@ -118,6 +119,17 @@ def test_a_changed_ledger_is_noticed_and_revoking_goes_on(case: str, root: Path)
     assert gaps[0] in Keystore(root).ledger.gaps
     renew(root, ["/b"], now=NOW, new_key=True) if "/b" in certain(root) else None
     assert gaps[0] in Keystore(root).ledger.gaps
+
+
+def test_who_certifies_a_key_is_told_that_the_ledger_may_lack_revocations(root: Path) -> None:
+    def kinds(name: str) -> set[str]:
+        signed = sign_request(root, make_request(generate_key(), name), now=NOW)
+        return {note.id for note in signed.notes}
+
+    assert "ledger.may-lack-revocations" not in kinds("/whole")
+    put(root, lines_of(root)[:-1])
+    assert "ledger.may-lack-revocations" in kinds("/cut")
+    assert "ledger.may-lack-revocations" in kinds("/later")
 
 
 def certain(root: Path) -> set[str]:

@@ -387,13 +387,15 @@ def test_the_answer_appears_with_the_keystore_or_not_at_all(
 
 def test_an_answer_that_the_robot_would_reject_is_not_written(home: Path, robot: Path) -> None:
     revoke(home, ["/base"], now=NOW)
-    before = snapshot(home)
-    distant = NOW + timedelta(days=4 * 365)
-    crl = (home / "public/identity_ca.crl.pem").read_bytes()
     sign_request(home, request_of(robot), now=NOW, dry_run=True)
-    (home / "public/identity_ca.crl.pem").write_bytes(crl[:200])
+    refresh_crl(home, now=NOW + timedelta(days=365))
+    before = snapshot(home)
+    crl = (home / "public/identity_ca.crl.pem").read_bytes()
     with pytest.raises(KeystoreError, match=r"the robot would reject.*crl\.pem"):
-        sign_request(home, request_of(robot), now=distant)
+        sign_request(home, request_of(robot), now=NOW)
+    (home / "public/identity_ca.crl.pem").write_bytes(crl[:200])
+    with pytest.raises(PkiError, match="revocation list .* cannot be read"):
+        sign_request(home, request_of(robot), now=NOW)
     (home / "public/identity_ca.crl.pem").write_bytes(crl)
     assert snapshot(home) == before
 

@@ -289,6 +289,8 @@ def test_what_an_earlier_ledger_lacks_is_not_forgotten(
     put_ledger_back(root, earlier)
     with pytest.raises(KeystoreError, match="was revoked"):
         sign_request(root, make_request(key, "/other"), now=NOW)
+    with pytest.raises(KeystoreError, match="enclave /b was revoked"):
+        sign_request(root, make_request(generate_key(), "/b"), now=NOW)
     sign_request(root, make_request(generate_key(), "/other"), now=NOW)
 
     earlier = Path(shutil.copytree(root, tmp_path / "later", symlinks=True))

@@ -445,7 +445,7 @@ class _Signer:
     def keep_zenoh(self) -> None:
         """Stage the Zenoh configurations that follow from all certified requests."""
         change = self._change
-        change.notes += [*self._writer.notes, *change.edit_notes()]
+        change.notes += [*self._writer.notes, *change.known.lack_notes(), *change.edit_notes()]
         change.keep_zenoh(self._writer.signed, stated=self._certified)
         change.notes += self.name_notes()
         change.entries += self._writer.entries
