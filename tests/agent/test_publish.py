@@ -497,6 +497,23 @@ def test_a_keystore_that_was_restored(publisher: Home) -> None:
     assert not publisher.publish().names("published")
 
 
+def test_a_keystore_that_was_restored_from_before_its_keys_were_replaced(publisher: Home) -> None:
+    """Robots know the new root, so what the keys in the backup sign would be refused by all."""
+    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    robot = publisher.robot()
+    publisher.publish(rotate=("timestamp",))
+    robot.gets()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    foreign = publisher.pub / "metadata/3.root.json"
+    foreign.write_bytes((publisher.pub / "metadata/1.root.json").read_bytes())
+    with pytest.raises(KeystoreError, match="is not the timestamp key of what"):
+        publisher.publish()
+    foreign.unlink()
+    assert publisher.publish(rotate=("timestamp",)).root.name == "3.root.json"
+    assert robot.gets() == publisher.robot().gets()
+
+
 def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:
     """Versions go on, and archives come again under later numbers."""
     robot, before = publisher.robot(), numbers(publisher)

@@ -488,6 +488,7 @@ class _Run:
         if keystore.has(FLEET_ROOT):
             documents = parse_json(keystore.read(FLEET_ROOT, "root metadata"))["roots"]
         self.roots = Roots(documents)
+        self.roots.follow(folder)
         self._folder = folder
         self._now = now
         self._dry_run = dry_run

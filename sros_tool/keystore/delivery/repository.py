@@ -33,10 +33,11 @@ from tuf.api.metadata import (
 )
 from tuf.api.serialization.json import JSONSerializer
 
-from sros_tool.errors import DocumentError, KeystoreError, PkiError
+from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.published import MetadataExpiry, PublishedRelease
 from sros_tool.keystore.delivery.release import release_target
+from sros_tool.xml import read_bytes
 
 _ROOT, _TARGETS, _SNAPSHOT, _TIMESTAMP = Root.type, Targets.type, Snapshot.type, Timestamp.type
 _METADATA = "metadata"
@@ -108,6 +109,19 @@ class Roots:
                 self.versions.append(version)
         except (RepositoryError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise DocumentError("it is not a chain of root metadata", f"{error}.") from error
+
+    def follow(self, folder: Path) -> None:
+        """Add the later versions in a publishing folder that the last version's key signed.
+
+        A keystore that was restored from a backup does not know them, but robots do.
+        """
+        while self.versions:
+            path = folder / _METADATA / f"{self.last.version + 1}.{_ROOT}.json"
+            try:
+                document = Metadata[Root].from_bytes(read_bytes(path, "root metadata")).to_dict()
+                self.versions = Roots([*self.as_json(), document]).versions
+            except (SrosError, RepositoryError, ValueError, KeyError, TypeError, AttributeError):
+                return
 
     @property
     def last(self) -> Root:
