@@ -514,6 +514,23 @@ def test_a_keystore_that_was_restored_from_before_its_keys_were_replaced(publish
     assert robot.gets() == publisher.robot().gets()
 
 
+def test_a_keystore_that_was_restored_from_before_all_robots_were_revoked(
+    publisher: Home,
+) -> None:
+    """Nothing is published any more, so no release has a later number."""
+    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    for robot in ("r1", "r2", "r5"):
+        publisher.run("revoke", "ks", "--robot", robot)
+    publisher.publish()
+    assert publisher.publish(after=timedelta(days=60)).names("published") == []
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    with pytest.raises(KeystoreError, match="published later without r1, r2, r5, which the"):
+        publisher.publish()
+    with pytest.raises(KeystoreError, match="which revocations the keystore lacks"):
+        publisher.publish(restored=True)
+
+
 def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:
     """Versions go on, and archives come again under later numbers."""
     robot, before = publisher.robot(), numbers(publisher)

@@ -512,24 +512,36 @@ class _Run:
         """
         latest = max((release.number for release in self._there.values()), default=0)
         if latest <= self.list.number:
-            return False
-        # Not by the next number of the ledger: a restored keystore may have issued files since.
-        entries = self.keystore.ledger_with("what", "release").entries
-        if any(entry.what == "release" and entry.number == latest for entry in entries):
-            return False
-        if not restored:
+            if not (removed := self._removed_later()):
+                return False
+            what = f"was published later without {first_few(removed, 3)}"
+        else:
+            # Not by the next number of the ledger: a restored keystore may have issued files since.
+            entries = self.keystore.ledger_with("what", "release").entries
+            if any(entry.what == "release" and entry.number == latest for entry in entries):
+                return False
             robots = [robot for robot, there in self._there.items() if there.number == latest]
+            what = f"has later releases: {first_few(robots, 3)} with the number {latest}"
+        if not restored:
             raise KeystoreError(
-                f"'{self._folder}' has later releases than the keystore '{self.keystore.root}' "
-                f"knows: {first_few(robots, 3)} with the number {latest}",
+                f"'{self._folder}' {what}, which the keystore '{self.keystore.root}' does not know",
                 "The keystore was restored from a backup, or is a copy. What was changed since, "
                 "such as a revocation, would be undone.",
                 "Restore a later backup. If there is none, repeat what was changed, and then add "
                 "--restored, which revokes again what these releases revoke.",
             )
+        self._number = max(latest, self.list.number)
         self.list.robots.clear()
-        self._number = latest
         return True
+
+    def _removed_later(self) -> list[str]:
+        """Return the robots without a release in metadata that is later than the keystore knows."""
+        from sros_tool.keystore.delivery.repository import RENEWED_ALONE
+
+        known, there = self.list.versions, self._present.versions()
+        if all(there.get(name, 0) <= known[name] for name in known.keys() - RENEWED_ALONE):
+            return []
+        return sorted(self.list.robots.keys() - self._there.keys())
 
     def revoke_again(self, keyring: Keyring) -> None:
         """Revoke what the last releases revoke, and the restored keystore does not.

@@ -40,6 +40,8 @@ from sros_tool.keystore.delivery.release import release_target
 from sros_tool.xml import read_bytes
 
 _ROOT, _TARGETS, _SNAPSHOT, _TIMESTAMP = Root.type, Targets.type, Snapshot.type, Timestamp.type
+RENEWED_ALONE = frozenset({_TIMESTAMP, _SNAPSHOT})
+"""The metadata that is renewed when nothing new is published."""
 _METADATA = "metadata"
 """The folder of the metadata in a publishing folder."""
 _BINS = "robots"
