@@ -672,7 +672,7 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
             "The policy assigns enclaves to node names, and `--ros-args -r __node:=NAME` sets "
             "the name.",
             "Give the node a name in the launch file, or start this command in an enclave of its "
-            "own: `sros run ROOT NAME -- COMMAND`.",
+            "own: `sros run KEYSTORE ENCLAVE -- COMMAND`.",
         )
     ns, name = node
     full = f"/{ns.strip('/')}/{name}".replace("//", "/")

@@ -26,6 +26,9 @@ REPLACE = (
     "Replace the file: `rm {path} && sros create_enclave {root} {enclave}` links the keystore's "
     "file, or issues the file again."
 )
+AT_HOME = "keystore that has the CA keys"
+"""How the remedies for an export name the keystore that issued it."""
+
 _IN_EXPORT = {
     _CLOCK: "Set the clock of this host; if it is right, sign again in the keystore that has the "
     "CA keys: `sros renew {root} {enclave}`. Then export the enclave again.",
@@ -432,11 +435,13 @@ class Fault(Enum):
     def remedy_in_export(self, file: str) -> str:
         """Return the remedy for this fault in ``file`` of an export, which has no CA keys."""
         text = self.remedy_in(file)
-        if "`" not in text or self is Fault.GOVERNANCE_DOMAIN:
+        if self is Fault.GOVERNANCE_DOMAIN:
+            return text.replace("To add a domain", f"To add a domain in the {AT_HOME}")
+        if "`" not in text:
             return text
         if text in _IN_EXPORT:
             return _IN_EXPORT[text]
-        return f"In the keystore that has the CA keys: {text} Then export the enclave again."
+        return f"In the {AT_HOME}: {text} Then export the enclave again."
 
 
 FAULTS = {fault.id: fault for fault in Fault}

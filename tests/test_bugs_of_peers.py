@@ -353,8 +353,8 @@ TRACEBACKS: dict[str, Callable[[Path, Path], list[str | Path]]] = {
     "missing enclave": _missing_enclave,
     "a quote in the name": lambda ks, _: ["create_enclave", ks, "/it's"],
     "latin-1": _latin_1,
-    "ROOT is a file": _root_is_a_file,
-    "ROOT is a dangling link": _dangling,
+    "KEYSTORE is a file": _root_is_a_file,
+    "KEYSTORE is a dangling link": _dangling,
     "corrupt CA key": _corrupt_key,
 }
 

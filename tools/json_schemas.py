@@ -135,7 +135,7 @@ VERBS: Mapping[str, str | Shapes] = {
     "zenoh": Shapes(
         "The configurations of Zenoh of a keystore's enclaves, or an existing one.",
         {
-            "ROOT": f"{_LIFECYCLE}:KeystoreZenoh",
+            "KEYSTORE": f"{_LIFECYCLE}:KeystoreZenoh",
             "--from": "sros_tool.checks.zenoh:ReadConfiguration",
         },
     ),

@@ -52,10 +52,10 @@ from sros_tool.zenoh.releases import too_old_because, version_text
 
 _RCL = "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy."
 _NAME_IT = (
-    "Start each process with `sros run ROOT NAME -- COMMAND...`, or set its enclave in the launch "
-    "file."
+    "Start each process with `sros run KEYSTORE ENCLAVE -- COMMAND...`, or set its enclave in the "
+    "launch file."
 )
-_ENV = '`eval "$(sros env ROOT NAME)"` sets all variables.'
+_ENV = '`eval "$(sros env KEYSTORE ENCLAVE)"` sets all variables.'
 
 ENABLE_MISSPELT = FindingKind(
     "runtime.enable-misspelt",
@@ -134,9 +134,9 @@ OTHER_DISTRIBUTION = FindingKind(
     "`sros check` decided by the DDS of those distributions. Another one can open or close what "
     "they do not, without any message.",
     "sros: `distributions` in the settings of a keystore, `distribution` in its fleet file.",
-    "Source one of them. Or compare the other one, by `--upgrade-to` of `sros check ROOT`, and add "
-    "it: `sros update_keystore ROOT --set distributions=NAME,...`, or `distribution` in the fleet "
-    "file.",
+    "Source one of them. Or compare the other one, by `--upgrade-to` of `sros check KEYSTORE`, and "
+    "add it: `sros update_keystore KEYSTORE --set distributions=NAME,...`, or `distribution` in "
+    "the fleet file.",
 )
 ENCLAVE_NOT_FOUND = FindingKind(
     "runtime.enclave-not-found",
@@ -145,13 +145,13 @@ ENCLAVE_NOT_FOUND = FindingKind(
     "With Enforce the node does not start; without Enforce it runs unsecured. Names are "
     "case-sensitive.",
     _RCL,
-    "Correct the name, or create the enclave with `sros create_enclave ROOT NAME`.",
+    "Correct the name, or create the enclave with `sros create_enclave KEYSTORE ENCLAVE`.",
 )
 NO_ENCLAVE = FindingKind(
     "runtime.enclave-unset",
     WARNING,
     "ROS_SECURITY_ENCLAVE_OVERRIDE is not set",
-    "A process without `--ros-args --enclave NAME` uses the enclave /, which the keystore does "
+    "A process without `--ros-args --enclave ENCLAVE` uses the enclave /, which the keystore does "
     "not have, and does not start.",
     _RCL,
     _NAME_IT,
@@ -160,7 +160,7 @@ UNSECURED_WITHOUT_ENCLAVE = FindingKind(
     "runtime.unsecured-without-enclave",
     ERROR,
     "ROS_SECURITY_ENCLAVE_OVERRIDE is not set, and nodes run unsecured",
-    "A process without `--ros-args --enclave NAME` uses the enclave /, which the keystore does "
+    "A process without `--ros-args --enclave ENCLAVE` uses the enclave /, which the keystore does "
     "not have. It runs UNSECURED, because ROS_SECURITY_STRATEGY is not exactly `Enforce`.",
     _RCL,
     f"Write ROS_SECURITY_STRATEGY=Enforce. {_NAME_IT}",
@@ -181,7 +181,7 @@ DOMAIN_NOT_GOVERNED = FindingKind(
     'No node starts: Fast DDS says "Not found topic access rule for topic ros_discovery_info", '
     'Cyclone DDS "Could not find domain in governance".',
     "DDS-Security 1.1, 9.4.1.2; measured.",
-    Fault.GOVERNANCE_DOMAIN.remedy.format(root="ROOT", enclave="NAME"),
+    Fault.GOVERNANCE_DOMAIN.remedy.format(root="KEYSTORE", enclave="ENCLAVE"),
 )
 CA_KEY_HERE = FindingKind(
     "runtime.ca-key-present",
@@ -189,8 +189,8 @@ CA_KEY_HERE = FindingKind(
     "nodes use the keystore that holds the CA keys",
     "An attacker who takes over a node can create any enclave, with any rights.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6.",
-    "Run nodes with an export (`sros distribute_key ROOT NAME TARGET`), and keep this keystore "
-    "elsewhere.",
+    "Run nodes with an export (`sros distribute_key KEYSTORE ENCLAVE TARGET`), and keep this "
+    "keystore elsewhere.",
 )
 
 _READ = (
@@ -331,8 +331,9 @@ def value_text(environment: Mapping[str, str], name: str) -> str:
 
 _SOURCE = "rmw_zenoh_cpp (zenoh_config.cpp); 1.10.2 of Zenoh measured."
 OWN_CONFIGURATION = (
-    "`sros zenoh ROOT` writes the configuration of each enclave, where the CA keys are; `sros env "
-    "ROOT NAME` and `sros run ROOT NAME -- COMMAND...` set the variables of an enclave."
+    "`sros zenoh KEYSTORE` writes the configuration of each enclave, where the CA keys are; `sros "
+    "env KEYSTORE ENCLAVE` and `sros run KEYSTORE ENCLAVE -- COMMAND...` set the variables of an "
+    "enclave."
 )
 
 NO_SESSION_FILE = FindingKind(

@@ -98,7 +98,7 @@ PROCESS_EXPIRED = FindingKind(
     "Processes that start, or find it, from now on refuse it.",
     "DDS-Security 1.1, 8.3.2.8 and 9.4.1.3.2.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2 (read at the "
     "start).",
-    "Renew the enclave (`sros renew ROOT NAME`), bring it here, and restart the process.",
+    "Renew the enclave (`sros renew KEYSTORE ENCLAVE`), bring it here, and restart the process.",
 )
 PROCESS_LOCAL_TIME = FindingKind(
     "runtime.process-local-time",
@@ -107,7 +107,7 @@ PROCESS_LOCAL_TIME = FindingKind(
     'Fast DDS reads their dates in the local time of the process, and says "Not found the '
     'identity subject name in permissions file".',
     "Fast DDS 2.6 to 3.6 (mktime); measured.",
-    "Run `sros renew ROOT NAME`, or start the process with TZ=UTC.",
+    "Run `sros renew KEYSTORE ENCLAVE`, or start the process with TZ=UTC.",
     vendors=FAST_DDS,
 )
 PROCESS_REPLACEABLE = FindingKind(
@@ -128,7 +128,7 @@ PROCESS_NOT_SEEN = FindingKind(
     "Run it as root: `sudo sros check runtime`.",
 )
 
-_NEW_AUTHORITY = Fault.CA_EXPIRED.remedy_in_export("").format(root="ROOT")
+_NEW_AUTHORITY = Fault.CA_EXPIRED.remedy_in_export("").format(root="KEYSTORE")
 """Remedy for an expired CA, which can no longer renew anything."""
 _MOST_LEDGER = 64 * 1024 * 1024
 _LOADED_BY_ZENOH = (IDENTITY_CA_FILE, CERTIFICATE_FILE, KEY_FILE)
@@ -407,7 +407,7 @@ PROCESS_UNSECURED = FindingKind(
     "a node without security next to secured nodes",
     "This node and the secured nodes do not see each other.",
     "DDS-Security 1.1, 9.4.1.2 (allow_unauthenticated_participants is false).",
-    "Start it with `sros run ROOT NAME -- COMMAND...`.",
+    "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
 PROCESS_RUNS_UNSECURED = FindingKind(
     "runtime.process-runs-unsecured",
@@ -416,7 +416,7 @@ PROCESS_RUNS_UNSECURED = FindingKind(
     "Its ROS_SECURITY_STRATEGY is not exactly `Enforce`, so rcl starts it unsecured where its "
     "enclave or a file of it is missing: everybody on the network hears it and can send to it.",
     "rcl 9 (rcl/src/rcl/security.c), rmw_dds_common (security.cpp); ran with ROS 2 Jazzy.",
-    "Stop it, and start it with `sros run ROOT NAME -- COMMAND...`.",
+    "Stop it, and start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
 MIXED_VENDORS = FindingKind(
     "runtime.mixed-vendors",
@@ -435,7 +435,7 @@ PROCESS_PERMISSIVE = FindingKind(
     "Its ROS_SECURITY_STRATEGY is not exactly `Enforce`: when its enclave or a file of it is "
     "missing, it starts unsecured.",
     "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy.",
-    "Start it with `sros run ROOT NAME -- COMMAND...`.",
+    "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
 PROCESS_OTHER_KEYSTORE = FindingKind(
     "runtime.process-other-keystore",
@@ -482,8 +482,8 @@ NOT_SECURED = FindingKind(
     "Everybody on the network hears these nodes and can send to them. That nothing else is found "
     "here says nothing about their security.",
     "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy.",
-    "Start nodes with `sros run ROOT NAME -- COMMAND...`, or set the variables with "
-    '`eval "$(sros env ROOT NAME)"`.',
+    "Start nodes with `sros run KEYSTORE ENCLAVE -- COMMAND...`, or set the variables with "
+    '`eval "$(sros env KEYSTORE ENCLAVE)"`.',
     prominent=True,
 )
 NODE_OPEN = FindingKind(
@@ -492,7 +492,7 @@ NODE_OPEN = FindingKind(
     "a node that runs open in a domain without secured nodes",
     "Everybody on the network hears it and can send to it.",
     "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy.",
-    "Start it with `sros run ROOT NAME -- COMMAND...`, or end it if nobody needs it.",
+    "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`, or end it if nobody needs it.",
 )
 
 _MOST_NODES = 20

@@ -9,9 +9,9 @@ from sros_tool.checks.kind import ERROR, NOTE, WARNING, FindingKind
 
 _ENGINE = "sros: its decision engine, with the rules of the DDS that each distribution ships."
 _DECIDE_ALIKE = (
-    "`sros explain ROOT NAME ... --all-distros` shows the rule that decides in each. Remove "
+    "`sros explain KEYSTORE ENCLAVE ... --all-distros` shows the rule that decides in each. Remove "
     "denials of what no rule allows, and sign the rights in the form that sros writes: `sros "
-    "create_permission ROOT NAME POLICY_FILE`."
+    "create_permission KEYSTORE ENCLAVE POLICY_FILE`."
 )
 
 OPENS = FindingKind(
@@ -39,7 +39,7 @@ REFUSED = FindingKind(
     "The DDS of the other distribution does not accept a file of the enclave, or its peers do not "
     "accept the enclave.",
     _ENGINE,
-    "Replace what is refused, before the update. `sros check ROOT --all-distros` names it.",
+    "Replace what is refused, before the update. `sros check KEYSTORE --all-distros` names it.",
 )
 ACCEPTED = FindingKind(
     "upgrade.accepted",
@@ -48,7 +48,7 @@ ACCEPTED = FindingKind(
     "The DDS of the other distribution accepts a file that is refused now, such as expired "
     "permissions: what was shut out joins again.",
     _ENGINE,
-    "If it must stay out, revoke it with `sros revoke ROOT NAME`. Otherwise replace what is "
+    "If it must stay out, revoke it with `sros revoke KEYSTORE ENCLAVE`. Otherwise replace what is "
     "refused now, so that both accept it.",
 )
 NO_NODE = FindingKind(
@@ -59,7 +59,7 @@ NO_NODE = FindingKind(
     "Iron and later also offer ~/get_type_description.",
     "ROS 2 Jazzy, rcl 9, rclcpp 28, rclpy 7 and rmw_dds_common; REP-2016.",
     "Include common/node.xml in the profiles of its nodes (`sros check POLICY_FILE` says how), and "
-    "sign the policy with `sros generate_artifacts -k ROOT -p POLICY_FILE`.",
+    "sign the policy with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`.",
 )
 BUFFERS = FindingKind(
     "upgrade.zenoh-buffers",
@@ -68,7 +68,7 @@ BUFFERS = FindingKind(
     "rmw_zenoh of Lyrical sends messages with arrays of bytes, such as images and point clouds, on "
     "keys below that of the topic. Files of an earlier sros drop them without a word.",
     "ros2/rmw_zenoh, rmw_publisher_data.cpp.",
-    "Write the files again with `sros zenoh ROOT`, and deliver them before the update.",
+    "Write the files again with `sros zenoh KEYSTORE`, and deliver them before the update.",
 )
 ZENOH = FindingKind(
     "upgrade.zenoh-release",
@@ -96,7 +96,7 @@ NOT_MEASURED = FindingKind(
     "sros decides by the rules of another release of this product, so that a difference between "
     "the two is not seen.",
     _ENGINE,
-    "Try the update on one robot, and look at its logs with `sros explain ROOT --log FILE`.",
+    "Try the update on one robot, and look at its logs with `sros explain KEYSTORE --log FILE`.",
     prominent=True,
 )
 DIFFER = FindingKind(
@@ -115,7 +115,7 @@ DISTRIBUTION_REFUSES = FindingKind(
     "The keystore or its fleet says that it is for both.",
     _ENGINE,
     "Replace what is refused, or correct `distributions` in the settings of the keystore: `sros "
-    "update_keystore ROOT --set distributions=NAME,...`.",
+    "update_keystore KEYSTORE --set distributions=NAME,...`.",
 )
 
 OF_ENCLAVES = (OPENS, CLOSES, REFUSED, ACCEPTED, NO_NODE, DIFFER, DISTRIBUTION_REFUSES)

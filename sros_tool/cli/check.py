@@ -942,7 +942,7 @@ def metrics(
 ) -> None:
     """Give Prometheus the expiry of all files of a keystore, and its number of findings.
 
-    ROOT is a keystore, or an export on a robot. The text is for the textfile collector of
+    KEYSTORE is a keystore, or an export on a robot. The text is for the textfile collector of
     node_exporter.
 
     Example:

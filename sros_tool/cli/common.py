@@ -420,7 +420,7 @@ def keystore_from_environment() -> Path:
 
 
 def keystore_argument(
-    name: str = "root", metavar: str = "[ROOT]"
+    name: str = "root", metavar: str = "[KEYSTORE]"
 ) -> Callable[[Decorated], Decorated]:
     """Add a keystore, by default that of the environment, as argument to a verb."""
 

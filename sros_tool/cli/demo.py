@@ -70,7 +70,7 @@ def _complete_scenario(
 @click.option(
     "--keystore",
     type=PATH,
-    metavar="ROOT",
+    metavar="KEYSTORE",
     help="Attack a copy of this keystore (with --scenario attacks); it is only read.",
 )
 @click.option(

@@ -55,7 +55,7 @@ _STREAM = Path("-")
 
 
 @verb("distribute_key")
-@words_argument("[ROOT] [NAME...] TARGET")
+@words_argument("[KEYSTORE] [ENCLAVE...] TARGET")
 @several_enclaves
 @click.option("--force", is_flag=True, help="Replace files in TARGET that differ.")
 @click.option(
@@ -75,7 +75,7 @@ def distribute_key(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    r"""Export the enclaves NAME... to TARGET: a folder, a .tar.gz, or - for standard output.
+    r"""Export ENCLAVE... to TARGET: a folder, a .tar.gz, or - for standard output.
 
     TARGET becomes a keystore with only these enclaves: files instead of links, and no CA key.
 
@@ -270,7 +270,7 @@ def verify(
 
 
 @verb("create_request")
-@click.argument("name")
+@click.argument("name", metavar="ENCLAVE")
 @keystore_argument("folder", "[DIR]")
 @click.option(
     "--again", is_flag=True, help="Write the signing request again, for the existing key."
@@ -281,7 +281,7 @@ def verify(
 def create_request(
     name: str, folder: Path, again: bool, key: str, dry_run: bool, as_json: bool
 ) -> None:
-    """On a robot: create the key of the enclave NAME in the folder DIR, and a signing request.
+    """On a robot: create the key of ENCLAVE in the folder DIR, and a signing request.
 
     The key never leaves DIR. With --key, it is made on the robot's PKCS#11 token, which it never
     leaves; DIR then holds only its URI. The PIN comes from the URI's pin-source=, from
@@ -323,7 +323,7 @@ def create_request(
 
 
 @verb("sign_request")
-@words_argument("[ROOT] REQUEST", shell_complete=complete_file)
+@words_argument("[KEYSTORE] REQUEST", shell_complete=complete_file)
 @click.option(
     "-p",
     "--policy-file",
@@ -353,7 +353,7 @@ def create_request(
     "--enclave",
     "only",
     multiple=True,
-    metavar="NAME",
+    metavar="ENCLAVE",
     help="Accept REQUEST only for this enclave; needed to certify a revoked enclave again."
     " For several requests, give the option once for each request, in the same order.",
 )

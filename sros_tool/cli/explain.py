@@ -149,7 +149,7 @@ def _refuse_ignored(mode: str) -> None:
 @verb("explain")
 @click.argument(
     "words",
-    metavar="[ROOT] [ENCLAVE] [publish|subscribe|call|serve|execute|join [NAME]]",
+    metavar="[KEYSTORE] [ENCLAVE] [publish|subscribe|call|serve|execute|join [NAME]]",
     nargs=-1,
     shell_complete=_complete_words,
 )
@@ -159,7 +159,9 @@ def _refuse_ignored(mode: str) -> None:
     type=click.Choice(["topic", "service", "action"]),
     help="Whether NAME is a topic, a service or an action.",
 )
-@click.option("--keystore", type=PATH, metavar="ROOT", help="A keystore, or an enclave's folder.")
+@click.option(
+    "--keystore", type=PATH, metavar="KEYSTORE", help="A keystore, or an enclave's folder."
+)
 @click.option(
     "--policy",
     type=PATH,
@@ -244,9 +246,9 @@ def explain(
     r"""Show whether DDS or Zenoh lets an enclave do something, by which rule, and how to change it.
 
     call and serve are about services, execute is about actions. If the rights name an action NAME
-    and no service NAME, call and serve are about the action; --type decides. ROOT is a keystore,
-    here or on a robot; ENCLAVE can also be an enclave's folder. With --policy and no keystore, the
-    policy itself is explained, before anything is signed.
+    and no service NAME, call and serve are about the action; --type decides. KEYSTORE is a
+    keystore, here or on a robot; ENCLAVE can also be an enclave's folder. With --policy and
+    no keystore, the policy itself is explained, before anything is signed.
 
     The exit status is 0 if it is allowed (with --who: to any enclave), and 1 if it is denied; with
     --log, 1 if the log reports a fault.
@@ -839,8 +841,8 @@ def _show_log(
 _ZENOH_TESTS = "caching permissions for `"
 _ONLY_TESTS = (
     "Zenoh's access control logged tests of declared keys: they do not tell which message was "
-    "dropped. `sros explain ROOT ENCLAVE publish|subscribe|call|serve NAME --vendor zenoh` shows "
-    "whether one is denied."
+    "dropped. `sros explain KEYSTORE ENCLAVE publish|subscribe|call|serve NAME --vendor zenoh` "
+    "shows whether one is denied."
 )
 
 

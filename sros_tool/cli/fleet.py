@@ -86,7 +86,7 @@ def fleet() -> None:
     help="Print the format of Ansible's dynamic inventory scripts.",
 )
 def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
-    """Print the robots of the keystore ROOT as an inventory of Ansible.
+    """Print the robots of KEYSTORE as an inventory of Ansible.
 
     Robots are hosts and groups are groups. Variables of a host are ansible_host, ansible_user,
     sros_robot, sros_namespace, sros_domain, sros_router, sros_crossing,
@@ -145,7 +145,7 @@ def _dds_here(moment: datetime) -> RobotDds:
 
 
 @fleet.command("confirm")
-@words_argument("[ROOT] FILE", shell_complete=complete_file)
+@words_argument("[KEYSTORE] FILE", shell_complete=complete_file)
 @click.option(
     "--robot",
     metavar="NAME",
@@ -156,7 +156,7 @@ def _dds_here(moment: datetime) -> RobotDds:
 @dry_run_option
 @json_option
 def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -> None:
-    """Store a robot's report of its files in the keystore ROOT.
+    """Store a robot's report of its files in KEYSTORE.
 
     FILE is what `sros fleet report` or the Ansible collection made on the robot; - is standard
     input. It replaces the last report of the robot. A report is no proof; `sros fleet status`
@@ -215,7 +215,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
 
 
 @fleet.command("collect")
-@words_argument("[ROOT] INBOX", shell_complete=complete_file)
+@words_argument("[KEYSTORE] INBOX", shell_complete=complete_file)
 @click.option(
     "--restored",
     multiple=True,
@@ -228,7 +228,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     "folder",
     type=PATH,
     metavar="PUB",
-    help="Publish afterwards, as `sros fleet publish ROOT PUB` does.",
+    help="Publish afterwards, as `sros fleet publish KEYSTORE PUB` does.",
 )
 @allow_refusal_option
 @dry_run_option
@@ -244,7 +244,7 @@ def _collect(
     """Take in what robots sent: keep their confirmations, and sign their requests for renewal.
 
     INBOX is a folder with ROBOT/confirmation.p7s of each robot that runs `sros agent`. Only the
-    robots of the fleet of the keystore ROOT are read. A message counts if an enclave of the same
+    robots of the fleet of KEYSTORE are read. A message counts if an enclave of the same
     robot signed it with a certificate that this keystore issued and did not revoke, and if it is
     later than the one before. Requests for renewal are signed for robots with renewal = "allowed"
     in the fleet file; their rights stay as they are. One bad message stops no other one.
@@ -361,7 +361,7 @@ _VALIDITIES = {
 
 
 @fleet.command("publish")
-@words_argument("[ROOT] PUB", shell_complete=complete_file)
+@words_argument("[KEYSTORE] PUB", shell_complete=complete_file)
 @click.option(
     "--root-key",
     type=PATH,
@@ -393,7 +393,7 @@ def _publish(
     as_json: bool,
     **validities: str | None,
 ) -> int:
-    """Publish what each robot of the keystore ROOT is to have, in the folder PUB.
+    """Publish what each robot of KEYSTORE is to have, in the folder PUB.
 
     PUB has plain files for any web server, bucket or USB stick, and no private key: for each robot
     an archive with the files of its enclaves, sealed by the permissions CA, and metadata of The
@@ -401,8 +401,8 @@ def _publish(
     it after each change, and before the timestamp expires, such as each hour. Unchanged robots keep
     their archives. Robots that are revoked or left the fleet lose theirs.
 
-    The keys are in ROOT/private. The root key signs only which keys the others are: move it away
-    from the keystore, and name it with --root-key to replace a key, and to renew it each year.
+    The keys are in KEYSTORE/private. The root key signs only which keys the others are: move it
+    away from the keystore, and name it with --root-key to replace a key, and to renew it each year.
 
     Example:
       $ sros fleet publish keystore pub
@@ -512,7 +512,7 @@ def _status(
 ) -> int:
     """Compare the files that each robot last confirmed with those that it should have.
 
-    A robot should have what an export from the keystore ROOT would give it now. A file is current;
+    A robot should have what an export from KEYSTORE would give it now. A file is current;
     earlier (issued for this enclave before); another's (issued for another enclave); revoked;
     missing; or unknown (never issued by this keystore). Processes use new files only after a
     restart: those that are due are in what the Ansible collection and `sros agent` confirm, and not

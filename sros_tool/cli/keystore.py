@@ -49,15 +49,15 @@ if TYPE_CHECKING:
 
 
 @verb("create_enclave")
-@words_argument("[ROOT] NAME...")
+@words_argument("[KEYSTORE] ENCLAVE...")
 @key_option
 @dry_run_option
 @json_option
 def create_enclave(words: tuple[str, ...], key: str, dry_run: bool, as_json: bool) -> None:
-    """Create the enclaves NAME... in the keystore ROOT.
+    """Create ENCLAVE... in KEYSTORE.
 
     An existing enclave keeps its key and its permissions; missing files are added. With --key, the
-    key is on a PKCS#11 token and cannot be copied; without object= in URI, its label is NAME.
+    key is on a PKCS#11 token and cannot be copied; without object= in URI, its label is ENCLAVE.
 
     Example:
       $ sros create_enclave keystore /talker /listener
@@ -93,7 +93,7 @@ _revoke_old_option = click.option(
 
 
 @verb("create_permission")
-@words_argument("[ROOT] [NAME...] POLICY_FILE")
+@words_argument("[KEYSTORE] [ENCLAVE...] POLICY_FILE")
 @several_enclaves
 @fleet_option("The robots that the placeholders of the policy stand for.")
 @_revoke_old_option
@@ -111,7 +111,7 @@ def create_permission(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Give the enclaves NAME... the permissions that POLICY_FILE states for them: all or none.
+    """Give ENCLAVE... the permissions that POLICY_FILE states for them: all or none.
 
     Anyone who has a copy of the replaced permissions, with the certificate of that time, can use
     them until they expire. With --revoke-old, processes that load the new crl.pem refuse them.
@@ -147,7 +147,7 @@ def create_permission(
     _show(result, as_json, [policy])
 
 
-_ORDER = "Write them in this order: `sros create_permission ROOT NAME... POLICY_FILE`."
+_ORDER = "Write them in this order: `sros create_permission KEYSTORE ENCLAVE... POLICY_FILE`."
 
 
 def _check_order(root: Path, names: Sequence[str], file: Path) -> None:
@@ -173,7 +173,7 @@ class _SeveralEnclavesAndPolicies(SeveralValues):
 
 @verb("generate_artifacts", cls=_SeveralEnclavesAndPolicies)
 @click.option("-k", "--keystore-root-path", type=PATH, help="The keystore; created if missing.")
-@click.option("-e", "--enclaves", multiple=True, metavar="NAME...", help="Enclaves to create.")
+@click.option("-e", "--enclaves", multiple=True, metavar="ENCLAVE...", help="Enclaves to create.")
 @click.option(
     "-p",
     "--policy-files",
@@ -235,7 +235,7 @@ def generate_artifacts(
     root = keystore_root_path or keystore_from_environment()
     if not enclaves and not policy_files:
         raise UsageError(
-            "neither an enclave nor a policy is named", "", "Give -e NAME... or -p FILE... ."
+            "neither an enclave nor a policy is named", "", "Give -e ENCLAVE... or -p FILE... ."
         )
     if fleet_file and not policy_files:
         raise UsageError("--fleet fills in policies, and none is named", "", "Give -p FILE... .")
@@ -324,7 +324,7 @@ def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
     from sros_tool.keystore.layout import FLEET
 
     if len(result.created) > _MANY_CREATED and not (as_json or result.dry_run):
-        whose = "--robot NAME" if (result.root / FLEET).exists() else "NAME..."
+        whose = "--robot NAME" if (result.root / FLEET).exists() else "ENCLAVE..."
         yield (
             f"created {len(result.created)} enclaves; to send them: `sros distribute_key "
             f"{quote(str(result.root))} {whose} FOLDER`"
@@ -343,7 +343,7 @@ def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
 def list_enclaves(
     root: Path, patterns: tuple[str, ...], robots: tuple[str, ...], as_json: bool
 ) -> None:
-    """List the enclaves of the keystore ROOT, sorted.
+    """List the enclaves of KEYSTORE, sorted.
 
     Example:
       $ sros list_enclaves keystore
@@ -469,7 +469,7 @@ def create_keystore(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Create a keystore in the folder ROOT, with the settings of a template.
+    """Create a keystore in the folder KEYSTORE, with the settings of a template.
 
     Passphrases of CA keys come from a prompt, from $SROS_CA_PASSPHRASE or from the file
     $SROS_CA_PASSPHRASE_FILE; the PIN of a token from a prompt or $SROS_PKCS11_PIN. A new
@@ -685,7 +685,7 @@ def update_keystore(
     as_json: bool,
     dry_run: bool,
 ) -> int:
-    r"""Change the settings of the keystore ROOT, and sign the affected files again.
+    r"""Change the settings of KEYSTORE, and sign the affected files again.
 
     KEY is a setting of sros.toml. What becomes looser and what tighter is shown, and what becomes
     looser has to be allowed. The enclaves keep their keys and their rights.
@@ -895,7 +895,7 @@ def _replaced_lines(update: KeystoreUpdate) -> Iterator[str]:
 
     if update.works_until:
         names = tuple(update.outcomes)
-        shown = " ".join(map(quote, names)) if len(names) <= _NAMES_SHOWN else "NAME..."
+        shown = " ".join(map(quote, names)) if len(names) <= _NAMES_SHOWN else "ENCLAVE..."
         ends = f"run `sros renew {quote(str(update.root))} {shown} --revoke-old`"
         if update.left:
             ends = f"add --revoke-old to the stage {update.left[-1]}, or {ends}"

@@ -48,7 +48,7 @@ _crl_option = click.option(
 
 
 @verb("renew")
-@words_argument("[ROOT] [NAME...]", required=False)
+@words_argument("[KEYSTORE] [ENCLAVE...]", required=False)
 @several_enclaves
 @click.option(
     "--all-expiring",
@@ -79,7 +79,7 @@ def renew(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Issue new certificates for the enclaves NAME..., and sign their permissions again.
+    """Issue new certificates for ENCLAVE..., and sign their permissions again.
 
     The rights stay the same.  Running processes keep the files they have loaded: restart them
     before those files expire.
@@ -88,7 +88,7 @@ def renew(
     expire.  With --revoke-old, processes that load the new crl.pem refuse them: restart the
     renewed processes first, then all others.
 
-    With --key, the enclaves NAME... get new keys on a token, and their key.pem files are removed.
+    With --key, ENCLAVE... get new keys on a token, and their key.pem files are removed.
 
     Example:
       $ sros renew keystore /talker
@@ -160,7 +160,7 @@ def _complete_reason(
 
 
 @verb("revoke")
-@words_argument("[ROOT] [NAME...]", required=False)
+@words_argument("[KEYSTORE] [ENCLAVE...]", required=False)
 @several_enclaves
 @click.option(
     "--reason",
@@ -191,7 +191,7 @@ def revoke(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Revoke the enclaves NAME...: processes that load the new crl.pem refuse them.
+    """Revoke ENCLAVE...: processes that load the new crl.pem refuse them.
 
     Their files move to the folder "revoked" of the keystore.  Export the other enclaves to their
     robots again: they need the new crl.pem and, during a CA rotation, the CA files.
@@ -251,7 +251,7 @@ def crl(
     as_json: bool,
     dry_run: bool,
 ) -> int:
-    """Show the revocation list of the keystore ROOT, or sign it again.
+    """Show the revocation list of KEYSTORE, or sign it again.
 
     DDS refuses every participant once the list has expired, so the exit status is 1 if it expires
     within 30 days.
@@ -424,7 +424,7 @@ def rotate_ca(
     as_json: bool,
     dry_run: bool,
 ) -> None:
-    """Replace the CAs of the keystore ROOT while its robots run.
+    """Replace the CAs of KEYSTORE while its robots run.
 
     Stage 1, distribute: a new CA is trusted next to the old one. Stage 2, reissue: the new CA
     issues all certificates, governance and permissions again. Stage 3, retire: the old CA is no

@@ -68,10 +68,10 @@ def observing_options(enclave_help: str) -> Callable[[Decorated], Decorated]:
             click.option(
                 "--keystore",
                 type=PATH,
-                metavar="ROOT",
+                metavar="KEYSTORE",
                 help="The keystore of that enclave. [default: $ROS_SECURITY_KEYSTORE]",
             ),
-            click.option("--enclave", metavar="NAME", help=enclave_help),
+            click.option("--enclave", metavar="ENCLAVE", help=enclave_help),
             click.option(
                 "--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or 0]"
             ),
@@ -382,8 +382,8 @@ def generate_policy(
         talker.log:7: talker-1: publish rt/nope in /talker_listener/talker
 
     On a secured robot, observe in a separate enclave. Create it with `sros generate_artifacts -k
-    ROOT -p observer.xml`: policies/observer.xml (see `sros policies`) has the few rights it needs.
-    Observe with --keystore ROOT --enclave /sros_observer.
+    KEYSTORE -p observer.xml`: policies/observer.xml (see `sros policies`) has the few rights it
+    needs. Observe with --keystore KEYSTORE --enclave /sros_observer.
     """
     present = _present_policy(file)
     if logs:

@@ -60,7 +60,7 @@ _NO_PIN = (
     f"no file has the PIN of the token (pin-source), so Fast DDS takes it from ${_FAST_DDS_PIN}, "
     "which root and this user can read in /proc."
 )
-_WORDS = words_argument("[ROOT] NAME")
+_WORDS = words_argument("[KEYSTORE] ENCLAVE")
 _DOMAIN = click.option(
     "--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's]"
 )
@@ -158,7 +158,7 @@ def _form_of(arguments: Sequence[str]) -> str:
     "there",
     metavar="DIR",
     help="The path of the keystore where the process runs: on the robot, in the container. "
-    f"[default: ROOT; for containers {INSTALLED}]",
+    f"[default: KEYSTORE; for containers {INSTALLED}]",
 )
 @click.option(
     "--name",
@@ -182,7 +182,7 @@ def env(
     accept_readable_key: bool,
     as_json: bool,
 ) -> None:
-    r"""Print the environment variables that make a process run in the enclave NAME.
+    r"""Print the environment variables that make a process run in ENCLAVE.
 
     The strategy is Enforce: a process that cannot run in the enclave does not start. If the
     variables cannot be given, what is printed instead keeps every node from starting. With
@@ -286,12 +286,12 @@ class _WithCommand(Verb):
 
 
 @verb("run", cls=_WithCommand)
-@words_argument("[ROOT] NAME -- COMMAND...", required=False, type=click.UNPROCESSED)
+@words_argument("[KEYSTORE] ENCLAVE -- COMMAND...", required=False, type=click.UNPROCESSED)
 @click.option(
     "--policy",
     metavar="FILE",
     type=PATH,
-    help="Instead of NAME: use the enclave that the policy FILE assigns to the node which "
+    help="Instead of ENCLAVE: use the enclave that the policy FILE assigns to the node which "
     "COMMAND starts.",
 )
 @_DOMAIN
@@ -308,12 +308,12 @@ def run(
     accept_readable_key: bool,
     no_ros_args: bool,
 ) -> None:
-    r"""Run COMMAND in the enclave NAME of the keystore ROOT, or not at all (strategy Enforce).
+    r"""Run COMMAND in ENCLAVE of KEYSTORE, or not at all (strategy Enforce).
 
     The enclave is checked first, so that problems are reported here and not by an obscure message
     of the middleware. A COMMAND that is known to start a ROS node (`ros2 run`, or an executable of
-    a ROS package) gets the arguments `--ros-args --enclave NAME`, so that the ROS graph shows the
-    enclave; with rmw_zenoh_cpp, others do not accept a node without them into their graph.
+    a ROS package) gets the arguments `--ros-args --enclave ENCLAVE`, so that the ROS graph shows
+    the enclave; with rmw_zenoh_cpp, others do not accept a node without them into their graph.
 
     With --policy, COMMAND gives its node a name: `--ros-args -r __node:=NAME -r __ns:=NAMESPACE`,
     as launch files do.
@@ -336,7 +336,8 @@ def run(
         )
     command = [*rest[0 if policy else 1 :], *ctx.meta[_COMMAND]]
     if not command:
-        raise UsageError("no command is given", "", "Write `sros run ROOT NAME -- COMMAND...`.")
+        remedy = "Write `sros run KEYSTORE ENCLAVE -- COMMAND...`."
+        raise UsageError("no command is given", "", remedy)
     name = enclave_of_node(policy, command) if policy else rest[0] if rest else ""
     if (other := named_enclave(command)) and other != name:
         raise UsageError(
@@ -413,7 +414,7 @@ class _WithCommandAfterDashes(_WithCommand):
 
 
 @verb("units", cls=_WithCommandAfterDashes)
-@words_argument("[ROOT] [NAME...] FOLDER [-- COMMAND...]")
+@words_argument("[KEYSTORE] [ENCLAVE...] FOLDER [-- COMMAND...]")
 @several_enclaves
 @click.option(
     "--job",
@@ -423,20 +424,20 @@ class _WithCommandAfterDashes(_WithCommand):
     help="renew: renew enclaves that expire within 30 days. check: check the keystore "
     "daily. metrics: write the keystore's metrics every 15 minutes. fleet: write "
     "them and the metrics of `sros fleet status`. guard: watch all ROS processes of the machine "
-    "(runs as root, without a timer). agent: run `sros agent` for the security folder ROOT of a "
-    "robot every 5 minutes.  Can be repeated.",
+    "(runs as root, without a timer). agent: run `sros agent` for the security folder KEYSTORE of "
+    "a robot every 5 minutes.  Can be repeated.",
 )
 @click.option(
     "--target",
     "there",
     metavar="DIR",
     help="The path of the keystore where the units run. "
-    f"[default: {INSTALLED} for nodes, ROOT for jobs]",
+    f"[default: {INSTALLED} for nodes, KEYSTORE for jobs]",
 )
 @click.option(
     "--user",
     metavar="NAME",
-    help=f"The user who runs the units. [default: {_NODE_USER}, for jobs the owner of ROOT]",
+    help=f"The user who runs the units. [default: {_NODE_USER}, for jobs the owner of KEYSTORE]",
 )
 @click.option(
     "--sros",
@@ -477,7 +478,7 @@ def units(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Write units of systemd to FOLDER: nodes in the enclaves NAME..., and timers (--job).
+    """Write units of systemd to FOLDER: nodes in ENCLAVE..., and timers (--job).
 
     A node runs in its enclave or not at all, sees the keys of no other enclave, and gets no right
     that a ROS node does not need. COMMAND is its program; the default is the file in

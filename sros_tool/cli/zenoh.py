@@ -121,7 +121,7 @@ def zenoh(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Write the files with which Zenoh enforces the rights of the keystore ROOT (rmw_zenoh).
+    """Write the files with which Zenoh enforces the rights of KEYSTORE (rmw_zenoh).
 
     Every enclave gets session.json5, and the router's enclave router.json5, each with the same
     document signed next to it.  They state the rights of the signed permissions.  The choices are

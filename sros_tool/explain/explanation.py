@@ -31,7 +31,7 @@ from sros_tool.explain.answer import (
     recorded_policy,
 )
 from sros_tool.explain.question import Question
-from sros_tool.faults import FAULTS, REPLACE, Fault
+from sros_tool.faults import AT_HOME, FAULTS, REPLACE, Fault
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     GOVERNANCE_P7S,
@@ -188,7 +188,7 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
         if fault:
             return _filled(fault.remedy_in_export(file), "KEYSTORE", enclave, file)
         mended = _filled(text, "KEYSTORE", enclave, file)
-        return f"In the keystore that has the CA keys: {mended} Then export the enclave again."
+        return f"In the {AT_HOME}: {mended} Then export the enclave again."
     if keystore and fault:
         wrong_issuer = fault is Fault.CERTIFICATE_ISSUER
         if wrong_issuer and _is_own_copy(keystore, enclave, IDENTITY_CA_FILE):

@@ -35,8 +35,8 @@ _COMMENT = """\
 # belongs to which robot. To change them, edit that file and run `sros generate_artifacts --fleet`.
 """
 FLEET_REMEDY = (
-    "Write it again from the fleet file: `sros generate_artifacts -k ROOT -p POLICY_FILE --fleet "
-    "FLEET_FILE`."
+    "Write it again from the fleet file: `sros generate_artifacts -k KEYSTORE -p POLICY_FILE "
+    "--fleet FLEET_FILE`."
 )
 _SHOWN = 5
 
@@ -95,7 +95,7 @@ def checked_fleet(keystore: Keystore) -> Fleet | None:
         raise KeystoreError(
             f"'{keystore.root / FLEET}' {problem}",
             "It decides which enclaves belong to a robot, and which domains they may join.",
-            FLEET_REMEDY.replace("ROOT", quote(str(keystore.root))),
+            FLEET_REMEDY.replace("KEYSTORE", quote(str(keystore.root))),
         )
     return load_fleet(keystore)
 

@@ -337,8 +337,8 @@ class ProcessTable:
     def _waiting(self, processes: list[Process]) -> set[int]:
         """Return the ids of processes that only wait for another, which uses ROS 2 or DDS.
 
-        An example is ``timeout 60 sros run ROOT NAME -- talker --ros-args``: no library of ROS 2 or
-        DDS, and a process below it that has them.
+        An example is ``timeout 60 sros run KEYSTORE ENCLAVE -- talker --ros-args``: no library of
+        ROS 2 or DDS, and a process below it that has them.
         """
         parents = {pid: looked_at.stat.parent for pid, looked_at in self._looked.items()}
         above: set[int] = set()

@@ -317,12 +317,13 @@ def _(bench: Bench) -> None:
     """A robot got all enclaves; /gone was revoked, and of the others one was exported again."""
     bench.checked = bench.root.with_name("robot")
     for line in (
-        "create_enclave ROOT /gone /kept",
-        "distribute_key ROOT --all ROBOT",
-        "revoke ROOT /gone",
-        "distribute_key ROOT /base ROBOT --force",
+        "create_enclave KEYSTORE /gone /kept",
+        "distribute_key KEYSTORE --all ROBOT",
+        "revoke KEYSTORE /gone",
+        "distribute_key KEYSTORE /base ROBOT --force",
     ):
-        words = line.replace("ROOT", str(bench.root)).replace("ROBOT", str(bench.checked)).split()
+        line = line.replace("KEYSTORE", str(bench.root)).replace("ROBOT", str(bench.checked))
+        words = line.split()
         sros(*words, env={"SROS_CA_PASSPHRASE": SECRET}).ok()
 
 

@@ -65,8 +65,8 @@ def commands(finding: Finding, policy: Path, target: Path, **others: object) -> 
         "OBSERVED": policy,
         "FLEET_FILE": target.with_name("fleet.toml"),
         "TARGET": target,
-        "NAME": name,
-        "NAME...": name,
+        "ENCLAVE": name,
+        "ENCLAVE...": name,
         "distributions=NAME,...": "distributions=kilted",
         "IDS": 0,
         "ID": 0,
@@ -205,7 +205,7 @@ def test_what_starts_with_the_variables_of_a_remedy_is_mended(
     found = next(each for each in found_in(state) if each.id == kind)
     node = state.running.processes[0]
     here = {**state.environment, **ENVIRONMENT}
-    named = commands(found, tmp_path, bench.root, **{"ROOT": bench.root, "COMMAND...": "env"})
+    named = commands(found, tmp_path, bench.root, **{"KEYSTORE": bench.root, "COMMAND...": "env"})
     assert named
     for words in named:
         if words[0] == "zenoh" and bench.path("enclaves/router").exists():
@@ -227,7 +227,7 @@ def test_no_remedy_of_the_runtime_names_a_command_that_refuses(
     state = change(runtime_cases.SOUND(runtime_cases.sound_state(bench), bench), bench)
     found = next(each for each in found_in(state) if each.id == kind)
     at(state.now, monkeypatch)
-    named = commands(found, tmp_path, tmp_path / "target", ROOT=bench.root, IDS="0,7")
+    named = commands(found, tmp_path, tmp_path / "target", KEYSTORE=bench.root, IDS="0,7")
     assert named
     for words in named:
         sros(*words, env={**state.environment, **ENVIRONMENT}).ok()

@@ -24,15 +24,15 @@ def keystore(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     "words",
     [
-        ("-v", "create_enclave", "ROOT", "/a"),
-        ("create_enclave", "-v", "ROOT", "/a"),
-        ("create_enclave", "ROOT", "/a", "--verbose"),
+        ("-v", "create_enclave", "KEYSTORE", "/a"),
+        ("create_enclave", "-v", "KEYSTORE", "/a"),
+        ("create_enclave", "KEYSTORE", "/a", "--verbose"),
     ],
 )
 def test_steps_are_reported_before_and_after_the_verb(
     keystore: Path, words: tuple[str, ...]
 ) -> None:
-    done = sros(*(keystore if word == "ROOT" else word for word in words)).ok()
+    done = sros(*(keystore if word == "KEYSTORE" else word for word in words)).ok()
     assert done.out == "created enclave /a\n"
     assert f"began a transaction in the keystore '{keystore}'" in done.err
     assert "opened the key of the identity CA" in done.err

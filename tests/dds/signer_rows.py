@@ -468,7 +468,7 @@ def rows() -> list[Row]:
 
 
 def list_rows(other: Pair, below: Pair) -> list[Row]:
-    """Rows with revocation lists; ``other`` is another CA, ``below`` one that `ROOT` issued."""
+    """Rows with revocation lists; ``other`` is another CA, ``below`` one that `KEYSTORE` issued."""
     no_lists = authority("identity CA", lists=False)
     below_no_lists = authority("identity sub CA", by=ROOT, lists=False)
     expired = Revocation(ROOT, (-5, -1))

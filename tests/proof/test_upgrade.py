@@ -215,7 +215,7 @@ def changed(
             continue
         product = next((name for name in (FAST, CYCLONE) if name in finding.text), "")
         text = f"{finding.subject}: {finding.text}".partition(": open on")[0]
-        assert "ROOT" not in finding.text and finding.remedy
+        assert "KEYSTORE" not in finding.text and finding.remedy
         if kind in ("refused", "accepted"):
             text = finding.subject
         elif not product:

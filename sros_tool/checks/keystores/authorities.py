@@ -17,6 +17,7 @@ from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
+from sros_tool.faults import AT_HOME
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import FLEET_REMEDY
 from sros_tool.keystore.issuing.ca_service import is_ca_service
@@ -54,7 +55,7 @@ NOT_A_CA = FindingKind(
     "a CA certificate without the right to issue certificates",
     "OpenSSL refuses every chain that contains it.",
     "RFC 5280, 4.2.1.9 and 4.2.1.3 (BasicConstraints, KeyUsage keyCertSign).",
-    "Replace it with `sros rotate_ca ROOT`.",
+    "Replace it with `sros rotate_ca KEYSTORE`.",
 )
 CA_EXTENSIONS = FindingKind(
     "keystore.ca-extensions",
@@ -63,7 +64,7 @@ CA_EXTENSIONS = FindingKind(
     "Fast DDS verifies strictly, and refuses such a CA as soon as there is an intermediate CA. "
     "CAs made by ros2/sros2 lack these extensions.",
     "RFC 5280, 4.2.1.1 to 4.2.1.3; openssl verify -x509_strict.",
-    "Before you add intermediate CAs, replace it with `sros rotate_ca ROOT`.",
+    "Before you add intermediate CAs, replace it with `sros rotate_ca KEYSTORE`.",
 )
 INTERMEDIATE = FindingKind(
     "portable.intermediate",
@@ -85,7 +86,8 @@ CA_PURPOSE = FindingKind(
     "emailProtection, if present. Fast DDS 2.14 and Cyclone DDS 11 check neither.",
     "RFC 8550, 4.4.2; Fast DDS 2.9.1 and 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2 and 11.0.1; "
     "measured.",
-    "Replace it with `sros rotate_ca ROOT`, or issue its certificate again with digitalSignature.",
+    "Replace it with `sros rotate_ca KEYSTORE`, or issue its certificate again with "
+    "digitalSignature.",
     vendors=(Vendor.FAST_2_9, Vendor.CYCLONE),
 )
 KEY_ALGORITHM = FindingKind(
@@ -113,7 +115,8 @@ WEAK = FindingKind(
     "Whoever computes the key, or a second document for the signature, can issue any identity or "
     "any permissions. DDS accepts both.",
     "NIST SP 800-57 part 1, 5.6, and SP 800-131A: RSA under 2048 bits, EC under 256 bits, SHA-1.",
-    "Replace a CA with `sros rotate_ca ROOT`; renew an enclave with `sros renew ROOT NAME`.",
+    "Replace a CA with `sros rotate_ca KEYSTORE`; renew an enclave with `sros renew KEYSTORE "
+    "ENCLAVE`.",
 )
 
 
@@ -173,8 +176,8 @@ ONE_AUTHORITY = FindingKind(
     "permissions for itself.",
     "CVE-2023-24011 class; reproduced on Cyclone DDS 0.10.2, where readers received data of such "
     "an enclave.",
-    "Run `sros update_keystore ROOT --set authorities.layout=separate`, and then `sros rotate_ca "
-    "ROOT --permissions --next`.",
+    "Run `sros update_keystore KEYSTORE --set authorities.layout=separate`, and then `sros "
+    "rotate_ca KEYSTORE --permissions --next`.",
 )
 CA_EXPIRES_SOON = FindingKind(
     "keystore.ca-ends-soon",
@@ -183,7 +186,7 @@ CA_EXPIRES_SOON = FindingKind(
     "Everything that the CA issued or signed expires with it, and replacing a CA takes several "
     "stages.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
-    "Begin to replace it now, with `sros rotate_ca ROOT`.",
+    "Begin to replace it now, with `sros rotate_ca KEYSTORE`.",
 )
 CA_EXPIRED = FindingKind(
     "keystore.ca-expired",
@@ -192,7 +195,7 @@ CA_EXPIRED = FindingKind(
     "Nothing can be issued or signed with the CA, and DDS refuses everything that it issued or "
     "signed.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 (Error '10' verifying CA certificate).",
-    "Replace it with `sros rotate_ca ROOT`, or correct the clock.",
+    "Replace it with `sros rotate_ca KEYSTORE`, or correct the clock.",
 )
 CA_MISSING = FindingKind(
     "keystore.ca-missing",
@@ -234,8 +237,8 @@ SETTINGS_MISSING = FindingKind(
     "New enclaves then follow the defaults of ros2/sros2: without a policy they may do "
     "everything, for ten years.",
     "sros: sros.toml holds the settings of a keystore.",
-    "Run `sros update_keystore ROOT --discard-edits`, which writes the settings that the ledger "
-    "has. If it has none, restore sros.toml from a backup.",
+    "Run `sros update_keystore KEYSTORE --discard-edits`, which writes the settings that the "
+    "ledger has. If it has none, restore sros.toml from a backup.",
 )
 SETTINGS_EDITED = FindingKind(
     "keystore.settings-edited",
@@ -244,7 +247,7 @@ SETTINGS_EDITED = FindingKind(
     "Files that are issued later may follow them, earlier files do not: the edit takes effect in "
     "part, and nobody was shown which protection it weakens.",
     "sros: the ledger has the settings as sros wrote them.",
-    edit_remedy("ROOT"),
+    edit_remedy("KEYSTORE"),
 )
 FLEET_EDITED = FindingKind(
     "keystore.fleet-edited",
@@ -262,8 +265,8 @@ LEFT_ENCLAVES = FindingKind(
     "Whoever has their files has their rights until they expire, and `--robot` does not choose "
     "them any more.",
     "sros: their paths are those of a robot's enclaves, and they belong to no robot.",
-    "Revoke them by `sros revoke ROOT NAME...` if the robots are gone. Keep an enclave that never "
-    "belonged to a robot.",
+    "Revoke them by `sros revoke KEYSTORE ENCLAVE...` if the robots are gone. Keep an enclave that "
+    "never belonged to a robot.",
 )
 NOT_AS_SETTINGS = FindingKind(
     "governance.not-as-settings",
@@ -271,7 +274,7 @@ NOT_AS_SETTINGS = FindingKind(
     "a signed governance that is not what the settings state",
     "DDS loads the signed governance. The [protection] in sros.toml has no effect.",
     "sros: sros.toml holds the settings of a keystore; DDS-Security 1.1, 9.4.1.2.",
-    edit_remedy("ROOT"),
+    edit_remedy("KEYSTORE"),
 )
 LEDGER_MISSING = FindingKind(
     "keystore.ledger-missing",
@@ -290,8 +293,8 @@ LEDGER_DAMAGED = FindingKind(
     "sros: each line of ledger.jsonl has the digest of the line before, ledger.p7s that of the "
     "last.",
     "Restore ledger.jsonl and ledger.p7s from the same backup. Without one, state all rights again "
-    "with `sros generate_artifacts -k ROOT -p POLICY_FILE`, and replace the CAs with `sros "
-    "rotate_ca ROOT --next`, so that nothing that the ledger lacks is valid.",
+    "with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`, and replace the CAs with `sros "
+    "rotate_ca KEYSTORE --next`, so that nothing that the ledger lacks is valid.",
 )
 LEDGER_UNCHAINED = FindingKind(
     "keystore.ledger-unchained",
@@ -300,8 +303,8 @@ LEDGER_UNCHAINED = FindingKind(
     "If one of these lines was removed, nothing shows it.",
     "sros: each line of ledger.jsonl has the digest of the line before, ledger.p7s that of the "
     "last.",
-    "New lines are chained. Once the CAs are replaced (`sros rotate_ca ROOT --next`), the earlier "
-    "lines no longer matter.",
+    "New lines are chained. Once the CAs are replaced (`sros rotate_ca KEYSTORE --next`), the "
+    "earlier lines no longer matter.",
 )
 LEDGER_UNPROVEN = FindingKind(
     "keystore.ledger-unproven",
@@ -312,9 +315,9 @@ LEDGER_UNPROVEN = FindingKind(
     "them.",
     "sros: each line of ledger.jsonl has the digest of the line before, ledger.p7s that of the "
     "last.",
-    "If you know that nobody else could change the keystore, run `sros update_keystore ROOT "
-    "--trust-records`. Otherwise state the rights again, with `sros generate_artifacts -k ROOT -p "
-    "POLICY_FILE` or `sros create_permission ROOT NAME POLICY_FILE`.",
+    "If you know that nobody else could change the keystore, run `sros update_keystore KEYSTORE "
+    "--trust-records`. Otherwise state the rights again, with `sros generate_artifacts -k KEYSTORE "
+    "-p POLICY_FILE` or `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
 )
 CRL_EXPIRES_SOON = FindingKind(
     "keystore.revocation-list-ends",
@@ -322,7 +325,7 @@ CRL_EXPIRES_SOON = FindingKind(
     "a revocation list that expires soon, or has expired",
     "Once it has expired, DDS refuses every participant.",
     "RFC 5280, 5.1.2.5; Fast DDS 2.6 to 3.6; measured.",
-    "Run `sros crl ROOT --refresh`.",
+    "Run `sros crl KEYSTORE --refresh`.",
 )
 CRL_ISSUER = FindingKind(
     "keystore.revocation-list-issuer",
@@ -330,7 +333,7 @@ CRL_ISSUER = FindingKind(
     "a revocation list that the identity CA did not sign",
     "DDS cannot verify any certificate with this list, and refuses every participant.",
     "RFC 5280, 6.3.3; Fast DDS 2.14.5.",
-    "Run `sros crl ROOT --refresh`.",
+    "Run `sros crl KEYSTORE --refresh`.",
 )
 
 _SOON = timedelta(days=90)
@@ -381,7 +384,8 @@ def _left_enclaves(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]
 
 _NEXT_CA = "Make a new keystore with the certificate of the next CA of the CA service."
 _NEXT_LIST = (
-    "Have the CA service sign a later list, and run `sros crl ROOT --refresh --crl FILE` with it."
+    "Have the CA service sign a later list, and run `sros crl KEYSTORE --refresh --crl FILE` with "
+    "it."
 )
 
 
@@ -502,8 +506,8 @@ def shared_ca_findings(
         accepted = keystore.accepts(
             ONE_AUTHORITY, lambda settings: not settings.separate_authorities
         )
-        there = f"In the keystore that has the CA keys: {ONE_AUTHORITY.remedy}"
-        remedy = _separation(keystore) if keystore.can_issue else there.replace("ROOT", "KEYSTORE")
+        at_home = f"In the {AT_HOME}: {ONE_AUTHORITY.remedy}"
+        remedy = _separation(keystore) if keystore.can_issue else at_home
         yield ONE_AUTHORITY.found("the CAs", text, file, remedy=remedy, accepted=accepted)
 
 
@@ -518,9 +522,9 @@ def _separation(keystore: CheckedKeystore) -> str:
         return ""
     if stage is not RotationStage.NONE:
         text = f"Go on with the rotation that is under way (stage {stage}): restart all processes, "
-        text += "and run `sros rotate_ca ROOT --next`."
+        text += "and run `sros rotate_ca KEYSTORE --next`."
         return text if len(files) > 1 else f"{text} Once it is complete: {ONE_AUTHORITY.remedy}"
-    return "Run `sros rotate_ca ROOT --permissions --next`." if len(files) > 1 else ""
+    return "Run `sros rotate_ca KEYSTORE --permissions --next`." if len(files) > 1 else ""
 
 
 def _revocation_list(keystore: CheckedKeystore) -> Iterator[Finding]:

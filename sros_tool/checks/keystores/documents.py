@@ -144,7 +144,7 @@ LOCAL_TIME = FindingKind(
     'Fast DDS reads their dates in local time, and says "Not found the identity subject name in '
     'permissions file".',
     "Fast DDS 2.6 to 3.6 (mktime); measured.",
-    "Run `sros renew ROOT NAME`, or let the host run in UTC.",
+    "Run `sros renew KEYSTORE ENCLAVE`, or let the host run in UTC.",
     vendors=FAST_DDS,
 )
 CHARACTER_CLASS = FindingKind(
@@ -441,8 +441,8 @@ def _domains(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Findi
 
 _GOVERNANCE = "DDS-Security 1.1, 9.4.1.2"
 _TEMPLATE = (
-    "Run `sros update_keystore ROOT --template production --dry-run` to see what it would change, "
-    "and then without --dry-run."
+    "Run `sros update_keystore KEYSTORE --template production --dry-run` to see what it would "
+    "change, and then without --dry-run."
 )
 
 UNAUTHENTICATED = FindingKind(
@@ -454,7 +454,8 @@ UNAUTHENTICATED = FindingKind(
     "protection too, Fast DDS refuses the document; only 2.9 ignores the attribute.",
     f"{_GOVERNANCE} (allow_unauthenticated_participants); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS "
     "0.10 and 11.0; measured.",
-    "Run `sros update_keystore ROOT --set protection.allow_unauthenticated_participants=false`.",
+    "Run `sros update_keystore KEYSTORE --set "
+    "protection.allow_unauthenticated_participants=false`.",
 )
 UNAUTHENTICATED_KEPT_OUT = FindingKind(
     "governance.unauthenticated-kept-out",
@@ -472,7 +473,7 @@ NO_JOIN_CONTROL = FindingKind(
     "The permissions of a participant are not checked when it joins; vendors then decide "
     "differently on a participant without permissions.",
     f"{_GOVERNANCE} (enable_join_access_control); Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
-    "Run `sros update_keystore ROOT --set protection.join_access_control=true`.",
+    "Run `sros update_keystore KEYSTORE --set protection.join_access_control=true`.",
 )
 NO_ACCESS_CONTROL = FindingKind(
     "governance.no-access-control",
@@ -580,7 +581,7 @@ XML_DIFFERS = FindingKind(
     "governance.xml differs from the signed governance.p7s",
     "DDS loads governance.p7s. The readable copy was changed and never signed.",
     "rcl 9 (security.c).",
-    f"{edit_remedy('ROOT')}",
+    f"{edit_remedy('KEYSTORE')}",
 )
 
 _OPEN = {

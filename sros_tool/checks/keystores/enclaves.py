@@ -53,7 +53,7 @@ _LOADING_KINDS = by_id(
             fault.title,
             fault.why,
             fault.source,
-            fault.remedy.format(root="ROOT", enclave="NAME", path="FILE"),
+            fault.remedy.format(root="KEYSTORE", enclave="ENCLAVE", path="FILE"),
             _NOT_LOADABLE,
         )
         for fault in Fault
@@ -80,11 +80,11 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
 def fault_remedy(enclave: CheckedEnclave, fault: Fault, name: str) -> str:
     """Return what to do about a fault in the file ``name`` of an enclave.
 
-    The text has the placeholders ``ROOT`` for the keystore and ``NAME`` for the enclave.
+    The text has the placeholders ``KEYSTORE`` for the keystore and ``ENCLAVE`` for the enclave.
     """
     file = enclave.file(name)
     if enclave.keystore.can_issue:
-        remedy, root, path = fault.remedy_in(name), "ROOT", quote(file)
+        remedy, root, path = fault.remedy_in(name), "KEYSTORE", quote(file)
         missing = _SHARED.get(name, "")
         if missing and not (enclave.keystore.root / missing).exists():
             remedy = f"Restore {missing} from a backup; every exported enclave has a copy of it."
@@ -92,7 +92,7 @@ def fault_remedy(enclave: CheckedEnclave, fault: Fault, name: str) -> str:
         remedy, root = fault.remedy_in_export(name), "KEYSTORE"
         there = f"KEYSTORE/enclaves{quote(enclave.name)}/{name}"
         path = there if "`" in remedy else quote(file)
-    return remedy.format(root=root, enclave="NAME", path=path)
+    return remedy.format(root=root, enclave="ENCLAVE", path=path)
 
 
 _SHARED = {
@@ -107,7 +107,7 @@ EXPIRES_SOON = FindingKind(
     "a certificate or permissions that expire soon",
     "Once they expire, the node no longer starts; on Cyclone DDS a running node stops.",
     "Fast DDS 2.14.5 (at start), Cyclone DDS 0.10.2 (timer).",
-    "Run `sros renew ROOT NAME`, and export the enclave again.",
+    "Run `sros renew KEYSTORE ENCLAVE`, and export the enclave again.",
 )
 OUTLIVES_CA = FindingKind(
     "enclave.outlives-ca",
@@ -124,8 +124,8 @@ PERMISSIONS_OUTLIVE = FindingKind(
     "They can be used with a later certificate of the same subject, even if its rights have "
     "changed since.",
     "ros2/sros2 issue 275; DDS-Security 1.1, 9.4.1.3.",
-    "Run `sros renew ROOT NAME`, which signs permissions that expire with the certificate at the "
-    "latest.",
+    "Run `sros renew KEYSTORE ENCLAVE`, which signs permissions that expire with the certificate "
+    "at the latest.",
 )
 NAME_MISMATCH = FindingKind(
     "enclave.name-mismatch",
@@ -151,7 +151,7 @@ NOT_UNIQUE = FindingKind(
     "The keystore adds a unique part to every subject, so that neither permissions of another "
     "enclave nor earlier permissions match it. This certificate is older, or was issued elsewhere.",
     "Cyclone DDS 0.10.2 (subsets of subjects); ros2/sros2 issue 275; measured on both vendors.",
-    "Run `sros renew ROOT NAME`.",
+    "Run `sros renew KEYSTORE ENCLAVE`.",
 )
 LONG_PERMISSIONS = FindingKind(
     "enclave.long-permissions",
@@ -159,8 +159,9 @@ LONG_PERMISSIONS = FindingKind(
     "permissions that are valid for years, for a subject that never changes",
     "Replaced permissions stay valid until they expire, for anyone who kept a copy.",
     "ros2/sros2 issue 275; DDS-Security 1.1, 9.4.1.3 (there is no revocation of permissions).",
-    "Run `sros update_keystore ROOT --set certificates.unique_subject=true`, so that subjects "
-    "change with every renewal, or `sros update_keystore ROOT --set permissions.validity=180d`.",
+    "Run `sros update_keystore KEYSTORE --set certificates.unique_subject=true`, so that subjects "
+    "change with every renewal, or `sros update_keystore KEYSTORE --set "
+    "permissions.validity=180d`.",
 )
 EVERYTHING = FindingKind(
     "keystore.allow-everything",
@@ -168,7 +169,7 @@ EVERYTHING = FindingKind(
     "an enclave that may do everything",
     "Its messages are authenticated and encrypted, but it can command every node.",
     "ros2/sros2 0.13 grants this to every enclave without a policy.",
-    "Give it a policy, with `sros create_permission ROOT NAME POLICY_FILE`.",
+    "Give it a policy, with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
 )
 ONLY_DENIALS = FindingKind(
     "keystore.only-denials",
@@ -186,7 +187,7 @@ XML_DIFFERS = FindingKind(
     "permissions.xml differs from the signed permissions.p7s",
     "DDS loads permissions.p7s. The readable copy was changed and never signed.",
     "DDS-Security 1.1, 9.4.1.3; rcl 9 (security.c).",
-    "Sign the intended permissions with `sros create_permission ROOT NAME POLICY_FILE`.",
+    "Sign the intended permissions with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
 )
 CRL_MISSING = FindingKind(
     "enclave.crl-missing",
@@ -194,7 +195,7 @@ CRL_MISSING = FindingKind(
     "an enclave without the revocation list of its keystore",
     "Its node continues to communicate with revoked enclaves.",
     "rmw_dds_common (crl.pem), since 2021.",
-    "Run `sros crl ROOT --refresh`, and export the enclave again.",
+    "Run `sros crl KEYSTORE --refresh`, and export the enclave again.",
 )
 WAITS = FindingKind(
     "enclave.waits-for-answer",

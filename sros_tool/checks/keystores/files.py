@@ -91,7 +91,7 @@ FOREIGN_OWNER = FindingKind(
     "root unpacks may belong to whoever has that number on this machine.",
     "POSIX owners; CWE-283.",
     "Run the check as the user that runs the nodes, or make that user the owner: "
-    "`chown -R USER ROOT`.",
+    "`chown -R USER KEYSTORE`.",
 )
 FOLDER_OPEN = FindingKind(
     "keystore.folder-open",
@@ -177,9 +177,9 @@ HOME_OR_ROBOT = FindingKind(
     "The keys belong where the keystore is kept. On a robot, an attacker who gets a CA key can "
     "create any enclave, with any rights. The files do not show which of the two this is.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "At home, keep the keys, and ask `sros check ROOT`. On a robot, put an export in its place "
-    "(`sros distribute_key ROOT NAME TARGET` at home); if others had access, replace the CAs "
-    "(`sros rotate_ca`).",
+    "At home, keep the keys, and ask `sros check KEYSTORE`. On a robot, put an export in its place "
+    "(`sros distribute_key KEYSTORE ENCLAVE TARGET` at home); if others had access, replace the "
+    "CAs (`sros rotate_ca`).",
 )
 UNREADABLE = FindingKind(
     "keystore.file-unreadable",

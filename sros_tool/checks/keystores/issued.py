@@ -39,7 +39,7 @@ SERIAL_TWICE = FindingKind(
     "two certificates of one CA with the same serial number",
     "A revocation list names serial numbers, so revoking one revokes the other.",
     "RFC 5280, 4.1.2.2.",
-    "Run `sros renew ROOT NAME` for one of them.",
+    "Run `sros renew KEYSTORE ENCLAVE` for one of them.",
 )
 KEY_TWICE = FindingKind(
     "keystore.key-twice",
@@ -47,7 +47,7 @@ KEY_TWICE = FindingKind(
     "two enclaves with the same key",
     "Each enclave can act as the other.",
     "RFC 5280, 4.1.2.6 (the subject is the holder of the key); DDS-Security 1.1, 9.3.",
-    "Run `sros renew ROOT NAME --new-key` for one of them.",
+    "Run `sros renew KEYSTORE ENCLAVE --new-key` for one of them.",
 )
 UNEXPLAINED = FindingKind(
     "keystore.not-in-ledger",
@@ -55,8 +55,9 @@ UNEXPLAINED = FindingKind(
     "a certificate or document that the keystore never issued",
     "It came from another source, or the ledger was reset to an earlier state.",
     "sros: ledger.jsonl.",
-    "Find out where it comes from. Then state the rights with `sros create_permission ROOT NAME "
-    "POLICY_FILE`, and issue the certificate again with `sros renew ROOT NAME --revoke-old`.",
+    "Find out where it comes from. Then state the rights with `sros create_permission KEYSTORE "
+    "ENCLAVE POLICY_FILE`, and issue the certificate again with `sros renew KEYSTORE ENCLAVE "
+    "--revoke-old`.",
 )
 OLD_PERMISSIONS = FindingKind(
     "enclave.old-permissions",
@@ -65,8 +66,8 @@ OLD_PERMISSIONS = FindingKind(
     "Their signature is valid, and if the subject stays the same DDS accepts them until they "
     "expire. Perhaps a backup was restored, or someone tries to get back a removed right.",
     "ros2/sros2 issue 275; sros: ledger.jsonl.",
-    "Sign the intended permissions with `sros create_permission ROOT NAME POLICY_FILE`. `sros "
-    "renew` refuses to sign these again.",
+    "Sign the intended permissions with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`. "
+    "`sros renew` refuses to sign these again.",
 )
 STALE = FindingKind(
     "enclave.stale-permissions",
@@ -75,7 +76,7 @@ STALE = FindingKind(
     "The policy was changed and not signed again, or the permissions were made from another "
     "policy.",
     "sros: the rights of policy and permissions, in ROS terms.",
-    "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`; `sros diff_policy` shows all "
+    "Run `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`; `sros diff_policy` shows all "
     "differences.",
 )
 LESS_PROTECTED = FindingKind(
@@ -85,7 +86,7 @@ LESS_PROTECTED = FindingKind(
     "The governance of the keystore decides. It was not made from this policy, or was changed "
     "since.",
     "DDS-Security 1.1, 9.4.1.2 (topic rules); sros: protect= in a policy.",
-    "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`, which raises the protection; all "
+    "Run `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`, which raises the protection; all "
     "processes have to be restarted with the new governance.",
 )
 NOT_IN_POLICY = FindingKind(
@@ -102,7 +103,7 @@ NOT_IN_KEYSTORE = FindingKind(
     "an enclave of the policy that the keystore does not have",
     "A node that starts in this enclave fails.",
     "rcl 9 (security.c).",
-    "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`.",
+    "Run `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`.",
 )
 
 AUTHORITIES_DIFFER = FindingKind(
@@ -129,7 +130,7 @@ OLDER_LIST = FindingKind(
     "an enclave with an older revocation list than another enclave",
     "Its processes communicate with enclaves that the newer list revokes.",
     "RFC 5280, 5.2.3; rmw_dds_common (crl.pem).",
-    "Export the enclave again, with `sros distribute_key ROOT NAME TARGET --force`.",
+    "Export the enclave again, with `sros distribute_key KEYSTORE ENCLAVE TARGET --force`.",
 )
 
 ROOT_ENCLAVE = FindingKind(
@@ -139,8 +140,8 @@ ROOT_ENCLAVE = FindingKind(
     "Every process that is started without an enclave runs in /, and gets all of its rights; "
     "without an enclave / in the keystore, it does not start.",
     "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",
-    "Start each process in its enclave, run `sros revoke ROOT /`, and remove the enclave / from "
-    "the policy.",
+    "Start each process in its enclave, run `sros revoke KEYSTORE /`, and remove the enclave / "
+    "from the policy.",
 )
 
 _Key = TypeVar("_Key")

@@ -55,6 +55,7 @@ from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
+from sros_tool.faults import AT_HOME
 from sros_tool.keystore.fleet import stated_distributions
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
@@ -273,10 +274,13 @@ def _at_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
 
 
 def _with_names(finding: Finding, root: Path) -> Finding:
-    """Return the finding with ROOT and NAME in its remedy replaced by keystore and enclave."""
-    remedy = re.sub(r"\bROOT\b", lambda _: quote(str(root)), finding.remedy)
+    """Return the finding with KEYSTORE and ENCLAVE in its remedy replaced by keystore and "
+    "enclave."""
+    remedy = finding.remedy
+    if AT_HOME not in remedy:
+        remedy = re.sub(r"\bKEYSTORE\b", lambda _: quote(str(root)), remedy)
     if finding.subject.startswith("/") and "," not in finding.subject:
-        remedy = re.sub(r"\bNAME\b", lambda _: quote(finding.subject), remedy)
+        remedy = re.sub(r"\bENCLAVE\b", lambda _: quote(finding.subject), remedy)
     return finding if remedy == finding.remedy else finding._replace(own_remedy=remedy)
 
 
@@ -321,7 +325,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list
         for finding in findings
         if finding.kind in _OF_AN_ENCLAVE and (finding.subject in names or finding.file in keys)
     ]
-    shown = " ".join(map(quote, names)) if len(names) <= _MOST_NAMED else "NAME..."
+    shown = " ".join(map(quote, names)) if len(names) <= _MOST_NAMED else "ENCLAVE..."
     command = f"sros create_permission {quote(str(root))} {shown} POLICY_FILE --revoke-old"
     return _with(
         findings,

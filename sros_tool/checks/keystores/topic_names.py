@@ -24,8 +24,8 @@ NO_ROS_NAME = FindingKind(
     "it should deny may be allowed.",
     _MAPPING,
     "Write the name as DDS has it, such as rt/chatter, rq/addRequest and rr/addReply, or let sros "
-    "write it: `sros create_permission ROOT NAME POLICY_FILE`. It is right only for a program that "
-    "uses DDS without ROS.",
+    "write it: `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`. It is right only for a "
+    "program that uses DDS without ROS.",
 )
 NOT_FOR_ROS = FindingKind(
     "permissions.not-for-ros",
@@ -35,7 +35,7 @@ NOT_FOR_ROS = FindingKind(
     "ROS topic begins with rt/, those of a service with rq/ and rr/.",
     _MAPPING,
     "None is needed if a program uses DDS without ROS. Otherwise give the enclave a policy: `sros "
-    "create_permission ROOT NAME POLICY_FILE`.",
+    "create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
     prominent=True,
 )
 RELAY_ONLY = FindingKind(

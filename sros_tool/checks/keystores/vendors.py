@@ -394,7 +394,7 @@ NO_NODE = FindingKind(
     "ROS 2 Jazzy, rcl 9, rclcpp 28, rclpy 7 and rmw_dds_common; ~/get_type_description since Iron "
     "(REP-2016).",
     "Include common/node.xml in the profiles of its nodes (`sros check POLICY_FILE` says how), and "
-    "sign the policy with `sros generate_artifacts -k ROOT -p POLICY_FILE`.",
+    "sign the policy with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`.",
 )
 _PARAMETER_EVENTS, _ROSOUT = "rt/parameter_events", "rt/rosout"
 _OF_TOOLS = (

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import SrosError
-from sros_tool.faults import Fault
+from sros_tool.faults import AT_HOME, Fault
 from sros_tool.keystore.layout import PERMISSIONS, SETTINGS, ZENOH_FILES
 
 if TYPE_CHECKING:
     from sros_tool.keystore.zenoh_files import Drifted, OpenedZenoh
 
-_AGAIN = "Run `sros zenoh ROOT`, and restart the processes that it names."
+_AGAIN = "Run `sros zenoh KEYSTORE`, and restart the processes that it names."
 _SOURCE = "sros (docs/zenoh.md); Zenoh 1.10 verifies no signature of its configuration."
 
 MISSING = FindingKind(
@@ -61,7 +61,7 @@ LEFT_OVER = FindingKind(
     "a signed Zenoh configuration that its enclave should not have",
     "A process that uses it enforces rules that the keystore no longer keeps in step.",
     _SOURCE,
-    "Run `sros zenoh ROOT`, or remove all with `sros zenoh ROOT --off`.",
+    "Run `sros zenoh KEYSTORE`, or remove all with `sros zenoh KEYSTORE --off`.",
 )
 LEFT_OUT = FindingKind(
     "zenoh.left-out",
@@ -69,8 +69,8 @@ LEFT_OUT = FindingKind(
     "an enclave that has no rights on Zenoh",
     "It gets no configuration, and all others deny it everything.",
     _SOURCE,
-    "State its rights with `sros create_permission ROOT NAME POLICY_FILE`, or revoke it if nobody "
-    "needs it.",
+    "State its rights with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`, or revoke it if "
+    "nobody needs it.",
 )
 SHARED_NODE = FindingKind(
     "zenoh.shared-node",
@@ -83,7 +83,7 @@ SHARED_NODE = FindingKind(
     "Name each node in the policy of one enclave. Where a wildcard gives an enclave the services "
     "of all nodes, deny those of the others' nodes, such as `/camera/*`.",
 )
-_RENEW = "Renew it with `sros renew ROOT NAME`, or revoke it if nobody needs it."
+_RENEW = "Renew it with `sros renew KEYSTORE ENCLAVE`, or revoke it if nobody needs it."
 _EXPIRED = {Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED}
 CANNOT_BE_MADE = FindingKind(
     "zenoh.cannot-be-made",
@@ -92,7 +92,7 @@ CANNOT_BE_MADE = FindingKind(
     "The keystore's settings define the network, but its permissions or its enclaves do not fit "
     "it, so the files are not kept up to date.",
     _SOURCE,
-    "Run `sros zenoh ROOT --dry-run` and do what it says.",
+    "Run `sros zenoh KEYSTORE --dry-run` and do what it says.",
 )
 
 _KINDS = {
@@ -129,8 +129,7 @@ def _of_opened(enclave: CheckedEnclave, opened: OpenedZenoh) -> Iterator[Finding
             remedy = kind.remedy
             if not enclave.keystore.is_home:
                 remedy = (
-                    "In the keystore that has the CA keys: run `sros zenoh KEYSTORE`. Then export "
-                    "the enclave again."
+                    f"In the {AT_HOME}: run `sros zenoh KEYSTORE`. Then export the enclave again."
                 )
             yield kind.found(enclave.name, text, enclave.file(problem.file), remedy=remedy)
 

@@ -172,7 +172,7 @@ def exports_note(root: Path, names: Sequence[str]) -> Note:
         return Note("keystore.export-again", text)
     shown = quote(str(root))
     text = "Robots have the former files: export the new ones (`sros distribute_key "
-    text += f"{shown} NAME TARGET --force`)"
+    text += f"{shown} ENCLAVE TARGET --force`)"
     remote = [name for name in names if key_on_robot(enclave_path(root, name))]
     if remote:
         text += f"; for {', '.join(remote)}, answer the request again (`sros sign_request "

@@ -305,7 +305,7 @@ def update_keystore(
             raise UsageError(
                 "nothing changes in the keystore, so no certificate is replaced",
                 "",
-                f"To replace and revoke certificates, run `sros renew {quote(str(root))} NAME "
+                f"To replace and revoke certificates, run `sros renew {quote(str(root))} ENCLAVE "
                 "--revoke-old`.",
             )
         update = _Updater(change, present, step, revoke_old=revoke_old).update(
