@@ -36,7 +36,7 @@ from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer,
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction import recovery
 from sros_tool.pki.crl import load_crl
-from tests.agent.published import DAY, Home
+from tests.agent.published import DAY, ROLES, Home, Thief
 from tests.support.harness import policy_text, snapshot, sros
 from tests.support.harness import publish as allow_publish
 
@@ -525,10 +525,108 @@ def test_a_keystore_that_was_restored_from_before_all_robots_were_revoked(
     assert publisher.publish(after=timedelta(days=60)).names("published") == []
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
-    with pytest.raises(KeystoreError, match="published later without r1, r2, r5, which the"):
+    for said in (False, True):
+        with pytest.raises(KeystoreError, match="published later without r1, r2, r5, which the"):
+            publisher.publish(restored=said)
+    for robot in ("r1", "r2", "r5"):
+        publisher.run("revoke", "ks", "--robot", robot)
+    publisher.publish()
+
+
+@pytest.mark.parametrize("revoked", [False, True])
+def test_a_keystore_that_was_restored_from_before_a_robot_was_removed(
+    publisher: Home, revoked: bool
+) -> None:
+    """The other robots got nothing new: it left the fleet, or their releases were refused."""
+    publisher.run("renew", "ks", "/r5/base")
+    publisher.publish()
+    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    fleet = publisher.folder / "fleet.toml"
+    change = {
+        False: "generate_artifacts -k ks -p policy.xml --fleet fleet.toml",
+        True: "revoke ks --robot r5",
+    }[revoked].split()
+    before = fleet.read_text()
+    fleet.write_text(before if revoked else before.replace("[robots.r5]\n", ""))
+    publisher.run(*change)
+    broken = [*publisher.root.glob("enclaves/r[12]/base/permissions.p7s")] if revoked else []
+    for path in broken:
+        path.write_bytes(b"x")
+    assert publisher.publish().names("published") == []
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    for said in (False, True):
+        with pytest.raises(KeystoreError, match="published later without r5, which") as refused:
+            publisher.publish(restored=said)
+        assert "`sros revoke" in refused.value.remedy and "restored" not in refused.value.remedy
+    publisher.run(*change)
+    assert "r5" not in publisher.publish().names("published")
+    publisher.robot("r1").gets()
+    publisher.robot("r5").refuses(FetchProblem.NOT_FOR_ROBOT)
+
+
+def test_a_robot_that_left_the_fleet_does_not_come_back_with_a_restored_keystore(
+    publisher: Home,
+) -> None:
+    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    (publisher.folder / "fleet.toml").write_text("[robots.r1]\n[robots.r2]\n")
+    change = ["generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml"]
+    publisher.run(*change)
+    publisher.run("renew", "ks", "/r1/base")
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    with pytest.raises(KeystoreError, match="later releases: r1 with the number"):
         publisher.publish()
-    with pytest.raises(KeystoreError, match="which revocations the keystore lacks"):
+    with pytest.raises(KeystoreError, match="later without r5, which"):
         publisher.publish(restored=True)
+    publisher.run(*change)
+    assert publisher.publish(restored=True).names("published") == ["r1", "r2"]
+
+
+@pytest.mark.parametrize("number", ["1" * 5000, "1" * 30, 10**12, 10**9, 0, -1, "1e3", "true"])
+def test_a_number_in_the_list_of_what_is_published_that_was_never_given(
+    publisher: Home, number: int | str
+) -> None:
+    path = publisher.root / "published.json"
+    kept = path.read_text()
+    known = str(read_published(Keystore(publisher.root)).number)
+    path.write_text(kept.replace(f'"number": {known}', f'"number": {number}', 1))
+    before = snapshot(publisher.folder)
+    with pytest.raises(DocumentError, match=r"published\.json' is damaged"):
+        publisher.publish()
+    assert snapshot(publisher.folder) == before
+    path.write_text(kept.replace('"timestamp": 1', f'"timestamp": {number}', 1))
+    if number != 10**9:
+        with pytest.raises(DocumentError, match=r"published\.json' is damaged"):
+            publisher.publish()
+    path.write_text(kept)
+    assert not publisher.publish().names("published")
+
+
+@pytest.mark.parametrize("number", [10**12 - 1, 10**12, 10**30, "many", None, True, 0])
+def test_a_thief_with_all_keys_who_counts_releases_up(publisher: Home, number: object) -> None:
+    thief = Thief(publisher, publisher.pub, *ROLES)
+    archive, _ = thief.archive("r1")
+    thief.put("r1", archive, number)  # type: ignore[arg-type]
+    before = snapshot(publisher.root)
+    for said in (False, True):
+        with pytest.raises(KeystoreError) as refused:
+            publisher.publish(restored=said)
+        assert len(str(refused.value)) < 700
+    assert snapshot(publisher.root) == before
+
+
+@pytest.mark.parametrize("version", [10**12 - 1, 10**12, 10**300])
+def test_a_thief_with_all_keys_who_counts_versions_up(publisher: Home, version: int) -> None:
+    thief = Thief(publisher, publisher.pub, *ROLES)
+    thief.sign("timestamp", lambda _signed: None, version)
+    before = snapshot(publisher.root)
+    with pytest.raises(KeystoreError, match="too high"):
+        publisher.publish()
+    assert snapshot(publisher.root) == before
+    shutil.rmtree(publisher.pub)
+    publisher.publish()
 
 
 def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:

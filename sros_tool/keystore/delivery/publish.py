@@ -16,6 +16,7 @@ from contextlib import ExitStack
 from datetime import datetime, timedelta
 from functools import lru_cache, partial
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from cryptography import x509
@@ -24,14 +25,18 @@ from cryptography.x509.oid import ExtensionOID
 from sros_tool import __version__
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.files import remove_file, staged_file
+from sros_tool.fleet.robots import Fleet
 from sros_tool.folders import Folder, make_folders
 from sros_tool.keystore.delivery.archive import listed_digests
 from sros_tool.keystore.delivery.export import released_enclave, released_files
 from sros_tool.keystore.delivery.published import (
+    BEGIN_AGAIN,
+    MOST_NUMBER,
     Evaluated,
     MetadataExpiry,
     PublishedRelease,
     PublishedRobot,
+    damaged_list,
     read_published,
 )
 from sros_tool.keystore.delivery.release import (
@@ -181,8 +186,7 @@ def publish(
             stack.callback(lock.release)
             lock.acquire()
         run = _Run(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
-        if run.check_numbers(restored):
-            run.revoke_again(keyring)
+        run.check_restored(restored, keyring)
         keys = _Keys(run.roots, root, root_key)
         keys.recover(dry_run)
         keys.open(rotate, now, run.expiry)
@@ -502,53 +506,75 @@ class _Run:
         self._changes: Sequence[FileChange] = ()
         self._notes: list[Note] = []
 
-    def check_numbers(self, restored: bool) -> bool:
-        """Refuse a folder with later releases than the keystore knows, unless it is ``restored``.
+    def check_restored(self, restored: bool, keyring: Keyring) -> None:
+        """Refuse a folder with later news than the keystore knows.
 
-        Return whether it was restored.
+        If it is said that the keystore was ``restored``, later releases are not refused, and what
+        they revoke is revoked again.
 
         Raises:
-            KeystoreError: the keystore was restored from a backup.
+            DocumentError: the list of what is published has numbers that were never given.
+            KeystoreError: the keystore was restored from a backup, or it cannot be told what the
+                later releases revoke.
         """
+        if self._has_later_releases(restored):
+            self._revoke_again(keyring)
+        if not (self._number and self._dry_run):  # which has not revoked again
+            self._check_removed()
+        if self._number:
+            self.list.robots.clear()
+
+    def _has_later_releases(self, restored: bool) -> bool:
+        """Return whether the folder has later releases; refuse that unless ``restored``."""
+        if self.list.number >= (unused := self.keystore.ledger_file.next_number()):
+            why = f"It has release {self.list.number}, and the ledger none after {unused - 1}."
+            raise damaged_list(self.keystore, why)
         latest = max((release.number for release in self._there.values()), default=0)
-        if latest <= self.list.number:
-            if not (removed := self._removed_later()):
-                return False
-            what = f"was published later without {first_few(removed, 3)}"
-        else:
-            # Not by the next number of the ledger: a restored keystore may have issued files since.
-            entries = self.keystore.ledger_with("what", "release").entries
-            if any(entry.what == "release" and entry.number == latest for entry in entries):
-                return False
-            robots = [robot for robot, there in self._there.items() if there.number == latest]
-            what = f"has later releases: {first_few(robots, 3)} with the number {latest}"
+        # Not by the next number of the ledger: a restored keystore may have issued files since.
+        entries = self.keystore.ledger_with("what", "release").entries if latest else ()
+        if latest <= self.list.number or any(
+            entry.what == "release" and entry.number == latest for entry in entries
+        ):
+            return False
         if not restored:
-            raise KeystoreError(
-                f"'{self._folder}' {what}, which the keystore '{self.keystore.root}' does not know",
-                "The keystore was restored from a backup, or is a copy. What was changed since, "
-                "such as a revocation, would be undone.",
-                "Restore a later backup. If there is none, repeat what was changed, and then add "
-                "--restored, which revokes again what these releases revoke.",
+            robots = [robot for robot, there in self._there.items() if there.number == latest]
+            raise self._restored(
+                f"has later releases: {first_few(robots, 3)} with the number {latest}",
+                "repeat what was changed, and then add --restored, which revokes again what these "
+                "releases revoke",
             )
-        self._number = max(latest, self.list.number)
-        self.list.robots.clear()
+        self._number = latest
         return True
 
-    def _removed_later(self) -> list[str]:
-        """Return the robots without a release in metadata that is later than the keystore knows."""
+    def _check_removed(self) -> None:
+        """Refuse to publish a robot again that was removed later than the keystore knows.
+
+        The releases of others need not tell whether it was revoked, or left the fleet.
+        """
         from sros_tool.keystore.delivery.repository import RENEWED_ALONE
 
         known, there = self.list.versions, self._present.versions()
-        if all(there.get(name, 0) <= known[name] for name in known.keys() - RENEWED_ALONE):
-            return []
-        return sorted(self.list.robots.keys() - self._there.keys())
+        if any(there.get(name, 0) > known[name] for name in known.keys() - RENEWED_ALONE):
+            fleet = recorded_fleet(self.keystore)
+            gone = sorted(self.list.robots.keys() - self._there.keys())
+            if removed := [robot for robot in gone if self._enclaves(fleet, robot)]:
+                revoke = f"sros revoke {quote(str(self.keystore.root))} --robot {removed[0]}"
+                raise self._restored(
+                    f"was published later without {first_few(removed, 3)}",
+                    f"revoke again what was revoked (`{revoke}`), take out of the fleet file what "
+                    "left the fleet, and publish again",
+                )
 
-    def revoke_again(self, keyring: Keyring) -> None:
-        """Revoke what the last releases revoke, and the restored keystore does not.
+    def _restored(self, what: str, remedy: str) -> KeystoreError:
+        return KeystoreError(
+            f"'{self._folder}' {what}, which the keystore '{self.keystore.root}' does not know",
+            "The keystore was restored from a backup, or is a copy. What was changed since, such "
+            "as a revocation, would be undone.",
+            f"Restore a later backup. If there is none, {remedy}.",
+        )
 
-        Raises:
-            KeystoreError: their revocation list cannot be read, or the CA cannot sign another.
-        """
+    def _revoke_again(self, keyring: Keyring) -> None:
+        """Revoke what the last releases revoke, and the restored keystore does not."""
         forgotten = ForgottenLists(self.keystore)
         problem = ""
         # Only these have the last list: others may have been refused since, and still have earlier.
@@ -556,12 +582,14 @@ class _Run:
         for robot, there in last:
             try:
                 if not (data := self._read(robot, there)):
-                    raise DocumentError(f"the archive of {robot} is missing or damaged")
-                files = read_release(data).files
+                    raise DocumentError(f"'{self._folder / there.path(robot)}' is not there, whole")
+                release = read_release(data)
+                if release.number != there.number:
+                    raise DocumentError(f"the release of {robot} has another number than was said")
             except SrosError as error:
                 problem = problem or f"{error.what[:1].upper()}{error.what[1:]}."
                 continue
-            for path, content in files.items():
+            for path, content in release.files.items():
                 if path.endswith(f"/{CRL_FILE}"):
                     forgotten.add(content)
             break
@@ -569,7 +597,8 @@ class _Run:
             raise KeystoreError(
                 f"no last release in '{self._folder}' can be read",
                 f"{problem} So it cannot be told which revocations the keystore lacks.",
-                "Restore the folder, or repeat the revocations, and publish in another folder.",
+                "Put it there from a copy of the folder, or from the robot, whose agent has it as "
+                "FOLDER/.agent/release.tar.gz.",
             )
         if forgotten.lists:
             revocation = restore_revocations(
@@ -593,28 +622,35 @@ class _Run:
         root, fleet = self.keystore.root, recorded_fleet(self.keystore)
         found, wanted = [], set()
         looked_at = fleet.robots.keys() if among is None else {robot.robot for robot in among}
-        for robot in (fleet.robots[name] for name in looked_at if name in fleet.robots):
-            names = [
-                name
-                for name in enclaves_of_robot(root, fleet, robot)
-                if (enclave_path(root, name) / CERTIFICATE_FILE).exists()
-            ]
+        for robot in looked_at:
+            names = self._enclaves(fleet, robot)
             if not names:
                 continue
-            wanted.add(robot.name)
+            wanted.add(robot)
             state = _state(root, names)
-            before = self.list.robots.get(robot.name)
+            before = self.list.robots.get(robot)
             if not before or before.files != state:
-                found.append(_Changed(robot.name, names, state))
-            elif not self._has(robot.name, before.release):
-                found.append(_Changed(robot.name, names, state))
-                self._damaged |= {robot.name} if robot.name in self._there else set()
+                found.append(_Changed(robot, names, state))
+            elif not self._has(robot, before.release):
+                found.append(_Changed(robot, names, state))
+                self._damaged |= {robot} if robot in self._there else set()
         known = self.list.robots.keys() | self._there.keys()
         gone = (known if among is None else looked_at) - wanted
         for name in gone:
             self.list.robots.pop(name, None)
         self._removed = sorted({*self._removed, *(gone & self._there.keys())})
         return found
+
+    def _enclaves(self, fleet: Fleet, robot: str) -> list[str]:
+        """Return the enclaves of a robot with certificates; none if it is not in the fleet."""
+        if robot not in fleet.robots:
+            return []
+        root = self.keystore.root
+        return [
+            name
+            for name in enclaves_of_robot(root, fleet, fleet.robots[robot])
+            if (enclave_path(root, name) / CERTIFICATE_FILE).exists()
+        ]
 
     def _has(self, robot: str, release: PublishedRelease) -> bool:
         """Return whether the folder has the archive of a release, undamaged."""
@@ -637,6 +673,12 @@ class _Run:
         """
         changed = self.changed(found)
         number = max(change.keystore.ledger_file.next_number(), self._number + 1)
+        if number > MOST_NUMBER:
+            raise KeystoreError(
+                f"no release can have the number {number}",
+                f"One before it has {number - 1}, which somebody with the targets key has written.",
+                BEGIN_AGAIN,
+            )
         authority = None if self._dry_run or not changed else change.permissions
 
         def work(part: Sequence[_Changed]) -> list[_Made]:

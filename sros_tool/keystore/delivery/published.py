@@ -6,12 +6,14 @@ The file saves work and keeps versions rising; what robots trust never rests on 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any, NamedTuple
 
 from sros_tool.errors import DocumentError
+from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
 from sros_tool.keystore.delivery.release import release_target
 from sros_tool.keystore.layout import PUBLISHED
 from sros_tool.keystore.reader import Keystore
@@ -21,6 +23,11 @@ from sros_tool.xml import read_bytes
 
 _FORMAT = 1
 _MOST_BYTES = 128 * 1024 * 1024
+MOST_NUMBER = 10**12 - 1
+"""Highest number of a release, as a seal can state it, and highest version of metadata."""
+BEGIN_AGAIN = "Begin again as after the theft of all keys: docs/fetching.md says how."
+"""Remedy for numbers that somebody has counted up as far as they go."""
+_DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 
 
 class PublishedRelease(NamedTuple):
@@ -37,6 +44,21 @@ class PublishedRelease(NamedTuple):
         """Return the path of the archive in the publishing folder."""
         folder, _, name = release_target(robot).rpartition("/")
         return f"targets/{folder}/{self.sha256}.{name}"
+
+    def checked(self) -> PublishedRelease:
+        """Return the release; raise `ValueError` if it is none that sros publishes."""
+        for value, most in ((self.number, MOST_NUMBER), (self.length, OF_ONE_ROBOT.packed)):
+            check_count(value, most)
+        if not (isinstance(self.sha256, str) and _DIGEST.match(self.sha256)):
+            raise ValueError("a SHA-256 is none")
+        return self
+
+
+def check_count(value: object, most: int = MOST_NUMBER) -> int:
+    """Return a number of a release or a version; raise `ValueError` if it is none."""
+    if type(value) is not int or not 1 <= value <= most:
+        raise ValueError("a number or version is none, or too high")
+    return value
 
 
 class Evaluated(NamedTuple):
@@ -109,20 +131,25 @@ def read_published(keystore: Keystore) -> Published:
         value = parse_json(read_bytes(path, what, most=_MOST_BYTES))
         return Published(
             {name: _robot(each) for name, each in value["robots"].items()},
-            {name: int(version) for name, version in value["versions"].items()},
+            {name: check_count(version) for name, version in value["versions"].items()},
             {path: parse_iso(time) for path, time in value["superseded"].items()},
         )
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
-        raise DocumentError(
-            f"'{keystore.root / PUBLISHED}' is damaged",
-            "",
-            "Restore it from a backup. If there is none, remove it: all robots then get their "
-            "releases again, with new numbers.",
-        ) from error
+        raise damaged_list(keystore) from error
+
+
+def damaged_list(keystore: Keystore, why: str = "") -> DocumentError:
+    """Return the error for a list that is not what was published, with the sentence ``why``."""
+    return DocumentError(
+        f"'{keystore.root / PUBLISHED}' is damaged",
+        why,
+        "Restore it from a backup. If there is none, remove it: all robots then get their "
+        "releases again, with new numbers.",
+    )
 
 
 def _robot(value: Mapping[str, Any]) -> PublishedRobot:
-    release = PublishedRelease(int(value["number"]), str(value["sha256"]), int(value["length"]))
+    release = PublishedRelease(value["number"], value["sha256"], value["length"]).checked()
     files, *times = value.get("evaluated", [""])
     evaluated = Evaluated(str(files), *map(parse_iso, times)) if times else None
     return PublishedRobot(release, str(value["content"]), str(value["files"]), evaluated)

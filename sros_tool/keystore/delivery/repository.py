@@ -35,7 +35,13 @@ from tuf.api.serialization.json import JSONSerializer
 
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
 from sros_tool.folders import Folder
-from sros_tool.keystore.delivery.published import MetadataExpiry, PublishedRelease
+from sros_tool.keystore.delivery.published import (
+    BEGIN_AGAIN,
+    MOST_NUMBER,
+    MetadataExpiry,
+    PublishedRelease,
+    check_count,
+)
 from sros_tool.keystore.delivery.release import release_target
 from sros_tool.xml import read_bytes
 
@@ -222,7 +228,7 @@ class Present:
         return {
             path.removeprefix(begin).removesuffix(end): PublishedRelease(
                 target.custom["number"], target.hashes["sha256"], target.length
-            )
+            ).checked()
             for each in self.bins.values()
             for path, target in each.signed.targets.items()
         }
@@ -282,7 +288,11 @@ def _read_present(folder: Folder, roots: Roots) -> Present:
     for name in roles.get_roles() if roles else ():
         bins[name] = _read(folder, Targets, name, meta[f"{name}.json"].version)
         _verify(targets.signed, name, bins[name])
-    return Present(timestamp, snapshot, file, targets, bins)
+    present = Present(timestamp, snapshot, file, targets, bins)
+    for version in present.versions().values():
+        check_count(version)
+    present.releases()
+    return present
 
 
 def _read(
@@ -389,6 +399,12 @@ class Composer:
     def _add(self, name: str, content: _Content, signers: Sequence[CryptoSigner]) -> None:
         """Add a file with a new version of the metadata ``name``."""
         content.version = self.versions[name] = self.versions.get(name, 0) + 1
+        if content.version > MOST_NUMBER:
+            raise KeystoreError(
+                f"the version {content.version} of {name}.json is too high",
+                "Somebody who has its key counted the versions up.",
+                BEGIN_AGAIN,
+            )
         content.expires = self._now + self._expiry.of(name)
         metadata = Metadata(content)
         for signer in signers:
