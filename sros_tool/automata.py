@@ -104,7 +104,7 @@ _MOST_KNOWN = 20_000
 
 @dataclass(frozen=True)
 class Automaton:
-    """A finite automaton: numbered positions, edges labelled with letters, accepting positions.
+    """A finite automaton: numbered positions, edges labeled with letters, accepting positions.
 
     Several edges from a position may have the same letter.  Equal expressions should have equal
     automata, because a comparison of equal automata needs no search.

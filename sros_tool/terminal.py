@@ -30,7 +30,7 @@ _COLOURS = {
 
 
 class Coloured(NamedTuple):
-    """A word printed in colour on a terminal, unless $NO_COLOR is set (https://no-color.org)."""
+    """A word printed in color on a terminal, unless $NO_COLOR is set (https://no-color.org)."""
 
     word: str
 

@@ -184,7 +184,7 @@ def _transport(
                 FetchProblem.UNREACHABLE,
                 "the certificates for TLS cannot be used",
                 _sentence(error),
-                "Look at the certificate, the key and the CAs that the agent is told to use.",
+                "Look at the certificate, the key and the CAs in the agent's settings.",
             ) from error
     if "://" in source:
         raise UsageError(

@@ -253,7 +253,7 @@ def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool
     pause = parse_duration(interval)
     if restarted and not once:
         raise UsageError("--restarted is for --once only")
-    read_settings(folder)  # whoever has no agent is told first, also with --interval
+    read_settings(folder)  # a missing agent is reported first, also with --interval
     if once:
         with only_agent(folder):
             done = _round(folder, read_settings(folder), restarted=restarted)

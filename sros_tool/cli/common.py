@@ -934,7 +934,7 @@ def read_log(log: str) -> str:
 
 
 def echo_findings(findings: Sequence[Finding], *, err: bool = False) -> None:
-    """Print one finding, or findings of one cause; the severity is in colour on a terminal."""
+    """Print one finding, or findings of one cause; the severity is in color on a terminal."""
     first = findings[0]
     if first.cause and len(findings) > 1:
         place = first.cause.place or first.place

@@ -599,7 +599,7 @@ _WORDS = {
 """State of a file or robot → its words in the output, if they differ from the state's name."""
 _DIGITS = re.compile(r"(\d+)")
 _SILENCE = timedelta(minutes=30)
-"""From when a robot that fetches, every five minutes unless it is told otherwise, is silent."""
+"""From when a robot that fetches, every five minutes by default, is silent."""
 _MOST_LINES, _MOST_GROUPS = 50, 3
 """Maximum number of listed files of a robot, and of listed groups or unrecorded enclaves."""
 

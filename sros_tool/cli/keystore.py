@@ -394,7 +394,7 @@ if TYPE_CHECKING:
 
 
 @verb("create_keystore")
-@click.argument("root", type=PATH)
+@click.argument("root", type=PATH, metavar="KEYSTORE")
 @click.option(
     "--template",
     "template_name",

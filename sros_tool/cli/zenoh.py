@@ -43,7 +43,7 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
 
 
 @verb("zenoh")
-@click.argument("root", type=PATH, required=False)
+@click.argument("root", type=PATH, metavar="[KEYSTORE]", required=False)
 @click.option(
     "--router",
     "routers",

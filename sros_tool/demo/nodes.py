@@ -178,7 +178,7 @@ class Node(Protocol):
 
 
 class NodeRole:
-    """The behaviour of a node in a role; call ``step`` repeatedly to do due work."""
+    """The behavior of a node in a role; call ``step`` repeatedly to do due work."""
 
     def __init__(self, node: Node, options: NodeOptions, events: EventWriter) -> None:
         self._node, self._options, self._events = node, options, events

@@ -220,7 +220,7 @@ class Answer(NamedTuple):
 
     @property
     def documented_only(self) -> bool:
-        """Whether the vendor's behaviour is known from its documentation alone, not from tests."""
+        """Whether the vendor's behavior is known from its documentation alone, not from tests."""
         return self.vendor.documented_only
 
     @property

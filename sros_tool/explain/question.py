@@ -60,7 +60,7 @@ OWN_PARTS = (
     Part(AccessVerb.PUBLISH, ROS_DISCOVERY_TOPIC, "node names"),
     Part(AccessVerb.SUBSCRIBE, ROS_DISCOVERY_TOPIC, "node names"),
 )
-"""The endpoints that every process of ROS 2 needs in order to start."""
+"""The endpoints that every process of ROS 2 needs to start."""
 
 
 @shows("word", "type", "right", "name", null_if_empty=("type", "right", "name"))

@@ -421,7 +421,7 @@ class ZenohEvaluator:
             sorted(
                 signed_path(drift.path) if drift.kind is Drift.UNSIGNED else drift.path
                 for drift in drifts
-                # Whether the files of the first two are signed is told apart.
+                # Whether the files of the first two are signed is distinguished.
                 if drift.enclave in deciding
                 and not (drift.kind is Drift.UNSIGNED and drift.enclave in ours)
             )

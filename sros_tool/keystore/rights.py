@@ -603,7 +603,7 @@ class RecordedRights:
         return self._looked_up[name]
 
     def of(self, name: str, digest: str, grant: Grant) -> SignedRights:
-        """Return the rights in an enclave's permissions, in order to sign them again.
+        """Return the rights in an enclave's permissions, to sign them again.
 
         ``grant`` has the rights; ``name``, ``digest`` and errors are as for `policy`.
         """

@@ -221,7 +221,7 @@ def _before_revocation(configuration: Configuration, state: OpenedEnclave) -> st
     try:
         crl = load_crl(data, CRL_FILE)
     except SrosError:
-        return ""  # a problem of the enclave that is told elsewhere
+        return ""  # a problem of the enclave that is reported elsewhere
     if configuration.revoked >= _last_revocation(lists=(crl,)):
         return ""
     return f"it is from before the last revocation in {CRL_FILE}, and may give the revoked rights"

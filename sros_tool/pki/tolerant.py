@@ -609,7 +609,7 @@ def _key_usage(content: bytes) -> x509.KeyUsage:
         bits = bits[: -value.content[0]]
     flags = [bit == "1" for bit in bits[: len(_USAGES)].ljust(len(_USAGES), "0")]
     usage = dict(zip(_USAGES, flags, strict=True))
-    # These say how keys are agreed upon, and the class has them only beside that.
+    # These say how keys are agreed upon, and the class has them only next to that.
     usage["key_agreement"] |= usage["encipher_only"] or usage["decipher_only"]
     return x509.KeyUsage(**usage)
 

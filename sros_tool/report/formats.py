@@ -372,11 +372,11 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
         text = _entities(_link_label(picture, link))
         lines.append(f'  {_end(link.source)} {arrow}|"{text}"| {_end(link.target)}')
         red = link.violates or link.qualifier is not ALLOW
-        colour = _DENIED if red else _COLOURS[link.mark]
-        styles[colour].append(number)
+        color = _DENIED if red else _COLOURS[link.mark]
+        styles[color].append(number)
     lines += [
-        f"  linkStyle {','.join(map(str, links))} stroke:{colour}"
-        for colour, links in sorted(styles.items())
+        f"  linkStyle {','.join(map(str, links))} stroke:{color}"
+        for color, links in sorted(styles.items())
     ]
     return "\n".join((*lines, ""))
 

@@ -384,7 +384,7 @@ def _fleet_head(status: Json) -> str:
     if status["unassigned"]:
         facts.append(f"{status['unassigned']} enclaves of no robot")
     return (
-        f"<header><h1>What is where</h1><p>{', '.join(facts)}.</p>"
+        f"<header><h1>Status of the fleet</h1><p>{', '.join(facts)}.</p>"
         f'<ul class="tiles">{tiles}</ul></header>'
     )
 

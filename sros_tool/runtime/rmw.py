@@ -1,4 +1,4 @@
-"""The RMWs of ROS 2: their middleware, how to recognise it, and which RMWs are installed.
+"""The RMWs of ROS 2: their middleware, how to recognize it, and which RMWs are installed.
 
 To add a vendor to sros, add its rules in `sros_tool.dds.decision.vendors`, its row in `MIDDLEWARE`
 here, and its log texts in `sros_tool.runtime.vendor_log`.
@@ -35,7 +35,7 @@ def cyclone_explains(stream: str) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class Middleware:
-    """A middleware that ROS 2 can use, and how to recognise it.
+    """A middleware that ROS 2 can use, and how to recognize it.
 
     ``rmw`` is a part of the names of its RMWs, and the names of its shared libraries begin with one
     of ``libraries``.  ``vendor`` is its DDS vendor, or None if it is not a DDS; ``explains`` are

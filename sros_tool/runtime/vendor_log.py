@@ -783,7 +783,7 @@ def log_text(line: str) -> tuple[LogText, re.Match[str]] | None:
 
 
 def plain_text(output: str) -> str:
-    """Return the output of a process without ANSI colour codes."""
+    """Return the output of a process without ANSI color codes."""
     return _COLOUR.sub("", output)
 
 

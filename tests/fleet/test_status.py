@@ -1,4 +1,4 @@
-"""What is where in a fleet: true after each thing that happens to robots, with real exports."""
+"""Status of a fleet: true after each thing that happens to robots, with real exports."""
 
 from __future__ import annotations
 

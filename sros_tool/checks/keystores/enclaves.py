@@ -392,7 +392,7 @@ def _copies(enclave: CheckedEnclave) -> Iterator[Finding]:
 
 
 def plain(document: bytes) -> bytes:
-    """Normalise a document for comparison: uniform line endings, no surrounding space."""
+    """Normalize a document for comparison: uniform line endings, no surrounding space."""
     return document.replace(b"\r\n", b"\n").strip()
 
 

@@ -70,7 +70,7 @@ class TopicNames(Enum):
 
 
 class DenyPartitions(Enum):
-    """Which partitions of an endpoint a deny rule must name in order to apply to the endpoint."""
+    """Which partitions of an endpoint a deny rule must name to apply to the endpoint."""
 
     ANY_OR_ALL = auto()
     """One of the endpoint's partitions; a rule without partitions applies to all."""
