@@ -2,38 +2,61 @@
 
 In Python ``SecuredNodes(keystore="keystore", policy="policy.xml")`` from this module, in XML
 ``<secured_nodes keystore="keystore" policy="policy.xml"/>``, before the nodes: it applies to the
-nodes that follow in its launch file and group, also in included files.
+nodes that follow in its launch file and group, also in included files.  ``ros2 launch --secured
+KEYSTORE POLICY_FILE`` puts it before a launch file.
 
-This is the only module that imports ``launch``, and only ``launch`` imports it: by the entry point
-``launch.frontend.launch_extension`` whenever it reads an XML or YAML file.
+This is the only module that imports ``launch``, and only ``launch`` and ``ros2 launch`` import it,
+by the entry points ``launch.frontend.launch_extension`` and ``ros2launch.option``.
 """
 
 from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Mapping
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from launch import Action, LaunchContext, SomeSubstitutionsType
+from launch import Action, LaunchContext, LaunchDescription, SomeSubstitutionsType
+from launch.descriptions import Executable
 from launch.frontend import Entity, Parser, expose_action
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 
 from sros_tool.runtime.environment import REFUSING
 
+if TYPE_CHECKING:
+    from sros_tool.enclave_environment import EnclaveEnvironment
+
 _PREFIX, _FILTER = "launch-prefix", "launch-prefix-filter"
 """Launch configurations: a prefix, and a pattern of the commands that get it."""
+_RUN = [sys.executable, "-P", "-m", "sros_tool", "run"]
+_prepare = Executable.prepare
+
+
+def _prepare_labelled(self: Any, context: LaunchContext, action: Action) -> None:
+    """Prepare a process, with the label that its output would have without the prefix of sros.
+
+    Launch labels a process by the first word of its command line, the prefix included.
+    """
+    _prepare(self, context, action)
+    command = self.final_cmd
+    if self.name is None and command[: len(_RUN)] == _RUN:
+        number = self.final_name.rpartition("-")[2]
+        own = Path(command[command.index("--") + 1]).name
+        self._Executable__final_name = f"{own}-{number}"
+
+
+Executable.prepare = _prepare_labelled
 
 
 @expose_action("secured_nodes")
 class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where it is missing
     """Launch action that starts every later process with ``sros run --policy``, in its enclave.
 
-    It sets the prefix of commands, in front of an existing prefix such as a debugger's.  Launch
-    itself, and processes with a prefix of their own, get variables with which no node starts, or
-    the variables of ``enclave``.  Launch needs an enclave if it talks to nodes, such as lifecycle
-    nodes and composable nodes.
+    It sets the prefix of commands, in front of an existing prefix such as a debugger's.  Processes
+    with a prefix of their own get variables with which no node starts.  Launch has a node itself if
+    it talks to others, such as lifecycle nodes and composable nodes: its node starts in
+    ``enclave``, by default the enclave in which the policy has the node ``launch_ros_*``.
     """
 
     def __init__(
@@ -59,11 +82,11 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
         return cls, arguments
 
     def execute(self, context: LaunchContext) -> None:
-        """Set the prefix and the variables.
+        """Set the prefix and the variables, and start the node of launch if it has an enclave.
 
         Raises:
-            RuntimeError: a path is empty, a filter would keep the prefix from some processes, or
-                no process can run in ``enclave``.
+            RuntimeError: a path is empty, a filter would keep the prefix from some processes, the
+                policy cannot be read, or no process can run in the enclave of launch.
         """
         keystore, policy, enclave = (
             perform_substitutions(context, substitutions) for substitutions in self._given
@@ -75,19 +98,77 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
                 f"secured_nodes cannot be used with {_FILTER}: the processes that it leaves out "
                 "would be in no enclave. Leave the filter out."
             )
-        context.environment.update(_environment(Path(keystore), enclave) if enclave else REFUSING)
-        before = context.launch_configurations.get(_PREFIX, "")
-        own = [sys.executable, "-P", "-m", "sros_tool", "run", keystore, "--policy", policy, "--"]
-        context.launch_configurations[_PREFIX] = f"{shlex.join(own)} {before}".rstrip()
+        secured = _of_launch(Path(keystore), Path(policy), enclave)
+        if secured:
+            from launch_ros.ros_adapters import get_ros_adapter
+
+            before = dict(context.environment)
+            context.environment.update({**REFUSING, **secured.variables})
+            try:
+                get_ros_adapter(context)
+            finally:
+                context.environment.clear()
+                context.environment.update(before)
+        context.environment.update(REFUSING)
+        root, file = (str(Path(path).absolute()) for path in (keystore, policy))
+        own = [*_RUN, root, "--policy", file, "--"]
+        prefix = context.launch_configurations.get(_PREFIX, "")
+        context.launch_configurations[_PREFIX] = f"{shlex.join(own)} {prefix}".rstrip()
 
 
-def _environment(keystore: Path, enclave: str) -> Mapping[str, str]:
-    """Return the variables of an enclave; raise `RuntimeError` if no process can run in it."""
+def _of_launch(keystore: Path, policy: Path, enclave: str) -> EnclaveEnvironment | None:
+    """Return the environment of the node of launch, or None if it has no enclave.
+
+    Raises:
+        RuntimeError: the policy cannot be read, or has the node in several enclaves, or no process
+            can run in the enclave.
+    """
     from sros_tool.cli.common import enclave_environment
     from sros_tool.errors import SrosError
+    from sros_tool.policy.document import read_policy
     from sros_tool.terminal import visible_line
 
     try:
-        return {**REFUSING, **enclave_environment(keystore, enclave).variables}
+        enclaves = read_policy(policy).enclaves_of_node("/", "launch_ros_*")
+        if not enclave and len(enclaves) > 1:
+            raise RuntimeError(
+                f"the policy has the node launch_ros_* in {len(enclaves)} enclaves: name one as "
+                "enclave of secured_nodes."
+            )
+        name = enclave or next((named.path for named in enclaves), "")
+        return enclave_environment(keystore, name) if name else None
     except SrosError as error:
         raise RuntimeError(visible_line(str(error))) from error
+
+
+class SecuredOption:
+    """The option ``--secured`` of ``ros2 launch``, which needs nothing else of an extension
+    (ros2launch 0.26, ``ros2launch/option/__init__.py``).
+    """
+
+    NAME = "secured"
+
+    def add_arguments(self, parser: ArgumentParser, _cli_name: str) -> None:
+        """Add the option."""
+        parser.add_argument(
+            "--secured",
+            nargs=2,
+            metavar=("KEYSTORE", "POLICY_FILE"),
+            help="Start each node in the enclave of KEYSTORE that POLICY_FILE names, by sros.",
+        )
+
+    def prestart(self, args: Namespace) -> None:
+        """Raise `RuntimeError` if a prefix of the command line would replace that of sros."""
+        if args.secured and (args.launch_prefix or args.launch_prefix_filter):
+            raise RuntimeError("--secured cannot be used with --launch-prefix.")
+
+    def prelaunch(self, description: LaunchDescription, args: Namespace) -> tuple[Any]:
+        """Return the launch description, with `SecuredNodes` in front if it was asked for."""
+        if args.secured:
+            keystore, policy = args.secured
+            secured = SecuredNodes(keystore=keystore, policy=policy)
+            description = LaunchDescription([secured, *description.entities])
+        return (description,)
+
+    def postlaunch(self, _status: int, _args: Namespace) -> None:
+        """Do nothing: all processes have ended."""

@@ -11,6 +11,7 @@ import importlib.util
 import os
 import shlex
 import sys
+from argparse import ArgumentParser
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -26,21 +27,46 @@ PREFIX, FILTER = "launch-prefix", "launch-prefix-filter"
 
 @pytest.fixture
 def action() -> Iterator[Any]:
-    """The class `SecuredNodes` with the parts of launch that it uses: texts are as they are."""
+    """The class `SecuredNodes` with the parts of launch that it uses: texts are as they are.
+
+    The node of launch that would start keeps the variables that it starts with.
+    """
 
     class Action:
         @classmethod
         def parse(cls, entity: object, parser: object) -> tuple[type, dict[str, Any]]:
             return cls, {}
 
-    launch, frontend, utilities = map(ModuleType, ("launch", "launch.frontend", "launch.utilities"))
-    launch.__dict__.update(Action=Action, LaunchContext=object, SomeSubstitutionsType=str)
+    class Executable:
+        def __init__(self, *cmd: str, name: str | None = None) -> None:
+            self.name, self.cmd = name, list(cmd)
+
+        def prepare(self, at: Any, action: object) -> None:
+            self.final_cmd = shlex.split(at.launch_configurations[PREFIX]) + self.cmd
+            self._Executable__final_name = f"{self.name or os.path.basename(self.final_cmd[0])}-7"
+
+        @property
+        def final_name(self) -> str:
+            return self._Executable__final_name
+
+    names = ("launch", "launch.descriptions", "launch.frontend", "launch.utilities")
+    launch, descriptions, frontend, utilities = map(ModuleType, names)
+    adapters = ModuleType("launch_ros.ros_adapters")
+    launch.__dict__.update(
+        Action=Action,
+        LaunchContext=object,
+        LaunchDescription=lambda entities: SimpleNamespace(entities=entities),
+        SomeSubstitutionsType=str,
+    )
+    descriptions.__dict__["Executable"] = Executable
+    adapters.__dict__["get_ros_adapter"] = lambda at: setattr(at, "node", dict(at.environment))
     frontend.__dict__.update(Entity=object, Parser=object, expose_action=lambda _: lambda c: c)
     utilities.__dict__.update(
         normalize_to_list_of_substitutions=lambda text: [text],
         perform_substitutions=lambda _, parts: "".join(parts),
     )
-    modules = {each.__name__: each for each in (launch, frontend, utilities)}
+    made = (launch, descriptions, frontend, utilities, adapters)
+    modules = {module.__name__: module for module in made}
     before = {name: sys.modules.get(name) for name in (*modules, "sros_tool.launch")}
     sys.modules.pop("sros_tool.launch", None)
     sys.modules.update(modules)
@@ -53,44 +79,100 @@ def action() -> Iterator[Any]:
 
 def context(**configurations: str) -> SimpleNamespace:
     named = {name.replace("_", "-"): value for name, value in configurations.items()}
-    return SimpleNamespace(launch_configurations=named, environment={})
+    return SimpleNamespace(launch_configurations=named, environment={"HOME": "/root"})
 
 
-def test_every_process_starts_by_the_policy(action: Any) -> None:
-    at = context()
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory, with a keystore ``ks`` and its policy ``p.xml``."""
+    policy = policy_text({"/line": publish("/x"), "/launch": publish("/y")})
+    (tmp_path / "p.xml").write_text(policy)
+    sros("generate_artifacts", "-k", tmp_path / "ks", "-p", tmp_path / "p.xml").ok()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_every_process_starts_by_the_policy(action: Any, place: Path) -> None:
     hostile = "a b'; touch x; $(id).xml"
+    (place / "p.xml").rename(hostile)
+    at = context()
     action(keystore="ks", policy=hostile).execute(at)
-    own = ["-P", "-m", "sros_tool", "run", "ks", "--policy", hostile, "--"]
+    own = ["-P", "-m", "sros_tool", "run", f"{place}/ks", "--policy", f"{place}/{hostile}", "--"]
     assert shlex.split(at.launch_configurations[PREFIX]) == [sys.executable, *own]
-    assert at.environment == REFUSING
-    debugged = context(launch_prefix="gdb -ex run --args")
-    action(keystore="ks", policy="p.xml").execute(debugged)
-    assert debugged.launch_configurations[PREFIX].endswith(" -- gdb -ex run --args")
+    assert at.environment == {"HOME": "/root", **REFUSING} and not hasattr(at, "node")
 
 
-def test_what_would_leave_a_process_out_is_refused(action: Any, tmp_path: Path) -> None:
+def test_a_process_keeps_the_label_of_its_output(action: Any, place: Path) -> None:
+    executable = sys.modules["launch.descriptions"].__dict__["Executable"]
+
+    def label(at: Any, **named: str) -> str:
+        process = executable("/opt/ros/lib/camera", "--ros-args", "--", "x", **named)
+        process.prepare(at, None)
+        return str(process.final_name)
+
+    at, debugged = context(), context(launch_prefix="/usr/bin/gdb -ex run --args")
+    for secured in (at, debugged):
+        action(keystore="ks", policy="p.xml").execute(secured)
+    assert (label(at), label(at, name="front")) == ("camera-7", "front-7")
+    assert debugged.launch_configurations[PREFIX].endswith(" -- /usr/bin/gdb -ex run --args")
+    assert (label(debugged), label(context(launch_prefix="env"))) == ("gdb-7", "env-7")
+
+
+def test_what_would_leave_a_process_out_is_refused(action: Any, place: Path) -> None:
     for at, given, why in (
         (context(launch_prefix_filter="x"), {}, FILTER),
         (context(), {"policy": ""}, "is empty"),
         (context(), {"keystore": ""}, "is empty"),
-        (context(), {"enclave": "/a"}, "keystore"),
+        (context(), {"policy": "none\x1b[2J"}, "none"),
+        (context(), {"keystore": "none\x1b[2J", "enclave": "/a"}, "keystore"),
     ):
-        words = {"keystore": str(tmp_path / "none\x1b[2J"), "policy": "p.xml", **given}
+        before = dict(at.environment)
         with pytest.raises(RuntimeError, match=why) as error:
-            action(**words).execute(at)
+            action(**{"keystore": "ks", "policy": "p.xml", **given}).execute(at)
         assert "\x1b" not in str(error.value)
-        assert PREFIX not in at.launch_configurations and not at.environment
+        assert PREFIX not in at.launch_configurations and at.environment == before
 
 
-def test_launch_itself_may_have_an_enclave(action: Any, tmp_path: Path) -> None:
-    (tmp_path / "p.xml").write_text(policy_text({"/launch": publish("/x")}))
-    sros("generate_artifacts", "-k", tmp_path / "ks", "-p", tmp_path / "p.xml").ok()
-    at = context()
-    action(keystore=str(tmp_path / "ks"), policy="p.xml", enclave="/launch").execute(at)
-    assert at.environment["ROS_SECURITY_ENCLAVE_OVERRIDE"] == "/launch"
-    assert at.environment["ROS_SECURITY_KEYSTORE"] == str(tmp_path / "ks")
+def test_launch_itself_may_have_an_enclave(action: Any, place: Path) -> None:
+    """Its variables are those of its node alone: other processes are not to run with them."""
+
+    def enclave_of_launch(**enclave: str) -> str:
+        at = context()
+        action(keystore="ks", policy="p.xml", **enclave).execute(at)
+        assert at.environment == {"HOME": "/root", **REFUSING}
+        assert at.node["ROS_SECURITY_KEYSTORE"] == str(place / "ks")
+        return str(at.node["ROS_SECURITY_ENCLAVE_OVERRIDE"])
+
+    assert enclave_of_launch(enclave="/launch") == "/launch"
     with pytest.raises(RuntimeError, match="/other"):
-        action(keystore=str(tmp_path / "ks"), policy="p.xml", enclave="/other").execute(context())
+        enclave_of_launch(enclave="/other")
+    policy = (place / "p.xml").read_text()
+    (place / "p.xml").write_text(policy.replace('node="n"', 'node="launch_ros_*"', 1))
+    assert enclave_of_launch() == "/line" != enclave_of_launch(enclave="/launch")
+    (place / "p.xml").write_text(policy.replace('node="n"', 'node="launch_ros_*"'))
+    with pytest.raises(RuntimeError, match="in 2 enclaves"):
+        enclave_of_launch()
+
+
+def test_the_option_of_ros2_launch(action: Any) -> None:
+    option = sys.modules["sros_tool.launch"].__dict__["SecuredOption"]()
+    parser = ArgumentParser()
+    for name in ("--launch-prefix", "--launch-prefix-filter"):
+        parser.add_argument(name)
+    option.add_arguments(parser, "launch")
+    open_robot = SimpleNamespace(entities=["robot.launch.py"])
+    without = parser.parse_args(["--launch-prefix", "gdb"])
+    option.prestart(without)
+    assert option.prelaunch(open_robot, without) == (open_robot,)
+    asked = ["--secured", "ks", "p.xml"]
+    option.prestart(parser.parse_args(asked))
+    (closed,) = option.prelaunch(open_robot, parser.parse_args(asked))
+    secured, rest = closed.entities
+    assert isinstance(secured, action) and rest == "robot.launch.py"
+    assert secured._given == (["ks"], ["p.xml"], [""])
+    for more in ("--launch-prefix", "--launch-prefix-filter"):
+        with pytest.raises(RuntimeError, match="--secured"):
+            option.prestart(parser.parse_args([*asked, more, "gdb"]))
 
 
 def test_its_attributes_in_xml(action: Any) -> None:
@@ -115,10 +197,12 @@ def test_with_the_launch_package_of_ros(tmp_path: Path, capfd: pytest.CaptureFix
     policy, root = tmp_path / "p.xml", tmp_path / "ks"
     policy.write_text(policy_text({"/line": publish("/x")}))
     sros("generate_artifacts", "-k", root, "-p", policy).ok()
-    show = "import os, sys; print(sys.argv[1], os.environ.get('ROS_SECURITY_ENCLAVE_OVERRIDE'))"
+    show = tmp_path / "show"
+    show.write_text('#!/bin/sh\necho "$1 ${ROS_SECURITY_ENCLAVE_OVERRIDE-None}"\n')
+    show.chmod(0o700)
 
     def process(name: str, **more: str) -> Any:
-        words = [sys.executable, "-c", show, name, "--ros-args", "-r", f"__node:={name}"]
+        words = [str(show), name, "--ros-args", "-r", f"__node:={name}"]
         return actions.ExecuteProcess(cmd=words, output="screen", **more)
 
     service = launch.LaunchService()
@@ -139,5 +223,5 @@ def test_with_the_launch_package_of_ros(tmp_path: Path, capfd: pytest.CaptureFix
         os.environ.clear()
         os.environ.update(before)
     said = "".join(capfd.readouterr())
-    assert "n /line" in said and "own None" in said
+    assert "[show-1] n /line" in said and "own None" in said
     assert "has the node /stranger in no enclave" in said and "stranger None" not in said

@@ -355,8 +355,9 @@ def run(
             "Name its path, or set up its environment first (ROS: `. /opt/ros/jazzy/setup.sh`).",
         )
     given = tuple(command)
-    if not no_ros_args and (command := list(with_enclave(given, name))) != list(given):
-        added = " ".join(command[len(given) :])
+    if not no_ros_args:
+        command = list(with_enclave(given, name))
+    if (added := " ".join(command[len(given) :])) and not policy:
         echo(
             f"added {added}, so that the ROS graph shows the enclave (--no-ros-args: do not)",
             err=True,
