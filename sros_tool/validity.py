@@ -22,10 +22,19 @@ valid at least 14 hours before its creation in UTC to work in every time zone.
 """
 
 _FIRST_YEAR = 1950
+_EPOCH = datetime.fromtimestamp(0, UTC)
 
 _DURATION = re.compile(r"(\d{1,10})([smhdwy])\Z", re.ASCII)
 _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400, "w": 604800, "y": 365 * 86400}
 _LONGEST = 100 * _SECONDS["y"]
+
+
+def time_of_file(seconds: float) -> datetime:
+    """Return the time in the state of a file, which its writer can set, also to one of no year."""
+    try:
+        return datetime.fromtimestamp(seconds, UTC)
+    except (ValueError, OverflowError, OSError):
+        return datetime.max.replace(tzinfo=UTC) if seconds > 0 else _EPOCH
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +63,16 @@ class Window:
         """Return how long a document with this validity is valid from when it was made.
 
         ``made`` is when that was, or when its file came here.  What sros makes is valid from
-        `BACKDATE` before; other programs may do without, which only ``made`` tells.  A validity
-        that is not longer than that was not made by sros.
+        `BACKDATE` before; other programs may do without, which only ``made`` tells, unless it is
+        long before.  A validity that is not longer than that was not made by sros.
         """
         latest = self.not_before + BACKDATE
         if latest >= self.not_after:
             latest = self.not_before
-        begin = latest if made is None else min(max(made, self.not_before), latest)
+        if made is None or made < self.not_before - BACKDATE:
+            begin = latest
+        else:
+            begin = min(max(made, self.not_before), latest)
         return self.not_after - begin
 
     def within(self, outer: Window) -> Window:

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta, tzinfo
+from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
@@ -73,7 +73,7 @@ from sros_tool.pki.certificates import validity_of
 from sros_tool.pki.crl import list_number, load_crl
 from sros_tool.pki.token import Secrets
 from sros_tool.runtime.processes import RunningProcesses, boot_id
-from sros_tool.validity import elapsed, iso
+from sros_tool.validity import elapsed, iso, time_of_file
 from sros_tool.xml import read_bytes
 
 _TOLERANCE = timedelta(minutes=2)
@@ -400,7 +400,11 @@ class _Round:
                 self._problems.append(f"{name} could not start: {enclave.problem}.")
 
     def _restart(self, names: Iterable[str], opened: Mapping[str, _Opened]) -> Sequence[str]:
-        """Restart the units of enclaves that are due; return the enclaves of those that did."""
+        """Restart the units of enclaves that are due.
+
+        Return the enclaves of those that did and whose processes can be seen: others are of users
+        that this one cannot look at, or no nodes.
+        """
         settings, machine = self._settings, self._machine
         if not settings.restart or not self._state.due:
             return ()
@@ -417,7 +421,7 @@ class _Round:
             systemd=machine.systemd or Systemd(settings.systemctl),
         )
         self._problems += done.problems
-        return done.enclaves
+        return [name for name in done.enclaves if seen.states[name] is not RunningFiles.NOT_SEEN]
 
     def _look_after(self, restarted: Sequence[str], names: Iterable[str]) -> EnclaveProcesses:
         """Look at the processes, until those of restarted units have loaded their files."""
@@ -505,7 +509,7 @@ class _Round:
         """Return the list that a release replaced by one that revokes less; None if none did."""
         with suppress(SrosError, OSError):
             path = agent_folder(self._folder) / _REPLACED_LIST
-            since = datetime.fromtimestamp(path.stat().st_mtime, UTC)
+            since = time_of_file(path.stat().st_mtime)
             if abs(self._machine.now - since) < _REPLACED_FOR:
                 return read_bytes(path, "revocation list", most=LONGEST_LIST).decode()
         return None

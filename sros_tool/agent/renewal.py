@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from sros_tool.keystore.reader import read_certificate
 from sros_tool.pki.certificates import make_request, validity_of
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.token import Secrets, open_enclave_key
+from sros_tool.validity import time_of_file
 from sros_tool.xml import read_bytes
 
 _NEW_KEYS = "new-keys"
@@ -36,7 +37,7 @@ def _is_due(file: Path, now: datetime) -> bool:
         SrosError: it cannot be read.
     """
     validity = validity_of(read_certificate(file))
-    here_since = datetime.fromtimestamp(file.stat().st_mtime, UTC)
+    here_since = time_of_file(file.stat().st_mtime)
     return now >= validity.not_after - validity.life(here_since) / 3
 
 

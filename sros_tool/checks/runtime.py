@@ -17,7 +17,7 @@ from sros_tool.dds.advisories import Advisory
 from sros_tool.runtime.processes import MappedLibrary, RunningProcesses
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
 from sros_tool.runtime.variables import ENABLE, KEYSTORE
-from sros_tool.validity import iso
+from sros_tool.validity import iso, time_of_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ def _clock(state: RuntimeState) -> Iterator[Finding]:
     files = [path for name in ("ledger.jsonl", "enclaves/*.p7s", "enclaves/**/cert.pem")
              for path in Path(root).glob(name)]  # fmt: skip
     newest = max((file.stat().st_mtime for file in files if file.exists()), default=0.0)
-    written = datetime.fromtimestamp(newest, UTC)
+    written = time_of_file(newest)
     clock = state.clock or state.now
     if written > clock + _TOLERANCE:
         text = f"the clock shows {iso(clock)}, but '{root}' was written at {iso(written)}"

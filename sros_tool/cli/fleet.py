@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from datetime import timedelta
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, NamedTuple
@@ -516,8 +515,9 @@ def _status(
     earlier (issued for this enclave before); another's (issued for another enclave); revoked;
     missing; or unknown (never issued by this keystore). Processes use new files only after a
     restart: those that are due are in what the Ansible collection and `sros agent` confirm, and not
-    in what `sros fleet report` does. A robot that was not heard of for too long is offline. Robots
-    of which the same is to be said share a line. A last line counts what is known of the robots'
+    in what `sros fleet report` does. A robot that was not heard of for too long is offline; one
+    that says it has a release which was never published is named, whatever files it has. Robots of
+    which the same is to be said share a line. A last line counts what is known of the robots'
     DDS by the advisories of sros; --robot and --advisories name it.
 
     Example:
@@ -593,13 +593,12 @@ _WORDS = {
     "missing": "lacking files",
     "broken": "broken in the keystore",
     "never": "never confirmed",
+    "later": "claims a later release",
     "unknown": "unknown files",
     "another": "another's files",
 }
 """State of a file or robot → its words in the output, if they differ from the state's name."""
 _DIGITS = re.compile(r"(\d+)")
-_SILENCE = timedelta(minutes=30)
-"""From when a robot that fetches, every five minutes by default, is silent."""
 _MOST_LINES, _MOST_GROUPS = 50, 3
 """Maximum number of listed files of a robot, and of listed groups or unrecorded enclaves."""
 
@@ -646,7 +645,7 @@ def _rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str,
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
         if robots or robot.state not in ("current", "none") or robot.notes or robot.problems:
             what = _unnamed("; ".join(_summary(robot, status.stage)), robot.robot)
-            row = (_word(robot.state), _to_do(robot, compared.at), what)
+            row = (_word(robot.state), robot.to_do, what)
             alike.setdefault((*row, robot.robot if robots else ""), []).append(robot)
         elif robot.state == "current":
             current.append(robot)
@@ -696,33 +695,6 @@ def _runs(names: Iterable[str], places: Mapping[str, int]) -> str:
     number = sum(map(len, runs))
     shown = ", ".join(words[:_MOST_GROUPS]) + (", ..." if len(words) > _MOST_GROUPS else "")
     return f"{shown} ({number} robots)" if number > _MOST_GROUPS else shown
-
-
-_TO_DO = {
-    "restart": "restart",
-    "offline": "find out why",
-    "broken": "sros check",
-    "never": "deliver",
-    "unknown": "find out why",
-    "another": "find out why",
-}
-"""State of a robot → what is to be done, if the state alone tells it."""
-
-
-def _to_do(robot: RobotStatus, at: datetime) -> str:
-    """Return what is to be done with a robot, in few words; "" if nothing is."""
-    if robot.state == "revoked" and not robot.enclaves:
-        return "take it out of the fleet file"
-    if robot.state in ("current", "none"):
-        return "see what" if robot.problems else ""
-    if robot.state in _TO_DO:
-        return _TO_DO[robot.state]
-    if not robot.fetches:
-        return "deliver"
-    if (robot.published or 0) == (robot.release or 0):
-        return "publish"
-    is_silent = robot.received is None or at - robot.received > _SILENCE
-    return "see whether it is on" if is_silent else "wait: it fetches"
 
 
 def _dds_findings(compared: ComparedFleet) -> Iterator[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from shlex import quote
@@ -13,12 +14,13 @@ from cryptography import x509
 
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.keystore.layout import CERTIFICATE_FILE
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import Template
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
-from sros_tool.validity import Window, iso, parse_duration
+from sros_tool.validity import Window, iso, parse_duration, time_of_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +42,8 @@ class Lifetime:
     name: str
     certificate: Window
     permissions: Window
+    came: datetime | None = None
+    """When the certificate was written here; it may be of a CA that back-dates nothing."""
 
     def expires(self) -> datetime:
         """Return the earlier expiry of certificate and permissions."""
@@ -51,8 +55,8 @@ class Lifetime:
             return self.expires() - now <= threshold.remaining
         assert threshold.elapsed is not None
         return any(
-            _elapsed(validity, now) >= threshold.elapsed
-            for validity in (self.certificate, self.permissions)
+            _elapsed(validity, now, made) >= threshold.elapsed
+            for validity, made in ((self.certificate, self.came), (self.permissions, None))
         )
 
 
@@ -61,7 +65,7 @@ class Credentials:
     """The certificate of an enclave and the grant that DDS reads, both not verified yet.
 
     ``signed`` is the permissions document with the grant, ``digest`` the SHA-256 of
-    ``permissions.p7s`` in hexadecimal.
+    ``permissions.p7s`` in hexadecimal; ``came`` is when the certificate was written here.
     """
 
     name: str
@@ -69,10 +73,11 @@ class Credentials:
     signed: smime.SignedDocument
     digest: str
     grant: Grant
+    came: datetime | None
 
     def lifetime(self) -> Lifetime:
         """Return the validity of the certificate and of the grant."""
-        return Lifetime(self.name, validity_of(self.certificate), self.grant.validity)
+        return Lifetime(self.name, validity_of(self.certificate), self.grant.validity, self.came)
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +231,10 @@ def read_credentials(keystore: Keystore, name: str) -> Credentials:
             f"Sign them again with `sros create_permission {quote(str(keystore.root))} {name} "
             "POLICY_FILE`.",
         )
-    return Credentials(name, certificate, granted.signed, granted.digest, granted.grant)
+    came = None
+    with suppress(OSError):
+        came = time_of_file((keystore.folder(name) / CERTIFICATE_FILE).stat().st_mtime)
+    return Credentials(name, certificate, granted.signed, granted.digest, granted.grant, came)
 
 
 def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
@@ -240,6 +248,6 @@ def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
     return f"{lifetime.name}  {first} {word} {iso(lifetime.expires())}"
 
 
-def _elapsed(validity: Window, now: datetime) -> float:
+def _elapsed(validity: Window, now: datetime, made: datetime | None) -> float:
     """Return the elapsed fraction of a validity, without its back-dating; above 1 after expiry."""
-    return 1 - (validity.not_after - now) / validity.life()
+    return 1 - (validity.not_after - now) / validity.life(made)

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from enum import StrEnum
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -81,6 +82,8 @@ class State(StrEnum):
     """The file in the keystore is missing or cannot be read, so no export can be made."""
     NEVER = "never"
     """The robot has sent no confirmation."""
+    LATER = "later"
+    """The robot says that it has installed a later release than was ever published for it."""
     UNKNOWN = "unknown"
     """A file that the ledger does not record as issued."""
     REVOKED = "revoked"
@@ -106,6 +109,18 @@ _EXPIRING = ("certificate", "permissions", "crl")
 """Kinds of files whose expiry on a robot the ledger tells."""
 _LONGEST_SILENCE = timedelta(days=1)
 """From when a robot that fetches is offline, if nothing else is asked for."""
+_SILENCE = timedelta(minutes=30)
+"""From when a robot that fetches, every five minutes by default, may be off."""
+_TO_DO = {
+    State.RESTART: "restart",
+    State.OFFLINE: "find out why",
+    State.BROKEN: "sros check",
+    State.NEVER: "deliver",
+    State.LATER: "find out why",
+    State.UNKNOWN: "find out why",
+    State.ANOTHER: "find out why",
+}
+"""State of a robot → what is to be done, if the state alone tells it."""
 
 
 def _kind_of(path: str) -> str:
@@ -149,18 +164,9 @@ class ConfirmedFile:
 
 
 @shows(
-    *("robot", "state", "enclaves", "revoked", "unrecorded", "sharing_name", "received", "clock"),
-    *(
-        "fetches",
-        "release",
-        "published",
-        "stage",
-        "files",
-        "pending",
-        "restart",
-        "running",
-        "crl_in_force",
-    ),
+    *("robot", "state", "to_do", "enclaves", "revoked", "unrecorded", "sharing_name", "received"),
+    *("clock", "fetches", "release", "published", "stage", "files", "pending", "restart"),
+    *("running", "crl_in_force"),
     *("expiry", "dds", "problems", "notes"),
     null_if_empty=("stage",),
 )
@@ -176,8 +182,9 @@ class RobotStatus:
     state: State
     """The worst state of the robot's files; ``revoked`` also if all its enclaves were revoked
     (``enclaves`` is 0); ``restart``: they are current, but processes still run with earlier ones;
-    ``offline``: its last confirmation is too old (`overdue`); ``never``: it sent
-    no confirmation; ``none``: it has no enclave in the keystore."""
+    ``offline``: its last confirmation is too old (`overdue`); ``later``: it says that it has a
+    later release than was ever published for it, so that nothing it says can be relied on;
+    ``never``: it sent no confirmation; ``none``: it has no enclave in the keystore."""
     enclaves: int
     """Number of the robot's enclaves in the keystore."""
     revoked: tuple[str, ...]
@@ -221,6 +228,8 @@ class RobotStatus:
     """What the robot's agent could not do, in its own words; null if it does not say it."""
     notes: tuple[str, ...]
     """Remarks, as clauses, such as on the robot's clock."""
+    to_do: str = ""
+    """What is to be done with the robot, in few words; empty if nothing is."""
 
     @property
     def unrecorded(self) -> tuple[str, ...]:
@@ -259,6 +268,24 @@ class RobotStatus:
         in_force = None if self.crl_in_force is None else False
         return replace(self, state=state, crl_in_force=in_force)
 
+    def with_to_do(self, now: datetime) -> RobotStatus:
+        """Return the status with what is to be done at ``now``."""
+        return replace(self, to_do=self._to_do(now))
+
+    def _to_do(self, now: datetime) -> str:
+        if self.state is State.REVOKED and not self.enclaves:
+            return "take it out of the fleet file"
+        if self.settled:
+            return "see what" if self.problems else ""
+        if self.state in _TO_DO:
+            return _TO_DO[self.state]
+        if not self.fetches:
+            return "deliver"
+        if (self.published or 0) == (self.release or 0):
+            return "publish"
+        is_silent = self.received is None or now - self.received > _SILENCE
+        return "see whether it is on" if is_silent else "wait: it fetches"
+
 
 @shows("keystore", "complete", "stage", "counts", "unassigned", "overdue", "robots")
 @dataclass(frozen=True, slots=True)
@@ -292,7 +319,7 @@ class FleetStatus:
         return not self.overdue and all(robot.settled for robot in self.robots)
 
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
-        """Return a copy in which the robots that were not heard of for too long are offline.
+        """Return a copy with what is to be done, in which robots not heard of for long are offline.
 
         These are the robots whose last confirmation is older than ``max_age``; without it, the
         robots that fetch and were not heard of for more than a day.  Messages of robots that fetch
@@ -307,7 +334,8 @@ class FleetStatus:
             and now - heard > (max_age or _LONGEST_SILENCE)
         )
         robots = (robot.offline() if robot.robot in late else robot for robot in self.robots)
-        return replace(self, robots=tuple(robots), overdue=late)
+        to_do = tuple(robot.with_to_do(now) for robot in robots)
+        return replace(self, robots=to_do, overdue=late)
 
 
 def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
@@ -526,6 +554,7 @@ class _Known:
     def __init__(
         self, keystore: Keystore, fleet: Fleet, compared: Sequence[_ComparedRobot]
     ) -> None:
+        self._keystore = keystore
         self._root = keystore.root
         self.has_list = keystore.has(CRL)
         """Whether the keystore has a revocation list."""
@@ -555,6 +584,17 @@ class _Known:
                     self._revoked.add(entry.enclave)
         robots = {robot.robot.name for robot in compared}
         self._unrecorded = unrecorded_enclaves(fleet, self._revoked, robots)
+
+    def is_later(self, robot: str, release: int) -> bool:
+        """Return whether no release with so high a number was ever published for a robot."""
+        last = self.published.get(robot)
+        return release > (self._last_release if last is None else last)
+
+    @cached_property
+    def _last_release(self) -> int:
+        """The highest number of a release that the ledger has; 0 without one."""
+        entries = self._keystore.ledger_with("what", "release").entries
+        return max((entry.number for entry in entries if entry.what == "release"), default=0)
 
     def revoked(self, robot: Robot) -> tuple[str, ...]:
         """Return the enclaves of a robot that were revoked and are not in the keystore."""
@@ -645,8 +685,17 @@ def _status(
     else:
         state = State.NEVER if compared.received is None else State.CURRENT
     received, confirmed = compared.received, compared.confirmed
+    is_later = bool(
+        compared.enclaves
+        and confirmed
+        and known.is_later(compared.robot.name, confirmed.release or 0)
+    )
+    if is_later:
+        state = max(state, State.LATER, key=_BADNESS.__getitem__)
     in_force = (
-        received is not None and not restart and set(counts.get("crl", ())) <= {State.CURRENT}
+        received is not None
+        and not (restart or is_later)
+        and set(counts.get("crl", ())) <= {State.CURRENT}
     )
     return RobotStatus(
         compared.robot.name,

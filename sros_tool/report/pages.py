@@ -393,7 +393,7 @@ def _fleet_table(status: Json) -> str:
     rows = sorted(status["robots"], key=lambda robot: (robot["state"] in _GOOD, robot["robot"]))
     heads = (
         *("robot", "state", "confirmed", "release", "published", "enclaves", "first expiry"),
-        *("CA stage", "what differs"),
+        *("CA stage", "to do", "what differs"),
     )
     return (
         f"<table><thead><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead>"
@@ -421,6 +421,7 @@ def _fleet_row(robot: Json) -> str:
         str(robot["enclaves"]),
         escape(min(robot["expiry"].values(), default="")),
         escape(robot["stage"] or ""),
+        escape(robot["to_do"]),
         "<br>".join(map(escape, (*what, *due, *robot["notes"], *(robot["problems"] or ())))),
     )
     return f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"

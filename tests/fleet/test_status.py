@@ -329,7 +329,7 @@ def test_a_restart_that_is_due(field: Field) -> None:
 def test_a_robot_that_fetches_is_offline_after_a_day(field: Field) -> None:
     """A robot that confirms by plays is not, unless somebody asks for it."""
     hours = timedelta(hours=1)
-    field.send("r1", release=3, problems=("the disk is full",))
+    field.send("r1", release=0, problems=("the disk is full",))
     assert field.states() == dict.fromkeys(ROBOTS, "current")
     for robot in ("r1", "r2"):
         field.age(robot, 23 * hours)
@@ -340,7 +340,7 @@ def test_a_robot_that_fetches_is_offline_after_a_day(field: Field) -> None:
     assert field.states() == {"r1": "offline", "r2": "current", "r3": "current"}
     assert (found["overdue"], found["complete"]) == (["r1"], False)
     assert [found["robots"][robot]["fetches"] for robot in ROBOTS] == [True, False, False]
-    assert found["robots"]["r1"]["release"] == 3
+    assert found["robots"]["r1"]["release"] == 0
     lines = field.run("fleet", "status", "ks", status=1).out.splitlines()
     assert lines[0] == "3 robots: 2 current, 1 offline"
     (line,) = (line for line in lines if line.startswith("r1 "))
@@ -527,12 +527,43 @@ def test_robots_that_differ_in_their_names_share_a_line(field: Field) -> None:
 def test_a_robot_that_does_not_fetch_what_is_published_may_be_off(field: Field) -> None:
     field.deliver(*ROBOTS)
     for robot in ROBOTS:
-        field.send(robot, release=1)
+        field.send(robot, release=0)
     field.run("renew", "ks", "--all")
     field.run("fleet", "publish", "ks", "pub")
     field.age("r3", timedelta(minutes=31))
     rows = field.run("fleet", "status", "ks", status=1).out
     assert rows.count("wait: it fetches") == 1 and rows.count("see whether it is on") == 1, rows
+    page = field.run("fleet", "status", "ks", "--html", status=1).out
+    assert page.count("<td>wait: it fetches</td>") == 2
+    assert page.count("<td>see whether it is on</td>") == 1
+
+
+def test_a_robot_that_says_it_has_a_release_that_was_never_published(field: Field) -> None:
+    """Its files are right, which it can say as well."""
+    field.send("r2", release=1)
+    assert field.states()["r2"] == "later", "nothing was published"
+    field.run("revoke", "ks", "/dispatcher")
+    field.run("fleet", "publish", "ks", "pub")
+    field.deliver(*ROBOTS)
+    number = field.status()["robots"]["r2"]["published"]
+    for robot, claimed in (("r1", number), ("r2", number + 1), ("r3", number)):
+        field.send(robot, release=claimed)
+    found = field.status()["robots"]
+    assert [found[name]["state"] for name in ROBOTS] == ["current", "later", "current"]
+    assert [found[name]["crl_in_force"] for name in ROBOTS] == [True, False, True]
+    rows = field.run("fleet", "status", "ks", status=1).out
+    assert "3 robots: 2 current, 1 claims a later release" in rows
+    assert re.search(r"\nr2 +claims a later release +.* ago +find out why +release ", rows)
+    field.age("r2", timedelta(days=2))
+    assert field.states()["r2"] == "later"
+    (field.root / "published.json").unlink()
+    assert field.states() == {"r1": "current", "r2": "later", "r3": "current"}
+    field.run("rotate_ca", "ks", "--next")
+    field.deliver(*ROBOTS)
+    field.send("r2", release=number + 1)
+    assert ": r2. " in field.run("rotate_ca", "ks", "--next", status=2).err
+    field.send("r2", release=number)
+    field.run("rotate_ca", "ks", "--next")
 
 
 def test_the_module_on_the_robot_confirms_the_same(field: Field) -> None:

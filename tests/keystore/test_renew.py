@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -23,6 +24,7 @@ from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import validity_of
 from sros_tool.policy.document import read_policy
+from sros_tool.validity import Window
 from tests.support.harness import (
     certificate,
     check_whole,
@@ -200,6 +202,26 @@ def test_a_short_life_is_not_over_as_it_begins(hours: int, tmp_path: Path) -> No
     assert not life.due(parse_threshold("66%"), NOW)
     assert not life.due(parse_threshold("66%"), NOW + 0.6 * short)
     assert life.due(parse_threshold("66%"), NOW + 0.7 * short)
+
+
+def test_the_life_of_a_certificate_of_another_ca_begins_when_it_came(tmp_path: Path) -> None:
+    """It is back-dated by nothing: of 30 hours, 20 are over, and not the last day alone."""
+    root = made(tmp_path / "ks", "/a")
+    file, hour = root / "enclaves/a/cert.pem", timedelta(hours=1)
+    (life,) = _lifetimes(Keystore(root))
+    short = replace(life, certificate=Window(NOW, NOW + 30 * hour))
+    assert not short.due(parse_threshold("66%"), NOW + 20 * hour)
+    os.utime(file, (NOW.timestamp(), NOW.timestamp()))
+    (life,) = _lifetimes(Keystore(root))
+    short = replace(life, certificate=short.certificate)
+    assert not short.due(parse_threshold("66%"), NOW + 19 * hour)
+    assert short.due(parse_threshold("66%"), NOW + 20 * hour)
+    for strange in (-1e12, 1e12):
+        os.utime(file, (strange, strange))
+        (life,) = _lifetimes(Keystore(root))
+        assert not replace(life, certificate=short.certificate).due(
+            parse_threshold("66%"), NOW + 20 * hour
+        )
 
 
 def test_all_that_expire(tmp_path: Path) -> None:

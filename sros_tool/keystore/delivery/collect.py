@@ -14,7 +14,7 @@ import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -69,14 +69,13 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.chains import chain_fault
 from sros_tool.pki.crl import SUPERSEDED
-from sros_tool.validity import Window, elapsed, iso, parse_duration, parse_iso
+from sros_tool.validity import Window, elapsed, iso, parse_duration, parse_iso, time_of_file
 from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words
 from sros_tool.wording import counted, first_few
 
 _MOST_NAMES = 100_000
 """Names in an inbox that are looked at, to name those of no robot of the fleet."""
 _SHOWN = 5
-_EARLIEST = datetime.fromtimestamp(0, UTC)
 _FEW = 4
 """Number of certificates up to which a ledger without index is searched for each of them."""
 
@@ -356,15 +355,7 @@ def _read_message(inbox: Folder, robot: str) -> _File | None:
         raise _RefusedError(f"it cannot be read: {os.strerror(error.errno or 0)}") from error
     except KeystoreError as error:  # a link or file in place of the robot's folder
         raise _RefusedError(error.what) from error
-    return _File(data, _time_of_file(state.st_mtime))
-
-
-def _time_of_file(seconds: float) -> datetime:
-    """Return the time in the state of a file; whoever wrote it can set any, also one of no year."""
-    try:
-        return datetime.fromtimestamp(seconds, UTC)
-    except (ValueError, OverflowError, OSError):
-        return datetime.max.replace(tzinfo=UTC) if seconds > 0 else _EARLIEST
+    return _File(data, time_of_file(state.st_mtime))
 
 
 def _unknown_names(inbox: Path, fleet: Fleet) -> Iterator[Note]:

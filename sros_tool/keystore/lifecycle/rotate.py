@@ -24,7 +24,7 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.fleet.enclaves import robot_of
 from sros_tool.keystore.fleet import checked_fleet, load_fleet
-from sros_tool.keystore.fleet_status import fleet_status
+from sros_tool.keystore.fleet_status import State, fleet_status
 from sros_tool.keystore.issuing.authority import Authority, write_bundle, write_copies
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
@@ -183,8 +183,8 @@ def robots_cut_off(
 
     These are the robots with enclaves that have not confirmed the stage before: first that they
     trust the new CA, then that they have the files it issued; those where processes still run with
-    earlier files; and those that fetch and are offline.  Without a fleet, or by the first stage, no
-    robot is cut off.
+    earlier files; and those that fetch and are offline, or say that they have what was never
+    published.  Without a fleet, or by the first stage, no robot is cut off.
 
     Raises:
         KeystoreError: the fleet file is not the file that sros wrote last.
@@ -210,6 +210,7 @@ def robots_cut_off(
         if robot.received is None
         or robot.restart
         or robot.robot in status.overdue
+        or robot.state is State.LATER
         or any(file.kind in needed and not file.surplus for file in robot.pending)
     )
 
