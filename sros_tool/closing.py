@@ -1,46 +1,103 @@
-"""From an open robot to a closed one: which process gets which enclave, and what proves it.
+"""From an open robot to a closed one: the steps, what each process needs, the proof, the way back.
 
 A process of Fast DDS shows its process id in the identifier of its DDS participant (two bytes of
 the GUID prefix; Fast DDS 2.6 to 3.6, ``GuidUtils.hpp``).  Other processes are known by the name
-that their command gives the node, or by the name of their program.  A wrong guess is safe: DDS
-denies the process what its enclave may not do.
+that their command gives the node, or by the name of their program.  A wrong guess is safe: the
+middleware denies the process what its enclave may not do.
+
+The steps are verbs of sros, which the caller runs (`Shell`); nothing is printed here.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
+import stat
+import subprocess
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime, tzinfo
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-from sros_tool.errors import DocumentError
-from sros_tool.explain.audit import DeniedRight
-from sros_tool.graph.learn import common_parts, stable_name
-from sros_tool.graph.observation import PUBLISH, SUBSCRIBE, Observation, ObservedNode
+from sros_tool.checks.kind import NOTE
+from sros_tool.checks.processes import PROCESS_NOT_SEEN, newer_files, process_findings
+from sros_tool.enclave_environment import loadable_environment
+from sros_tool.errors import DocumentError, SrosError, UnavailableError, UsageError
+from sros_tool.explain.audit import DeniedRight, audit, audited_enclaves
+from sros_tool.files import policies_dir, remove_file, replace_file
+from sros_tool.folders import make_folders
+from sros_tool.graph.learn import common_parts, is_tool, stable_name
+from sros_tool.graph.observation import (
+    PUBLISH,
+    SUBSCRIBE,
+    Observation,
+    ObservedNode,
+    from_json,
+    make_observation,
+)
+from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.participant import JoinContext
+from sros_tool.owners import other_writers, replaceable_on_the_way
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import RIGHTS, Policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.runtime.environment import node_argument, render_environment
+from sros_tool.runtime.environment import (
+    COMPOSE,
+    RMW_ZENOH,
+    Container,
+    node_argument,
+    object_name,
+    render_container,
+    render_environment,
+)
 from sros_tool.runtime.processes import (
     SERVICE_NAME,
     Process,
+    ProcessTable,
+    RunningProcesses,
     launch_verb,
     process_origin,
     program_of,
 )
-from sros_tool.runtime.units import unit_instance
-from sros_tool.runtime.variables import ENABLE, KEYSTORE, STRATEGY
-from sros_tool.values import DryRun, FileChanges, Words, as_plain, shows
-from sros_tool.wording import first_few
+from sros_tool.runtime.rmw import RMW, chosen_vendor
+from sros_tool.runtime.units import unit_changes, unit_instance, write_units
+from sros_tool.runtime.variables import ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_of
+from sros_tool.values import DryRun, FileChange, FileChanges, Words, as_plain, shows
+from sros_tool.wording import counted, first_few
 from sros_tool.xml import read_bytes
 
 _FAST_DDS = "010f"
 """The first two bytes of a participant of Fast DDS: its vendor id (RTPS 2.3, 9.4.5.1)."""
 _NODE_PARTS = ("common/node.xml", "common/rclcpp_node.xml", "common/rclpy_node.xml")
 _MOST_LINES, _MOST_NAMES = 20, 3
-DROP_IN, COMMANDS = "sros-close.conf", "commands.txt"
+_SYSTEMD = Path("/etc/systemd/system")
+_OBSERVER, _ROUTER = "/sros_observer", "/router"
+_DROP_IN, COMMANDS, _SERVICES = "sros-close.conf", "commands.txt", "compose.yaml"
+_RESTART_SECONDS, _START_SECONDS = 30.0, 3.0
+"""How long processes may take until they run in their enclaves: restarted by sros, or by hand."""
+_TRIES = 3
+
+
+class Shell(NamedTuple):
+    """What closing a robot needs of the command line.
+
+    ``run`` runs a verb of sros, and returns its status, its output and its messages, unless its
+    second argument lets it show these itself.  ``say`` shows progress.
+    """
+
+    run: Callable[[Sequence[str], bool], tuple[int, str, str]]
+    say: Callable[[str], None]
+    environment: Mapping[str, str]
+    now: Callable[[], datetime]
+    zone: tzinfo
+
+
+# ── values ──────────────────────────────────────────────────────────────────────────────────
 
 
 class ClosedProcess(NamedTuple):
@@ -60,29 +117,48 @@ class ClosedProcess(NamedTuple):
     """The unit of systemd that starts it alone; empty for a process that is restarted by hand."""
     known_by: Annotated[str, Words(("process id", "node name", "program", "elimination"))]
     """How sros knows that this process has the nodes of the enclave."""
-
     launch: Sequence[str] = ()
     """The command of the `ros2 launch` that started it; empty for a process of its own."""
+    container: str = ""
+    """The id of the Docker container in which it runs; empty outside of containers."""
+    rmw: str = ""
+    """rmw_zenoh_cpp for a process on Zenoh; empty on DDS."""
 
     @property
     def open_command(self) -> str:
         """The shell command that starts the process as it was started."""
+        if self.container:
+            return "docker compose up -d"
         return f"cd {shlex.quote(self.folder)} && {shlex.join(self.launch or self.command)}"
 
     def secured_command(self, folder: Path) -> str:
-        """Return the shell command that starts the process, or its launch, in its enclave."""
-        run = ("sros", "run", str(folder / "export"))
-        if not self.launch:
-            words = shlex.join((*run, self.enclave, "--", *self.command))
-        else:
-            prefix = shlex.join((*run, "--policy", str(folder / "policy.xml"), "--"))
+        """Return the shell command that starts the process, its launch or all containers secured.
+
+        ``folder`` is that of the closed robot.
+        """
+        if self.container:
+            overlay = shlex.quote(str(folder / "start" / _SERVICES))
+            return f"docker compose -f compose.yaml -f {overlay} up -d"
+        if self.launch:
             after = launch_verb(tuple(self.launch)) + 1
-            words = shlex.join(
-                (*self.launch[:after], "--launch-prefix", prefix, *self.launch[after:])
-            )
-            # A node to which the launch file gives a prefix of its own does not start.
-            words = f"{ENABLE}=true {STRATEGY}=Enforce {KEYSTORE}= {words}"
+            words = _launch_words(folder, self.launch[:after], self.launch[after:], self.rmw)
+        else:
+            run = ("sros", "run", str(folder / "export"), self.enclave)
+            words = shlex.join((*run, *_rmw_option(self.rmw), "--", *self.command))
         return f"cd {shlex.quote(self.folder)} && {words}"
+
+
+def _launch_words(folder: Path, before: Sequence[str], after: Sequence[str], rmw: str) -> str:
+    """Return a command of ``ros2 launch`` whose processes run in the enclaves of a closed robot."""
+    run = ("sros", "run", str(folder / "export"), "--policy", str(folder / "policy.xml"))
+    prefix = shlex.join((*run, *_rmw_option(rmw), "--"))
+    words = shlex.join((*before, "--launch-prefix", prefix, *after))
+    # A node to which the launch file gives a prefix of its own does not start.
+    return f"{ENABLE}=true {STRATEGY}=Enforce {KEYSTORE}= {words}"
+
+
+def _rmw_option(rmw: str) -> Sequence[str]:
+    return ("--rmw", rmw) if rmw else ()
 
 
 class ObservedProcesses(NamedTuple):
@@ -98,18 +174,31 @@ class ObservedProcesses(NamedTuple):
     """Enclaves with nodes that no process of this machine is known to have: also if another process
     has nodes of the same names."""
 
+    @property
+    def rmw(self) -> str:
+        """rmw_zenoh_cpp for a robot on Zenoh; empty on DDS."""
+        return next((process.rmw for process in self.processes if process.rmw), "")
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The units of systemd that start a process alone, by its enclave."""
+        return {process.enclave: process.unit for process in self.processes if process.unit}
+
     def within(self, policy: Policy) -> ObservedProcesses:
         """Return a copy without enclaves that the policy does not have any more."""
-        names = {enclave.path for enclave in policy.enclaves}
+        names = {_ROUTER, *(enclave.path for enclave in policy.enclaves)}
         return self._replace(
             processes=[process for process in self.processes if process.enclave in names],
             elsewhere=[enclave for enclave in self.elsewhere if enclave in names],
         )
 
     def by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
-        """Map the shell commands for what no unit of systemd starts alone to its processes."""
+        """Map the shell commands for what no unit of systemd starts alone to its processes.
+
+        A router of Zenoh comes first: nodes wait for it.
+        """
         commands: dict[str, list[ClosedProcess]] = {}
-        for process in self.processes:
+        for process in sorted(self.processes, key=lambda process: process.enclave != _ROUTER):
             if not process.unit:
                 commands.setdefault(process.secured_command(folder), []).append(process)
         return commands
@@ -177,10 +266,22 @@ def assign(
     }
     origins = {pid: process_origin(pid) for pid in left}
     units = Counter(origin.unit for origin in origins.values())
+    assigned: list[ClosedProcess] = []
+
+    def give(process: Process, enclave: str, known_by: str) -> None:
+        origin = origins[process.pid]
+        del left[process.pid]
+        unit = origin.unit if units[origin.unit] == 1 else ""
+        start = enclave, process.pid, process.command, origin.folder, process.user
+        rmw = RMW_ZENOH if process.is_zenoh else ""
+        more = known_by, origin.launch, origin.container, rmw
+        assigned.append(ClosedProcess(*start, unit, *more))
+
+    for router in [process for process in left.values() if process.is_router]:
+        give(router, _ROUTER, "program")
     by_enclave: dict[str, list[ObservedNode]] = {}
     for node in nodes:
         by_enclave.setdefault(node.enclaves[0], []).append(node)
-    assigned: list[ClosedProcess] = []
     for known_by, shows_node in _KNOWN_BY.items():
         without = sorted(by_enclave.keys() - {process.enclave for process in assigned})
         if known_by == "elimination" and len(without) > 1:
@@ -192,14 +293,9 @@ def assign(
                 for process in left.values()
                 if any(shows_node(process, node) for node in of_enclave)
             ]
-            if len(processes) > len({node.participant for node in of_enclave}):
-                continue  # it is not clear which of them
-            for process in processes:
-                del left[process.pid]
-                unit, folder, launch = origins[process.pid]
-                alone = unit if units[unit] == 1 else ""
-                start = enclave, process.pid, process.command, folder, process.user
-                assigned.append(ClosedProcess(*start, alone, known_by, launch))
+            if len(processes) <= len({node.participant for node in of_enclave}):
+                for process in processes:
+                    give(process, enclave, known_by)
     return ObservedProcesses(
         domain,
         sorted(assigned),
@@ -254,7 +350,8 @@ def read_processes(path: Path) -> ObservedProcesses:
         value = json.loads(read_bytes(path, "list of processes"))
         processes = [ClosedProcess(**process) for process in value["processes"]]
         for process in processes:
-            texts = (process.enclave, process.folder, *process.command, *process.launch)
+            words = (process.enclave, process.folder, process.container, process.rmw)
+            texts = (*words, *process.command, *process.launch)
             if not all(isinstance(text, str) for text in texts):
                 raise ValueError(f"{texts} are not all text")
             if process.unit and not re.fullmatch(SERVICE_NAME, process.unit, re.A):
@@ -266,52 +363,15 @@ def read_processes(path: Path) -> ObservedProcesses:
         ) from error
 
 
-def processes_document(observed: ObservedProcesses) -> bytes:
-    """Return the file that `read_processes` reads."""
-    return f"{json.dumps(as_plain(observed), indent=2)}\n".encode()
-
-
-# ── how they are started ────────────────────────────────────────────────────────────────────
-
-
-def mark(folder: Path) -> str:
-    """Return the first line of each drop-in that is made for a folder."""
-    return f"# Made by `sros close {folder}`; undone by its --undo.\n"
-
-
-def start_files(
-    folder: Path, observed: ObservedProcesses, variables: Mapping[str, Mapping[str, str]]
-) -> dict[str, str]:
-    """Map the paths of the files that say how to start each process secured to their content.
-
-    ``folder`` is absolute, and ``variables`` maps enclaves to their environment.
-    """
-    files = {
-        f"{unit_instance(enclave)}.env": render_environment(of_enclave, "docker")
-        for enclave, of_enclave in variables.items()
-    }
-    for process in observed.processes:
-        if process.unit:
-            text = render_environment(variables[process.enclave], "systemd")
-            files[f"units/{process.unit}.d/{DROP_IN}"] = f"{mark(folder)}[Service]\n{text}"
-    lines = [
-        "# No script: stop all of these processes (secured and open ones do not hear each other),",
-        "# and start each by its command, where it is started now: a start script, a terminal.",
-    ]
-    for command, processes in observed.by_hand(folder).items():
-        lines += ["", f"# {', '.join(process.enclave for process in processes)}", command]
-    return {**files, COMMANDS: "".join(f"{line}\n" for line in lines)}
-
-
 # ── who may do what ─────────────────────────────────────────────────────────────────────────
 
 
-def access_lines(policy: Policy, folder: Path, shipped: Path) -> list[str]:
+def access_lines(policy: Policy, folder: Path) -> list[str]:
     """Return a line for each name in a policy, with who uses it on either side.
 
     Rights that every node needs are left out; they are those of the common parts.
     """
-    common = common_parts(folder, shipped)
+    common = common_parts(folder, policies_dir())
     parts = [part for part in _NODE_PARTS if part in common.rights]
     ordinary = {
         (enclave.path, right.right, right.name)
@@ -324,27 +384,496 @@ def access_lines(policy: Policy, folder: Path, shipped: Path) -> list[str]:
         if right.kind in RIGHTS and (right.enclave, right.right, right.name) not in ordinary:
             of_name = sides.setdefault((right.kind, right.name), {})
             of_name.setdefault(right.right, []).append(right.enclave)
+    kinds = [*RIGHTS]
     lines = [
         f"{kind.removesuffix('s')} {name}: {' -> '.join(_users(of_name, e) for e in RIGHTS[kind])}"
-        for (kind, name), of_name in sorted(sides.items(), key=_two_sided_first)
+        for (kind, name), of_name in sorted(
+            sides.items(), key=lambda side: (-len(side[1]), kinds.index(side[0][0]), side[0][1])
+        )
     ]
     more = len(lines) - _MOST_LINES
     return [*lines[:_MOST_LINES], *([f"and {more} more names"] if more > 0 else [])]
-
-
-def _two_sided_first(side: tuple[tuple[str, str], Mapping[str, object]]) -> tuple[int, int, str]:
-    (kind, name), of_name = side
-    return -len(of_name), [*RIGHTS].index(kind), name
 
 
 def _users(of_name: Mapping[str, Sequence[str]], right: str) -> str:
     return first_few(of_name.get(right, ()), _MOST_NAMES) or "nobody"
 
 
-# ── the proof ───────────────────────────────────────────────────────────────────────────────
+# ── the steps ───────────────────────────────────────────────────────────────────────────────
 
 
-def lost_endpoints(
+class _Step(NamedTuple):
+    """The words of a command line of sros, what it makes, and where its output goes."""
+
+    words: Sequence[str]
+    made: Path | None = None
+    into: Path | None = None
+
+    @property
+    def command(self) -> str:
+        redirected = f" > {shlex.quote(str(self.into))}" if self.into else ""
+        return f"sros {shlex.join(self.words)}{redirected}"
+
+
+class OpenRobot:
+    """A robot that is being closed into a folder.
+
+    Raises:
+        SrosError: others can change what is in the folder, which says what systemd starts, or a
+            file in it is broken.
+    """
+
+    def __init__(self, folder: Path, domain: int | None, shell: Shell) -> None:
+        self.folder, self._shell = folder, shell
+        self.policy, self.observer = folder / "policy.xml", folder / "observer.xml"
+        self.requirements = folder / "requirements.toml"
+        self.keystore, self.export = folder / "keystore", folder / "export"
+        self.start, self.page = folder / "start", folder / "rights.html"
+        self.seen, self.processes = folder / "observed.json", folder / "processes.json"
+        self._check_own()
+        self.observed = read_processes(self.processes) if self.processes.exists() else None
+        named = domain_of(shell.environment) if domain is None else domain
+        known = self.observed.domain if self.observed else named
+        if domain not in (None, known):
+            raise UsageError(
+                f"the robot was watched in domain {known}, not {domain}",
+                "",
+                "Close each domain into a folder of its own.",
+            )
+        self.domain = known
+
+    def _check_own(self) -> None:
+        """Raise `SrosError` if others can change what is in the folder.
+
+        Whoever runs sros by sudo is trusted, as root is.
+        """
+        sudo = self._shell.environment.get("SUDO_UID", "") if os.geteuid() == 0 else ""
+        trusted = frozenset({0, os.geteuid(), *([int(sudo)] if sudo.isdecimal() else [])})
+        files = (self.policy, self.seen, self.processes)
+        for path in (self.folder, self.start, self.start / "units", *files):
+            ways = [*replaceable_on_the_way(path, trusted)]
+            if path.exists() and (why := other_writers(path.stat(), trusted)):
+                ways.insert(0, (path, why))
+            for step, why in ways:
+                raise SrosError(
+                    f"others can change '{path}'",
+                    f"'{step}': {why}.",
+                    "Close the robot into a folder that only you and root can change.",
+                )
+
+    def steps(self, duration: str | None) -> list[_Step]:
+        """Return the steps; with a ``duration``, the robot is watched even if it was before."""
+        policy, keystore, needed = str(self.policy), str(self.keystore), str(self.requirements)
+        domain = ("--domain", str(self.domain))
+        learn = ["generate_policy", policy, "--enclave-per-node", *domain]
+        learn += ["--watch", duration] if duration else []
+        learn += ["--dry-run"] if self.policy.exists() else []  # it may have been edited
+        only_errors = ("--fail-on", "error")
+        both, created = ("-p", policy, str(self.observer)), ("--template", "production")
+        on_zenoh = self._shell.environment.get(RMW) == RMW_ZENOH
+        return [
+            _Step((*learn, "--json"), None if duration else self.processes, self.seen),
+            _Step(("check", policy, "--suggest"), self.requirements, self.requirements),
+            _Step(("create_keystore", keystore, *created, *domain), self.keystore),
+            _Step(("generate_artifacts", "-k", keystore, *both)),
+            *([_Step(("zenoh", keystore))] if on_zenoh else ()),
+            _Step(("distribute_key", keystore, "--all", str(self.export), "--force")),
+            _Step(("check", policy, keystore, "--policy", policy, *only_errors)),
+            _Step(("check", keystore, "--requirements", needed, *only_errors)),
+            _Step(("view", policy, *created, "-o", str(self.page), "--force")),
+        ]
+
+    def prepare(self, duration: str | None, *, partial: bool, dry_run: bool) -> Closing:
+        """Do the steps whose results are not there yet, and write how each process is started.
+
+        Raises:
+            SrosError: the robot cannot be watched, or the keystore was brought to another machine.
+        """
+        if self.export.exists() and not self.keystore.exists():
+            raise UsageError(
+                f"the keystore '{self.keystore}' is not there, and '{self.export}' comes from it",
+                "A new keystore would have other CAs.",
+                "Bring it back to change the robot; --proof and --undo need only the export.",
+            )
+        steps, problems = [], []
+        for step in self.steps(duration):
+            state = "kept" if step.made and step.made.exists() else "open"
+            if dry_run:
+                self._shell.say(f"{'kept' if state == 'kept' else 'would run'}: {step.command}")
+            elif state == "open":
+                state, problem = self._do(step)
+                problems += [problem] if problem else []
+            steps.append(CloseStep(step.command, state))
+        observed = self._current()
+        if dry_run:
+            return Closing(self.folder, observed, steps, (), (), (), dry_run, ())
+        changes = self._write_starts(observed)
+        denied = self._denied()
+        problems += self._problems(observed, partial=partial)
+        said = [str(right) for right in denied]
+        return Closing(self.folder, observed, steps, said, problems, (), dry_run, changes)
+
+    def _current(self) -> ObservedProcesses:
+        """Return the processes of the enclaves that the policy has."""
+        observed = self.observed or ObservedProcesses(self.domain)
+        return observed.within(read_policy(self.policy)) if self.policy.exists() else observed
+
+    def _do(self, step: _Step) -> tuple[str, str]:
+        """Do a step; return its state, and why the robot is not closed yet, or "".
+
+        Raises:
+            SrosError: the robot cannot be watched.
+        """
+        watches = step.into == self.seen
+        if watches:
+            self._check_open()
+        self._shell.say(f"$ {step.command}")
+        status, output, messages = self._shell.run(step.words, bool(step.into))
+        if watches and status:
+            raise UnavailableError("there is no robot to close: no node was observed")
+        if status:
+            for line in () if step.into else f"{output}{messages}".splitlines():
+                self._shell.say(line)
+            return "findings", f"findings of `{step.command}`"
+        if step.into:
+            replace_file(step.into, output.encode())
+        return "done", self._keep_processes(output) if watches else ""
+
+    def _check_open(self) -> None:
+        """Make the folder; raise `SrosError` if the robot cannot be watched as an open one."""
+        named = self._shell.environment
+        if named.get(ENABLE) == "true":
+            raise UsageError(
+                f"{ENABLE} is set, so this shell does not see an open robot",
+                "",
+                f"Unset {ENABLE}.",
+            )
+        for process in ProcessTable().look(self._shell.now()).processes:
+            if process.is_zenoh and named.get(RMW) != RMW_ZENOH and self._is_neighbour(process):
+                raise UsageError(
+                    f"{process.label} speaks Zenoh, and this shell does not",
+                    "",
+                    f"Run `export {RMW}={RMW_ZENOH}`, and this command again.",
+                )
+        make_folders(self.folder)
+
+    def _is_neighbour(self, process: Process) -> bool:
+        return process.domain == str(self.domain) and not process.network
+
+    def _keep_processes(self, document: str) -> str:
+        """Write which process has which nodes, and the policy of the observer.
+
+        Return what an earlier policy lacks of what was seen, as a sentence.
+        """
+        replace_file(self.observer, (policies_dir() / "observer.xml").read_bytes())
+        nodes = [node for node in self._observation().nodes if not is_tool(node)]
+        running = ProcessTable().look(self._shell.now()).processes
+        self.observed = assign(nodes, running, self.domain)
+        replace_file(self.processes, f"{json.dumps(as_plain(self.observed), indent=2)}\n".encode())
+        number = counted(len(self.observed.processes), "process", "processes")
+        self._shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
+        learned = json.loads(document)
+        if not (learned["dry_run"] and learned["added"]):
+            return ""
+        add = f"sros generate_policy {shlex.quote(str(self.policy))} --enclave-per-node"
+        return (
+            f"'{self.policy}' stays as it is, and lacks {counted(len(learned['added']), 'right')} "
+            f"seen now; if they are right, add them: {add}"
+        )
+
+    def _observation(self) -> Observation:
+        """Return the nodes that were observed, without those of enclaves that the policy lacks."""
+        names = {enclave.path for enclave in read_policy(self.policy).enclaves}
+        try:
+            nodes = from_json(json.loads(read_bytes(self.seen, "observation"))).nodes
+            return make_observation(node for node in nodes if names.issuperset(node.enclaves))
+        except (ValueError, TypeError, KeyError) as error:
+            raise DocumentError(
+                f"'{self.seen}' is no observation", f"{error}", "Watch the robot again: --for 1m."
+            ) from error
+
+    def _variables(self, enclave: str, rmw: str = "") -> dict[str, str]:
+        """Return the environment of an enclave of the export."""
+        shell, domain = self._shell, str(self.domain)
+        return loadable_environment(
+            self.export,
+            enclave,
+            domain,
+            rmw or None,
+            environment=shell.environment,
+            now=shell.now(),
+            zone=shell.zone,
+        ).variables
+
+    def _write_starts(self, observed: ObservedProcesses) -> list[FileChange]:
+        """Write how each process is started secured; return what changed."""
+        folder = self.folder.absolute()
+        variables = {
+            process.enclave: self._variables(process.enclave, process.rmw)
+            for process in observed.processes
+        }
+        files = {
+            f"{unit_instance(enclave)}.env": render_environment(of_enclave, "docker")
+            for enclave, of_enclave in variables.items()
+        }
+        services = ["# Rename the services to those of your own file, and give both to Compose."]
+        for process in observed.processes:
+            of_enclave = variables[process.enclave]
+            if process.unit:
+                text = render_environment(of_enclave, "systemd")
+                files[f"units/{process.unit}.d/{_DROP_IN}"] = f"{self._mark()}[Service]\n{text}"
+            where = str(folder / "export/enclaves" / process.enclave.strip("/"))
+            name = object_name(process.enclave)
+            service = render_container(Container(process.enclave, name, of_enclave, where), COMPOSE)
+            services += ["services:", *service.splitlines()[1:]][len(services) > 1 :]
+        lines = [
+            "# No script: stop all of these processes (secured and open ones do not hear each",
+            "# other), and start each by its command, where it is started now: a start script, ...",
+        ]
+        for command, processes in observed.by_hand(folder).items():
+            lines += ["", f"# {', '.join(process.enclave for process in processes)}", command]
+        launch = _launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE"), observed.rmw)
+        lines += ["", "# Any launch file; its nodes need a name in it.", launch]
+        files |= {COMMANDS: _text(lines), _SERVICES: _text(services)}
+        changes = unit_changes(self.start, files, force=True)
+        write_units(self.start, files, changes)
+        return [FileChange(action, str(self.start / path)) for path, action in changes.items()]
+
+    def _mark(self) -> str:
+        """Return the first line of each drop-in that is made for this folder."""
+        return f"# Made by `sros close {self.folder.absolute()}`; undone by its --undo.\n"
+
+    @property
+    def _rights(self) -> Path:
+        """The keystore, or the policy if the keystore was brought to another machine."""
+        return self.keystore if self.keystore.exists() else self.policy
+
+    def _denied(self) -> Sequence[DeniedRight]:
+        """Return what the keystore denies to the nodes as they were observed."""
+        context = JoinContext(self.domain, self._shell.now(), self._shell.zone)
+        vendor = chosen_vendor(None, None, self._shell.environment)[0]
+        enclaves = audited_enclaves(self._rights, vendor, context)
+        return audit(self._observation(), enclaves, _OBSERVER).denied
+
+    def _problems(self, observed: ObservedProcesses, *, partial: bool) -> Iterator[str]:
+        """Yield what keeps the robot from running closed, with what to do."""
+        policy = read_policy(self.policy)
+        for name in list_enclaves(self.keystore):
+            if name not in (_OBSERVER, _ROUTER) and not policy.enclave(name):
+                revoke = f"sros revoke {shlex.quote(str(self.keystore))} {name}"
+                yield f"the policy does not have {name}, and the keystore does: {revoke}"
+        owner, export = self.export.stat().st_uid, self.export.absolute()
+        users = sorted({process.user for process in observed.processes})
+        for user in users:
+            closed = [path for path in export.parents if not _may_enter(user, path.stat())]
+            if closed and user:
+                yield f"user {user}, who runs processes, cannot enter '{closed[-1]}'"
+            if user != owner:
+                yield (
+                    f"processes run as user {user}, and only user {owner} can read the enclaves: "
+                    f"chown -R {user} {shlex.quote(str(self.export))}"
+                )
+        if partial:
+            return
+        for text in observed.unknown:
+            yield f"no node is known of {text}; it would not be heard any more (accept: --partial)"
+        for enclave in observed.elsewhere:
+            yield (
+                f"nodes of {enclave} are of no known process of this machine; they would not be "
+                "heard any more (accept: --partial)"
+            )
+
+    # ── applying ────────────────────────────────────────────────────────────────────────────
+
+    def apply(self, prepared: Closing, *, dry_run: bool) -> Closing:
+        """Restart the units of systemd that do not run in their enclaves, with drop-ins.
+
+        Proves that the robot is closed, if nothing is left to do by hand.
+        """
+        observed = prepared.observed
+        paths = [f"{unit}.d/{_DROP_IN}" for unit in sorted(observed.units.values())]
+        files = {path: read_bytes(self.start / "units" / path, "unit").decode() for path in paths}
+        self._own_drop_ins(observed)
+        changes = unit_changes(_SYSTEMD, files, force=True)
+        for path, action in changes.items():
+            self._shell.say(f"{'would ' if dry_run else ''}{action} {_SYSTEMD / path}")
+        if not dry_run:
+            write_units(_SYSTEMD, files, changes)
+        closed = self._in_their_enclaves(ProcessTable().look(self._shell.now()))
+        open_units = [unit for enclave, unit in observed.units.items() if enclave not in closed]
+        self._restart(sorted(open_units), dry_run=dry_run)
+        done = [FileChange(action, str(_SYSTEMD / path)) for path, action in changes.items()]
+        by_hand = dry_run or observed.by_hand(self.folder)
+        proofs = () if by_hand else self._proofs(observed, _RESTART_SECONDS)
+        return prepared._replace(proofs=proofs, changes=[*prepared.changes, *done])
+
+    def _restart(self, units: Sequence[str], *, dry_run: bool) -> None:
+        """Let systemd read its units again, and restart some.  Raises `SrosError`."""
+        for words in [["daemon-reload"], ["restart", *units]] if units else []:
+            command = ["systemctl", *words]
+            self._shell.say(f"{'would run:' if dry_run else '$'} {shlex.join(command)}")
+            try:
+                ended = 0 if dry_run else subprocess.run(command, check=False).returncode
+            except OSError as error:
+                raise UnavailableError(f"systemctl cannot be run: {error.strerror}") from error
+            if ended:
+                raise SrosError(
+                    f"`{shlex.join(command)}` ended with {ended}",
+                    "Secured and open processes do not hear each other.",
+                    "Mend it and run --apply again, or go back with --undo.",
+                )
+
+    def _own_drop_ins(self, observed: ObservedProcesses) -> list[Path]:
+        """Return the drop-ins of this folder; raise `SrosError` if a unit has that of another."""
+        drop_ins = [
+            path
+            for path in sorted(_SYSTEMD.glob(f"*.d/{_DROP_IN}"))
+            if read_bytes(path, "unit").startswith(self._mark().encode())
+        ]
+        for unit in sorted({*observed.units.values()}):
+            path = _SYSTEMD / f"{unit}.d/{_DROP_IN}"
+            if path not in drop_ins and os.path.lexists(path):
+                raise SrosError(
+                    f"'{path}' is not the drop-in of this folder",
+                    "Its first line names another folder, or was changed. Nothing was changed.",
+                    "Use the folder that it names, as it was written, or remove the drop-in.",
+                )
+        return drop_ins
+
+    def undo(self, *, dry_run: bool) -> Closing:
+        """Remove the drop-ins of this folder, restart their units, and say what to do by hand."""
+        observed = self.observed or ObservedProcesses(self.domain)
+        drop_ins = self._own_drop_ins(observed)
+        for path in drop_ins:
+            self._shell.say(f"{'would remove' if dry_run else 'removed'} {path}")
+            if not dry_run:
+                remove_file(path)
+        of_drop_ins = {path.parent.name.removesuffix(".d") for path in drop_ins}
+        self._restart(sorted({*observed.units.values()} | of_drop_ins), dry_run=dry_run)
+        by_hand = [process for process in observed.processes if not process.unit]
+        for command in dict.fromkeys(process.open_command for process in by_hand):
+            self._shell.say(f"by hand, restart it open: {command}")
+        changes = [FileChange("remove", str(path)) for path in drop_ins]
+        return Closing(self.folder, observed, (), (), (), (), dry_run, changes)
+
+    # ── the proof ───────────────────────────────────────────────────────────────────────────
+
+    def prove(self, *, dry_run: bool) -> Closing:
+        """Prove that the robot is closed."""
+        observed = self._current()
+        proofs = () if dry_run else self._proofs(observed, _START_SECONDS)
+        return Closing(self.folder, observed, (), (), (), proofs, dry_run, ())
+
+    def _proofs(self, observed: ObservedProcesses, patience: float) -> list[Proof]:
+        """Wait until each process runs in its enclave, and prove that the robot is closed."""
+        expected = {process.enclave for process in observed.processes}
+        table, end = ProcessTable(), time.monotonic() + patience
+        while True:
+            running = table.look(self._shell.now())
+            missing = sorted(expected - self._in_their_enclaves(running))
+            if not missing:
+                break
+            if time.monotonic() > end:
+                named = first_few(missing, 5)
+                reason = f"none with the present files of {named}; start it as {self.start} says"
+                return [Proof(_CLAIM, False, reason)]
+            time.sleep(0.2)
+        before = self._observation()
+        return [
+            self._proof_of_processes(len(expected), running),
+            self._proof_of_talk(before),
+            self._proof_of_silence(before),
+        ]
+
+    def _in_their_enclaves(self, running: RunningProcesses) -> set[str]:
+        """Return the enclaves in which a process runs with the present files of the export."""
+        export = str(self.export.absolute())
+        return {
+            process.enclave.name
+            for process in running.processes
+            if process.asks_for_security and self._is_neighbour(process)
+            if process.enclave and process.enclave.keystore == export
+            if process.enclave.is_there and not [*newer_files(process, process.enclave)]
+        }
+
+    def _proof_of_processes(self, number: int, running: RunningProcesses) -> Proof:
+        """Look for processes that are open, or that something is wrong with."""
+        self._shell.say(
+            f'$ eval "$(sros env {shlex.quote(str(self.export))} {_OBSERVER})"; sros check runtime'
+        )
+        # This shell starts no node.
+        here = {**self._shell.environment, **self._variables(_OBSERVER), ENCLAVE: ""}
+        near = tuple(filter(self._is_neighbour, running.processes))
+        running, now = replace(running, processes=near), self._shell.now()
+        found = process_findings(here, running, now=now, zone=self._shell.zone)
+        findings = [finding for finding in found if finding.severity > NOTE]
+        for finding in findings:
+            self._shell.say(f"{finding.subject}: {finding.text}. {finding.remedy}")
+        wrong = [finding for finding in findings if finding.id != PROCESS_NOT_SEEN.id]
+        if findings:
+            first = (wrong or findings)[0]
+            return Proof(_CLAIM, False if wrong else None, f"{first.subject}: {first.text}")
+        return Proof(_CLAIM, True, f"{counted(number, 'enclave')}, and no open process")
+
+    def _proof_of_talk(self, before: Observation) -> Proof:
+        """Compare what an observer in an enclave sees now with what was seen before."""
+        claim, denied = "everything that talked still talks", self._denied()
+        words = ("audit", str(self._rights), "--keystore", str(self.export), "--enclave", _OBSERVER)
+        step = _Step((*words, "--domain", str(self.domain), "--json"))
+        for _ in range(_TRIES):  # nodes may still be starting
+            try:
+                status, value = self._asked(step)
+            except UnavailableError as error:
+                return Proof(claim, None, f"{error}")
+            wrong = {
+                "gone": _lost_endpoints(before, from_json(value), denied),
+                "denied": [f"{right['enclave']} {right['name']}" for right in value["denied"]],
+                "refused": [refused["enclave"] for refused in value["refused"]],
+                "not seen": [unseen["node"] or unseen["enclave"] for unseen in value["unseen"]],
+                "not judged": value["unjudged"],
+                "not done": ["the ROS graph kept changing"] if status else [],
+            }
+            reason = next((f"{why}: {first_few(of, 3)}" for why, of in wrong.items() if of), "")
+            if not reason:
+                number = counted(len(before.nodes), "node")
+                but = f", but for {counted(len(denied), 'right')} that the policy denies now"
+                seen = f"{number} with {before.endpoint_count} endpoints as before"
+                return Proof(claim, True, f"{seen}{but if denied else ''}")
+        return Proof(claim, False, reason)
+
+    def _proof_of_silence(self, before: Observation) -> Proof:
+        """Look for nodes as an open listener, who saw them before."""
+        claim = "an open listener finds nothing"
+        words = ("generate_policy", str(self.folder / "open.xml"), "--domain", str(self.domain))
+        try:
+            _, value = self._asked(_Step((*words, "--dry-run", "--json")))
+        except UnavailableError as error:
+            return Proof(claim, None, f"{error}")
+        if value["nodes"]:
+            nodes = {f"{node['namespace'].rstrip('/')}/{node['name']}" for node in value["nodes"]}
+            return Proof(claim, False, f"it sees {first_few(sorted(nodes), 3)}")
+        number = counted(len(before.nodes), "node")
+        return Proof(claim, True, f"the observer that saw {number} before sees none")
+
+    def _asked(self, step: _Step) -> tuple[int, Any]:
+        """Return the status of a verb, and the JSON that it prints."""
+        self._shell.say(f"$ {step.command}")
+        status, output, _ = self._shell.run(step.words, False)
+        return status, json.loads(output)
+
+
+_CLAIM = "every process runs in its enclave"
+
+
+def _may_enter(user: int, folder: os.stat_result) -> bool:
+    return bool(folder.st_mode & (stat.S_IXUSR if folder.st_uid == user else 0o011))
+
+
+def _text(lines: Iterable[str]) -> str:
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _lost_endpoints(
     before: Observation, now: Observation, denied: Iterable[DeniedRight]
 ) -> list[str]:
     """Return what nodes did before, are not ``denied``, and do not do now, as text."""

@@ -470,21 +470,24 @@ _LIBRARY_FOLDERS = (
 class ProcessOrigin(NamedTuple):
     """How a process was started: each part is empty if it has none, has ended, or hides it.
 
-    ``unit`` is its system service of systemd, ``folder`` its working directory, and ``launch`` the
-    command of the ``ros2 launch`` that started it, or that it is.
+    ``unit`` is its system service of systemd, ``folder`` its working directory, ``launch`` the
+    command of the ``ros2 launch`` that started it, or that it is, and ``container`` the id of its
+    Docker container.
     """
 
     unit: str = ""
     folder: str = ""
     launch: tuple[str, ...] = ()
+    container: str = ""
 
 
 def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
     """Return how a process was started."""
-    unit = folder = ""
+    unit = folder = container = ""
     with suppress(OSError):
         text = (proc / str(pid) / "cgroup").read_text(errors="surrogateescape")
         unit = service[1] if (service := _SERVICE.search(text)) else ""
+        container = docker[1][:12] if (docker := _DOCKER.search(text)) else ""
         folder = str((proc / str(pid) / "cwd").readlink())
     with suppress(OSError, IndexError, ValueError):
         while pid > 1:
@@ -494,8 +497,8 @@ def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
             finally:
                 os.close(handle)
             if launch_verb(command):
-                return ProcessOrigin(unit, folder, command)
-    return ProcessOrigin(unit, folder)
+                return ProcessOrigin(unit, folder, command, container)
+    return ProcessOrigin(unit, folder, (), container)
 
 
 def launch_verb(command: tuple[str, ...]) -> int:
@@ -512,6 +515,8 @@ _SERVICE = re.compile(
     r"^(?:0:|\d+:name=systemd):/system\.slice/(?:.*/)?(" + SERVICE_NAME + r")$", re.M | re.A
 )
 """A line of /proc/PID/cgroup, of version 2 or 1 (cgroups(7)); not for users' own services."""
+_DOCKER = re.compile(r"/docker[-/]([0-9a-f]{64})(?:\.scope)?(?:/|$)", re.M | re.A)
+"""The same for a container, as Docker's two cgroup drivers name it."""
 
 
 def _version(name: str) -> str:

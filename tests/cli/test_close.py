@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from sros_tool import closing
 from sros_tool.cli import close
 from sros_tool.closing import assign
 from sros_tool.graph import observe
@@ -137,10 +138,10 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         "sros_tool.closing.process_origin",
         lambda pid: ProcessOrigin(robot.units.get(units.get(pid, ""), ""), "/opt", robot.launch),
     )
-    monkeypatch.setattr(close, "_SYSTEMD", tmp_path / "systemd")
+    monkeypatch.setattr(closing, "_SYSTEMD", tmp_path / "systemd")
     for number in ("_RESTART_SECONDS", "_START_SECONDS"):
-        monkeypatch.setattr(close, number, 0.1)
-    monkeypatch.setattr(close, "_TRIES", 1)
+        monkeypatch.setattr(closing, number, 0.1)
+    monkeypatch.setattr(closing, "_TRIES", 1)
     for name in ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", "ROS_SECURITY_ENABLE"):
         monkeypatch.delenv(name, raising=False)
     (tmp_path / "systemd").mkdir()
@@ -195,10 +196,10 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     ended = robot.close()
     assert policy.read_text() == changed
     assert "/listener subscribe topic /chatter (/listener)" in ended.out
-    again = robot.close("--for", "1s")
+    again = robot.close("--for", "1s", status=1)
     assert policy.read_text() == changed
-    assert "nothing is closed yet; " in again.err.splitlines()[-1]
-    assert "stays as it is, and lacks 1 right seen now; if they are right, add" in again.err
+    assert "nothing is closed yet; mend this first:\n  'robot/policy.xml' stays as it " in again.out
+    assert "lacks 1 right seen now; if they are right, add them: sros gener" in again.out
     robot.remaining = (TALKER, ros_node("listener", "04"))
     said = robot.close("--apply").out
     assert "36 endpoints as before, but for 1 right that the policy denies now\n" in said
@@ -255,7 +256,7 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
         "yes: everything that talked still talks: 2 nodes with 36 endpoints as before",
         "yes: an open listener finds nothing: the observer that saw 2 nodes before sees none",
     ]
-    assert "the robot is closed; bring robot/keystore to another machine" in closed.err
+    assert "the robot is closed; next: bring robot/keystore to another machine" in closed.err
     robot.close("--apply")
     assert len(robot.restarts) == 2  # they run in their enclaves already
     (robot.folder / "robot/keystore").rename(robot.folder / "home")
@@ -276,7 +277,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     ended = robot.close("--apply", status=1)
     assert robot.restarts == []
     assert "stop process 4711, and start it by:\n  cd /opt && sros run " in ended.out
-    assert ended.err.endswith("then: sros close robot --proof\n")
+    assert ended.err.endswith("next: these commands, and then sros close robot --proof\n")
     assert (
         "no: every process runs in its enclave: none with the present files of /listener, /talker; "
         in robot.close("--proof", status=1).out
@@ -330,11 +331,14 @@ def test_what_is_interrupted_at_any_step_goes_on(
     run = close._run
     robot.units = UNITS
     policy = robot.folder / "robot/policy.xml"
-    for step in close._Places(Path("robot")).steps(0, None):
+    shell = closing.Shell(run, print, os.environ, lambda: datetime.now(UTC), UTC)
+    for step in closing.OpenRobot(robot.folder / "robot", 0, shell).steps(None):
 
-        def interrupted(done: Any, step: Any = step, **more: Any) -> Any:
-            is_it = done.words == step.words or done.words[0] == step.words[0] == "generate_policy"
-            ended = run(done, **more) if after or not is_it else None
+        def interrupted(words: Any, live: bool, step: Any = step) -> Any:
+            is_it = [Path(word).name for word in words if word != "--dry-run"] == [
+                Path(word).name for word in step.words
+            ]
+            ended = run(words, live) if after or not is_it else None
             if is_it:
                 raise KeyboardInterrupt
             return ended
@@ -359,9 +363,9 @@ def test_applying_that_is_interrupted_goes_on_or_back(
 
     robot.units = UNITS
     robot.close()
-    place = "sros_tool.runtime.units" if function == "write_units" else "sros_tool.cli.close"
+    place: Any = closing if function == "write_units" else closing.OpenRobot
     with monkeypatch.context() as patched:
-        patched.setattr(f"{place}.{function}", interrupted)
+        patched.setattr(place, function, interrupted)
         robot.close("--apply", status=130)
     assert robot.restarts == []
     robot.close("--undo")
@@ -385,7 +389,7 @@ def test_units_that_do_not_restart_are_named(robot: Robot) -> None:
 def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     robot.units = UNITS
     robot.more = (Process(5, ("other", "--ros-args"), {}, datetime.now(UTC)),)
-    assert "looks wrong: no node is known of process 5 (other)" in robot.close().out
+    assert "first:\n  no node is known of process 5 (other)" in robot.close(status=1).out
     assert "would not be heard any more (accept: --partial)" in robot.close("--apply", status=1).out
     assert robot.restarts == []
     robot.more = (replace(robot.more[0], pid=6, environment={"ROS_DOMAIN_ID": "1"}),)
@@ -401,7 +405,7 @@ def test_a_policy_with_an_error_closes_nothing(robot: Robot) -> None:
     policy.write_text("".join(e for e in rosout.splitlines(True) if "<xi:include" not in e))
     assert policy.read_text() != rosout
     ended = robot.close("--apply", status=1)
-    assert "looks wrong: findings of `sros check robot/policy.xml" in ended.out
+    assert "  findings of `sros check robot/policy.xml" in ended.out
     assert robot.restarts == []
 
 
@@ -416,7 +420,7 @@ def test_processes_of_another_user_need_the_files(
     (robot.folder / "robot").mkdir(mode=0o700)
     said = robot.close(status=1).out
     assert "chown -R 1234 robot/export" in said
-    assert "looks wrong: user 1234, who runs processes, cannot enter '/" in said
+    assert "  user 1234, who runs processes, cannot enter '/" in said
     robot.close("--apply", status=1)
     assert robot.restarts == []
 
@@ -570,7 +574,8 @@ def test_a_process_that_was_launched_is_launched_secured(tmp_path: Path, robot: 
     made_up(tmp_path, 7, *LAUNCH, parent=1)
     made_up(tmp_path, 8, "/bin/sh", "-c", "talker", parent=7)
     made_up(tmp_path, 9, "/opt/talker", parent=8)
-    assert process_origin(9, tmp_path) == process_origin(7, tmp_path) == ("", "/opt", LAUNCH)
+    origin = ProcessOrigin("", "/opt", LAUNCH)
+    assert process_origin(9, tmp_path) == process_origin(7, tmp_path) == origin
     assert launch_verb(("ros2", "launch")) == 1
     assert not any(map(launch_verb, [("ros2", "run", "launch"), ("launch",), ()]))
 
@@ -584,6 +589,6 @@ def test_a_process_that_was_launched_is_launched_secured(tmp_path: Path, robot: 
     )
     said = robot.close("--apply", status=1).out
     assert f"stop process 4712 and 4711, and start it by:\n  {command}" in said
-    assert (place / "start/commands.txt").read_text().endswith(f"\n# /listener, /talker\n{command}")
+    assert f"\n# /listener, /talker\n{command}" in (place / "start/commands.txt").read_text()
     undone = robot.close("--undo", status=1).err
     assert undone.count("restart it open: cd /opt && /usr/bin/python3 /opt/ros/jazzy/bin/ros2") == 1
