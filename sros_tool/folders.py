@@ -77,9 +77,10 @@ class Folder:
         """The user id and the group id of the folder."""
         return self._owner
 
-    def forget(self) -> None:
-        """Close cached descriptors of subfolders, whose paths have changed."""
-        for path in [handle for handle in self._handles if handle]:
+    def forget(self, folder: str = "") -> None:
+        """Close cached descriptors of ``folder`` and its subfolders, whose paths have changed."""
+        below = f"{folder}/" if folder else ""
+        for path in [path for path in self._handles if path and f"{path}/".startswith(below)]:
             os.close(self._handles.pop(path))
 
     # ── looking ────────────────────────────────────────────────────────────────────────────
@@ -121,6 +122,11 @@ class Folder:
     def names(self, path: str = "") -> list[str]:
         """Return the sorted names in the folder at ``path``."""
         return sorted(os.listdir(self.handle(path)))
+
+    def links(self, path: str) -> list[str]:
+        """Return the names of the symbolic links in the folder at ``path``."""
+        with os.scandir(self.handle(path)) as entries:
+            return [entry.name for entry in entries if entry.is_symlink()]
 
     def read(self, path: str, *, most: int = _MOST_BYTES) -> bytes:
         """Return the content of the regular file at ``path``, of at most ``most`` bytes."""
@@ -267,7 +273,7 @@ class Folder:
         here, name, there, new = self._pair(source, target)
         with self._naming(target):
             os.rename(name, new, src_dir_fd=here, dst_dir_fd=there)
-        self.forget()
+        self.forget(source)
 
     def link(self, source: str, target: str) -> None:
         """Make ``target`` a second name (a hard link) of the file ``source``."""

@@ -20,7 +20,7 @@ from sros_tool import folders
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.export import distribute
-from sros_tool.keystore.layout import REQUIRED_FILES, STAGE, enclave_folder, is_keystore
+from sros_tool.keystore.layout import REQUIRED_FILES, REVOKED, STAGE, enclave_folder, is_keystore
 from sros_tool.keystore.lifecycle import change
 from sros_tool.keystore.lifecycle.create import (
     create_enclaves,
@@ -28,6 +28,7 @@ from sros_tool.keystore.lifecycle.create import (
     create_permission,
     generate_artifacts,
 )
+from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import recovery
 from sros_tool.keystore.transaction import recovery as locking
@@ -213,6 +214,7 @@ SCENARIOS = {
         OLD,
         {**OLD, "/c": "*", "/c/d": "*"},
     ),
+    "revoke": Scenario(lambda w: revoke(w / "ks", ["/b"], now=NOW), OLD, {"/a": "old_a"}),
     "completion": Scenario(
         lambda w: create_enclaves(w / "ks", ["/b"], now=NOW),
         {"/a": "old_a"},
@@ -272,28 +274,30 @@ def seen(keystore: Path) -> dict[str, str]:
 
 
 def dangling(keystore: Path) -> list[Path]:
-    """Links that lead nowhere, beside those that are still in a stage."""
+    """Links that lead nowhere, beside those in a stage and in folders that were moved away."""
     return [
         Path(parent, name)
         for parent, folders, files in os.walk(keystore)
         for name in (*folders, *files)
-        if STAGE not in parent and not Path(parent, name).exists()
+        if STAGE not in parent and REVOKED not in parent and not Path(parent, name).exists()
     ]
 
 
 def check_moment(scenario: Scenario, w: Path, prepared: Path) -> None:
     """What must hold at any moment: every enclave is as before or as after, and so are all."""
     keystore = w / scenario.keystore
+    gone = scenario.before.keys() - scenario.after
     for path in dangling(keystore):  # only what was not there before, and is not there yet
         assert STAGE in os.readlink(path), path
-        assert not (prepared / path.relative_to(w)).exists(), path
-    folders = [keystore / enclave_folder(name) for name in scenario.before]
+        removed = {keystore / enclave_folder(name) / "cert.pem" for name in gone}
+        assert path in removed or not (prepared / path.relative_to(w)).exists(), path
+    folders = [keystore / enclave_folder(name) for name in scenario.before.keys() - gone]
     if scenario.keystore != "out":
         check_whole(keystore)
     assert all((folder / "key.pem").exists() for folder in folders)
     visible = seen(keystore)
     existing = {name: topic for name, topic in visible.items() if name in scenario.before}
-    wanted = {name: scenario.after[name] for name in scenario.before}
+    wanted = {name: scenario.after[name] for name in scenario.before if name not in gone}
     assert existing in (scenario.before, wanted), existing
     new = {name: topic for name, topic in visible.items() if name not in scenario.before}
     assert new.items() <= scenario.after.items(), new
@@ -317,8 +321,8 @@ def again(scenario: Scenario, w: Path) -> None:
     try:
         scenario.verb(w)
     except KeystoreError as error:
-        assert "already exists" in str(error), error
-        assert not scenario.before
+        done = "already exists" if not scenario.before else "was revoked at"
+        assert done in str(error), error
 
 
 class Stage:
@@ -370,7 +374,9 @@ def test_death_at_every_step(name: str, stage: Stage) -> None:
     assert len(outcomes) > (scenario.before != scenario.after)
 
 
-@pytest.mark.parametrize("name", ["generate_artifacts", "generate_artifacts, empty root"])
+@pytest.mark.parametrize(
+    "name", some(["generate_artifacts", "generate_artifacts, empty root", "revoke"], 2)
+)
 def test_death_while_recovering_from_death(name: str, stage: Stage) -> None:
     scenario = SCENARIOS[name]
     _, steps = in_child(lambda: scenario.verb(stage.fresh()))
@@ -698,6 +704,23 @@ def test_a_list_of_files_that_a_stranger_made_up_moves_nothing(
     assert snapshot(keystore.parent) == before
 
 
+@pytest.mark.parametrize(
+    ("path", "to"),
+    [
+        ("enclaves/a/cert.pem", "enclaves/b"),
+        ("enclaves/a/cert.pem", "revoked/../private"),
+        ("enclaves/a/key.pem", "revoked/1a"),
+        ("private/cert.pem", "revoked/1a"),
+    ],
+)
+def test_a_list_of_files_moves_no_folder_elsewhere(path: str, to: str, keystore: Path) -> None:
+    made_up_stage(keystore, "after", [[path, "", None, to]])
+    before = snapshot(keystore)
+    with pytest.raises(KeystoreError, match=r"would move to.*restore"):
+        create_enclaves(keystore, ["/new"], now=NOW)
+    assert snapshot(keystore) == before
+
+
 def test_a_list_of_files_leads_through_no_link(keystore: Path, tmp_path: Path) -> None:
     outside = tmp_path / "outside"
     (keystore / "enclaves/a").rename(outside)
@@ -711,7 +734,7 @@ def test_a_list_of_files_leads_through_no_link(keystore: Path, tmp_path: Path) -
     assert snapshot(tmp_path) == before
 
 
-@pytest.mark.parametrize("text", ["", "{}", "[]", '{"version": 3, "moves": []}', '{"version": 2}'])
+@pytest.mark.parametrize("text", ["", "{}", "[]", '{"version": 4, "moves": []}', '{"version": 3}'])
 def test_a_list_of_files_that_cannot_be_read_is_told(text: str, keystore: Path) -> None:
     made_up_stage(keystore, "after", [])
     (keystore / STAGE / stage_of.MANIFEST).write_text(text)

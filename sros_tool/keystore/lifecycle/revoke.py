@@ -287,7 +287,10 @@ def _is_router(change: KeystoreChange, router: str) -> KeystoreError:
 
 
 def _move_away(change: KeystoreChange, name: str) -> Entry:
-    """Stage the move of an enclave's files to ``revoked``; return the entry of its certificate."""
+    """Stage the move of an enclave's files to ``revoked``; return the entry of its certificate.
+
+    A folder that has nothing else moves as a whole, unless others could open its key.
+    """
     transaction, folder = change.transaction, enclave_folder(name)
     certificate = change.keystore.certificate_of(name)
     if not issued_by(certificate, change.identity.certificate):
@@ -298,14 +301,26 @@ def _move_away(change: KeystoreChange, name: str) -> Entry:
         )
     target = f"{REVOKED}/{certificate.serial_number:x}"
     with os.scandir(transaction.root / folder) as entries:
-        is_link = {entry.name: entry.is_symlink() for entry in entries}
+        there = {entry.name: entry for entry in entries}
+    links = [file for file in _FILES if file in there and there[file].is_symlink()]
+    files = [file for file in _FILES if file in there and file not in links]
+    if (
+        name != "/"
+        and CERTIFICATE_FILE in files
+        and len(files) + len(links) == len(there)
+        and all(there[file].is_file() for file in files)
+        and not (_PRIVATE in files and there[_PRIVATE].stat().st_mode & 0o077)
+        and not os.path.lexists(transaction.root / target)
+    ):
+        transaction.move_folder(folder, target, files, links)
+        return certificate_entry(change.now, "certificate", certificate, name)
     for file in _FILES:
         path = f"{folder}/{file}"
         if name == "/" and file == "governance.p7s":
             continue  # the governance of the keystore is in the folder of the enclave /
-        if file not in is_link:
+        if file not in there:
             continue
-        if not is_link[file]:
+        if file not in links:
             known = file == CERTIFICATE_FILE
             place = transaction.root / path
             data = change.keystore.read(place, file) if known else transaction.read(path)

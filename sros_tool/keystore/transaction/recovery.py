@@ -21,7 +21,7 @@ from typing import Self
 
 from sros_tool.errors import KeystoreError
 from sros_tool.folders import Folder
-from sros_tool.keystore.layout import ENCLAVES, LOCK, PRIVATE, STAGE, folder_mode
+from sros_tool.keystore.layout import CERTIFICATE_FILE, ENCLAVES, LOCK, PRIVATE, STAGE, folder_mode
 from sros_tool.keystore.transaction.stage import (
     ADDED,
     AFTER,
@@ -208,13 +208,15 @@ def _remove_stage(folder: Folder) -> None:
 
 def _replace_links(folder: Folder, moves: Sequence[Move]) -> None:
     """Replace the links into the stage with the new files and links."""
-    _make_folders(folder, {move.path.rpartition("/")[0] for move in moves})
+    _make_folders(folder, {(move.to or move.path).rpartition("/")[0] for move in moves})
 
     def replace(part: Sequence[Move]) -> None:
         spare = f"{STAGE}/spare.{os.getpid()}"
-        for path, before, after in part:
+        for path, before, after, to in part:
             name = staged_name(path)
-            if after is None:
+            if to:
+                _move_folder(folder, path, to)
+            elif after is None:
                 if _leads_into_stage(folder, path):
                     folder.unlink(path)
             elif after:
@@ -227,12 +229,25 @@ def _replace_links(folder: Folder, moves: Sequence[Move]) -> None:
                 folder.unlink(f"{STAGE}/{BEFORE}/{name}", missing_ok=True)
 
     map_slices(moves, replace)
-    _remove_empty_folders(folder, (move.path for move in moves if move.after is None))
+    removed = (move for move in moves if move.after is None)
+    gone = (move.path.rpartition("/")[0] if move.to else move.path for move in removed)
+    _remove_empty_folders(folder, gone)
+
+
+def _move_folder(folder: Folder, certificate: str, to: str) -> None:
+    """Move the folder of a removed ``certificate`` to ``to``, without the links in it."""
+    with contextlib.suppress(FileNotFoundError):  # an earlier recovery moved it
+        folder.rename(certificate.rpartition("/")[0], to)
+    with contextlib.suppress(FileNotFoundError):  # an earlier recovery put it back
+        kept = f"{STAGE}/{BEFORE}/{staged_name(certificate)}"
+        folder.replace(kept, f"{to}/{CERTIFICATE_FILE}")
+    for link in folder.links(to):
+        folder.unlink(f"{to}/{link}")
 
 
 def _undo(folder: Folder, moves: Sequence[Move]) -> None:
     """Restore the files that links into the stage replaced."""
-    for path, before, _ in moves:
+    for path, before, *_ in moves:
         if not _leads_into_stage(folder, path):
             continue
         if before is None:

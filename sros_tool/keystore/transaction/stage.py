@@ -24,22 +24,32 @@ from typing import NamedTuple, overload
 
 from sros_tool.errors import KeystoreError
 from sros_tool.folders import Folder
-from sros_tool.keystore.layout import STAGE, is_layout_path
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    ENCLAVES,
+    REVOKED,
+    STAGE,
+    is_layout_path,
+)
 
 BEFORE, AFTER, LIVE, ADDED, MANIFEST = "before", "after", "live", "added", "manifest.json"
-_VERSION = 2
+_VERSION = 3
+_EARLIER = 2
+"""The version without moves of folders."""
 
 
 class Move(NamedTuple):
     """The change of a path in an existing folder of the keystore.
 
     ``before`` and ``after`` are the content of the path: None for nothing, "" for a file, and the
-    target of a symbolic link.
+    target of a symbolic link.  If the path is the certificate of an enclave whose whole folder
+    moves, ``to`` is the new path of that folder.
     """
 
     path: str
     before: str | None
     after: str | None
+    to: str = ""
 
 
 CLOSE = "close"
@@ -185,7 +195,7 @@ def _read_manifest(folder: Folder) -> tuple[Move, ...]:
     """
     try:
         read = json.loads(folder.read(f"{STAGE}/{MANIFEST}"))
-        if read["version"] != _VERSION:
+        if read["version"] not in (_EARLIER, _VERSION):
             raise ValueError(f"its version is not {_VERSION}")
         return tuple(_move(*move) for move in read["moves"])
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
@@ -194,7 +204,7 @@ def _read_manifest(folder: Folder) -> tuple[Move, ...]:
         ) from error
 
 
-def _move(path: str, before: str | None, after: str | None) -> Move:
+def _move(path: str, before: str | None, after: str | None, to: str = "") -> Move:
     for state in (before, after):
         if state is not None and not isinstance(state, str):
             raise ValueError(f"{state!r} is not the state of a path")
@@ -202,7 +212,13 @@ def _move(path: str, before: str | None, after: str | None) -> Move:
         raise ValueError(f"{path!r} is not a file of a keystore")
     if after and not _stays_inside(path, after):
         raise ValueError(f"the link {path!r} would lead out of the keystore, to {after!r}")
-    return Move(path, before, after)
+    if to and not (_OF_ENCLAVE.fullmatch(path) and after is None and _MOVED.fullmatch(to)):
+        raise ValueError(f"the folder of {path!r} would move to {to!r}")
+    return Move(path, before, after, to)
+
+
+_OF_ENCLAVE = re.compile(rf"{ENCLAVES}/.+/{re.escape(CERTIFICATE_FILE)}")
+_MOVED = re.compile(rf"{REVOKED}/[0-9a-f]+")
 
 
 def _stays_inside(path: str, target: str) -> bool:

@@ -28,6 +28,7 @@ from typing import Self, TypeVar
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder, make_folders, remove_folders
 from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
     ENCLAVES,
     KEY_FILE,
     PRIVATE,
@@ -335,6 +336,18 @@ class Transaction:
             raise KeystoreError(f"'{self.root}/{path}' does not exist")
         self._begin_change(path, "remove")
         self._moves.append(Move(path, before, None))
+
+    def move_folder(self, folder: str, to: str, files: Sequence[str], links: Sequence[str]) -> None:
+        """Stage the move of an enclave's folder, with its ``files`` and without its ``links``.
+
+        The commit takes the certificate away, without which no node starts in the enclave; the rest
+        of the folder is moved once it is committed.
+        """
+        for name in files:
+            self._begin_change(f"{to}/{name}", "create")
+        for name in (*files, *links):
+            self._begin_change(f"{folder}/{name}", "remove")
+        self._moves.append(Move(f"{folder}/{CERTIFICATE_FILE}", "", None, to))
 
     def _prepare(self, path: str, after: str) -> str | None:
         """Record a change of ``path``, and return the path of its staged file in `_in`.
