@@ -659,26 +659,31 @@ def test_a_rotation_copies_no_file_from_outside(
     assert list((keystore / "retired").glob("*.key.pem"))
 
 
+@pytest.mark.parametrize("whole", [True, False])
 def test_revoking_copies_no_file_that_a_link_leads_to_meanwhile(
-    keystore: Path, outside: Path, monkeypatch: pytest.MonkeyPatch
+    whole: bool, keystore: Path, outside: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     key = keystore / "enclaves/a/key.pem"
     key.unlink()
     key.symlink_to(outside / "shadow")
+    if not whole:
+        (key.parent / "notes.txt").touch()  # then file by file is moved
     scandir = os.scandir
 
     def before(path: Path) -> Any:
         """Show the enclave's folder as it was a moment before: with files, and no link."""
         if path != key.parent:
             return scandir(path)
-        entries = [SimpleNamespace(name=e.name, is_symlink=lambda: False) for e in scandir(path)]
-        return nullcontext(entries)
+        mode = SimpleNamespace(st_mode=0o600)
+        file = {"is_symlink": lambda: False, "is_file": lambda: True, "stat": lambda: mode}
+        return nullcontext([SimpleNamespace(name=entry.name, **file) for entry in scandir(path)])
 
     with monkeypatch.context() as patched:
         patched.setattr(os, "scandir", before)
-        with pytest.raises(KeystoreError, match="is a link out of"):
+        with nullcontext() if whole else pytest.raises(KeystoreError, match="is a link out of"):
             revoke(keystore, ["/a"], now=NOW)
-    assert not (keystore / "revoked").exists()
+    assert (keystore / "revoked").exists() == whole
+    assert not list(keystore.glob("revoked/*/key.pem"))
 
 
 @pytest.mark.parametrize("file", ["key.pem", "identity_ca.cert.pem", "governance.p7s"])

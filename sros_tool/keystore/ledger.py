@@ -263,7 +263,8 @@ class _Files(NamedTuple):
 
     ``state`` is None without a ledger; ``lines`` is the content of the file, None if it is too long
     to keep in memory, or follows sealed parts.  ``ledger_index`` is None without an index that
-    fits.  ``part`` is the number of the last part, which is the file.
+    fits.  ``part`` is the number of the last part, which is the file; ``later`` is the name of a
+    later part, "" without one.
     """
 
     head: _Head | None
@@ -271,6 +272,7 @@ class _Files(NamedTuple):
     lines: bytes | None
     ledger_index: LedgerIndex | None = None
     part: int = 1
+    later: str = ""
 
 
 class LedgerFile:
@@ -389,8 +391,14 @@ class LedgerFile:
             return self._new_index(file)
 
     def last_part(self) -> tuple[int, int]:
-        """Return the number and the size, in bytes, of the part to which lines are added."""
+        """Return the number and the size, in bytes, of the part to which lines are added.
+
+        Raises:
+            KeystoreError: there is a later part.
+        """
         files = self._opened()
+        if files.later:
+            raise _later_part(self.root, files.later)
         return files.part, files.state.st_size if files.state else 0
 
     def content(self) -> Iterator[bytes]:
@@ -442,19 +450,26 @@ class LedgerFile:
         return may_restore
 
     def _read(self) -> _Files:
+        files = self._read_once()
+        while files.later and not self._is_still(files):  # another process has just sealed a part
+            files = self._read_once()
+        return files
+
+    def _read_once(self) -> _Files:
         head = self._read_head(self._read_first)
         self._read_first = read_bytes
         file = _open(self.root, self._follow_link)
         if file is None:
-            return _Files(head, None, b"")
+            return _Files(head, None, b"", later=_later_than(self.root, 0))
         with file:
             state = os.fstat(file.fileno())
             before = _sealed_before(file)
             part = before.number + 1 if before else 1
+            later = _later_than(self.root, part, state)
             if head and (index := self._index(file, head)):
-                return _Files(head, state, None, index, part)
+                return _Files(head, state, None, index, part, later)
             kept = state.st_size <= _MOST_KEPT and not before
-            return _Files(head, state, file.read() if kept else None, part=part)
+            return _Files(head, state, file.read() if kept else None, None, part, later)
 
     def _index(self, file: BinaryIO, head: _Head) -> LedgerIndex | None:
         """Return the index that the head states; None without one for a ledger with this end.
@@ -610,6 +625,9 @@ class LedgerFile:
         entries, numbers, faults = read.entries, read.numbers, [*read.faults]
         if fault := _head_fault(files.head, read.lines, read.signed, chained=read.chained):
             faults.append(fault)
+        if files.later:
+            text = f"{files.later} is a later part of it, so an earlier ledger was put back"
+            faults.append(_Fault(read.lines, text))
         recorded = [_Fault(entry.number, entry.reason) for entry in entries if entry.what == GAP]
         gaps = (at for at, entry in zip(numbers, entries, strict=True) if entry.what == GAP)
         last_recorded = max(gaps, default=0)
@@ -648,9 +666,27 @@ def _not_as_sealed(root: Path, sealed: Entry) -> KeystoreError:
     )
 
 
-def _later_part(root: Path, number: int) -> KeystoreError:
+def _later_than(root: Path, part: int, last: os.stat_result | None = None) -> str:
+    """Return the name of a later part of the ledger than the ``last`` one; "" without one.
+
+    ``part`` is the number of the last part, which may have another name, or be a copy of its file.
+    """
+    if not root.exists():
+        return ""
+    for name in sorted(filter(SEALED_LEDGER.fullmatch, os.listdir(root)), reverse=True):
+        number = int(name.split(".")[1])
+        with suppress(OSError):  # a link of a transaction that is not committed yet
+            state = (root / name).stat()
+            is_last = last and os.path.samestat(state, last)
+            is_longer = number == part and last and state.st_size > last.st_size
+            if (number > part and not is_last) or is_longer:
+                return name
+    return ""
+
+
+def _later_part(root: Path, name: str) -> KeystoreError:
     return KeystoreError(
-        f"'{root / ledger_part(number)}' is a later part of the ledger than {LEDGER}",
+        f"'{root / name}' is a later part of the ledger than {LEDGER}",
         "An earlier ledger was put back, which lacks what the keystore issued and revoked since.",
         f"Restore {LEDGER}, its parts and {LEDGER_HEAD} from the latest backup; or, if they are "
         "lost, move the later parts to an archive.",
@@ -975,7 +1011,8 @@ def append(
     links = _Links(chain(gaps, entries), present.previous, index)
     number, size = file.last_part()
     seals = index is not None and size + _LINE_BYTES * len(entries) >= _SEALED_FROM
-    is_part = seals or SEALED_LEDGER.fullmatch(transaction.target_after(LEDGER) or "")
+    named = transaction.target_after(LEDGER) or ""
+    is_part = seals or SEALED_LEDGER.fullmatch(named)
     digest = hashlib.sha256()
 
     def content() -> Iterator[bytes]:
@@ -983,9 +1020,9 @@ def append(
             digest.update(block)
             yield block
 
-    if os.path.lexists(transaction.root / ledger_part(number + 1)):
-        raise _later_part(transaction.root, number + 1)
     transaction.write_parts(ledger_part(number) if is_part else LEDGER, content())
+    if SEALED_LEDGER.fullmatch(named) and named != ledger_part(number):
+        transaction.remove(named)  # somebody renamed the last part
     for _ in links:  # of a dry run, which writes nothing
         pass
     if index and seals:
@@ -993,7 +1030,7 @@ def append(
         links.add(Entry(iso(now), SEALED, sha256=digest.hexdigest(), number=number))
         number += 1
         transaction.write_parts(ledger_part(number), links)
-    if is_part and transaction.target_after(LEDGER) != ledger_part(number):
+    if is_part and named != ledger_part(number):
         transaction.link(LEDGER, ledger_part(number))
     lines = present.ledger.lines + links.count
     head = f"lines {lines}\nsha256 {links.previous}\n"

@@ -239,11 +239,17 @@ def test_a_copy_without_the_link_goes_on(root: Path, tmp_path: Path) -> None:
     copied = Path(shutil.copytree(root, tmp_path / "copied", symlinks=True))
     (copied / LEDGER).unlink()
     shutil.copy(copied / ledger_part(3), copied / LEDGER)
+    before = (copied / LEDGER_HEAD).read_bytes()
     check_answers(copied)
     renew(copied, ["/a"], now=NOW)
     assert not (copied / LEDGER).is_symlink()
     check_answers(copied)
     assert Keystore(copied).ledger.gaps == ()
+    # The copy is put back as it was, next to the part that it became.
+    (copied / LEDGER).replace(copied / ledger_part(3))
+    shutil.copy(root / ledger_part(3), copied / LEDGER)
+    (copied / LEDGER_HEAD).write_bytes(before)
+    assert f"{ledger_part(3)} is a later part" in str(Keystore(copied).ledger.gaps)
 
 
 def test_a_link_elsewhere_is_not_followed(root: Path, tmp_path: Path) -> None:
@@ -299,14 +305,21 @@ def test_what_an_earlier_ledger_lacks_is_not_forgotten(
     revoke(root, ["/c"], now=NOW)
     assert len(parts(root)) == 5
     put_ledger_back(root, earlier)
-    before = snapshot(root)
-    for sealed_from in (1, 1 << 30):
-        monkeypatch.setattr(ledger_module, "_SEALED_FROM", sealed_from)
-        with pytest.raises(KeystoreError, match=f"{ledger_part(4)}' is a later part"):
-            create_enclaves(root, ["/d"], now=NOW)
-    assert snapshot(root) == before
-    for number in (4, 5):
-        (root / ledger_part(number)).unlink()
+    for later in (5, 4):
+        before = snapshot(root)
+        for sealed_from in (1, 1 << 30):
+            monkeypatch.setattr(ledger_module, "_SEALED_FROM", sealed_from)
+            with pytest.raises(KeystoreError, match=f"{ledger_part(later)}' is a later part"):
+                create_enclaves(root, ["/d"], now=NOW)
+        assert snapshot(root) == before
+        damaged = f"{ledger_part(later)} is a later part of it, so an earlier ledger was put back"
+        asking = (CHECK, ("verify",), ("inspect",), ("inspect", "--history"))
+        for asked in asking:
+            found = sros(*asked, root)
+            assert (found.status, damaged in found.out) == (1, True), found
+        (root / ledger_part(later)).unlink()
+    sros(*CHECK, root).ok()
+    assert not [asked for asked in asking if "later part" in sros(*asked, root).out]
     create_enclaves(root, ["/d"], now=NOW)
 
 
