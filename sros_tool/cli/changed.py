@@ -5,7 +5,7 @@ The change itself goes to standard output, or what ``--json`` prints; all else t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.transaction.stage import Change
 
 _NAMES_SHOWN = 5
-_MAX_NAMES = 20
+MAX_NAMES = 20
 """Number of enclaves that a message names."""
 _CLOSED_SHOWN = 3
 
@@ -65,6 +65,20 @@ def print_changed(
             echo(line)
     _tell(told)
     print_follow_up(result, after, rights=rights, exported=exported, restart=restart)
+
+
+def enclave_lines(names: Sequence[str], text: str) -> Iterator[str]:
+    """Yield ``text`` for each enclave, or once for more than 20 of them, unless steps are logged.
+
+    ``text`` has the words ``enclave {}``.
+    """
+    import logging
+
+    if len(names) <= MAX_NAMES or logging.getLogger("sros_tool").isEnabledFor(logging.INFO):
+        yield from map(text.format, names)
+    else:
+        several = text.replace("enclave {}", counted(len(names), "enclave"))
+        yield f"{several}: {shown_names(names)} (-v lists all)"
 
 
 def print_follow_up(
@@ -153,9 +167,9 @@ def _print_restart(
         return
     number = counted(len(names), "enclave")
     text = f"restart the processes of {number} for it to take effect: "
-    text += first_few(names, _MAX_NAMES)
+    text += first_few(names, MAX_NAMES)
     if zenoh and zenoh.files and set(zenoh.restart) != set(names):
-        text += f"; of those on Zenoh: {first_few(zenoh.restart, _MAX_NAMES) or 'none'}"
+        text += f"; of those on Zenoh: {first_few(zenoh.restart, MAX_NAMES) or 'none'}"
     if exported and (published := publish_command(root)):
         text += f"; robots that fetch: {published} first"
     again = "; where they run from an export, export them again first" if exported else ""

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sros_tool.cli.changed import json_form, print_changed, rights_lines, shown_names
+from sros_tool.cli.changed import (
+    MAX_NAMES,
+    enclave_lines,
+    json_form,
+    print_changed,
+    rights_lines,
+    shown_names,
+)
 from sros_tool.cli.common import (
     PATH,
     SeveralValues,
@@ -315,7 +322,7 @@ def _created_lines(result: Creation) -> Iterator[str]:
         (again, "signed the permissions of enclave {} again, with the same rights"),
         (result.completed, "completed enclave {}"),
     ):
-        yield from map(text.format, names)
+        yield from enclave_lines(names, text)
 
 
 def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
@@ -323,12 +330,9 @@ def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
     from sros_tool.keystore.fleet import publish_command
     from sros_tool.keystore.layout import FLEET
 
-    if len(result.created) > _MANY_CREATED and not (as_json or result.dry_run):
+    if len(result.created) > MAX_NAMES and not (as_json or result.dry_run):
         whose = "--robot NAME" if (result.root / FLEET).exists() else "ENCLAVE..."
-        yield (
-            f"created {len(result.created)} enclaves; to send them: `sros distribute_key "
-            f"{quote(str(result.root))} {whose} FOLDER`"
-        )
+        yield f"to send them: `sros distribute_key {quote(str(result.root))} {whose} FOLDER`"
     published = "" if as_json or result.dry_run else publish_command(result.root)
     if published and (result.changed or result.completed):
         yield f"robots that fetch get the change by {published}"
@@ -907,4 +911,3 @@ def _replaced_lines(update: KeystoreUpdate) -> Iterator[str]:
 
 
 _NAMES_SHOWN = 5
-_MANY_CREATED = 20

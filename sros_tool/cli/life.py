@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sros_tool.cli.changed import json_form, print_changed, print_follow_up, print_plan
+from sros_tool.cli.changed import (
+    enclave_lines,
+    json_form,
+    print_changed,
+    print_follow_up,
+    print_plan,
+)
 from sros_tool.cli.common import (
     PATH,
     allow_refusal_option,
@@ -120,7 +126,7 @@ def renew(
     print_changed(
         result,
         json_form(result, "RenewedEnclaves") if as_json else None,
-        (f"renewed enclave {name}" for name in result.outcomes),
+        enclave_lines(tuple(result.outcomes), "renewed enclave {}"),
         told=_replaced_lines(result),
     )
 
@@ -233,7 +239,7 @@ def revoke(
 
         enclaves = list(map(RevokedEnclave, result.outcomes))
         shown = json_form(result, "RevokedEnclaves", enclaves=enclaves)
-    print_changed(result, shown, (f"revoked enclave {name}" for name in result.outcomes))
+    print_changed(result, shown, enclave_lines(tuple(result.outcomes), "revoked enclave {}"))
 
 
 @verb("crl")

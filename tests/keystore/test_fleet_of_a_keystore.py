@@ -14,6 +14,7 @@ import pytest
 from sros_tool.fleet import enclaves
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.fleet import left_enclaves
+from sros_tool.keystore.layout import list_enclaves
 from tests.support.harness import Ended, policy_text, publish, snapshot, sros
 
 FLEET = "[robots]\na = {}\na_arm = {}\n"
@@ -179,13 +180,21 @@ def test_a_request_for_robots_that_the_keystore_does_not_know(made: Path, tmp_pa
     assert "its fleet does not have the robot of enclave /new" in ended.err, ended
 
 
-def test_many_new_enclaves_are_counted_with_the_next_step(tmp_path: Path) -> None:
-    """What to do next is not lost behind a line for each of them."""
+def test_many_enclaves_are_counted_with_the_next_step(tmp_path: Path) -> None:
+    """What to do next is not lost behind a line for each of them; -v and JSON have them all."""
     (tmp_path / "fleet.toml").write_text("".join(f"[robots.r{n}]\n" for n in range(21)))
     (tmp_path / "policy.xml").write_text(policy_text({"/{robot}": publish("x")}))
     root = tmp_path / "ks"
     words = ("-p", tmp_path / "policy.xml", "--fleet", tmp_path / "fleet.toml")
     ended = sros("generate_artifacts", "-k", root, *words).ok()
-    assert ended.out.count("created enclave ") == 21
-    said = f"created 21 enclaves; to send them: `sros distribute_key {root} --robot NAME FOLDER`"
-    assert said in ended.err
+    some = "/r0, /r1, /r10, /r11, /r12 and 16 more (-v lists all)"
+    assert ended.out.endswith(f"\ncreated 21 enclaves: {some}\n")
+    assert f"to send them: `sros distribute_key {root} --robot NAME FOLDER`" in ended.err
+    assert sros("renew", root, "--all").ok().out == f"renewed 21 enclaves: {some}\n"
+    every = [f"renewed enclave {name}" for name in list_enclaves(root)]
+    assert sros("renew", root, "--all", "-v").ok().out.splitlines() == every
+    assert len(json.loads(sros("renew", root, "--all", "--json").ok().out)["enclaves"]) == 21
+    assert sros("revoke", root, "/r0").ok().out == "revoked enclave /r0\n"
+    left = "/r1, /r10, /r11, /r12, /r13 and 16 more (-v lists all)"
+    sros("create_enclave", root, "/spare").ok()
+    assert sros("revoke", root, "--all").ok().out == f"revoked 21 enclaves: {left}\n"
