@@ -7,8 +7,6 @@ those that nginx counted.
 from __future__ import annotations
 
 import os
-import re
-import shutil
 import subprocess
 import time
 from collections.abc import Iterator
@@ -26,25 +24,12 @@ from sros_tool.agent.settings import read_settings
 from sros_tool.cli.program import program
 from sros_tool.keystore.issuing.keyring import no_secrets
 from sros_tool.runtime.processes import RunningProcesses
+from tests.support.nginx import certify_server, nginx_of_page
 
 _PORT = 18443
-_PAGE = Path(__file__).parents[1] / "docs/fetching.md"
-_AROUND = """
-daemon off;
-pid {folder}/nginx.pid;
-error_log {folder}/error.log;
-{user}
-events {{ worker_connections 4000; }}
-http {{
-    log_format sizes '$request_method $request_length $bytes_sent';
-    access_log {folder}/access.log sizes;
-    proxy_temp_path {folder}/t1;
-    fastcgi_temp_path {folder}/t2;
-    uwsgi_temp_path {folder}/t3;
-    scgi_temp_path {folder}/t4;
-    include {folder}/fleet.conf;
-}}
-"""
+_LOG = """\
+log_format sizes '$request_method $request_length $bytes_sent';
+    access_log {folder}/access.log sizes;"""
 
 
 def fetching(folder: Path, robots: int, rules: int) -> Iterator[Figure]:
@@ -114,26 +99,12 @@ def _set_up(folder: Path, name: str) -> None:
 
 
 def _nginx(folder: Path) -> subprocess.Popen[bytes]:
-    etc, place = folder / "etc", folder / "nginx"
-    for needed in (etc, place, folder / "srv/inbox"):
-        needed.mkdir()
-    shutil.copy(folder / "keystore/public/identity_ca.cert.pem", etc)
-    subprocess.run(
-        [
-            *("openssl", "req", "-x509", "-newkey", "ec", "-nodes", "-subj", "/CN=home"),
-            *("-pkeyopt", "ec_paramgen_curve:prime256v1", "-addext", "subjectAltName=IP:127.0.0.1"),
-            *("-keyout", etc / "server.key.pem", "-out", etc / "server.cert.pem"),
-        ],
-        check=True,
-        capture_output=True,
-    )
-    (block,) = re.findall(r"```nginx\n(.*?)```", _PAGE.read_text(), re.DOTALL)
-    block = block.replace("/etc/nginx/fleet/", f"{etc}/").replace("/srv/fleet", f"{folder}/srv")
-    block = block.replace("listen 443", f"listen 127.0.0.1:{_PORT}")
-    user = "user root;" if os.geteuid() == 0 else ""
-    (place / "fleet.conf").write_text(block)
-    (place / "nginx.conf").write_text(_AROUND.format(folder=place, user=user))
-    return _Server(["/usr/sbin/nginx", "-c", str(place / "nginx.conf")])
+    (folder / "srv/inbox").mkdir()
+    certify_server(folder, folder / "keystore")
+    place = folder / "nginx"
+    log = _LOG.format(folder=place)
+    listen = f"127.0.0.1:{_PORT}"
+    return _Server(nginx_of_page(folder, place, listen=listen, log=log, main="daemon off;"))
 
 
 class _Server(subprocess.Popen[bytes]):

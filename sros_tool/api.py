@@ -87,6 +87,8 @@ def create_keystore(
     template: str | Template = "development",
     *,
     domains: int | str = 0,
+    identity_ca: AnyPath | None = None,
+    identity_key: str | None = None,
     encrypt_ca_keys: bool = False,
     short_passphrase: bool = False,
     secrets: Secrets | None = None,
@@ -99,6 +101,8 @@ def create_keystore(
         template: The keystore template: "development", "production", "sros2", the path of a TOML
             file, or a `Template` from `load_template`.
         domains: The ROS domain ids of the keystore, such as 0, "0,7" or "10-19".
+        identity_ca: The certificate (PEM) of an existing CA, which then is the identity CA.
+        identity_key: Its key: ``issuer:NAME`` for a CA service, ``pkcs11:...`` or ``file:PATH``.
         encrypt_ca_keys: Encrypt the CA keys with the passphrase that ``secrets`` returns.
         short_passphrase: Accept a passphrase of less than 12 characters, which is soon guessed.
         secrets: Called for the passphrase of a CA key, or the PIN of a token.
@@ -106,7 +110,7 @@ def create_keystore(
 
     Raises:
         KeystoreError: The folder holds a keystore or a part of one, or a CA key cannot be used.
-        DocumentError: The template does not exist, or is malformed.
+        DocumentError: The template or ``identity_ca`` does not exist, or is malformed.
         UsageError: ``domains`` are not domain ids, or the passphrase is too short.
 
     Example:
@@ -120,7 +124,8 @@ def create_keystore(
         template=load_template(template) if isinstance(template, str) else template,
         domains=DomainSet.parse(str(domains), "domains"),
         now=_moment(now),
-        keyring=_keyring(secrets, encrypt=encrypt_ca_keys, short=short_passphrase),
+        keyring=_keyring(secrets, identity_key, encrypt=encrypt_ca_keys, short=short_passphrase),
+        imported={} if identity_ca is None else {"identity": _content(identity_ca)},
     )
     return Keystore(result.root, result.notes)
 
@@ -344,6 +349,7 @@ def revoke(
     enclaves: Iterable[str],
     *,
     reason: str = "unspecified",
+    crl: AnyPath | None = None,
     secrets: Secrets | None = None,
     now: datetime | None = None,
     dry_run: bool = False,
@@ -357,6 +363,7 @@ def revoke(
         keystore: The keystore, or its path.
         enclaves: The names of the enclaves.
         reason: Why, as RFC 5280 names reasons: ``keyCompromise``, ``cessationOfOperation``, ...
+        crl: The revocation list (PEM) of a CA service, which alone can sign it.
         secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
         now: The time of the revocation; the current time by default.
         dry_run: Report the changes without making them.
@@ -366,7 +373,8 @@ def revoke(
         ``next_update`` (when the revocation list expires).
 
     Raises:
-        KeystoreError: An enclave does not exist, or the key of the identity CA is missing.
+        KeystoreError: An enclave does not exist, the key of the identity CA is missing, or ``crl``
+            is missing or does not revoke these enclaves.
         UsageError: No enclave is given, or ``reason`` is unknown.
 
     Example:
@@ -383,6 +391,7 @@ def revoke(
         names,
         now=_moment(now),
         reason=reason,
+        crl=b"" if crl is None else _content(crl),
         keyring=_keyring(secrets),
         dry_run=dry_run,
     )
@@ -730,10 +739,23 @@ def _policy(given: AnyPath | Policy) -> Policy:
     return read_policy(given) if isinstance(given, str | PathLike) else given
 
 
-def _keyring(secrets: Secrets | None, *, encrypt: bool = False, short: bool = False) -> Keyring:
-    from sros_tool.keystore.issuing.keyring import Keyring, no_secrets
+def _keyring(
+    secrets: Secrets | None,
+    identity_key: str | None = None,
+    *,
+    encrypt: bool = False,
+    short: bool = False,
+) -> Keyring:
+    from sros_tool.keystore.issuing.keyring import Keyring, absolute_place, no_secrets
 
-    return Keyring(secrets or no_secrets, encrypt=encrypt, short_passphrase=short)
+    places = {"identity": absolute_place(identity_key)} if identity_key else {}
+    return Keyring(secrets or no_secrets, places, encrypt, short)
+
+
+def _content(path: AnyPath) -> bytes:
+    from sros_tool.xml import read_bytes
+
+    return read_bytes(Path(path), "file")
 
 
 def _several(parameter: str, given: Iterable[Item]) -> Iterable[Item]:

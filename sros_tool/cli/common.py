@@ -732,25 +732,16 @@ def keyring(
     The defaults are $SROS_IDENTITY_KEY and $SROS_PERMISSIONS_KEY. ``encrypt`` protects new keys
     with a passphrase, which may be short with $SROS_SHORT_PASSPHRASE.
     """
-    from sros_tool.keystore.issuing.keyring import Keyring
+    from sros_tool.keystore.issuing.keyring import Keyring, absolute_place
 
     given = {"identity": identity, "permissions": permissions}
     places = {role: given[role] or os.environ.get(name, "") for role, name in _KEY_PLACES.items()}
     return Keyring(
         _Secrets(encrypt),
-        {role: _absolute(place) for role, place in places.items() if place},
+        {role: absolute_place(place) for role, place in places.items() if place},
         encrypt,
         bool(os.environ.get("SROS_SHORT_PASSPHRASE")),
     )
-
-
-def _absolute(place: str) -> str:
-    from sros_tool.keystore.issuing.ca_service import is_ca_service
-    from sros_tool.pki.token import is_token_uri
-
-    if is_token_uri(place) or is_ca_service(place):
-        return place
-    return f"file:{Path(place.removeprefix('file:')).absolute()}"
 
 
 def secrets() -> Callable[[str], str]:

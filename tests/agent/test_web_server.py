@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import http.client
-import os
-import re
 import shutil
 import socket
 import ssl
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,25 +20,9 @@ from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.keystore.confirmation import MAX_BYTES, MESSAGE_FILE
 from tests.support.harness import policy_text, publish, sros
 from tests.support.messages import said_by, signed_message
+from tests.support.nginx import NGINX, certify_server, nginx_of_page
 
-NGINX = "/usr/sbin/nginx"
-PAGE = Path(__file__).parents[2] / "docs/fetching.md"
 pytestmark = pytest.mark.skipif(not Path(NGINX).exists(), reason="nginx is needed")
-
-_AROUND = """
-pid {folder}/nginx.pid;
-error_log {folder}/error.log;
-{user}
-events {{}}
-http {{
-    access_log off;
-    proxy_temp_path {folder}/t1;
-    fastcgi_temp_path {folder}/t2;
-    uwsgi_temp_path {folder}/t3;
-    scgi_temp_path {folder}/t4;
-    include {folder}/fleet.conf;
-}}
-"""
 
 
 @dataclass
@@ -51,6 +33,7 @@ class Server:
     run: Path
     """Folder of the configuration and the process of nginx."""
     port: int = 0
+    command: Sequence[str] = ()
 
     @property
     def address(self) -> str:
@@ -94,27 +77,16 @@ class Server:
 
     def start(self, *, with_list: bool = False) -> None:
         """Start nginx as the page says, with the paths and a free port of this machine."""
-        (block,) = re.findall(r"```nginx\n(.*?)```", PAGE.read_text(), re.DOTALL)
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
-        text = block.replace("/etc/nginx/fleet/", f"{self.folder}/etc/")
-        text = text.replace("/srv/fleet", str(self.folder / "srv"))
-        text = text.replace("listen 443", f"listen 127.0.0.1:{self.port}")
-        if with_list:
-            text = text.replace("#ssl_crl", "ssl_crl")
-        self.run.mkdir()
-        (self.run / "fleet.conf").write_text(text)
-        user = "user root;" if os.geteuid() == 0 else ""
-        (self.run / "nginx.conf").write_text(_AROUND.format(folder=self.run, user=user))
-        assert self._nginx() == 0, (self.run / "error.log").read_text()
+        listen = f"127.0.0.1:{self.port}"
+        self.command = nginx_of_page(self.folder, self.run, listen=listen, with_list=with_list)
+        ended = subprocess.run(self.command, capture_output=True, check=False)
+        assert ended.returncode == 0, (self.run / "error.log").read_text()
 
     def stop(self) -> None:
-        self._nginx("-s", "stop")
-
-    def _nginx(self, *words: str) -> int:
-        command = [NGINX, "-p", str(self.run), "-c", str(self.run / "nginx.conf"), *words]
-        return subprocess.run(command, capture_output=True, check=False).returncode
+        subprocess.run([*self.command, "-s", "stop"], capture_output=True, check=False)
 
 
 @pytest.fixture(scope="module")
@@ -131,17 +103,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     ):
         sros(*line.split(), cwd=folder).ok()
     (folder / "srv/inbox").mkdir()
-    (folder / "etc").mkdir()
-    shutil.copy(folder / "ks/public/identity_ca.cert.pem", folder / "etc")
-    subprocess.run(
-        [
-            *("openssl", "req", "-x509", "-newkey", "ec", "-nodes", "-subj", "/CN=home"),
-            *("-pkeyopt", "ec_paramgen_curve:prime256v1", "-addext", "subjectAltName=IP:127.0.0.1"),
-            *("-keyout", folder / "etc/server.key.pem", "-out", folder / "etc/server.cert.pem"),
-        ],
-        check=True,
-        capture_output=True,
-    )
+    certify_server(folder, folder / "ks")
     made.start()
     yield made
     made.stop()

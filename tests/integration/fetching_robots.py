@@ -29,9 +29,8 @@ from sros_tool.runtime.netns import end_with_parent
 from tests.integration.robots import FAKETIME
 from tests.support.children import importing, run, wait_for
 from tests.support.harness import Ended, sros
+from tests.support.nginx import NGINX, certify_server, nginx_of_page
 
-NGINX = "/usr/sbin/nginx"
-PAGE = Path(__file__).parents[2] / "docs/fetching.md"
 MISSING = [
     program
     for program in (NGINX, "ip", "nft", "nsenter", "unshare")
@@ -52,21 +51,6 @@ unit='{folder}/units/'"${{2%.service}}"
 test -f "$unit.pid" && kill -9 "$(cat "$unit.pid")"
 setsid "$unit" </dev/null >>"$unit.log" 2>&1 &
 echo $! > "$unit.pid"
-"""
-
-_NGINX = """
-pid {folder}/nginx.pid;
-error_log {folder}/error.log;
-user root;
-events {{ worker_connections 2000; }}
-http {{
-    access_log off;
-    proxy_temp_path {folder}/t1;
-    fastcgi_temp_path {folder}/t2;
-    uwsgi_temp_path {folder}/t3;
-    scgi_temp_path {folder}/t4;
-    include {folder}/fleet.conf;
-}}
 """
 
 
@@ -198,6 +182,8 @@ class Home:
     robots: dict[str, Robot] = field(default_factory=dict)
     lies: list[str] = field(default_factory=list)
     """Robots that were called current and were not."""
+    server: Sequence[str] = ()
+    """The command of nginx."""
 
     def sros(self, *words: object) -> Ended:
         return sros(*words, cwd=self.folder)
@@ -250,8 +236,7 @@ class Home:
 
     def nginx(self, *words: str) -> None:
         """Run nginx in the network of home."""
-        configuration = self.folder / "nginx"
-        run([*self.network.enter, NGINX, "-c", configuration / "nginx.conf", *words])
+        run([*self.network.enter, *self.server, *words])
 
     network: Namespaces = field(init=False)
 
@@ -333,24 +318,8 @@ def _connect(home: Namespaces, street: Namespaces) -> None:
 
 def _serve(home: Home) -> None:
     """Start nginx as docs/fetching.md says, with the paths of this folder."""
-    etc = home.folder / "etc"
-    etc.mkdir()
-    shutil.copy(home.folder / "keystore/public/identity_ca.cert.pem", etc)
-    run(
-        [
-            *("openssl", "req", "-x509", "-newkey", "ec", "-nodes", "-subj", "/CN=home"),
-            *("-pkeyopt", "ec_paramgen_curve:prime256v1"),
-            *("-addext", f"subjectAltName=IP:{HOME_ADDRESS}"),
-            *("-keyout", etc / "server.key.pem", "-out", etc / "server.cert.pem"),
-        ]
-    )
-    (block,) = re.findall(r"```nginx\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    block = block.replace("/etc/nginx/fleet/", f"{etc}/")
-    block = block.replace("/srv/fleet", str(home.folder / "srv"))
-    configuration = home.folder / "nginx"
-    configuration.mkdir()
-    (configuration / "fleet.conf").write_text(block)
-    (configuration / "nginx.conf").write_text(_NGINX.format(folder=configuration))
+    certify_server(home.folder, home.folder / "keystore", HOME_ADDRESS)
+    home.server = nginx_of_page(home.folder, home.folder / "nginx")
     home.nginx()
 
 

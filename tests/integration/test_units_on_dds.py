@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.runtime.netns import try_isolation
 from sros_tool.runtime.units import Job, job_units, node_settings, node_template
+from tests.agent.test_fetch import Quiet, serving
 from tests.integration.converse import converse, listener, talker
 from tests.support.children import python, run
 from tests.support.harness import policy_text, publish, sros
@@ -115,7 +117,7 @@ def test_the_jobs_do_their_work_under_their_restrictions(robot: Path, tmp_path: 
     stated = ("-p", tmp_path / "robot.xml", "--fleet", tmp_path / "fleet.toml")
     sros("generate_artifacts", "-k", keystore, *stated).ok()
     ended = {Job.CHECK: 1, Job.FLEET: 1}  # no node starts with these rights; r1 confirmed nothing
-    # The guard never ends, and an agent works on a robot that fetches.
+    # The guard never ends, and the agent has a test of its own.
     for job in (each for each in Job if each not in (Job.GUARD, Job.AGENT)):
         files = job_units(job, str(keystore), user="root", sros="/bin/sros")
         (tmp_path / "job").write_text(files[f"sros-{job}.service"])
@@ -127,3 +129,45 @@ def test_the_jobs_do_their_work_under_their_restrictions(robot: Path, tmp_path: 
     assert (keystore / "enclaves/arm/cert.pem").read_bytes() != before
     assert "sros_enclaves{" in (metrics / "sros.prom").read_text()
     assert 'robot="r1"' in (metrics / "fleet.prom").read_text()
+
+
+@pytest.fixture
+def outside() -> Iterator[Path]:
+    """A folder on the file system that a unit cannot change; shared memory it can."""
+    with tempfile.TemporaryDirectory(dir="/var/tmp") as folder:
+        yield Path(folder)
+
+
+@sometimes("the agent under its restrictions")
+def test_the_agent_does_its_work_under_its_restrictions(tmp_path: Path, outside: Path) -> None:
+    """It fetches over the network, installs, and confirms; twin: nothing is left to write to."""
+    (tmp_path / "fleet.toml").write_text("[robots.r1]\n")
+    (tmp_path / "p.xml").write_text(policy_text({"/{robot}/a": publish("/a")}))
+    keystore, pub, robot, inbox = (tmp_path / "ks", tmp_path / "pub", outside / "r", outside / "i")
+    inbox.mkdir()
+    stated = ("-p", tmp_path / "p.xml", "--fleet", tmp_path / "fleet.toml")
+    sros("generate_artifacts", "-k", keystore, *stated).ok()
+    sros("distribute_key", keystore, "--robot", "r1", robot).ok()
+    sros("renew", keystore, "/r1/a").ok()
+    sros("fleet", "publish", keystore, pub).ok()
+    unit, place = tmp_path / "agent", robot / "enclaves/r1/a/cert.pem"
+    files = job_units(Job.AGENT, str(robot), user="root", sros="/bin/sros", writable=[str(inbox)])
+    unit.write_text(files["sros-agent.service"])
+    (line,) = re.findall("^ExecStart=/bin/sros (.*)$", unit.read_text(), re.M)
+    (writable,) = re.findall("^ReadWritePaths=(.*)$", unit.read_text(), re.M)
+    kept = [path.removeprefix("-") for path in writable.split()]
+    with serving(partial(Quiet, directory=str(pub))) as address:
+        sros(
+            *("agent", "init", robot, "--robot", "r1", "--root", pub / "metadata/1.root.json"),
+            *("--from", address, "--inbox", inbox),
+        ).ok()
+
+        def agent(*kept: str, status: int) -> None:
+            program = [sys.executable, "-m", "sros_tool", *line.split()]
+            run([sys.executable, CONFINED, unit, *kept, "--", *program], status=status)
+
+        agent(status=2)
+        assert place.read_bytes() != (keystore / "enclaves/r1/a/cert.pem").read_bytes()
+        agent(*kept, status=0)
+    assert place.read_bytes() == (keystore / "enclaves/r1/a/cert.pem").read_bytes()
+    assert sros("fleet", "collect", keystore, inbox).ok().out.startswith("1 robot: 1 kept")

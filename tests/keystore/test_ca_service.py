@@ -14,6 +14,7 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
+import sros_tool
 from sros_tool.api import check
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.delivery.signing import sign_request
@@ -266,6 +267,28 @@ def test_the_service_signs_the_revocation_list(site: Path) -> None:
     assert present and present.number == 6
     (ends,) = (found for found in check(site) if found.id == "keystore.revocation-list-ends")
     assert f"sros crl {site} --refresh --crl FILE" in ends.remedy
+
+
+def test_python_takes_a_service_and_the_list_that_it_signed(
+    tmp_path: Path, install: Install
+) -> None:
+    install(office(tmp_path))
+    made = sros_tool.create_keystore(
+        tmp_path / "site",
+        TEMPLATE,
+        identity_ca=tmp_path / "ca.pem",
+        identity_key="issuer:test",
+        now=now(),
+    )
+    sros_tool.create_enclaves(made, ["/talker", "/listener"])
+    first = certificate(made.path / "enclaves/talker/cert.pem")
+    assert first.issuer == CA.subject
+    with pytest.raises(sros_tool.KeystoreError, match="it alone signs revocation lists"):
+        sros_tool.revoke(made, ["/talker"])
+    with pytest.raises(sros_tool.DocumentError, match=r"none\.pem"):
+        sros_tool.revoke(made, ["/talker"], crl=tmp_path / "none.pem")
+    (tmp_path / "list.pem").write_bytes(listed(first.serial_number))
+    assert sros_tool.revoke(made, ["/talker"], crl=tmp_path / "list.pem").restart == ("/listener",)
 
 
 def test_what_a_service_cannot_do_is_refused(site: Path, tmp_path: Path) -> None:

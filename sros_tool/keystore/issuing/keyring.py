@@ -244,6 +244,13 @@ class Keyring:
         return lambda: self.secrets(f"the passphrase of the {role} CA key")
 
 
+def absolute_place(place: str) -> str:
+    """Return the place of a key as a URI, also where it is the path of a file."""
+    if is_token_uri(place) or is_ca_service(place):
+        return place
+    return f"file:{Path(place.removeprefix('file:')).absolute()}"
+
+
 def _refuse_ca_service(role: str, place: str) -> None:
     if is_ca_service(place):
         raise KeystoreError(
