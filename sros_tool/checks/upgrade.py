@@ -81,11 +81,11 @@ ZENOH = FindingKind(
 VULNERABILITIES = FindingKind(
     "upgrade.vulnerabilities",
     NOTE,
-    "known vulnerabilities that the update mends or brings",
+    "known vulnerabilities that the update fixes or brings",
     "The latest releases that both distributions ship are compared; `sros check runtime` looks at "
     "the libraries that processes have loaded.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
-    "Take new ones into account before the update. Those that no release mends stay: keep others "
+    "Take new ones into account before the update. Those that no release fixes stay: keep others "
     "out of the network.",
     prominent=True,
 )

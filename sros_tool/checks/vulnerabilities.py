@@ -25,14 +25,14 @@ KNOWN_VULNERABILITIES = FindingKind(
     "Some end a process by one packet of anybody on the network, also of a secured robot; the "
     "version that counts is that of the library which a process has loaded.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
-    "Upgrade the package of the library to a release with the mends, and restart the processes. "
-    "Vulnerabilities that no release mends stay: keep others out of the network.",
+    "Upgrade the package of the library to a release with the fixes, and restart the processes. "
+    "Vulnerabilities that no release fixes stay: keep others out of the network.",
 )
 PACKAGE_VULNERABILITIES = FindingKind(
     "runtime.package-vulnerabilities",
     NOTE,
-    "a DDS with known vulnerabilities, unless its package mends them",
-    "Packages of Debian and Ubuntu carry mends of later releases under the version of an earlier "
+    "a DDS with known vulnerabilities, unless its package fixes them",
+    "Packages of Debian and Ubuntu carry fixes of later releases under the version of an earlier "
     "one, so the version of the library does not tell.",
     "Advisories in the OSV format; Debian's changelog of fastdds 2.9.1+ds-1+deb12u2, which names "
     "eight numbers of 2023.",
@@ -45,7 +45,7 @@ UNCLEAR_VULNERABILITIES = FindingKind(
     NOTE,
     "a DDS without known vulnerabilities, of which some advisories say nothing",
     "The history of a release line that does not name a vulnerability does not show whether the "
-    "line is not affected or not mended.",
+    "line is not affected or not fixed.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
     "Look the numbers up in the advisories of the product.",
 )
@@ -183,7 +183,7 @@ def vulnerability_metrics(
         Metric(
             "sros_dds_known_vulnerabilities",
             "Number of known vulnerabilities of each DDS release that processes have loaded, "
-            "without regard to mends of a package.",
+            "without regard to fixes of a package.",
             tuple(
                 Sample(number, {"product": product, "version": version})
                 for (product, version), number in sorted(numbers.items())
@@ -217,13 +217,13 @@ def _described(known: Sequence[Advisory], version: str) -> str:
     numbers = version_numbers(version)
     major = numbers[0] if numbers else ""
     releases = Counter(advisory.mended_in(numbers) if numbers else "" for advisory in known)
-    mends = [
+    fixes = [
         f"{number} in {release}" if release else f"{number} in no known release {major}.x"
         for release, number in sorted(releases.items(), reverse=True)
     ]
     ids = ", ".join(advisory.id for advisory in known)
     count = counted(len(known), "known vulnerability", "known vulnerabilities")
-    return f"{count} ({'; '.join(needs)}), mended: {', '.join(mends)}: {ids}"
+    return f"{count} ({'; '.join(needs)}), fixed: {', '.join(fixes)}: {ids}"
 
 
 def _unclear(advisories: Sequence[Advisory]) -> str:
@@ -245,5 +245,5 @@ def _remedy(kind: FindingKind, library: MappedLibrary) -> str:
         package = "fastrtps" if distribution in _FASTRTPS else "fastdds"
     return (
         f"Upgrade the package ros-{distribution}-{package}, and restart the processes. "
-        "Vulnerabilities that no release mends stay: keep others out of the network."
+        "Vulnerabilities that no release fixes stay: keep others out of the network."
     )

@@ -166,7 +166,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
     for proof in closed.proofs:
         echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}")
     if closed.problems:
-        echo(f"nothing {'was closed' if applies else 'is closed yet'}; mend this first:")
+        echo(f"nothing {'was closed' if applies else 'is closed yet'}; fix this first:")
         for problem in closed.problems:
             echo(f"  {problem}")
         echo(f"next: sros close {folder}{' --apply' if applies else ''}", err=True)

@@ -478,7 +478,7 @@ class ComparedFleet(NamedTuple):
     status: FleetStatus
     outdated_dds: Sequence[str]
     """Robots with a DDS that has known vulnerabilities which a later release of the same major
-    version mends, sorted by name; if there are any, the exit status is 1."""
+    version fixes, sorted by name; if there are any, the exit status is 1."""
     findings: Sequence[Finding]
     """Findings on known vulnerabilities of the robots' DDS, as those of ``sros check runtime``."""
 
@@ -533,7 +533,7 @@ def _status(
 
     The exit status is 0 if every robot that is not revoked confirmed that it has what an export
     would give it now, and no restart that is due, and 1 if not, or if a robot has a DDS with known
-    vulnerabilities that a later release of the same major version mends.
+    vulnerabilities that a later release of the same major version fixes.
     """
     from sros_tool.checks.vulnerabilities import is_mended_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status

@@ -640,7 +640,7 @@ class UsedLibrary(NamedTuple):
     version: str
     """Version of the DDS in three numbers; empty if the name of the library does not show it."""
     packaged: bool
-    """Whether a package of Debian or Ubuntu has the library, which can carry mends of later
+    """Whether a package of Debian or Ubuntu has the library, which can carry fixes of later
     releases."""
     vulnerabilities: Sequence[str] | None
     """Ids of the known vulnerabilities of this version; null if they are not known."""
@@ -658,7 +658,7 @@ class UsedLibrary(NamedTuple):
             return f"{name} has no known vulnerability{unclear}."
         number = counted(len(self.vulnerabilities), "known vulnerability", "known vulnerabilities")
         ids = first_few(self.vulnerabilities, most)
-        unless = ", unless its package mends them" if self.packaged else ""
+        unless = ", unless its package fixes them" if self.packaged else ""
         return f"{name} has {number}{unless}: {ids}{unclear}."
 
 

@@ -187,8 +187,8 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
             return _filled(text, root, enclave, file)
         if fault:
             return _filled(fault.remedy_in_export(file), "KEYSTORE", enclave, file)
-        mended = _filled(text, "KEYSTORE", enclave, file)
-        return f"In the {AT_HOME}: {mended} Then export the enclave again."
+        remedy = _filled(text, "KEYSTORE", enclave, file)
+        return f"In the {AT_HOME}: {remedy} Then export the enclave again."
     if keystore and fault:
         wrong_issuer = fault is Fault.CERTIFICATE_ISSUER
         if wrong_issuer and _is_own_copy(keystore, enclave, IDENTITY_CA_FILE):

@@ -890,7 +890,7 @@ def _dds_metrics(
     yield Metric(
         "sros_fleet_dds_known_vulnerabilities",
         "Number of known vulnerabilities of each DDS release of a robot, in a process or only "
-        "installed, without regard to mends of a package.",
+        "installed, without regard to fixes of a package.",
         tuple(numbers),
     )
     yield Metric(

@@ -307,7 +307,7 @@ def _vulnerabilities(
         unclear = {advisory.id for advisory in known[1].unclear} if known[1] else set()
         parts = [f"{len(old & new)} stay"] if old & new else []
         for ids, what in (
-            (old - new - unclear, "mended"),
+            (old - new - unclear, "fixed"),
             (old & unclear, f"not known for {releases[1].latest}"),
             (new - old, "new"),
         ):

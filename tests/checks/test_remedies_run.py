@@ -214,8 +214,8 @@ def test_what_starts_with_the_variables_of_a_remedy_is_mended(
         if words[0] in STARTS:
             given = {**state.environment, **dict(variables(words[0], ended.out))}
             started = replace(node, environment=given)
-            mended = replace(state, environment=given)
-            again = runtime_cases.with_processes(mended, started, sound.running.processes[1])
+            fixed = replace(state, environment=given)
+            again = runtime_cases.with_processes(fixed, started, sound.running.processes[1])
             assert kind not in {each.id for each in found_in(again)}, words
 
 

@@ -58,9 +58,9 @@ def test_a_mended_release_has_no_known_vulnerability() -> None:
     assert finding.text.endswith("Not known for this release: CVE-2024-30258, CVE-2024-30259")
     (finding,) = vulnerability_findings(running(library._replace(version="3.2.4")))
     assert finding.id == "runtime.known-vulnerabilities"
-    mended = MappedLibrary("Cyclone DDS", "11.0.1", "/opt/ros/lyrical/lib/libddsc.so.11.0.1")
-    assert not list(vulnerability_findings(running(mended)))
-    assert list(vulnerability_findings(running(mended._replace(version="0.10.5"))))
+    fixed = MappedLibrary("Cyclone DDS", "11.0.1", "/opt/ros/lyrical/lib/libddsc.so.11.0.1")
+    assert not list(vulnerability_findings(running(fixed)))
+    assert list(vulnerability_findings(running(fixed._replace(version="0.10.5"))))
 
 
 def test_a_path_names_no_package_that_is_none() -> None:

@@ -198,7 +198,7 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert "/listener subscribe topic /chatter (/listener)" in ended.out
     again = robot.close("--for", "1s", status=1)
     assert policy.read_text() == changed
-    assert "nothing is closed yet; mend this first:\n  'robot/policy.xml' stays as it " in again.out
+    assert "nothing is closed yet; fix this first:\n  'robot/policy.xml' stays as it " in again.out
     assert "lacks 1 right seen now; if they are right, add them: sros gener" in again.out
     robot.remaining = (TALKER, ros_node("listener", "04"))
     said = robot.close("--apply").out

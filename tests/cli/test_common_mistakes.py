@@ -1,4 +1,4 @@
-"""The commonest mistakes of beginners: the answer is short, and mends the mistake."""
+"""The commonest mistakes of beginners: the answer is short, and fixes the mistake."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def words(text: str) -> int:
     return sum(len(line.split()) for line in text.splitlines() if not line.strip().startswith("<"))
 
 
-def mend(text: str, folder: Path) -> None:
+def fix(text: str, folder: Path) -> None:
     """Do what the answer says: save its XML as allow.xml, and run its commands."""
     if "allow.xml" in text:
         xml = [line.strip() for line in text.splitlines() if line.strip().startswith("<")]
@@ -82,7 +82,7 @@ def test_a_mistake_is_mended_by_the_commands_of_its_answer(
     line: str, mistake: Callable[[Path], None], folder: Path
 ) -> None:
     mistake(folder)
-    mend(answer(folder, line), folder)
+    fix(answer(folder, line), folder)
     sros(*shlex.split(line), cwd=folder).ok()
 
 
@@ -109,7 +109,7 @@ def test_nodes_without_the_common_part_get_it(folder: Path) -> None:
     policy = folder / "six.xml"
     policy.write_text(policy_text({f"/{name}": publish("/x") for name in "abcdef"}))
     text = answer(folder, "check policy six.xml --severity error")
-    mend(text, folder)
+    fix(text, folder)
     assert INCLUDE in text
     policy.write_text(with_common(policy.read_text()))
     sros("check", "policy", "six.xml", "--severity", "error", cwd=folder).ok()

@@ -70,7 +70,7 @@ def test_nothing_is_copied_over_a_file_that_differs(tmp_path: Path) -> None:
 # ── one paragraph ──────────────────────────────────────────────────────────────────────────
 
 
-def mended(policy: Path, said: str) -> None:
+def fixed(policy: Path, said: str) -> None:
     """Do what the paragraph says: its command, and its line in every profile."""
     (include,) = set(re.findall(r"<xi:include [^>]*/>", " ".join(said.split())))
     for command in re.findall("`(sros .+?)`", " ".join(said.split())):
@@ -95,7 +95,7 @@ def test_nodes_without_the_common_part_are_one_paragraph_with_one_mend(tmp_path:
     assert sorted(cause["findings"]) == list(range(24))
     markdown = sros("check", "robot.xml", "--format", "markdown", cwd=tmp_path).out
     assert markdown.count("**error**") == 1
-    mended(policy, ended.out)
+    fixed(policy, ended.out)
     assert sros("check", "--strict", "robot.xml", cwd=tmp_path).ok().out == ""
 
 
@@ -115,7 +115,7 @@ def test_nodes_that_lack_less_are_counted(tmp_path: Path) -> None:
     said = " ".join(sros("check", "robot.xml", cwd=tmp_path).out.split())
     assert "publish /rosout (1 nodes)" not in said
     assert "publish /rosout (1 node)" in said
-    mended(policy, said)
+    fixed(policy, said)
     sros("check", "robot.xml", cwd=tmp_path).ok()
 
 
@@ -141,7 +141,7 @@ def test_a_policy_that_cannot_work_is_said_when_it_is_signed(tmp_path: Path, dry
         document = json.loads(sros(*words, "--json", *planned, cwd=tmp_path).ok().out)
         notes = [each["text"] for each in document["notes"] if each["id"].startswith("policy.")]
         assert len(notes) == 1 and "2 nodes lack the common part" in notes[0]
-    mended(tmp_path / "robot.xml", ended.err)
+    fixed(tmp_path / "robot.xml", ended.err)
     for words in signing("robot.xml"):
         assert "lack" not in sros(*words, *planned, cwd=tmp_path).ok().err
 
@@ -192,7 +192,7 @@ def test_a_keystore_is_checked_with_its_policy_and_without(tmp_path: Path) -> No
         assert len(both.out.splitlines()) <= 10
     one = sros("check", "ks/enclaves/arm", "--policy", "robot.xml", cwd=tmp_path)
     assert "a node lacks the common part" in one.out
-    mended(policy, both.out)
+    fixed(policy, both.out)
     sros(*sign, cwd=tmp_path).ok()
     sros("check", "ks", cwd=tmp_path).ok()
     sros("check", "ks", "--policy", "robot.xml", "--strict", cwd=tmp_path).ok()

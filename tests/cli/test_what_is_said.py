@@ -220,15 +220,15 @@ def test_a_revocation_list_names_the_enclaves(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "mend"),
+    ("wrong", "fix"),
     [
         (("services reply", "services publish"), "It has request=, reply=."),
         (('version="0.2.0"', 'version="0.3.0"'), 'write version="0.2.0"'),
     ],
 )
 def test_a_policy_that_cannot_be_read_says_how_to_mend_it(
-    wrong: tuple[str, str], mend: str, tmp_path: Path
+    wrong: tuple[str, str], fix: str, tmp_path: Path
 ) -> None:
     text = policy_text({"/a": '<services reply="ALLOW"><service>x</service></services>'})
     (tmp_path / "p.xml").write_text(text.replace(*wrong))
-    assert mend in sros("check", tmp_path / "p.xml").out
+    assert fix in sros("check", tmp_path / "p.xml").out

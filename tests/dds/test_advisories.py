@@ -85,7 +85,7 @@ def test_a_file_adds_advisories(tmp_path: Path) -> None:
     known = known_vulnerabilities("Fast DDS", "3.6.2", read_advisories(path))
     assert known is not None
     assert len(known.known) == NUMBERS["Fast DDS", "3.6.2"] + 1
-    path.write_bytes(document(id="CVE-2025-67108"))  # mended at last
+    path.write_bytes(document(id="CVE-2025-67108"))  # fixed at last
     known = known_vulnerabilities("Fast DDS", "3.6.3", read_advisories(path))
     assert known is not None
     assert "CVE-2025-67108" not in {advisory.id for advisory in known.known}

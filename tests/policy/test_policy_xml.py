@@ -309,16 +309,16 @@ def test_a_namespace_that_begins_with_a_wildcard_means_absolute_names(
 
 
 @pytest.mark.parametrize(
-    ("group", "mend"),
+    ("group", "fix"),
     [
         ('<services reply="ALLOW"><topic>a</topic></services>', "or move it into <topics>."),
         ('<topics publish="ALLOW"><name>a</name></topics>', "Write <topic> in its place."),
     ],
 )
 def test_an_element_in_a_wrong_place_comes_with_its_mend(
-    group: str, mend: str, tmp_path: Path
+    group: str, fix: str, tmp_path: Path
 ) -> None:
     (tmp_path / "policy.xml").write_text(policy_text({"/a": group}))
     with pytest.raises(PolicyError, match="expected") as error:
         read_policy(tmp_path / "policy.xml")
-    assert error.value.remedy.endswith(mend)
+    assert error.value.remedy.endswith(fix)

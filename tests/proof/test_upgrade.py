@@ -269,9 +269,9 @@ def test_an_update_mends_and_brings_known_vulnerabilities(bench: Bench) -> None:
         for before, after in ((jazzy, lyrical), (lyrical, jazzy), (jazzy, jazzy._replace(until="")))
     ]
     there, back = "Fast DDS 2.14.6 to 3.6.2", "Fast DDS 3.6.2 to 2.14.6"
-    assert texts[0][there].startswith("9 stay; mended: CVE-")
-    assert texts[1][back] == texts[0][there].replace("mended", "new")
-    assert texts[0]["Cyclone DDS 0.10.5 to 11.0.1"] == "mended: CVE-2023-24011"
+    assert texts[0][there].startswith("9 stay; fixed: CVE-")
+    assert texts[1][back] == texts[0][there].replace("fixed", "new")
+    assert texts[0]["Cyclone DDS 0.10.5 to 11.0.1"] == "fixed: CVE-2023-24011"
     assert texts[2] == {}
     releases = {"introduced": "2.14.0"}, {"fixed": "3.0.0"}
     record: dict[str, object] = {
@@ -283,7 +283,7 @@ def test_an_update_mends_and_brings_known_vulnerabilities(bench: Bench) -> None:
             }
         ],
     }
-    for lines, said in (([], "mended: "), (["3.6"], "not known for 3.6.2: ")):
+    for lines, said in (([], "fixed: "), (["3.6"], "not known for 3.6.2: ")):
         record["database_specific"] = {"unclear_lines": lines}
         advisories = parse_advisories(json.dumps(record).encode(), "it")
         asked = replace(at, advisories=advisories)
