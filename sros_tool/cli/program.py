@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 
 class VerbEntry(NamedTuple):
-    """A verb: its module, one line of help, aliases, and its name in the module if different."""
+    """A verb: its module, one line of help, aliases, and its name in the module if different.
+
+    The line says what the verb does, or which question it answers.
+    """
 
     module: str
     help: str
@@ -40,19 +43,19 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         ),
         "update_keystore": VerbEntry("keystore", "Change the settings of a keystore."),
         "list_enclaves": VerbEntry("keystore", "List the enclaves of a keystore.", ("list_keys",)),
-        "inspect": VerbEntry("inspect", "Show the contents of a keystore or a single file."),
+        "inspect": VerbEntry("inspect", "What is in this keystore, enclave or file?"),
     },
     "Life of keys": {
         "renew": VerbEntry("life", "Renew certificates and permissions of enclaves."),
         "revoke": VerbEntry("life", "Revoke enclaves."),
         "rotate_ca": VerbEntry("life", "Replace the CAs, stage by stage."),
-        "crl": VerbEntry("life", "Show the revocation list, or sign it again."),
+        "crl": VerbEntry("life", "Who is revoked, until when? Sign the list again."),
     },
     "Deployment": {
         "distribute_key": VerbEntry(
             "deployment", "Export enclaves for the robot they run on.", ("export_enclave",)
         ),
-        "verify": VerbEntry("deployment", "Check whether a robot's enclaves can be used."),
+        "verify": VerbEntry("deployment", "On a robot: can nodes start in its enclaves?"),
         "create_request": VerbEntry(
             "deployment", "Create a key on the robot, and a signing request."
         ),
@@ -60,7 +63,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "import": VerbEntry(
             "deployment", "Install a signed answer on the robot.", attribute="import_verb"
         ),
-        "fleet": VerbEntry("fleet", "Show what the robots of a fleet have."),
+        "fleet": VerbEntry("fleet", "Which robots have what? Publish it to them."),
         "agent": VerbEntry("agent", "On a robot: fetch what home publishes, install it, confirm."),
         "zenoh": VerbEntry("zenoh", "Write the files that make Zenoh enforce policies."),
     },
@@ -68,21 +71,19 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "generate_policy": VerbEntry("observing", "Learn a policy from the running robot."),
         "merge_policy": VerbEntry("policy", "Add the rights of policies to a policy file."),
         "diff_policy": VerbEntry(
-            "policy", "Compare the rights of policies, permissions, keystores."
+            "policy", "How do the rights of two policies or keystores differ?"
         ),
         "minimize_policy": VerbEntry("policy", "Remove unused rights from a policy."),
-        "explain": VerbEntry("explain", "Show what DDS decides, by which rule, and why."),
-        "view": VerbEntry("view", "Draw who may do what, as a page, SVG, DOT or Mermaid."),
+        "explain": VerbEntry("explain", "May an enclave do this? By which rule?"),
+        "view": VerbEntry("view", "Who may do what? Draw it."),
         "policies": VerbEntry("policy", "List or copy the policies that ship with sros."),
     },
     "Checks": {
-        "check": VerbEntry(
-            "check", "Find errors and weaknesses in policies, keystores, the runtime."
-        ),
-        "review": VerbEntry("review", "Review a change of policies and keystores in git."),
-        "metrics": VerbEntry("check", "Give Prometheus the expiry and findings of a keystore."),
-        "audit": VerbEntry("audit", "Report what a policy would deny to the running robot."),
-        "doctor": VerbEntry("check", "Find out which DDS here enforces security."),
+        "check": VerbEntry("check", "Is it right? A policy, a keystore, and what runs here."),
+        "review": VerbEntry("review", "May this change of policies and keystores be merged?"),
+        "metrics": VerbEntry("check", "What should Prometheus alert on?"),
+        "audit": VerbEntry("audit", "What would a policy deny to the robot that runs now?"),
+        "doctor": VerbEntry("check", "Does the DDS on this machine enforce security?"),
     },
     "Running": {
         "env": VerbEntry("running", "Print the environment of an enclave."),
