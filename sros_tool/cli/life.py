@@ -383,6 +383,11 @@ _DONE = {
     is_flag=True,
     help="Extend the validity of the identity CA, with the same key and without stages.",
 )
+@click.option(
+    "--identity-ca",
+    type=PATH,
+    help="With --same-key: the later certificate (PEM) of the CA service.",
+)
 @click.option("--ca-validity", metavar="SPAN", help="How long the new CA is valid, such as 10y.")
 @click.option(
     "--identity-key",
@@ -420,6 +425,7 @@ def rotate_ca(
     to: str | None,
     finish: bool,
     same_key: bool,
+    identity_ca: Path | None,
     ca_validity: str | None,
     identity_key: str | None,
     permissions_key: str | None,
@@ -462,12 +468,15 @@ def rotate_ca(
     from sros_tool.keystore.lifecycle.rotate import rotate_ca as work
     from sros_tool.keystore.lifecycle.rotation import RotationStage, rotation_status
     from sros_tool.validity import parse_span
+    from sros_tool.xml import read_bytes
 
     if sum((status, go_on, to is not None, finish, same_key)) > 1:
         raise UsageError("give only one of --status, --next, --to, --finish and --same-key")
     if not (go_on or to or finish or same_key):
         _show_status(rotation_status(root, now=now()), _unconfirmed(root), as_json)
         return
+    if identity_ca and not same_key:
+        raise UsageError("--identity-ca has no effect without --same-key", "", "Add --same-key.")
     validity = parse_span(ca_validity) if ca_validity is not None else None
     if same_key:
         if permissions:
@@ -481,6 +490,7 @@ def rotate_ca(
             now=now(),
             keyring=keyring(),
             validity=validity,
+            issued=read_bytes(identity_ca, "CA certificate") if identity_ca else b"",
             allow_refusal=allow_refusal,
             dry_run=dry_run,
         )

@@ -23,7 +23,7 @@ from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.lifecycle.rotate import rotate_ca
+from sros_tool.keystore.lifecycle.rotate import renew_identity_ca, rotate_ca
 from sros_tool.keystore.lifecycle.update import update_keystore
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
@@ -37,7 +37,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.crl import Revoked, sign_crl
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.validity import Window, parse_iso
-from tests.support.harness import certificate, snapshot
+from tests.support.harness import certificate, snapshot, sros
 
 DAY = timedelta(days=1)
 
@@ -267,6 +267,37 @@ def test_the_service_signs_the_revocation_list(site: Path) -> None:
     assert present and present.number == 6
     (ends,) = (found for found in check(site) if found.id == "keystore.revocation-list-ends")
     assert f"sros crl {site} --refresh --crl FILE" in ends.remedy
+
+
+def test_a_later_certificate_of_the_service_for_the_same_key(site: Path, tmp_path: Path) -> None:
+    def renewed(name: str, key: Any = CA_KEY, days: int = 2000) -> bytes:
+        return pem(issue_ca(key, common_name(name), Window(now() - DAY, now() + days * DAY)))
+
+    before, later = snapshot(site), renewed("head office")
+    for issued, words in (
+        (b"", "with --identity-ca FILE"),
+        (renewed("another office"), "another name or key"),
+        (renewed("head office", OTHER), "another name or key"),
+        (renewed("head office", days=800), "expire before the old one"),
+        (made(CA.subject, CA_KEY.public_key()), "cannot be the identity CA"),
+        (b"x", "cannot be read"),
+    ):
+        with pytest.raises(SrosError, match=words):
+            renew_identity_ca(site, now=now(), issued=issued)
+        assert snapshot(site) == before
+    (tmp_path / "later.pem").write_bytes(later)
+    sros("rotate_ca", site, "--same-key", "--identity-ca", tmp_path / "later.pem").ok()
+    assert (site / "enclaves/talker/identity_ca.cert.pem").read_bytes() == later
+    assert not [found for found in check(site) if found.severity > "note"]
+    create_enclaves(site, ["/arm"], now=now())
+    serial = certificate(site / "enclaves/talker/cert.pem").serial_number
+    revoke(site, ["/talker"], now=now(), crl=listed(serial, days=300))
+    assert not [found for found in check(site) if found.severity > "note"]
+    assert sros("rotate_ca", site, "--identity-ca", tmp_path / "later.pem", "--next").status == 2
+    own = tmp_path / "own"
+    create_keystore(own, template=TEMPLATE, now=now())
+    with pytest.raises(UsageError, match="only a CA service"):
+        renew_identity_ca(own, now=now(), issued=later)
 
 
 def test_python_takes_a_service_and_the_list_that_it_signed(

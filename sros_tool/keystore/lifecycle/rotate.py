@@ -25,7 +25,13 @@ from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.fleet.enclaves import robot_of
 from sros_tool.keystore.fleet import checked_fleet, load_fleet
 from sros_tool.keystore.fleet_status import State, fleet_status
-from sros_tool.keystore.issuing.authority import Authority, write_bundle, write_copies
+from sros_tool.keystore.issuing.authority import (
+    Authority,
+    ImportedAuthority,
+    check_imported,
+    write_bundle,
+    write_copies,
+)
 from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
@@ -308,10 +314,13 @@ def renew_identity_ca(
     now: datetime,
     keyring: Keyring = IN_KEYSTORE,
     validity: Span | None = None,
+    issued: bytes = b"",
     allow_refusal: Sequence[Vendor] = (),
     dry_run: bool = False,
 ) -> RotationStep:
     """Issue a new certificate for the identity CA, with the same name and key and a later expiry.
+
+    If a CA service is the identity CA, it has ``issued`` the certificate (PEM).
 
     Nothing else changes: on Cyclone DDS 0.10.2 and Fast DDS 2.9.1 (measured), the certificates that
     the CA issued have a valid chain to its old and to its new certificate.  A permissions CA cannot
@@ -319,8 +328,8 @@ def renew_identity_ca(
 
     Raises:
         KeystoreError: the keystore has a single CA, a rotation is in progress, or the CA is not
-            self-signed, or its key is weak or missing.
-        UsageError: the new certificate would expire before the present one.
+            self-signed, or its key is weak or missing, or ``issued`` is of another CA.
+        UsageError: the new certificate would expire before the present one, or is missing.
     """
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
@@ -339,30 +348,57 @@ def renew_identity_ca(
                 "",
                 f"Finish it first with `sros rotate_ca {quote(str(root))} --next`.",
             )
-        key = keyring.open(change.keystore, IDENTITY, change.template)
         old, *above = change.keystore.certificates_of("identity_ca")
-        if above or not same_key(old, key):
-            raise KeystoreError(
-                "the identity CA cannot be renewed with the same key",
-                "It is not self-signed, or the key belongs to another certificate.",
-                "Rotate it without --same-key.",
+        if issued or keyring.ca_service(root, IDENTITY, change.template):
+            renewed = _renewed_by_service(change, old, issued)
+            new, bundle, signer = renewed.certificate, renewed.bundle, change.permissions
+        else:
+            key = keyring.open(change.keystore, IDENTITY, change.template)
+            if above or not same_key(old, key):
+                raise KeystoreError(
+                    "the identity CA cannot be renewed with the same key",
+                    "It is not self-signed, or the key belongs to another certificate.",
+                    "Rotate it without --same-key.",
+                )
+            if is_weak(old.public_key()):
+                raise KeystoreError(
+                    "the identity CA cannot be renewed with the same key",
+                    f"The key is weak: {algorithm(old.public_key())}.",
+                    "Rotate it without --same-key.",
+                )
+            new = issue_ca(
+                key, old.subject, window(now, validity or change.template.authority_validity)
             )
-        if is_weak(old.public_key()):
-            raise KeystoreError(
-                "the identity CA cannot be renewed with the same key",
-                f"The key is weak: {algorithm(old.public_key())}.",
-                "Rotate it without --same-key.",
-            )
-        new = issue_ca(
-            key, old.subject, window(now, validity or change.template.authority_validity)
-        )
+            bundle, signer = pem(new), Authority(new, key)
         _check_later(old, new)
-        write_bundle(change.transaction, "identity_ca", (IDENTITY,), pem(new), change.names)
+        write_bundle(change.transaction, "identity_ca", (IDENTITY,), bundle, change.names)
         change.transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
         change.entries.append(certificate_entry(now, "ca", new, reason=SAME_KEY))
-        change.record(Authority(new, key))
+        change.record(signer)
         change.finish()
     return _step(change, stage=RotationStage.NONE, files=("identity_ca",))
+
+
+def _renewed_by_service(
+    change: KeystoreChange, old: x509.Certificate, issued: bytes
+) -> ImportedAuthority:
+    """Return the later certificate that a CA service gave itself, with the same name and key."""
+    if not (issued and change.keyring.ca_service(change.root, IDENTITY, change.template)):
+        raise UsageError(
+            "only a CA service issues its own certificate",
+            "",
+            "Leave --identity-ca out." if issued else "Give the new one with --identity-ca FILE.",
+        )
+    renewed = check_imported(IDENTITY, issued, None, change.now)
+    new = renewed.certificate
+    if (old.subject, old.public_key()) != (new.subject, new.public_key()):
+        raise KeystoreError(
+            "the certificate has another name or key than the identity CA",
+            "All enclaves would need other certificates, and both CAs a revocation list.",
+            "Make a new keystore for another CA.",
+        )
+    change.notes += renewed.notes
+    return renewed
 
 
 class _Rotator:
@@ -754,8 +790,9 @@ def _make_successors(
         raise UsageError(
             f"the identity CA of keystore '{change.root}' is a CA service",
             "sros cannot replace its CA.",
-            "Replace the permissions CA alone, with --permissions. Once the service has another "
-            "CA, make a new keystore with its certificate.",
+            "Replace the permissions CA alone, with --permissions. If the service has a later "
+            "certificate for the same key, take it with --same-key --identity-ca FILE; for another "
+            "key, make a new keystore.",
         )
     for file, serves in files.items():
         if wanted & set(serves) and not set(serves) <= wanted:
