@@ -146,9 +146,17 @@ class VerbGroup(click.Group):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments; without any, print the help and exit."""
         if not args and not ctx.resilient_parsing:
-            echo(ctx.get_help(), err=True)
+            echo_lines(ctx.get_help(), err=True)
             ctx.exit(NOT_DONE)
         return super().parse_args(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the verbs of the group with whole sentences; click would cut them to one line."""
+        verbs = ((name, self.get_command(ctx, name)) for name in self.list_commands(ctx))
+        with formatter.section("Verbs"):
+            formatter.write_dl(
+                [(name, verb.get_short_help_str(limit=200)) for name, verb in verbs if verb]
+            )
 
 
 class _Program(VerbGroup):

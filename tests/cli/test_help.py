@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
 
 import pytest
 from click.testing import CliRunner
 
 from sros_tool.cli.program import FAMILIES, program
+from tests.support.harness import sros
 from tests.support.tables import for_every
 
 VERBS = {name: verb for family in FAMILIES.values() for name, verb in family.items()}
@@ -25,6 +27,17 @@ def help_of(*words: str, width: int = 80) -> str:
 def test_no_line_of_a_help_is_longer_than_80_columns(verb: str, width: int) -> None:
     lines = help_of(*filter(None, [verb]), width=width).splitlines()
     assert [line for line in lines if len(line) > 80] == [], f"in `sros {verb} --help`"
+
+
+@for_every(["", "fleet", "agent"])
+def test_a_group_without_arguments_prints_its_help(verb: str) -> None:
+    """With whole sentences, also where they need two lines, and on standard error."""
+    words = list(filter(None, [verb]))
+    ended = sros(*words)
+    assert (ended.status, ended.out) == (2, "")
+    assert ended.err == sros(*words, "--help").ok().out
+    assert len(ended.err.splitlines()) > 10
+    assert not re.search(r"(?m)^  \w+  .*\.\.\.$", ended.err), "a sentence was cut"
 
 
 @for_every(VERBS)
