@@ -50,7 +50,7 @@ class _Agent(Verb, VerbGroup):
 
 @click.group("agent", cls=_Agent)
 def agent() -> None:
-    """On a robot: fetch what home publishes for it, install it, and confirm.
+    """On a robot: fetch its releases from home, install them, and confirm.
 
     Example:
       $ sros agent init /etc/sros/keystore --robot r1 --root root.json \\
@@ -64,7 +64,7 @@ def agent() -> None:
 @click.option("--robot", metavar="NAME", required=True, help="The name of this robot.")
 @click.option(
     "--from", "source", metavar="PLACE", required=True,
-    help="What `sros fleet publish` writes: a URL (https, http) or a folder.",
+    help="The folder that `sros fleet publish` writes: as a URL (https, http) or a path.",
 )  # fmt: skip
 @click.option(
     "--inbox", metavar="PLACE", required=True,
@@ -72,7 +72,9 @@ def agent() -> None:
 )  # fmt: skip
 @click.option(
     "--root", "root_file", metavar="FILE", required=True, type=PATH,
-    help="The root metadata (root.json) that home published first; from it on, all is verified.",
+    help=(
+        "The first root metadata (root.json) that home published; the agent verifies everything "
+        "by it."),
 )  # fmt: skip
 @click.option(
     "--ca", "authorities", metavar="SHA256|FILE", multiple=True,
@@ -230,12 +232,12 @@ def _unit(text: str) -> Unit:
 )  # fmt: skip
 @json_option
 def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool) -> int:
-    """Keep the enclaves in FOLDER as home publishes them, and confirm what is there and runs.
+    """Fetch and install the robot's releases in FOLDER, and confirm its files and processes.
 
     A round fetches the robot's release, verifies it, installs it whole or not at all, restarts
-    units or says what is due, looks at the running processes, asks for renewal in the last third
-    of a certificate's life, and sends a signed message. A part that fails does not keep the others
-    from their work, and the next round goes on where this one was.
+    units or reports the restarts that are due, checks the running processes, asks for renewal in
+    the last third of a certificate's validity, and sends a signed message. If one step fails, the
+    others still run, and the next round tries it again.
 
     Example:
       $ sros agent run /etc/sros/keystore --once
@@ -318,11 +320,13 @@ def _due_lines(folder: Path, due: Sequence[str], unseen: Sequence[str]) -> Itera
 @click.argument("folder", type=PATH)
 @click.option(
     "--max-age", metavar="DURATION", default="1d", show_default=True,
-    help="The source and the inbox have to be reached at least this often.",
+    help=(
+        "Longest time since the agent last reached the source and the inbox; after that, the exit "
+        "status is 1."),
 )  # fmt: skip
 @json_option
 def _status(folder: Path, max_age: str, as_json: bool) -> int:
-    """Show what the agent of FOLDER last did, and what waits.
+    """Show the result of the agent's last round in FOLDER, and what is due.
 
     Example:
       $ sros agent status /etc/sros/keystore

@@ -905,11 +905,11 @@ def _watch_processes(
 
 @verb("metrics")
 @keystore_argument()
-@output_option("Replace FILE at once, which ends in .prom, instead of printing.")
+@output_option("Replace FILE (*.prom) atomically instead of printing.")
 @click.option(
     "--earliest",
     is_flag=True,
-    help="Print only the earliest expiry, not that of every enclave; for large keystores.",
+    help="Print only the earliest expiry, not the expiry of every enclave; for large keystores.",
 )
 @click.option(
     "--policy",

@@ -84,14 +84,14 @@ def close(
     """Close the robot that runs open on this machine, step by step.
 
     Watches the robot on DDS or Zenoh, and writes into FOLDER its policy, requirements that hold
-    now, a production keystore with an enclave for each process, an export of them without CA keys,
-    and how each process is started secured. Each step is a verb, which is shown. What is there is
-    kept: edit policy.xml and requirements.toml, and run it again.
+    now, a production keystore with an enclave for each process, an export of the enclaves without
+    CA keys, and the files that start each process secured. Each step is a command, which is
+    printed. Existing files are kept: edit policy.xml and requirements.toml, and run it again.
 
     Nothing is closed before --apply, which restarts the processes that are units of systemd, and
-    shows the commands for all others. --proof, which --apply does by itself if nothing is left to
-    do by hand, asks: does every process run in its enclave, does everything that talked still talk,
-    does an open listener find nothing? --undo goes back.
+    shows the commands for all others. --proof checks that every process runs in its enclave, that
+    everything that talked still talks, and that an open listener finds nothing; --apply does it
+    too, if nothing is left to do by hand. --undo goes back.
 
     Example:
       $ sros close robot --for 5m

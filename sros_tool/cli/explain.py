@@ -247,8 +247,8 @@ def explain(
 
     call and serve are about services, execute is about actions. If the rights name an action NAME
     and no service NAME, call and serve are about the action; --type decides. KEYSTORE is a
-    keystore, here or on a robot; ENCLAVE can also be an enclave's folder. With --policy and
-    no keystore, the policy itself is explained, before anything is signed.
+    keystore, here or on a robot; ENCLAVE can also be an enclave's folder. With --policy and no
+    keystore, sros decides by the policy alone, before anything is signed.
 
     The exit status is 0 if it is allowed (with --who: to any enclave), and 1 if it is denied; with
     --log, 1 if the log reports a fault.

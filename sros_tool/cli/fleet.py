@@ -240,13 +240,14 @@ def _collect(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Take in what robots sent: keep their confirmations, and sign their requests for renewal.
+    """Collect the messages of robots: keep their confirmations, and sign their requests for
+    renewal.
 
-    INBOX is a folder with ROBOT/confirmation.p7s of each robot that runs `sros agent`. Only the
-    robots of the fleet of KEYSTORE are read. A message counts if an enclave of the same
-    robot signed it with a certificate that this keystore issued and did not revoke, and if it is
-    later than the one before. Requests for renewal are signed for robots with renewal = "allowed"
-    in the fleet file; their rights stay as they are. One bad message stops no other one.
+    INBOX is a folder with ROBOT/confirmation.p7s of each robot that runs `sros agent`. Reads only
+    the messages of robots in the fleet of KEYSTORE. Accepts a message if an enclave of the same
+    robot signed it, with a certificate that this keystore issued and did not revoke, and if it is
+    later than the robot's last message. Signs requests for renewal if the fleet file has renewal =
+    "allowed" for the robot; rights do not change. A refused message does not stop the others.
 
     Example:
       $ sros fleet collect keystore inbox
@@ -392,16 +393,17 @@ def _publish(
     as_json: bool,
     **validities: str | None,
 ) -> int:
-    """Publish what each robot of KEYSTORE is to have, in the folder PUB.
+    """Publish a release for each robot of KEYSTORE in the folder PUB.
 
     PUB has plain files for any web server, bucket or USB stick, and no private key: for each robot
     an archive with the files of its enclaves, sealed by the permissions CA, and metadata of The
-    Update Framework, by which `sros agent` on the robot refuses what is old, mixed or forged. Run
-    it after each change, and before the timestamp expires, such as each hour. Unchanged robots keep
-    their archives. Robots that are revoked or left the fleet lose theirs.
+    Update Framework, by which `sros agent` on the robot refuses old, mixed or forged files. Run it
+    after each change, and before the timestamp expires, for example each hour. Archives of
+    unchanged robots stay; archives of robots that were revoked or left the fleet are removed.
 
-    The keys are in KEYSTORE/private. The root key signs only which keys the others are: move it
-    away from the keystore, and name it with --root-key to replace a key, and to renew it each year.
+    The keys are in KEYSTORE/private. The root key only signs the list of the other keys: move it
+    away from the keystore, and name it with --root-key when you replace a key, and once a year to
+    renew that list.
 
     Example:
       $ sros fleet publish keystore pub
@@ -511,14 +513,14 @@ def _status(
 ) -> int:
     """Compare the files that each robot last confirmed with those that it should have.
 
-    A robot should have what an export from KEYSTORE would give it now. A file is current;
+    A robot should have the files that an export from KEYSTORE would give it now. A file is current;
     earlier (issued for this enclave before); another's (issued for another enclave); revoked;
     missing; or unknown (never issued by this keystore). Processes use new files only after a
-    restart: those that are due are in what the Ansible collection and `sros agent` confirm, and not
-    in what `sros fleet report` does. A robot that was not heard of for too long is offline; one
-    that says it has a release which was never published is named, whatever files it has. Robots of
-    which the same is to be said share a line. A last line counts what is known of the robots'
-    DDS by the advisories of sros; --robot and --advisories name it.
+    restart: confirmations by the Ansible collection and `sros agent` say which restarts are due,
+    those by `sros fleet report` do not. A robot without a recent confirmation is offline. A robot
+    that claims a release which was never published is named, whatever files it has. Robots with the
+    same state share a line. The last line counts known vulnerabilities of the robots' DDS, by the
+    advisories of sros; --robot and --advisories name them.
 
     Example:
       $ sros fleet status keystore

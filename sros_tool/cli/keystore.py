@@ -120,8 +120,9 @@ def create_permission(
 ) -> None:
     """Give ENCLAVE... the permissions that POLICY_FILE states for them: all or none.
 
-    Anyone who has a copy of the replaced permissions, with the certificate of that time, can use
-    them until they expire. With --revoke-old, processes that load the new crl.pem refuse them.
+    Anyone who has a copy of the replaced permissions, and of the certificate and key used with
+    them, can use them until they expire. With --revoke-old, processes that load the new crl.pem
+    refuse them.
 
     Example:
       $ sros create_permission keystore /talker_listener/talker policy.xml
@@ -220,9 +221,9 @@ def generate_artifacts(
 
     The permissions in a policy replace the current permissions of an enclave, unless these state
     the same and more than a third of their validity is left. To sign them again in any case, use
-    `sros create_permission` or `sros renew`. What --revoke-old does is described at `sros
-    create_permission --help`. Where a policy demands more protection of a name than the keystore
-    gives, the governance of all enclaves is signed again.
+    `sros create_permission` or `sros renew`. `sros create_permission --help` explains --revoke-old.
+    If a policy demands more protection for a name than the keystore gives, the governance of all
+    enclaves is signed again.
 
     Example:
       $ sros generate_artifacts -k keystore -e /spare \
@@ -691,13 +692,14 @@ def update_keystore(
 ) -> int:
     r"""Change the settings of KEYSTORE, and sign the affected files again.
 
-    KEY is a setting of sros.toml. What becomes looser and what tighter is shown, and what becomes
-    looser has to be allowed. The enclaves keep their keys and their rights.
+    KEY is a setting of sros.toml. Prints which settings become looser and which tighter; looser
+    settings need --allow-looser. The enclaves keep their keys and their rights.
 
-    By default all is changed at once. With --next, in two stages: first the certificates and
-    permissions, after which processes are restarted one by one; then, with the same command, the
-    governance. Where that changes the protection of messages, processes with the old one and with
-    the new one do not communicate (Cyclone DDS 0.10.2, Fast DDS 2.14.5): restart them together.
+    By default, everything changes at once. With --next, the change has two stages: first the
+    certificates and permissions, after which you can restart processes one by one; then, with the
+    same command, the governance. If the governance changes the protection of messages, processes
+    with the old and with the new governance do not communicate (Cyclone DDS 0.10.2, Fast DDS
+    2.14.5): restart them together.
 
     The exit status of a dry run is 1 if --allow-looser is needed and missing.
 

@@ -438,17 +438,17 @@ def rotate_ca(
 ) -> None:
     """Replace the CAs of KEYSTORE while its robots run.
 
-    Stage 1, distribute: a new CA is trusted next to the old one. Stage 2, reissue: the new CA
-    issues all certificates, governance and permissions again. Stage 3, retire: the old CA is no
-    longer trusted. Processes load the new files only when they start: after each stage, restart
-    them all, and export exported enclaves again.
+    Stage 1, distribute: enclaves trust the new CA as well as the old one. Stage 2, reissue: the new
+    CA issues all certificates, governance and permissions again. Stage 3, retire: enclaves no
+    longer trust the old CA. Processes load the new files only when they start: after each stage,
+    export the exported enclaves again, and restart all processes.
 
     With Fast DDS (2.9.1), all processes can talk to each other at every moment of a rotation.
     Cyclone DDS (0.10.2) trusts one CA at a time: after stage 2, restart all its processes
     together. To only extend the validity of the identity CA, use --same-key: it has no stages and
     needs no common restart.
 
-    In a keystore with a fleet, a stage is refused while robots have not confirmed the one before
+    In a keystore with a fleet, a stage is refused until all robots have confirmed the stage before
     (`sros fleet confirm`).
 
     Example:

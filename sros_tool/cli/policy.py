@@ -495,8 +495,8 @@ def policies(
 
     --convert gives a policy of version 0.1.0 (ROS 2 Crystal to Eloquent) the present format, with
     the same rights: each node becomes an enclave with the node's name. Nodes of a later ROS 2 need
-    more, which --with-node-rights adds. The result is one file: includes are resolved, and comments
-    are lost. The exit status is 1 if a part was left out.
+    more rights; --with-node-rights adds them. The result is one file: includes are resolved, and
+    comments are lost. The exit status is 1 if a part was left out.
 
     Example:
       $ sros policies

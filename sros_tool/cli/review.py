@@ -172,8 +172,8 @@ def review(
     repository.
 
     Both commits are read from git itself: nothing is checked out, files of the work tree are read
-    only to say that they differ, no link of a commit is followed, and nothing that the repository
-    has or configures is run. What was not looked at is in the result.
+    only to report that they differ, no link in a commit is followed, and nothing that the
+    repository has or configures is run. The result names everything that was not reviewed.
 
     Example:
       $ sros review --base refs/remotes/origin/main --policy robot/robot.xml

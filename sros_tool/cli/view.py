@@ -156,9 +156,9 @@ def view(
     Zenoh configuration with what it should allow. --observed compares the rights in SOURCE with
     those that are used. --focus shows who may use a name, and who can influence those enclaves.
 
-    In a keystore with more than 1,000 enclaves, only some of equal robots are read in full; of the
-    others, only the text of their permissions is compared, which the page says. --json, --focus,
-    --requirements, --observed and comparisons read all.
+    In a keystore with more than 1,000 enclaves, robots that differ only in names are not all read
+    in full: for most of them, only the text of the permissions is compared, and the page says so.
+    --json, --focus, --requirements, --observed and comparisons read everything.
 
     The page is one file that needs no network. No format contains keys or paths of this machine.
 

@@ -123,10 +123,10 @@ def zenoh(
 ) -> None:
     """Write the files with which Zenoh enforces the rights of KEYSTORE (rmw_zenoh).
 
-    Every enclave gets session.json5, and the router's enclave router.json5, each with the same
-    document signed next to it.  They state the rights of the signed permissions.  The choices are
-    kept in the keystore's settings, and from then on every verb that changes the keystore keeps
-    the files in step.
+    Every enclave gets session.json5, and the router's enclave gets router.json5; a signed copy is
+    next to each file. The files state the same rights as the signed permissions. The options are
+    stored in the keystore's settings; from then on, every verb that changes the keystore also
+    updates the files.
 
     Example:
       $ sros zenoh keystore
