@@ -125,7 +125,7 @@ PROCESS_NOT_SEEN = FindingKind(
     "processes that could not be looked at",
     "They may be nodes, even open or revoked ones. The other findings do not cover them.",
     "proc(5), ptrace(2) (PTRACE_MODE_READ_FSCREDS).",
-    "Run it as root: `sudo sros check runtime`.",
+    "Run it as root, and not in a container: `sudo sros check runtime`.",
 )
 
 _NEW_AUTHORITY = Fault.CA_EXPIRED.remedy_in_export("").format(root="KEYSTORE")

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
     from sros_tool.distributions import Distribution
-    from sros_tool.explain.answer import Answer, PolicyChange
+    from sros_tool.explain.answer import Answer
     from sros_tool.explain.asking import AskedEnclave, AskingContext
     from sros_tool.explain.log import LogFinding
     from sros_tool.explain.question import Question
@@ -143,7 +143,11 @@ def _refuse_ignored(mode: str) -> None:
         if name in _IGNORED[mode] and context.params[name]:
             option = parameter.opts[0]
             text = f"{mode} takes no {option}" if mode else f"{option} goes with {_GOES_WITH[name]}"
-            raise UsageError(text, "", "Leave it out.")
+            remedy = "Leave it out."
+            if name == "robots":
+                remedy = "Name one of the robot's enclaves instead; `sros list_enclaves KEYSTORE "
+                remedy += f"--robot {quote(context.params[name][0])}` lists them."
+            raise UsageError(text, "", remedy)
 
 
 @verb("explain")
@@ -303,7 +307,7 @@ def explain(
         chosen = None if why_zenoh else chosen_vendor(vendor, distro, os.environ)
         only = patterns, robots
         return _show_who(root, rest, kind, chosen, why_zenoh, asking, only, as_json)
-    question = _question(rest, kind)
+    question = _question(root, rest, kind)
     asked = _open(root, rest[0], policy, asking)
     context = asking.context(asked.enclave.joined_domains)
     explanation: DdsExplanation | ZenohExplanation
@@ -406,16 +410,16 @@ def _policy_alone(root: Path | None, asked: AskedEnclave, policy: Path | None) -
     return [Note("explain.policy-alone", text)]
 
 
-def _question(rest: tuple[str, ...], kind: str | None) -> Question:
+def _question(root: Path | None, rest: tuple[str, ...], kind: str | None) -> Question:
     """Return the question in the words after the keystore: enclave, operation and name."""
     from sros_tool.explain.question import ask
 
     if not 2 <= len(rest) <= 3:
-        raise UsageError(
-            "explain takes an enclave, an operation and a name",
-            "",
-            "Write for example `sros explain /talker publish /chatter`.",
-        )
+        remedy = "Write for example `sros explain /talker publish /chatter`."
+        if root and len(rest) == 1 and rest[0].startswith("/"):
+            folder = quote(f"{root}/enclaves{rest[0]}")
+            remedy += f" `sros inspect {folder}` shows everything that this enclave may do."
+        raise UsageError("explain takes an enclave, an operation and a name", "", remedy)
     return ask(rest[1], rest[2] if len(rest) > 2 else "", kind)
 
 
@@ -509,7 +513,7 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
 def _to_do_lines(answer: Answer) -> Iterator[str]:
     """Yield the change of the policy, or the remedy, and the commands."""
     if answer.change:
-        yield from _change_lines(answer.change)
+        yield from _change_lines(answer)
     if answer.remedy:
         yield _row("remedy", answer.remedy)
     for number, command in enumerate(answer.commands):
@@ -539,9 +543,12 @@ def _protection_words(answer: Answer) -> Iterator[str]:
             yield f"ACCESS CONTROL OFF for {' and '.join(off)}"
 
 
-def _change_lines(change: PolicyChange) -> Iterator[str]:
+def _change_lines(answer: Answer) -> Iterator[str]:
     from sros_tool.explain.answer import ADDITION
 
+    change, policy = answer.change, answer.enclave.policy
+    if change is None:
+        return
     yield _row("change", "in the policy:")
     for edit in change.edits:
         if edit.xml:
@@ -556,7 +563,11 @@ def _change_lines(change: PolicyChange) -> Iterator[str]:
         if is_expression(right.name):
             yield f"    this also removes the denial of all other names in {right.name}"
     if change.document:
-        yield f"    save as {ADDITION}"
+        if answer.is_for_a_fleet and policy:
+            place = _shown(policy.source)
+            yield f"    add at {place}, with placeholders for the robot's name and namespace"
+        else:
+            yield f"    save as {ADDITION}"
         yield from (f"      {line}" for line in change.document.splitlines())
 
 

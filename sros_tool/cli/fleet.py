@@ -497,6 +497,11 @@ class ComparedFleet(NamedTuple):
 @click.option("--prometheus", is_flag=True, help="Print metrics for node_exporter's textfile.")
 @click.option("--html", is_flag=True, help="Print the status as an HTML page.")
 @advisories_option
+@click.option(
+    "--no-advisories",
+    is_flag=True,
+    help="Leave known vulnerabilities of the robots' DDS out of the output and the exit status.",
+)
 @output_option("Replace FILE at once instead of printing.")
 @dry_run_option
 @json_option
@@ -507,6 +512,7 @@ def _status(
     prometheus: bool,
     html: bool,
     advisories: Path | None,
+    no_advisories: bool,
     output: Path | None,
     dry_run: bool,
     as_json: bool,
@@ -535,7 +541,8 @@ def _status(
 
     The exit status is 0 if every robot that is not revoked confirmed that it has what an export
     would give it now, and no restart that is due, and 1 if not, or if a robot has a DDS with known
-    vulnerabilities that a later release of the same major version fixes.
+    vulnerabilities that a later release of the same major version fixes (--no-advisories: this does
+    not count).
     """
     from sros_tool.checks.vulnerabilities import is_mended_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
@@ -546,6 +553,9 @@ def _status(
         raise UsageError("--json, --prometheus and --html exclude each other", "", "Choose one.")
     if as_json and output:
         raise UsageError("--json takes no --output", "", "Leave one of them out.")
+    if no_advisories and (advisories or prometheus):
+        other = "--advisories" if advisories else "--prometheus"
+        raise UsageError(f"{other} and --no-advisories exclude each other", "", "Choose one.")
     moment = now()
     oldest = parse_duration(max_age) if max_age is not None else None
     if output:
@@ -556,7 +566,11 @@ def _status(
     with progress("comparing"):
         status = fleet_status(Keystore(root), robots)
     status = status.with_overdue(moment, oldest)
-    reported = {robot.robot: robot.dds for robot in status.robots if robot.received}
+    reported = {
+        robot.robot: robot.dds
+        for robot in status.robots
+        if robot.received and not no_advisories and robot.state != "revoked"
+    }
     outdated = [
         robot
         for robot, dds in reported.items()
@@ -617,8 +631,9 @@ def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) ->
         behind = sum(robot.stage != status.stage for robot in status.robots if robot.enclaves)
         yield f"CA rotation: {status.stage}; {counted(behind, 'robot')} not there yet"
     lists = [robot.crl_in_force for robot in status.robots if robot.crl_in_force is not None]
-    if not all(lists):
-        yield f"the revocation list is in force on {sum(lists)} of {counted(len(lists), 'robot')}"
+    if lists:
+        number = f"all {len(lists)}" if all(lists) else f"{sum(lists)} of {len(lists)}"
+        yield f"the revocation list is in force on {number} robots"
     if status.unassigned:
         whom = "it" if status.unassigned == 1 else "them"
         yield f"{counted(status.unassigned, 'enclave')} of no robot: nothing is known of {whom}"

@@ -212,7 +212,7 @@ def zenoh_backend() -> Backend:
         raise UnavailableError(
             "the demo on Zenoh needs the package eclipse-zenoh",
             "It is not installed in this Python.",
-            "Install it with `pip install 'sros_tool[zenoh]'`.",
+            "Install it with `pip install 'eclipse-zenoh>=1.10.1'`.",
         )
     numbers = tuple(int(part) for part in version.split(".")[:2] if part.isdigit())
     if numbers < _OLDEST_ZENOH:

@@ -412,7 +412,7 @@ def _load_yaml(data: bytes, what: str) -> Any:
         raise UnavailableError(
             f"{what} is in YAML, and PyYAML is not installed",
             "PyYAML is part of ansible-core.",
-            "Run `pip install 'sros_tool[fleet]'`, or name the JSON of `ansible-inventory --list`.",
+            "Run `pip install ansible-core`, or name the JSON of `ansible-inventory --list`.",
         ) from error
     loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:

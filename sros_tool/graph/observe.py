@@ -192,7 +192,7 @@ def _require_rclpy() -> None:
             "rclpy is not installed for this Python, and sros needs it to observe the ROS graph",
             f"Python is {sys.executable}.",
             "On a machine with ROS 2, source its setup file first (. /opt/ros/jazzy/setup.bash); "
-            "elsewhere install sros with it: pip install 'sros_tool[ros]'. "
+            "elsewhere: `pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-std-msgs`. "
             "A policy can still be learned from logs with --from-log.",
         )
 

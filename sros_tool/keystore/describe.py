@@ -10,6 +10,7 @@ from contextlib import suppress
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal, NamedTuple
 
 from cryptography import x509
@@ -32,8 +33,10 @@ from sros_tool.keystore.layout import (
     ca_certificate,
     ca_key,
     enclave_folder,
+    enclaves_below,
     is_keystore,
     list_enclaves,
+    locate_enclave,
     permissions_ca_for,
     refuse_earlier,
     revoked_certificates,
@@ -59,6 +62,7 @@ from sros_tool.translate import ros_rights
 from sros_tool.translate_zenoh.rights import domains_of, stated_names
 from sros_tool.validity import iso
 from sros_tool.values import Words, shows
+from sros_tool.wording import first_few
 from sros_tool.xml import parse, read_bytes
 from sros_tool.zenoh.configuration import (
     Configuration,
@@ -506,6 +510,16 @@ _NOT_SIGNED = SignatureFacts(signed=False, signature_verified=False, signer=None
 # ── describing ─────────────────────────────────────────────────────────────────────────────
 
 
+def _one_below(folder: Path) -> str:
+    """Return a remedy that names the enclaves in a folder of enclaves, "" if it has none."""
+    with suppress(SrosError):
+        root, name = locate_enclave(folder)
+        if enclaves := enclaves_below(root, name):
+            command = quote(str(root / enclave_folder(enclaves[0])))
+            return f"It holds {first_few(enclaves, 3)}; name one: `sros inspect {command}`."
+    return ""
+
+
 def describe(
     path: Path,
     *,
@@ -538,6 +552,7 @@ def describe(
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
             "It has no enclaves folder, and neither cert.pem nor permissions.p7s.",
+            _one_below(path),
         )
     data = files.read(path, "file")
     try:

@@ -276,7 +276,7 @@ class RobotStatus:
         if self.state is State.REVOKED and not self.enclaves:
             return "take it out of the fleet file"
         if self.settled:
-            return "see what" if self.problems else ""
+            return "look into it" if self.problems else ""
         if self.state in _TO_DO:
             return _TO_DO[self.state]
         if not self.fetches:

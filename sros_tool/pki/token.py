@@ -256,7 +256,7 @@ def _usable(parsed: TokenUri, *, named: bool) -> TokenUri:
         raise UnavailableError(
             "keys on PKCS#11 tokens need the Python package python-pkcs11",
             "",
-            "Install it with `pip install 'sros_tool[pkcs11]'`.",
+            "Install it with `pip install python-pkcs11`.",
         )
     return parsed
 

@@ -101,6 +101,36 @@ def test_no_with_a_change_that_works(keystore: Path, tmp_path: Path) -> None:
     assert "sros merge_policy" in found.out and "<service>/reset</service>" in found.out
 
 
+def test_the_policy_of_a_fleet_is_changed_where_it_is_and_issued_for_all(tmp_path: Path) -> None:
+    policy = tmp_path / "robot.xml"
+    policy.write_text(policy_text({"/{robot}/base": publish("{namespace}/odom")}))
+    (tmp_path / "fleet.toml").write_text('[robots.r1]\nnamespace = "/r1"\n')
+    issue = f"generate_artifacts -k {tmp_path / 'ks'} -p {policy} --fleet {tmp_path / 'fleet.toml'}"
+    sros(*issue.split()).ok()
+    asked = (tmp_path / "ks", "/r1/base", "publish", "/r1/map", "--policy", policy)
+    found = explain(*asked)
+    assert found.status == 1 and f"    add at {policy}:1, with placeholders for the" in found.out
+    assert "allow.xml" not in found.out
+    policy.write_text(
+        policy.read_text().replace("</topics>", "<topic>{namespace}/map</topic></topics>")
+    )
+    for command in answer(*asked[:-2], "--policy", policy)["commands"]:
+        sros(*command.split()[1:]).ok()
+    assert explain(*asked).status == 0
+
+
+def test_everything_that_an_enclave_may_do_is_shown_by_inspect(keystore: Path) -> None:
+    refused = explain(keystore, ENCLAVE)
+    command = refused.err.partition("`sros inspect ")[2].partition("`")[0]
+    assert refused.status == 2 and "publish topics" in sros("inspect", command).ok().out
+    above = sros("inspect", Path(command).parent)
+    assert above.status == 2 and f"It holds {OTHER}" in above.err
+    named = above.err.partition("`sros inspect ")[2].partition("`")[0]
+    assert "subscribe topics" in sros("inspect", named).ok().out
+    chosen = explain(keystore, "--robot", "r1")
+    assert chosen.status == 2 and "`sros list_enclaves KEYSTORE --robot r1`" in chosen.err
+
+
 def test_a_denial_is_lifted_by_an_edit(tmp_path: Path) -> None:
     text = with_includes(
         policy_text(

@@ -406,6 +406,10 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     assert in_force() == [True, False, False]
     text = field.run("fleet", "status", "ks", "--prometheus", status=1).out
     assert [value for _, value in samples(text, "sros_fleet_revocation_list_in_force")] == [1, 0, 0]
+    field.deliver("r3")
+    field.send("r2", running={"/r2/base": RunningFiles.CURRENT})
+    said = field.run("fleet", "status", "ks").out
+    assert "\nthe revocation list is in force on all 3 robots\n" in said
 
 
 def test_expiry_on_robots_is_that_of_the_files_that_they_have(field: Field) -> None:
@@ -622,6 +626,7 @@ def test_the_dds_of_a_robot(
         and len(ended.out.splitlines()) == 3
     )
     assert text in field.run("fleet", "status", "ks", "--robot", "r1", status=ended.status).out
+    assert "DDS" not in field.run("fleet", "status", "ks", "--no-advisories").out
     found = json.loads(field.run("fleet", "status", "ks", "--json", status=ended.status).out)
     assert (found["complete"], found["outdated_dds"]) == (True, outdated)
     assert text in " ".join(finding["text"] for finding in found["findings"])

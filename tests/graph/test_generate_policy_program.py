@@ -28,7 +28,7 @@ def test_without_rclpy_one_paragraph_says_what_to_install(tmp_path: Path) -> Non
     assert (ended.status, ended.out) == (2, "")
     assert ended.err.count("\n") == 1
     assert ended.err.startswith("Unable to generate policy: rclpy is not installed")
-    assert "pip install 'sros_tool[ros]'" in ended.err
+    assert "pip install 'ros-jazzy-rclpy[fastrtps]'" in ended.err
     assert list(tmp_path.iterdir()) == []
 
 

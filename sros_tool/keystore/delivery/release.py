@@ -74,7 +74,7 @@ def check_tuf() -> None:
         raise UnavailableError(
             "the Python package tuf is not installed",
             "It signs and verifies what robots fetch.",
-            "Install it: `pip install 'sros_tool[fetch]'`.",
+            "Install it: `pip install 'tuf>=6'`.",
         ) from error
 
 
