@@ -21,6 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, tzinfo
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -49,7 +50,9 @@ from sros_tool.policy.rights import policy_rights
 from sros_tool.runtime.environment import (
     COMPOSE,
     RMW_ZENOH,
+    ROS_ARGS,
     Container,
+    named_enclave,
     node_argument,
     object_name,
     render_container,
@@ -65,7 +68,7 @@ from sros_tool.runtime.processes import (
     program_of,
 )
 from sros_tool.runtime.rmw import RMW, chosen_vendor
-from sros_tool.runtime.units import unit_changes, unit_instance, write_units
+from sros_tool.runtime.units import unit_changes, unit_instance, unit_words, write_units
 from sros_tool.runtime.variables import ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_of
 from sros_tool.values import DryRun, FileChange, FileChanges, Words, as_plain, shows
 from sros_tool.wording import counted, first_few
@@ -568,7 +571,9 @@ class OpenRobot:
         replace_file(self.observer, (policies_dir() / "observer.xml").read_bytes())
         nodes = [node for node in self._observation().nodes if not is_tool(node)]
         running = ProcessTable().look(self._shell.now()).processes
-        self.observed = assign(nodes, running, self.domain)
+        observed = assign(nodes, running, self.domain)
+        processes = [_as_its_unit_starts(process) for process in observed.processes]
+        self.observed = observed._replace(processes=processes)
         replace_file(self.processes, f"{json.dumps(as_plain(self.observed), indent=2)}\n".encode())
         number = counted(len(self.observed.processes), "process", "processes")
         self._shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
@@ -621,6 +626,9 @@ class OpenRobot:
             of_enclave = variables[process.enclave]
             if process.unit:
                 text = render_environment(of_enclave, "systemd")
+                if _needs_argument(process):
+                    words = (*process.command, ROS_ARGS, "--enclave", process.enclave)
+                    text += f"ExecStart=\nExecStart={' '.join(unit_words(words))}\n"
                 files[f"units/{process.unit}.d/{_DROP_IN}"] = f"{self._mark()}[Service]\n{text}"
             where = str(folder / "export/enclaves" / process.enclave.strip("/"))
             name = object_name(process.enclave)
@@ -720,7 +728,7 @@ class OpenRobot:
                 raise SrosError(
                     f"`{shlex.join(command)}` ended with {ended}",
                     "Secured and open processes do not hear each other.",
-                    "Mend it and run --apply again, or go back with --undo.",
+                    "Fix it and run --apply again, or go back with --undo.",
                 )
 
     def _own_drop_ins(self, observed: ObservedProcesses) -> list[Path]:
@@ -750,7 +758,7 @@ class OpenRobot:
                 remove_file(path)
         of_drop_ins = {path.parent.name.removesuffix(".d") for path in drop_ins}
         self._restart(sorted({*observed.units.values()} | of_drop_ins), dry_run=dry_run)
-        by_hand = [process for process in observed.processes if not process.unit]
+        by_hand = chain.from_iterable(observed.by_hand(self.folder).values())
         for command in dict.fromkeys(process.open_command for process in by_hand):
             self._shell.say(f"by hand, restart it open: {command}")
         changes = [FileChange("remove", str(path)) for path in drop_ins]
@@ -860,6 +868,30 @@ class OpenRobot:
         self._shell.say(f"$ {step.command}")
         status, output, _ = self._shell.run(step.words, False)
         return status, json.loads(output)
+
+
+def _needs_argument(process: ClosedProcess) -> bool:
+    """Return whether the command has to name the enclave: on Zenoh others look at that alone."""
+    is_node = bool(process.rmw) and process.enclave != _ROUTER
+    return is_node and named_enclave(process.command) != process.enclave
+
+
+def _as_its_unit_starts(process: ClosedProcess) -> ClosedProcess:
+    """Return a process with the command of its unit, to which an argument can be added.
+
+    Without the unit if that starts another command, such as a script.
+    """
+    if not (process.unit and _needs_argument(process)):
+        return process
+    asking = ["systemctl", "show", "--property=ExecStart", "--value", process.unit]
+    try:
+        shown = subprocess.run(asking, capture_output=True, check=False).stdout
+    except OSError:
+        shown = b""
+    for words in (process.command, process.command[1:]):
+        if f"; argv[]={' '.join(words)} ;".encode() in shown:
+            return process._replace(command=words)
+    return process._replace(unit="")
 
 
 _CLAIM = "every process runs in its enclave"

@@ -20,10 +20,8 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from types import FrameType
-from typing import Any
 
 import zenoh
 import zenoh.ext
@@ -37,6 +35,7 @@ from sros_tool.demo.nodes import (
     enclave_in,
     parse_options,
 )
+from sros_tool.graph.zenoh_tokens import NODE, configuration
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 
 _POLL_SECONDS = 0.02
@@ -60,33 +59,6 @@ _ACTION_TYPES = {
 _QOS = "::,7:,:,:,,"
 """The QoS in a graph token: keep the last 7, else the defaults of rmw_zenoh."""
 _CDR_HEADER = b"\0\1\0\0"
-_DEFAULTS: Mapping[bool, Mapping[str, Any]] = {
-    True: {"mode": "router", "listen": {"endpoints": ["tcp/localhost:7447"]}},
-    False: {
-        "mode": "peer",
-        "listen": {"endpoints": ["tcp/localhost:0"]},
-        "connect": {"endpoints": ["tcp/localhost:7447"]},
-    },
-}
-"""The defaults of rmw_zenoh that matter here, for a router (True) and a session (False)."""
-
-
-def _configuration(variables: Mapping[str, str], *, router: bool) -> zenoh.Config:
-    """Return the configuration that the variables of rmw_zenoh choose.
-
-    Raises:
-        zenoh.ZError: a file or a value is not valid.
-    """
-    uri = variables.get(f"ZENOH_{'ROUTER' if router else 'SESSION'}_CONFIG_URI", "")
-    if uri:
-        config = zenoh.Config.from_json5(Path(uri).read_text(encoding="utf-8"))
-    else:
-        unsecured = {"scouting": {"multicast": {"enabled": False}}, **_DEFAULTS[router]}
-        config = zenoh.Config.from_json5(json.dumps(unsecured))
-    for each in filter(None, variables.get("ZENOH_CONFIG_OVERRIDE", "").split(";")):
-        name, _, value = each.partition("=")
-        config.insert_json5(name, value)
-    return config
 
 
 def _type_of(name: str, default: tuple[str, str]) -> tuple[str, str]:
@@ -122,7 +94,7 @@ class _ZenohNode:
         self._graph: set[str] = set()
         self._declared: list[object] = []
         self._keep = self._declared.append  # what nobody keeps is undeclared
-        self._announce(_NODE)
+        self._announce(NODE)
 
     def _announce(self, kind: str, name: str = "", types: tuple[str, str] = ("", "")) -> bytes:
         """Put an entity of the node into the graph, and return its GID."""
@@ -202,7 +174,7 @@ class _ZenohNode:
                 self._graph.add(token)
                 return
             self._graph.discard(token)
-            if _kind_of(token) == _NODE:
+            if _kind_of(token) == NODE:
                 # As rmw_zenoh: all of the node goes with it, and nobody looks at the enclave.
                 node = _node_of(token)
                 self._graph.difference_update({e for e in self._graph if _node_of(e) == node})
@@ -224,7 +196,7 @@ class _ZenohNode:
         others = [
             chunks
             for token in tuple(self._graph)
-            if _kind_of(token) == _NODE
+            if _kind_of(token) == NODE
             and (chunks := token.split("/"))[8] == name
             and chunks[6] != self._enclave
         ]
@@ -242,9 +214,6 @@ class _ZenohNode:
         """Return the key expression of a ROS name with its type and the hash of the type."""
         parts = ("**",) if name == "/**" else (name.strip("/"), *kind)
         return "/".join((self._domain, *parts))
-
-
-_NODE = "NN"
 
 
 def _kind_of(token: str) -> str:
@@ -382,7 +351,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     zenoh.init_log_from_env_or("error,zenoh_link_tls=warn,zenoh_link_tls::utils=error")
     stage = ProcessStage.PARTICIPANT
     try:
-        config = _configuration(os.environ, router=options.role == "router")
+        config = configuration(os.environ, router=options.role == "router")
         if options.role == _FLOODER:
             _flood(json.loads(config.get_json("connect/endpoints"))[0], events, stop)
             return 0

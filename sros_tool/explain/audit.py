@@ -48,7 +48,7 @@ from sros_tool.graph.observation import (
     ObservedNode,
     make_observation,
 )
-from sros_tool.keystore.layout import enclave_names, enclave_path
+from sros_tool.keystore.layout import ROUTER_FILE, enclave_names, enclave_path
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave, plan_enclave
 from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
@@ -153,7 +153,11 @@ def audited_enclaves(
             "Omit --fleet.",
         )
     if rights.kind == "keystore":
-        return keystore_enclaves(rights, enclave_names(path), vendor, context)
+        names = enclave_names(path)
+        with_nodes = [
+            name for name in names if not (enclave_path(path, name) / ROUTER_FILE).exists()
+        ]
+        return keystore_enclaves(rights, with_nodes, vendor, context)
     if rights.kind != "policy":
         raise UsageError(
             f"'{path}' is neither a policy nor a keystore",

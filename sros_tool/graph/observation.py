@@ -20,7 +20,7 @@ import sys
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Protocol
 
 from sros_tool.values import Words, shows
 
@@ -44,6 +44,7 @@ class ObservedNode:
     ``enclaves`` holds the enclave of the process; all candidates, sorted, if the graph does not
     show which enclave it is.  ``participant`` is the first 12 bytes of the identifiers of the
     node's endpoints, in hexadecimal (RTPS 2.3, 8.2.4.1): nodes of the same process have the same.
+    On Zenoh it is ``zenoh-`` and the id of the session.
     """
 
     enclaves: tuple[str, ...]
@@ -52,7 +53,8 @@ class ObservedNode:
     name: str
     """Name of the node, without its namespace."""
     participant: str
-    """DDS participant of the node's process: the GUID prefix, in hexadecimal."""
+    """DDS participant of the node's process: the GUID prefix, in hexadecimal. On Zenoh, zenoh- and
+    the id of the session."""
     endpoints: frozenset[Endpoint]
 
     @property
@@ -195,12 +197,12 @@ def main() -> int:
         )
     except Exception as error:  # whatever rclpy raises has to reach the parent as a reason
         time.sleep(_LOG_FLUSH_SECONDS)
-        _send(report, {"failed": stage, "reason": f"{type(error).__name__}: {error}"})
+        send(report, {"failed": stage, "reason": f"{type(error).__name__}: {error}"})
         return 1
     rmw = rclpy.get_rmw_implementation_identifier()
     try:
-        _send(report, {"ready": rmw})
-        _look(node, report, period, rmw in _ORDERED)
+        send(report, {"ready": rmw})
+        report_graph(_Observer(node), report, period, ordered=rmw in _ORDERED)
     except BrokenPipeError:
         pass
     finally:
@@ -209,14 +211,24 @@ def main() -> int:
     return 0
 
 
-def _look(node: Any, report: Any, period: float, ordered: bool) -> None:
+class GraphObserver(Protocol):
+    """Something that sees the ROS graph."""
+
+    def sight(self) -> tuple[list[Any], list[Any]] | None:
+        """Return nodes and endpoints of the same moment, or None."""
+
+
+def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered: bool) -> None:
+    """Report the graph after each change until standard input is closed.
+
+    ``ordered`` says that the nodes are listed by ascending participant.
+    """
     before: object = None
-    observer = _Observer(node)
     while True:
         now = observer.sight()
         if now is not None and now != before:
             listed, endpoints = before = now
-            _send(report, {"ordered": ordered, "listed": listed, "endpoints": endpoints})
+            send(report, {"ordered": ordered, "listed": listed, "endpoints": endpoints})
         if select.select([sys.stdin], [], [], period)[0]:
             return
 
@@ -277,7 +289,8 @@ class _Observer:
         return sorted(endpoint for endpoint in endpoints if (endpoint[0], endpoint[2]) != own)
 
 
-def _send(report: Any, value: object) -> None:
+def send(report: Any, value: object) -> None:
+    """Write a line of the report."""
     report.write(json.dumps(value) + "\n")
 
 

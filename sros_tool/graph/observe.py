@@ -67,16 +67,18 @@ class RosGraph:
     """The live ROS graph, observed by a child process; use it as a context manager.
 
     ``environment`` has additional variables for the child process: the domain, and the enclave if
-    the observer is to be secured.
+    the observer is to be secured.  With rmw_zenoh_cpp, the child process uses Zenoh, else rclpy.
 
     Raises:
-        UnavailableError: rclpy is not installed.
-        ObserverError: rclpy cannot start a node.
+        UnavailableError: rclpy, or Zenoh for Python, is not installed.
+        ObserverError: rclpy cannot start a node, or Zenoh cannot connect.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
-        _require_rclpy()
         self._environment = {**_NO_SHARED_MEMORY, **os.environ, **(environment or {})}
+        on_zenoh = self._environment.get("RMW_IMPLEMENTATION") == "rmw_zenoh_cpp"
+        self._module = f"sros_tool.graph.{'zenoh_tokens' if on_zenoh else 'observation'}"
+        _require("zenoh" if on_zenoh else "rclpy")
         self.rmw = ""
 
     def __enter__(self) -> Self:
@@ -86,7 +88,7 @@ class RosGraph:
             self._process = subprocess.Popen(
                 # -P: never import modules from the current folder.
                 [
-                    *(sys.executable, "-P", "-m", "sros_tool.graph.observation"),
+                    *(sys.executable, "-P", "-m", self._module),
                     *(str(write_end), str(_PERIOD_SECONDS)),
                 ],
                 stdin=subprocess.PIPE,
@@ -181,20 +183,28 @@ class RosGraph:
             "import": "rclpy cannot be imported",
             "participant": "rclpy cannot start",
             "node": "rclpy cannot start a node to observe the graph",
+            "session": "the observer cannot connect to the Zenoh router",
         }[answer["failed"]]
         return ObserverError(what, f"{answer['reason']}".rstrip(".") + ".", output)
 
 
-def _require_rclpy() -> None:
-    """Raise `UnavailableError` if this Python has no rclpy."""
-    if importlib.util.find_spec("rclpy") is None:
+def _require(module: str) -> None:
+    """Raise `UnavailableError` if this Python has no ``rclpy``, or no ``zenoh``."""
+    if importlib.util.find_spec(module) is not None:
+        return
+    if module == "zenoh":
         raise UnavailableError(
-            "rclpy is not installed for this Python, and sros needs it to observe the ROS graph",
+            "Zenoh is not installed for this Python, and sros needs it to observe the ROS graph",
             f"Python is {sys.executable}.",
-            "On a machine with ROS 2, source its setup file first (. /opt/ros/jazzy/setup.bash); "
-            "elsewhere: `pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-std-msgs`. "
-            "A policy can still be learned from logs with --from-log.",
+            "Run `pip install eclipse-zenoh`.",
         )
+    raise UnavailableError(
+        "rclpy is not installed for this Python, and sros needs it to observe the ROS graph",
+        f"Python is {sys.executable}.",
+        "On a machine with ROS 2, source its setup file first (. /opt/ros/jazzy/setup.bash); "
+        "elsewhere: `pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-std-msgs`. "
+        "A policy can still be learned from logs with --from-log.",
+    )
 
 
 def _parse_listed(listed: Sequence[Sequence[str]]) -> tuple[Listed, ...]:

@@ -566,7 +566,13 @@ _DOMAIN = re.compile(r"(?:0|[1-9][0-9]{0,8})\Z", re.ASCII)
 
 @lru_cache(maxsize=65536)
 def _topics(key: str, domain: int, begin: str) -> NameSet:
-    """Return the topics with a prefix that stand for what a key expression includes."""
+    """Return the topics with a prefix that stand for what a key expression includes.
+
+    No ROS name has a part that begins with "@": such keys are the history of a topic, which belongs
+    to its right, or the graph.
+    """
+    if "/@" in key:
+        return NameSet()
     end, space = _ENDS[begin], str(domain)
     key = untyped(key)
     name = key.removesuffix(_UNTYPED).removeprefix(space)

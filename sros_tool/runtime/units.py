@@ -187,7 +187,9 @@ def node_settings(
     """
     folder = _check_path(keystore, "the keystore") + "/enclaves"
     place = folder + enclave.rstrip("/")
-    program = " ".join(_words(command)) if command else f"{_NODES}{enclave.rstrip('/') or '/root'}"
+    program = (
+        " ".join(unit_words(command)) if command else f"{_NODES}{enclave.rstrip('/') or '/root'}"
+    )
     lines = [
         f"# Enclave {enclave} for {TEMPLATE}.",
         _MADE,
@@ -214,7 +216,7 @@ def node_settings(
             "--match",
             enclave,
         )
-        lines.append(f"ExecStartPre={' '.join(_words(verify))}")
+        lines.append(f"ExecStartPre={' '.join(unit_words(verify))}")
     return "\n".join((*lines, f"ExecStart={program}")) + "\n"
 
 
@@ -397,7 +399,7 @@ def _lines(lines: Iterable[str]) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def _words(command: Sequence[str]) -> Iterable[str]:
+def unit_words(command: Sequence[str]) -> Iterable[str]:
     """Yield the words of a command, quoted so that systemd passes them on unchanged.
 
     Raises:

@@ -1,9 +1,11 @@
-"""A robot that runs open on rclpy is closed on Cyclone DDS, and heard by nobody else."""
+"""A live robot is closed: on Cyclone DDS, on Zenoh; everything talks, and nobody else hears it."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -22,10 +24,7 @@ from tests.support.children import apart, has_isolation, importing, wait_for
 from tests.support.harness import Ended, sros
 from tests.support.long_form import sometimes
 
-pytestmark = [
-    pytest.mark.dds,
-    pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not here"),
-]
+pytestmark = pytest.mark.dds
 
 DOMAIN = 187
 SCRIPT = Path(__file__).with_name("ros_nodes") / "turning.py"
@@ -89,6 +88,7 @@ def proofs(ended: Ended) -> dict[str, Any]:
     return {proof["claim"]: proof for proof in json.loads(ended.out)["proofs"]}
 
 
+@pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not here")
 @sometimes("a live robot is closed")
 def test_a_robot_is_closed(tmp_path: Path) -> None:
     if not has_isolation():
@@ -117,3 +117,92 @@ def test_a_robot_is_closed(tmp_path: Path) -> None:
     # On the wheels of rclpy, which enforce no security, there is no observer with an enclave.
     assert talk["holds"] is None and "without DDS Security" in talk["reason"], talk
     assert silence["holds"] is True and "that saw 2 nodes before" in silence["reason"], silence
+
+
+# ── Zenoh ──────────────────────────────────────────────────────────────────────────────────
+
+ZENOH_NODES = SCRIPT.with_name("zenoh_nodes.py")
+ON_ZENOH = {
+    "talker": "/chatter",
+    "listener": "/chatter",
+    "server": "/add",
+    "client": "/add",
+    "action_server": "/count",
+    "action_client": "/count",
+}
+HEARING = ("listener", "client", "action_client")
+
+
+@contextmanager
+def all_running(folder: Path, commands: list[str]) -> Iterator[None]:
+    """Run shell commands, the router first, until everybody who should hear something does."""
+    reports = [folder / f"{role}.jsonl" for role in HEARING]
+    for report in reports:
+        report.write_text("")
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    children = []
+    try:
+        for command in commands:
+            environment = importing(PATH=path)
+            output = (folder / "robot.log").open("ab")
+            words = ["/bin/sh", "-c", command.replace(" && ", " && exec ", 1)]
+            children.append(
+                subprocess.Popen(
+                    words, env=environment, stdout=output, stderr=output, preexec_fn=end_with_parent
+                )
+            )
+            if len(children) == 1:
+                wait_for(lambda: "router ready" in (folder / "robot.log").read_text(), "router")
+        wait_for(lambda: all(map(heard, reports)), "everybody hears what is for them")
+        yield
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+        (folder / "robot.log").rename(folder / "robot.log.before")
+
+
+def play_on_zenoh(folder: Path) -> dict[str, Any]:
+    """Close the robot by the commands that sros says, and open it again by them."""
+    (folder / "rmw_zenohd").symlink_to(ZENOH_NODES)
+    programs = [[sys.executable, "rmw_zenohd"]]
+    for role, name in ON_ZENOH.items():
+        node = [sys.executable, str(ZENOH_NODES), f"{role}.jsonl", role, name]
+        programs.append([*node, "--ros-args", "-r", f"__node:={role}"])
+    named = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp", "ROS_SECURITY_ENABLE": None}
+    named |= {"ROS_DOMAIN_ID": None, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+
+    def close(*words: str) -> Ended:
+        return sros("close", "robot", *words, env=named, cwd=folder)
+
+    said: dict[str, Any] = {}
+    with all_running(folder, [f"cd {folder} && {shlex.join(words)}" for words in programs]):
+        said["open"] = close()
+        said["applied"] = close("--apply")
+    starts = [line[2:] for line in said["applied"].out.splitlines() if line.startswith("  ")]
+    with all_running(folder, starts):
+        said["closed"] = close("--proof", "--partial", "--json")
+    said["undone"] = close("--undo")
+    mark = "by hand, restart it open: "
+    lines = said["undone"].err.splitlines()
+    with all_running(folder, [line.removeprefix(mark) for line in lines if mark in line]):
+        said["open again"] = close("--proof", "--partial", "--json")
+    return said
+
+
+@pytest.mark.skipif(importlib.util.find_spec("zenoh") is None, reason="Zenoh is not here")
+@sometimes("a live robot is closed")
+def test_a_robot_on_zenoh_is_closed_and_opened_again(tmp_path: Path) -> None:
+    if not has_isolation():
+        pytest.skip("needs a network of its own")
+    said = apart(lambda: play_on_zenoh(tmp_path))
+    assert said["open"].status == 0, said["open"]
+    assert "  action /count: /action_client -> /action_server\n" in said["open"].out
+    assert said["applied"].status == 1
+    assert said["closed"].status == 0, said["closed"]
+    processes, talk, silence = proofs(said["closed"]).values()
+    assert processes["holds"] is not False, processes
+    assert talk["reason"] == "6 nodes with 118 endpoints as before", talk
+    assert silence["holds"] is True, silence
+    (first,) = proofs(said["open again"]).values()
+    assert first["holds"] is False
