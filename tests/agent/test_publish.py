@@ -640,6 +640,25 @@ def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:
     assert robot.gets() == publisher.robot().gets()
 
 
+@pytest.mark.parametrize("at", ["metadata", "targets", "targets/robots", "metadata/timestamp.json"])
+def test_links_and_pipes_in_a_publishing_folder_lead_nowhere(publisher: Home, at: str) -> None:
+    place, kept = publisher.pub / at, publisher.folder / "kept"
+    place.rename(kept)
+    outside = publisher.folder / "outside"
+    outside.mkdir()
+    for is_link in (True, False):
+        if is_link:
+            place.symlink_to(outside)
+        else:
+            os.mkfifo(place)
+        with pytest.raises((KeystoreError, OSError)):
+            publisher.publish()
+        place.unlink()
+    assert not [*outside.iterdir()]
+    kept.rename(place)
+    publisher.publish()
+
+
 def test_the_folder_of_another_keystore(publisher: Home) -> None:
     for name in ("fleet_root.json", "published.json"):
         (publisher.root / name).unlink()

@@ -197,6 +197,16 @@ def test_two_at_once(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     home.run("fleet", "confirm", "ks", "said", "--robot", "r1")
 
 
+def test_an_inbox_that_is_moved_away_meanwhile(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
+    def meanwhile(root: Path, received: Received) -> str:
+        home.inbox.rename(home.folder / "elsewhere")
+        return keep(root, received)
+
+    home.send("r1")
+    monkeypatch.setattr(collecting, "keep", meanwhile)
+    assert home.of("r1").outcome == "kept"
+
+
 def test_the_verb_says_what_it_did(home: Home) -> None:
     now = datetime.now(UTC)
     home.send("r1", now)

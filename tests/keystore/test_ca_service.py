@@ -17,6 +17,8 @@ from cryptography.hazmat.primitives import hashes
 import sros_tool
 from sros_tool.api import check
 from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.keystore.confirmation import MESSAGE_FILE
+from sros_tool.keystore.delivery.collect import collect
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.issuing import ca_service
 from sros_tool.keystore.issuing.keyring import Keyring
@@ -37,7 +39,8 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.crl import Revoked, sign_crl
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.validity import Window, parse_iso
-from tests.support.harness import certificate, snapshot, sros
+from tests.support.harness import certificate, policy_text, publish, snapshot, sros
+from tests.support.messages import key_of, said_by, signed_message
 
 DAY = timedelta(days=1)
 
@@ -346,3 +349,37 @@ def test_what_a_service_cannot_do_is_refused(site: Path, tmp_path: Path) -> None
     create_enclaves(own, ["/talker"], now=now())
     with pytest.raises(UsageError, match="Leave --crl out"):
         revoke(own, ["/talker"], now=now(), crl=listed(1))
+
+
+def test_a_later_list_of_the_service_that_a_robot_sends_stops_no_renewal(
+    tmp_path: Path, install: Install
+) -> None:
+    """Everybody may have it, also with certificates of other sites alone."""
+    install(office(tmp_path))
+    root, then = tmp_path / "site", now() + 20 * DAY
+    create_keystore(
+        root, template=TEMPLATE, now=now(), keyring=SERVICE, imported={"identity": pem(CA)}
+    )
+    (tmp_path / "fleet.toml").write_text(
+        '[groups.some]\nrenewal = "allowed"\n[robots]\n'
+        'r1 = { groups = ["some"] }\nr2 = { groups = ["some"] }\n'
+    )
+    (tmp_path / "policy.xml").write_text(policy_text({"/{robot}/base": publish("/x")}))
+    stated = ("-p", tmp_path / "policy.xml", "--fleet", tmp_path / "fleet.toml")
+    sros("generate_artifacts", "-k", root, *stated).ok()
+    for robot, crl in (("r1", listed(4711, number=7, days=300).decode()), ("r2", None)):
+        folder, enclave = tmp_path / robot, f"/{robot}/base"
+        sros("distribute_key", root, "--robot", robot, folder).ok()
+        request = make_request(key_of(folder, enclave), enclave).decode()
+        said = said_by(folder, robot, then, crl=crl, requests=(request,))
+        (tmp_path / "inbox" / robot).mkdir(parents=True)
+        message = tmp_path / "inbox" / robot / MESSAGE_FILE
+        message.write_bytes(signed_message(folder, enclave, said))
+    found = collect(root, tmp_path / "inbox", now=then)
+    assert [robot.requests[0].outcome for robot in found.robots] == ["renewed", "renewed"]
+    assert "fleet.later-list" in [note.id for note in found.notes]
+    mine = certificate(root / "enclaves/r1/base/cert.pem").serial_number
+    said = said_by(tmp_path / "r2", "r2", then, sequence=2, crl=listed(mine, number=8).decode())
+    message.write_bytes(signed_message(tmp_path / "r2", "/r2/base", said))
+    (note,) = collect(root, tmp_path / "inbox", now=then).notes
+    assert note.text.startswith("r1, r2 have a revocation list of the CA service")

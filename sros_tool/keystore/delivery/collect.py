@@ -12,12 +12,13 @@ import errno
 import hashlib
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, NamedTuple
 
 from cryptography import x509
@@ -360,7 +361,8 @@ def _read_message(inbox: Folder, robot: str) -> _File | None:
 
 def _unknown_names(inbox: Path, fleet: Fleet) -> Iterator[Note]:
     """Yield a note on names in the inbox that are those of no robot."""
-    with os.scandir(inbox) as entries:
+    names: list[str] = []
+    with suppress(OSError), os.scandir(inbox) as entries:  # others can move the folder
         names = sorted(entry.name for entry in islice(entries, _MOST_NAMES))
     unknown = [ascii(name)[1:-1] for name in names if name not in fleet.robots]
     if unknown:
@@ -667,7 +669,8 @@ def _revoke_again(
 ) -> tuple[str, list[Note], list[FileChange]]:
     """Revoke what lists of robots revoke and the keystore does not; refuse what they vouched for.
 
-    ``telling`` are robots with such lists.  If it fails, nothing is signed.  Return as `_sign`.
+    ``telling`` are robots with such lists.  If it fails, nothing is signed; a note says it of the
+    list of a CA service, which alone can sign another.  Return as `_sign`.
     """
     if not forgotten.lists:
         return "", [], []
@@ -677,6 +680,14 @@ def _revoke_again(
         if again & {*request.vouching}:
             request.done("refused", "its certificate was revoked")
     have = "has" if len(telling) == 1 else "have"
+    if keyring.ca_service(root, IDENTITY, Keystore(root).template):
+        # Its list is for all sites, and everybody can have it: nobody else has to wait.
+        text = (
+            f"{first_few(telling, _SHOWN)} {have} a revocation list of the CA service that the "
+            f"keystore does not know: take it with `sros crl {quote(str(root))} --refresh "
+            "--crl FILE`"
+        )
+        return "", [Note("fleet.later-list", text)], []
     try:
         restored = restore_revocations(
             root, forgotten.lists, now=now, keyring=keyring, dry_run=dry_run

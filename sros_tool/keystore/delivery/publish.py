@@ -91,7 +91,7 @@ if TYPE_CHECKING:
 _ROLES = ("root", "targets", "snapshot", "timestamp")
 _ONLINE = _ROLES[1:]
 """The roles whose keys have to be in the keystore."""
-_METADATA, _ARCHIVES = "metadata", "targets/robots"
+_METADATA, _TARGETS, _ARCHIVES = "metadata", "targets", "targets/robots"
 _KEPT = timedelta(days=2)
 """How long files stay that nothing names any more: robots may be in the middle of an update."""
 _OURS = re.compile(
@@ -180,9 +180,12 @@ def publish(
     _check_apart(root, folder)
     with ExitStack() as stack:
         if not dry_run:
-            for part in (_METADATA, _ARCHIVES):
-                make_folders(folder / part)
-            lock = KeystoreLock(stack.enter_context(Folder(folder)), "publishing folder")
+            make_folders(folder)
+            opened = stack.enter_context(Folder(folder))
+            for part in (_METADATA, _TARGETS, _ARCHIVES):
+                if not opened.is_folder(part):
+                    opened.mkdir(part, 0o755)
+            lock = KeystoreLock(opened, "publishing folder")
             stack.callback(lock.release)
             lock.acquire()
         run = _Run(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
