@@ -90,8 +90,8 @@ class Fault(Enum):
     FILE_NO_FILE = (
         "file-no-file",
         "a folder or a pipe in place of a file of an enclave",
-        "DDS cannot read it. Where a file that is to be mounted into a container is not there, "
-        "some programs make a folder with its name.",
+        "DDS cannot read it. If a file to be mounted into a container does not exist, some "
+        "container programs make a folder with its name.",
         _RCL,
         f"Remove it, and put the file in its place. {_RESTORE}",
     )
@@ -186,10 +186,10 @@ class Fault(Enum):
     KEY_TWICE = (
         "key-twice",
         "an enclave with a key in a file, and another on a token",
-        "rmw_fastrtps of ROS 2 Jazzy and later uses the one on the token, every other RMW the "
-        "file, which can be copied.",
+        "rmw_fastrtps of ROS 2 Jazzy and later uses the key on the token; every other RMW uses "
+        "the file, which can be copied.",
         "rmw_dds_common of ROS 2 Jazzy (security.cpp).",
-        "Keep the one that belongs to cert.pem: delete key.pem, or {path}.",
+        "Keep the key that belongs to cert.pem: delete key.pem, or {path}.",
     )
     CRL_MALFORMED = (
         "crl-malformed",
@@ -270,11 +270,11 @@ class Fault(Enum):
         "a document that no CA signed, and that vendors accept",
         "Cyclone DDS 0.10 and Fast DDS 2.9.1 accept every signer whose certificate the "
         "permissions CA issued. If that CA also issues identities, each enclave can sign rights "
-        "for itself: whoever has its key signed these.",
+        "for itself: someone with the signer's key signed this document.",
         "CVE-2023-24011; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
-        "Unless you signed it so on purpose, take the key of the signer for stolen: `sros revoke "
-        "{root} {enclave}`. If one CA is for both, use separate CAs for identities and documents, "
-        "as keystore.one-authority says.",
+        "Unless you signed it on purpose, treat the signer's key as stolen: `sros revoke {root} "
+        "{enclave}`. If one CA is for both, use separate CAs for identities and documents, as "
+        "keystore.one-authority says.",
         {"governance.p7s": f"Find out who signed it. {_GOVERNANCE}"},
     )
     GOVERNANCE_MALFORMED = (

@@ -131,12 +131,12 @@ OTHER_DISTRIBUTION = FindingKind(
     "runtime.other-distribution",
     WARNING,
     "ROS_DISTRO is none of the distributions that the keystore is for",
-    "`sros check` decided by the DDS of those distributions. Another one can open or close what "
-    "they do not, without any message.",
+    "`sros check` decided by the DDS of those distributions. Another distribution can allow or "
+    "deny other accesses, without any message.",
     "sros: `distributions` in the settings of a keystore, `distribution` in its fleet file.",
-    "Source one of them. Or compare the other one, by `--upgrade-to` of `sros check KEYSTORE`, and "
-    "add it: `sros update_keystore KEYSTORE --set distributions=NAME,...`, or `distribution` in "
-    "the fleet file.",
+    "Source one of these distributions. Or check the other one, with `--upgrade-to` of `sros "
+    "check KEYSTORE`, and add it: `sros update_keystore KEYSTORE --set distributions=NAME,...`, "
+    "or `distribution` in the fleet file.",
 )
 ENCLAVE_NOT_FOUND = FindingKind(
     "runtime.enclave-not-found",
@@ -393,7 +393,7 @@ PROCESS_OPEN = FindingKind(
     ERROR,
     "a process of rmw_zenoh that asks for security and enforces nothing",
     "It runs without a session file, or with one that has no access control: whoever connects to "
-    "it, or plays its router, reads everything from it and sends it anything.",
+    "it, or impersonates its router, reads everything from it and sends it anything.",
     _SOURCE,
     f"Stop it, and start it again. {OWN_CONFIGURATION}",
 )

@@ -202,8 +202,8 @@ MISSPELT = FindingKind(
     "policy.name-misspelt",
     WARNING,
     "a name that differs slightly from a name of the other side",
-    "Neither of the two names has a counterpart, so the nodes do not communicate: one is perhaps "
-    "a typing error, or of another kind, such as a service where an action is called.",
+    "Neither of the two names has a counterpart, so the nodes do not communicate: one of them may "
+    "have a typing error, or be of another kind, such as a service where an action is called.",
     "sros: the policy as a whole.",
     "Write the same name, of the same kind, on both sides, as the nodes have it after remapping.",
 )
@@ -213,9 +213,9 @@ CONTRADICTING_PROTECTION = FindingKind(
     ERROR,
     "a name with contradicting protect= values",
     "A keystore has one governance for all enclaves, so a name has one protection; a wildcard "
-    "says it of all names that it matches. No keystore can be made from this.",
+    "sets it for all names that it matches. No keystore can follow this policy.",
     "DDS-Security 1.1, 9.4.1.2 (topic rules); sros: protect= in a policy.",
-    "Say the same in both places, or in one of them only.",
+    "State the same protection in both places, or only in one of them.",
 )
 
 _LONGEST = 247
@@ -376,8 +376,8 @@ NO_TYPE_DESCRIPTION = FindingKind(
     ERROR,
     "a node that may not offer ~/get_type_description",
     "Nodes of ROS 2 Iron and later offer this service when they start, and exit if it is denied. "
-    "Nodes of earlier distributions, such as Humble, do not have it: name theirs with --distro, "
-    "or by $ROS_DISTRO.",
+    "Nodes of earlier distributions, such as Humble, do not have it: if yours is one of them, "
+    "name it with --distro or in $ROS_DISTRO.",
     "ROS 2 Jazzy, rclcpp 28 and rclpy 7 (node type descriptions interface); Iron, rclcpp 21; "
     "REP-2016.",
     f'Allow <services reply="ALLOW"><service>~/get_type_description</service></services>. '
@@ -622,7 +622,7 @@ ROOT_ENCLAVE = FindingKind(
     "without an enclave / in the keystore, it does not start.",
     "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",
     "Remove the enclave / from the policy once each process has its own: `sros generate_policy "
-    "POLICY --enclave-per-node` learns them so.",
+    "POLICY --enclave-per-node` writes such a policy.",
 )
 
 
@@ -850,9 +850,9 @@ REDUNDANT_INCLUDE = FindingKind(
 SHARED_NAMESPACE = FindingKind(
     "policy.shared-namespace",
     WARNING,
-    "robots whose namespaces are the same, or lie in one another",
-    "Names of one robot are also names of the other: both publish and subscribe them, and what is "
-    "allowed with a wildcard in the outer namespace is allowed in the inner one.",
+    "robots with the same namespace, or with one namespace inside the other",
+    "Both robots publish and subscribe to the same names; and a wildcard in the outer namespace "
+    "also matches the names in the inner one.",
     "rcl (names are the namespace and the rest); sros (placeholder {namespace}).",
     "Give each robot a namespace of its own in the fleet file, or a ROS domain of its own.",
 )

@@ -117,7 +117,7 @@ PROCESS_REPLACEABLE = FindingKind(
     "Whoever can write to a folder of the keystore decides with which files the process starts "
     "the next time.",
     "POSIX.1-2017, rename() and unlink(): they need only the right to write to the folder.",
-    "Take the right to write from others: `chmod go-w FOLDER`.",
+    "Remove the write permission of other users: `chmod go-w FOLDER`.",
 )
 PROCESS_NOT_SEEN = FindingKind(
     "runtime.process-not-seen",
@@ -462,7 +462,8 @@ PROCESS_ELSEWHERE = FindingKind(
     "It cannot reach the nodes of this network, and is compared only with nodes of its own "
     "network.",
     "network_namespaces(7).",
-    "Run `sros check runtime` in that network, too, or look whether they are meant to be there.",
+    "Run `sros check runtime` in that network, too, or find out whether the node is meant to be "
+    "there.",
     prominent=True,
 )
 
@@ -479,8 +480,8 @@ NOT_SECURED = FindingKind(
     "runtime.not-secured",
     NOTE,
     "security is not enabled here: nodes start open",
-    "Everybody on the network hears these nodes and can send to them. That nothing else is found "
-    "here says nothing about their security.",
+    "Everybody on the network hears these nodes and can send to them. The absence of other "
+    "findings says nothing about their security.",
     "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy.",
     "Start nodes with `sros run KEYSTORE ENCLAVE -- COMMAND...`, or set the variables with "
     '`eval "$(sros env KEYSTORE ENCLAVE)"`.',

@@ -17,7 +17,8 @@ VACUOUS = FindingKind(
     "requirement.vacuous",
     WARNING,
     "a requirement, or a part of one, that cannot fail",
-    "It protects nothing: perhaps a name is misspelt or was changed, or everybody is excepted.",
+    "It protects nothing: perhaps a name is misspelled or was changed, or the exceptions cover "
+    "every enclave.",
     "The requirements file.",
     "Correct the name or the exceptions, or remove the requirement.",
 )
@@ -37,7 +38,7 @@ ASSUMED = FindingKind(
     "The governance of the keystore protects topics, and a policy alone has none. A keystore's "
     "template can protect less than the default template.",
     "The requirements file.",
-    "Name the keystore's template with --template, say protect= in the policy, or check the "
+    "Name the keystore's template with --template, write protect= in the policy, or check the "
     "keystore.",
     prominent=True,
 )
@@ -48,7 +49,8 @@ NOT_CROSSING = FindingKind(
     "The enclave has the right, and so has an enclave at another router, but the routers do not "
     "pass the name on to each other.",
     "The requirements file, and the router.json5 of both routers.",
-    "Add the name to `crossing` in the settings, or ignore this if it is for one robot alone.",
+    "Add the name to `crossing` in the settings, or ignore this if the name is used on one robot "
+    "only.",
     prominent=True,
 )
 NOT_ON_ZENOH = FindingKind(

@@ -9,9 +9,9 @@ from sros_tool.checks.kind import ERROR, NOTE, WARNING, FindingKind
 
 _ENGINE = "sros: its decision engine, with the rules of the DDS that each distribution ships."
 _DECIDE_ALIKE = (
-    "`sros explain KEYSTORE ENCLAVE ... --all-distros` shows the rule that decides in each. Remove "
-    "denials of what no rule allows, and sign the rights in the form that sros writes: `sros "
-    "create_permission KEYSTORE ENCLAVE POLICY_FILE`."
+    "`sros explain KEYSTORE ENCLAVE ... --all-distros` shows the rule that decides for each "
+    "distribution. Remove denials of names that no rule allows, and sign the rights in the form "
+    "that sros writes: `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`."
 )
 
 OPENS = FindingKind(
@@ -46,10 +46,10 @@ ACCEPTED = FindingKind(
     WARNING,
     "an enclave that is refused now and runs after the update",
     "The DDS of the other distribution accepts a file that is refused now, such as expired "
-    "permissions: what was shut out joins again.",
+    "permissions: the enclave can join again.",
     _ENGINE,
-    "If it must stay out, revoke it with `sros revoke KEYSTORE ENCLAVE`. Otherwise replace what is "
-    "refused now, so that both accept it.",
+    "If it must stay out, revoke it with `sros revoke KEYSTORE ENCLAVE`. Otherwise replace the "
+    "refused file, so that both distributions accept it.",
 )
 NO_NODE = FindingKind(
     "upgrade.node-cannot-start",
@@ -103,8 +103,8 @@ DIFFER = FindingKind(
     "distribution.differ",
     ERROR,
     "an access that is open on one distribution of the keystore and closed on another",
-    "The keystore or its fleet says that it is for both. The same signed permissions give an "
-    "enclave more rights on one of them.",
+    "The settings of the keystore or its fleet name both distributions. The same signed "
+    "permissions give an enclave more rights on one of them.",
     _ENGINE,
     _DECIDE_ALIKE,
 )
@@ -112,7 +112,7 @@ DISTRIBUTION_REFUSES = FindingKind(
     "distribution.refused",
     ERROR,
     "an enclave that runs on one distribution of the keystore and not on another",
-    "The keystore or its fleet says that it is for both.",
+    "The settings of the keystore or its fleet name both distributions.",
     _ENGINE,
     "Replace what is refused, or correct `distributions` in the settings of the keystore: `sros "
     "update_keystore KEYSTORE --set distributions=NAME,...`.",

@@ -22,8 +22,8 @@ KNOWN_VULNERABILITIES = FindingKind(
     "runtime.known-vulnerabilities",
     WARNING,
     "a DDS with known vulnerabilities",
-    "Some end a process by one packet of anybody on the network, also of a secured robot; the "
-    "version that counts is that of the library which a process has loaded.",
+    "With some of them, anyone on the network can crash a process with one packet, also on a "
+    "secured robot. The version is the one of the library that the process has loaded.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
     "Upgrade the package of the library to a release with the fixes, and restart the processes. "
     "Vulnerabilities that no release fixes stay: keep others out of the network.",
@@ -32,20 +32,20 @@ PACKAGE_VULNERABILITIES = FindingKind(
     "runtime.package-vulnerabilities",
     NOTE,
     "a DDS with known vulnerabilities, unless its package fixes them",
-    "Packages of Debian and Ubuntu carry fixes of later releases under the version of an earlier "
-    "one, so the version of the library does not tell.",
+    "Packages of Debian and Ubuntu can have fixes of later releases under an earlier version "
+    "number, so the version does not show whether the library is vulnerable.",
     "Advisories in the OSV format; Debian's changelog of fastdds 2.9.1+ds-1+deb12u2, which names "
     "eight numbers of 2023.",
-    "Compare the numbers with the changelog of the package (`apt changelog`) or the security "
+    "Compare the CVE numbers with the changelog of the package (`apt changelog`) or the security "
     "tracker of the distribution.",
     prominent=True,
 )
 UNCLEAR_VULNERABILITIES = FindingKind(
     "runtime.vulnerabilities-unclear",
     NOTE,
-    "a DDS without known vulnerabilities, of which some advisories say nothing",
-    "The history of a release line that does not name a vulnerability does not show whether the "
-    "line is not affected or not fixed.",
+    "a DDS without known vulnerabilities, but with advisories that do not mention its release line",
+    "If the history of a release line does not mention a vulnerability, either the line is not "
+    "affected, or the vulnerability is not fixed there.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
     "Look the numbers up in the advisories of the product.",
 )
@@ -53,7 +53,7 @@ VERSION_UNKNOWN = FindingKind(
     "runtime.dds-version-unknown",
     NOTE,
     "a DDS of unknown version",
-    "Which known vulnerabilities it has cannot be told.",
+    "sros cannot tell which known vulnerabilities it has.",
     "The name of the library that a process has mapped.",
     "Look for the version in the package that the library belongs to; if the library was replaced, "
     "restart the processes.",
@@ -63,7 +63,7 @@ ROBOTS_UNKNOWN = FindingKind(
     "runtime.robots-dds-unknown",
     NOTE,
     "robots whose DDS is not known, or not all of it",
-    "Which known vulnerabilities they have cannot be told.",
+    "sros cannot tell which known vulnerabilities they have.",
     "The last confirmations of the robots.",
     "Confirm again with this version of sros (`sros fleet report` on the robot), as a user who may "
     "look at all processes, and while the nodes run.",

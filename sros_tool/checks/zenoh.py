@@ -76,8 +76,8 @@ DEFAULT_ALLOW = FindingKind(
     "zenoh.default-allow",
     ERROR,
     "access control that allows what no rule denies",
-    "A query or a put with a wildcard passes a denial, and a process that "
-    "matches two subjects is denied only what both deny.",
+    "A query or a put with a wildcard gets past a denial, and a process that matches two subjects "
+    "is denied only what both subjects deny.",
     _MEASURED,
     'Write "default_permission": "deny", and rules that allow.',
 )
@@ -85,8 +85,8 @@ NOTHING_ALLOWED = FindingKind(
     "zenoh.nothing-allowed",
     WARNING,
     "access control under which no message passes",
-    "There is no policy that gives a subject a rule, and the default is to deny: Zenoh opens, and "
-    "drops everything without a message.",
+    "No policy gives a subject a rule, and the default is to deny: sessions open, and Zenoh drops "
+    "everything without a log line.",
     _MEASURED,
     _BY_SROS,
 )
@@ -104,20 +104,21 @@ SELF_LIMITING = FindingKind(
     "zenoh.self-limiting",
     ERROR,
     "a session whose rules bind only itself",
-    "No rule names another process: they say what this one may do, and only while it obeys. Any "
-    "other process with a certificate of the CA publishes to it, and reads from it.",
+    "No rule names another process: the rules say what this process may do, and bind it only "
+    "while it obeys. Any other process with a certificate of the CA publishes to it, and reads "
+    "from it.",
     "zenoh_security_tools writes such files; Zenoh 1.10.2, measured.",
     _BY_SROS,
 )
 DENY_IN_WILDCARD = FindingKind(
     "zenoh.deny-in-wildcard",
     ERROR,
-    "a denial that a wildcard passes",
-    "A rule applies to a message only if it includes the key of the message as a whole. A put, a "
-    "query or a subscription with a wildcard is not included in the denial, but is allowed, and "
-    "reaches what was denied.",
+    "a denial that a wildcard gets past",
+    "A rule applies to a message only if it covers the whole key expression of the message. A "
+    "put, a query or a subscription with a wildcard is wider than the denial, so it is allowed, "
+    "and reaches the denied names.",
     "Zenoh 1.5.1, 1.6.2 and 1.10.2, measured.",
-    "Allow the names that are meant, and remove the denial.",
+    "Allow the intended names, and remove the denial.",
 )
 DENY_OVERRULED = FindingKind(
     "zenoh.deny-overruled",
@@ -131,7 +132,7 @@ OVERLAPPING = FindingKind(
     "zenoh.overlapping-subjects",
     WARNING,
     "subjects that match the same process",
-    "Such a process has the rights of both; up to Zenoh 1.5.1, those of one of them, by chance.",
+    "Such a process has the rights of both subjects; up to Zenoh 1.5.1, of either one, by chance.",
     "Zenoh 1.5.1 (issue 2137 of zenoh) and 1.10.2, measured.",
     "Use one subject for each name.",
 )
@@ -218,8 +219,8 @@ ADMIN_SPACE = FindingKind(
     "zenoh.admin-space",
     WARNING,
     "Zenoh's admin space",
-    "It shows sessions, connections and the configuration; where it can be written, it changes "
-    "them.",
+    "Anyone who can read it sees sessions, connections and the configuration; anyone who can "
+    "write to it can change them.",
     _MEASURED,
     'Write "enabled": false in adminspace.',
 )

@@ -243,9 +243,9 @@ SETTINGS_MISSING = FindingKind(
 SETTINGS_EDITED = FindingKind(
     "keystore.settings-edited",
     WARNING,
-    "settings that were edited by hand and not carried out",
-    "Files that are issued later may follow them, earlier files do not: the edit takes effect in "
-    "part, and nobody was shown which protection it weakens.",
+    "settings that were edited by hand and not applied",
+    "Files that are issued later may follow the edit, earlier files do not; and nobody was shown "
+    "which protection it weakens.",
     "sros: the ledger has the settings as sros wrote them.",
     edit_remedy("KEYSTORE"),
 )
@@ -271,7 +271,7 @@ LEFT_ENCLAVES = FindingKind(
 NOT_AS_SETTINGS = FindingKind(
     "governance.not-as-settings",
     WARNING,
-    "a signed governance that is not what the settings state",
+    "a signed governance that differs from the settings",
     "DDS loads the signed governance. The [protection] in sros.toml has no effect.",
     "sros: sros.toml holds the settings of a keystore; DDS-Security 1.1, 9.4.1.2.",
     edit_remedy("KEYSTORE"),

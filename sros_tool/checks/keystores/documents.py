@@ -56,7 +56,7 @@ DEFAULT_ALLOW = FindingKind(
     "a grant that allows by default",
     "Fast DDS ignores <default>, and denies; Cyclone DDS allows everything that no rule names.",
     "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
-    "Write <default>DENY</default>, and an allow rule for the topics that are meant.",
+    "Write <default>DENY</default>, and an allow rule for the intended topics.",
 )
 ALLOW_RULES = FindingKind(
     "portable.several-allow-rules",
@@ -196,8 +196,8 @@ DOMAINS = FindingKind(
     "permissions and governance for different domains",
     "In a domain that only one of them names, no node of the enclave can communicate.",
     "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; measured.",
-    "Sign both for the same domains: `sros create_permission` uses those of the governance, or the "
-    "one of the robot in the fleet.",
+    "Sign both for the same domains: `sros create_permission` uses the domains of the governance, "
+    "or the robot's domain in the fleet file.",
 )
 FEWER_DOMAINS = FindingKind(
     "enclave.fewer-domains",

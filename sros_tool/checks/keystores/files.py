@@ -51,7 +51,7 @@ KEY_READABLE = FindingKind(
     ERROR,
     "a private key that others can read",
     "Anyone who can read it can act as that enclave, or with a CA key as any enclave. Neither rcl "
-    "nor DDS checks modes, and ros2/sros2 creates keys with mode 0644.",
+    "nor DDS checks file modes, and ros2/sros2 creates keys with mode 0644.",
     "ros2/sros2 0.13; rcl 9, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 check no modes.",
     "Run `chmod 600` on the key. If others had access, revoke the enclave, or "
     "replace the CA (`sros rotate_ca`).",
@@ -87,8 +87,8 @@ FOREIGN_OWNER = FindingKind(
     "keystore.foreign-owner",
     WARNING,
     "a keystore of another user",
-    "The owner can replace all its files, and so decides whom your nodes trust. An archive that "
-    "root unpacks may belong to whoever has that number on this machine.",
+    "The owner can replace all its files, and so decides whom your nodes trust. Files that root "
+    "unpacks from an archive may belong to the user who has the archive's user id on this machine.",
     "POSIX owners; CWE-283.",
     "Run the check as the user that runs the nodes, or make that user the owner: "
     "`chown -R USER KEYSTORE`.",
@@ -139,8 +139,8 @@ FOREIGN_STAGE = FindingKind(
     "keystore.transaction-not-ours",
     ERROR,
     "an interrupted write that sros cannot have left",
-    "Somebody else may have made it up, in the keystore or in the archive that it came from, to "
-    "have files moved in your name. Every verb that writes refuses to go on.",
+    "Somebody else may have forged it, in the keystore or in the archive that the keystore came "
+    "from, so that sros moves files in your name. Every verb that writes refuses to go on.",
     "sros: keystore/transaction/stage.py; CWE-59.",
     "Find out who can write to the keystore, look at what is in the folder, and remove it.",
 )
@@ -156,7 +156,7 @@ ARCHIVE = FindingKind(
     "keystore.archive",
     WARNING,
     "an archive or a container of keys where none belongs",
-    "It may hold private keys: as a backup of the keystore, those of its CAs. It is not opened.",
+    "It may hold private keys; a backup of the keystore has its CA keys. sros does not open it.",
     "ROS 2 keystore layout: private/ alone is for keys of CAs.",
     "Look at what is in it, and move it to a safe place. If others had access to a CA key in it, "
     "replace the CA (`sros rotate_ca`).",
@@ -175,11 +175,12 @@ HOME_OR_ROBOT = FindingKind(
     ERROR,
     "a keystore with keys that must not be on a robot",
     "The keys belong where the keystore is kept. On a robot, an attacker who gets a CA key can "
-    "create any enclave, with any rights. The files do not show which of the two this is.",
+    "create any enclave, with any rights. The files do not show whether this folder is at home or "
+    "on a robot.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "At home, keep the keys, and ask `sros check KEYSTORE`. On a robot, put an export in its place "
-    "(`sros distribute_key KEYSTORE ENCLAVE TARGET` at home); if others had access, replace the "
-    "CAs (`sros rotate_ca`).",
+    "At home, keep the keys, and run `sros check KEYSTORE`. On a robot, put an export in its "
+    "place (`sros distribute_key KEYSTORE ENCLAVE TARGET` at home); if others had access, replace "
+    "the CAs (`sros rotate_ca`).",
 )
 UNREADABLE = FindingKind(
     "keystore.file-unreadable",

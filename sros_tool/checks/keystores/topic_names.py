@@ -23,8 +23,8 @@ NO_ROS_NAME = FindingKind(
     "another name decides on nothing that a node does, so what it should allow is denied, and what "
     "it should deny may be allowed.",
     _MAPPING,
-    "Write the name as DDS has it, such as rt/chatter, rq/addRequest and rr/addReply, or let sros "
-    "write it: `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`. It is right only for a "
+    "Write the DDS name, such as rt/chatter, rq/addRequest and rr/addReply, or let sros write it: "
+    "`sros create_permission KEYSTORE ENCLAVE POLICY_FILE`. The present name is right only for a "
     "program that uses DDS without ROS.",
 )
 NOT_FOR_ROS = FindingKind(

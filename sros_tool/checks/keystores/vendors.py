@@ -51,10 +51,10 @@ REFUSED = FindingKind(
     "enclave.refused",
     ERROR,
     "an enclave that no DDS vendor accepts",
-    "Every vendor that is asked refuses it, or its peers do, so no node can run in it. With "
-    "--vendor only that vendor is asked.",
+    "Every vendor refuses it, or peers refuse its nodes, so no node can run in it. With --vendor, "
+    "only that vendor counts.",
     _ENGINE,
-    f"Replace what the vendors refuse. {_SEE}",
+    f"Replace the files that the vendors refuse. {_SEE}",
 )
 SOME_REFUSE = FindingKind(
     "portable.refused",
@@ -62,7 +62,8 @@ SOME_REFUSE = FindingKind(
     "an enclave that some DDS vendors refuse",
     "A node runs in it with one RMW, and fails, or finds no peer, with another.",
     _ENGINE,
-    f"Use an RMW of a vendor that accepts it, or replace what the others refuse. {_SEE}",
+    "Use an RMW of a vendor that accepts it, or replace the files that the other vendors "
+    f"refuse. {_SEE}",
 )
 DIFFER = FindingKind(
     "portable.vendors-differ",

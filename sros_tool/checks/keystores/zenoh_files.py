@@ -67,7 +67,7 @@ LEFT_OUT = FindingKind(
     "zenoh.left-out",
     WARNING,
     "an enclave that has no rights on Zenoh",
-    "It gets no configuration, and all others deny it everything.",
+    "It gets no configuration, and all other enclaves deny it everything.",
     _SOURCE,
     "State its rights with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`, or revoke it if "
     "nobody needs it.",
