@@ -42,7 +42,7 @@ from sros_tool.keystore.layout import (
     revoked_certificates,
     search_enclaves,
 )
-from sros_tool.keystore.ledger import GAP, SEALED, Entry
+from sros_tool.keystore.ledger import GAP, RESTORED, SEALED, Entry
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
 from sros_tool.keystore.reader import FilesReadOnce, Keystore, open_enclave
 from sros_tool.keystore.zenoh_files import OpenedZenoh, ZenohFault, open_zenoh
@@ -1012,7 +1012,7 @@ def history(root: Path, *, now: datetime) -> History:
     settings = _files(root, iter((SETTINGS,)))
 
     def status(entry: Entry) -> HistoryStatus:
-        if entry.what == GAP:
+        if entry.what in (GAP, RESTORED):
             return HistoryStatus.DAMAGED
         if entry.what == SEALED:
             return HistoryStatus.SEALED

@@ -65,6 +65,10 @@ if TYPE_CHECKING:
 
 GAP = "gap"
 SEALED = "sealed"
+RESTORED = "restored"
+REPORTED = "reported"
+"""The ``reason`` of a certificate that only the message of a robot showed: it can be revoked, and
+proves nothing."""
 SAME_KEY = "same key"
 """The ``reason`` of a CA certificate that has the same key as the CA's certificate before."""
 
@@ -81,8 +85,9 @@ class Entry(NamedTuple):
     """What was issued or done: ``ca``, ``certificate``, ``permissions``, ``governance``, ``crl``,
     ``revocation``, ``answer`` (the signed list of the files sent to a robot), ``settings`` (of the
     keystore), ``fleet``, ``release`` (the list of the robots' releases that were published at the
-    same time), ``sealed`` (the part of the ledger before this line), or ``gap``: lines before were
-    missing or changed."""
+    same time), ``sealed`` (the part of the ledger before this line), ``restored`` (the keystore
+    came from a backup, so that entries are missing), or ``gap``: lines before were missing or
+    changed."""
     enclave: str = ""
     """Name of the enclave; empty if the entry is for no enclave. All later keys are empty, too, if
     they do not apply."""
@@ -99,12 +104,14 @@ class Entry(NamedTuple):
     policy: str = ""
     """SHA-256 of the policy that permissions were made from, with its includes."""
     reason: str = ""
-    """Reason of a revocation, or fault that a gap records."""
+    """Reason of a revocation, fault that a gap records, or how a certificate became known if the
+    keystore did not issue it with this line."""
     key: str = ""
     """SHA-256 of the public key (DER) of the certificate, or of the revoked certificate."""
     number: int = 0
-    """Number of an answer or of releases (later ones have higher numbers), last line of a gap, or
-    number of the sealed part; else 0."""
+    """Number of an answer or of releases (later ones have higher numbers), last line of a gap,
+    number of the sealed part, or a number above all that the keystore gave before it was
+    restored; else 0."""
     settings: str = ""
     """The settings of the keystore, as TOML."""
     nodes: str = ""

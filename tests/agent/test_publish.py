@@ -13,6 +13,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
+from cryptography import x509
 
 from sros_tool.agent.fetch import FetchProblem
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
@@ -495,6 +496,68 @@ def test_a_keystore_that_was_restored(publisher: Home) -> None:
     assert load_crl(own, "it").number > listed.number
     assert load_crl(own, "it").revoked[0].serial == listed.revoked[0].serial
     assert not publisher.publish().names("published")
+
+
+@pytest.mark.parametrize("revoked_first", [True, False])
+def test_revoking_after_a_restore_covers_certificates_of_after_the_backup(
+    publisher: Home, revoked_first: bool
+) -> None:
+    """A thief keeps the files that the robot fetched after the backup."""
+    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    publisher.run("renew", "ks", "--all")
+    publisher.publish()
+    stolen = Keystore(publisher.root).certificate_of("/r5/base")
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    revoke = ("revoke", "ks", "--robot", "r5")
+    if revoked_first:
+        publisher.run(*revoke)
+    done = publisher.publish(restored=True)
+    assert [note.id for note in done.notes] == ["fleet.certificates-restored"]
+    if not revoked_first:
+        said = publisher.run(*revoke).err
+        assert "may lack earlier certificates: the keystore was restored from a backup" in said
+        assert "see `sros rotate_ca`" in said
+    publisher.run("renew", "ks", "--all")
+    publisher.publish()
+    release = publisher.robot("r1").gets()
+    (crl,) = (data for path, data in release.files.items() if path.endswith("crl.pem"))
+    listed = load_crl(crl, "of r1")
+    assert listed.revokes(stolen.serial_number)
+    own = release.files["enclaves/r1/base/cert.pem"]
+    assert not listed.revokes(x509.load_pem_x509_certificate(own).serial_number)
+    assert "[keystore." not in sros("check", "ks", cwd=publisher.folder).out
+    # Whatever is unknown ends with the CA.
+    publisher.run("rotate_ca", "ks", "--finish", "--allow-unconfirmed")
+    assert "restored" not in publisher.run("revoke", "ks", "/r2/base").err
+
+
+def test_a_publishing_folder_teaches_nothing_that_the_cas_did_not_sign(publisher: Home) -> None:
+    """A certificate of another CA, one that is recorded already, and files that are no archives."""
+    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    publisher.run("renew", "ks", "/r1/base")
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    publisher.run("create_keystore", "other")
+    publisher.run("create_enclave", "other", "/r2/base")
+    certificate = (publisher.folder / "other/enclaves/r2/base/cert.pem").read_bytes()
+    own = (publisher.root / "enclaves/r5/base/cert.pem").read_bytes()
+    folder = publisher.pub / "targets/robots"
+    for number, content in enumerate((certificate, own)):
+        files = {"enclaves/r2/base/cert.pem": content}
+        (seal,) = seal_releases([("r2", 999, files)], publisher.permissions_ca())
+        data = pack_release(Release("r2", 999, files, seal))
+        (folder / f"{hashlib.sha256(data).hexdigest()}.r2.tar.gz").write_bytes(data)
+        (folder / f"{number:064x}.r5.tar.gz").write_bytes(b"x")
+    before = len(Keystore(publisher.root).ledger.entries)
+    publisher.publish(restored=True)
+    added = Keystore(publisher.root).ledger.entries[before:]
+    assert [(entry.what, entry.enclave) for entry in added] == [
+        ("restored", ""),
+        ("certificate", "/r1/base"),
+        ("release", ""),
+    ]
 
 
 def test_a_keystore_that_was_restored_from_before_its_keys_were_replaced(publisher: Home) -> None:

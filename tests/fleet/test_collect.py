@@ -284,7 +284,7 @@ def test_a_certificate_that_proves_nothing(home: Home) -> None:
     issuer = Issuer(authority, of_authority)
     forged = issuer.issue(own.subject, key.public_key(), validity_of(own))
     home.put("r1", smime.sign(document, forged, key))
-    assert home.of("r1").why == "its certificate is not in the ledger of the keystore"
+    assert "is not in the ledger of the keystore, though its identity CA" in home.of("r1").why
     home.run("create_keystore", "other")
     home.run("create_enclave", "other", "/r1/base")
     foreign = home.folder / "other/enclaves/r1/base"
@@ -301,7 +301,7 @@ def test_a_certificate_that_proves_nothing(home: Home) -> None:
 
 
 def test_a_revoked_robot_that_is_still_in_the_fleet(home: Home) -> None:
-    """Its messages are not read, and fail no run; what it said last does not count any more."""
+    """Its messages do not count, and fail no run; nor does what it said before."""
     home.send("r2")
     home.send("r3")
     assert home.collect().complete
@@ -315,7 +315,7 @@ def test_a_revoked_robot_that_is_still_in_the_fleet(home: Home) -> None:
         ended = sros("fleet", "collect", "ks", "inbox", cwd=home.folder)
         assert ended.status == 0, ended
         assert "1 revoked" in ended.out.splitlines()[0]
-        assert "r2: revoked: all its enclaves were revoked; its message is not read" in ended.out
+        assert "r2: revoked: all its enclaves were revoked; its message does not count" in ended.out
     shutil.rmtree(home.inbox / "r2")
     assert (home.of("r2").outcome, home.of("r2").why) == ("revoked", "")
     found = json.loads(sros("fleet", "status", "ks", "--json", cwd=home.folder).out)
@@ -403,6 +403,43 @@ def test_what_only_robots_know_to_be_revoked_is_revoked_again(home: Home) -> Non
     assert "was revoked" in again.robots[1].why
     home.run("inspect", "ks", "--history")
     assert sros("fleet", "status", "ks", "--json", cwd=home.folder).status == 1
+
+
+def test_what_the_ca_signed_counts_in_a_message_that_does_not(home: Home) -> None:
+    """Its certificate can be revoked then, and vouches for nothing; its list revokes."""
+    backup = shutil.copytree(home.root, home.folder / "backup", symlinks=True)
+    home.run("revoke", "ks", "--robot", "r2")
+    home.run("renew", "ks", "/r1/base")
+    home.run("distribute_key", "ks", "--robot", "r1", "r1", "--force")
+    later = home.certificate("/r1/base")
+    crl = (home.folder / "r1/enclaves/r1/base/crl.pem").read_text()
+    home.send("r1", crl=crl, requests=(home.request("r1"),))
+    shutil.rmtree(home.root)
+    backup.rename(home.root)
+    for notes in (["fleet.revocations-restored", "fleet.certificates-restored"], []):
+        found = home.collect()
+        assert found.robots[0].outcome == "refused" and "ledger" in found.robots[0].why
+        assert not found.robots[0].requests and not found.not_signed
+        assert [note.id for note in found.notes] == notes
+    assert not (home.root / "enclaves/r2/base").exists()
+    assert "restored from a backup" in sros("revoke", "ks", "/r1/base", cwd=home.folder).err
+    crl_at_home = Keystore(home.root).revocation_list
+    assert crl_at_home and crl_at_home.revokes(later.serial_number)
+
+
+def test_a_certificate_of_a_revoked_robot_is_revoked_when_it_becomes_known(home: Home) -> None:
+    backup = shutil.copytree(home.root, home.folder / "backup", symlinks=True)
+    home.run("renew", "ks", "/r2/base")
+    home.run("distribute_key", "ks", "--robot", "r2", "r2", "--force")
+    later = home.certificate("/r2/base")
+    shutil.rmtree(home.root)
+    backup.rename(home.root)
+    home.run("revoke", "ks", "--robot", "r2")
+    home.send("r2")
+    assert home.of("r2").outcome == "revoked"
+    crl = Keystore(home.root).revocation_list
+    assert crl and crl.revokes(later.serial_number)
+    assert home.of("r2").outcome == "revoked" and not home.collect().notes
 
 
 def test_a_weak_key_is_not_certified(home: Home) -> None:

@@ -50,9 +50,9 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     has_enclave,
 )
-from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.ledger import REPORTED, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
-from sros_tool.keystore.lifecycle.revocation_list import ForgottenLists, revoked_serials
+from sros_tool.keystore.lifecycle.revocation_list import Forgotten, revoked_serials
 from sros_tool.keystore.lifecycle.revoke import (
     REVOKED_AGAIN,
     restore_revocations,
@@ -205,16 +205,18 @@ def collect(
             fleet.robot(name)
         verifier = _Verifier(keystore, fleet, now, frozenset(restored))
         renewals = _Renewals(keystore, fleet, now)
-        forgotten = ForgottenLists(keystore)
+        forgotten = Forgotten(keystore, now)
         telling: list[str] = []
         changes: list[FileChange] = []
         taken: list[_Taken] = []
         for message in _read_inbox(inbox, fleet, verifier):
             if message.verified:
                 message.requests = renewals.judge(message.robot, message.verified)
-                crl = message.verified.confirmation.crl
-                if crl and forgotten.add(crl.encode()):
-                    telling.append(message.robot.name)
+                message.crl = message.verified.confirmation.crl
+            if message.crl and forgotten.add(message.crl.encode()):
+                telling.append(message.robot.name)
+            if message.stranger:
+                forgotten.add_certificate(message.stranger, REPORTED)
             if message.received:
                 path = confirmation_file(message.robot.name)
                 action = "replace" if (root / path).exists() else "create"
@@ -270,19 +272,24 @@ class _Taken:
     sequence: int | None = None
     verified: _Verified | None = None
     received: Received | None = None
+    crl: str | None = None
+    """The revocation list in the message, which counts if a CA of the keystore signed it."""
+    stranger: x509.Certificate | None = None
+    """The certificate of the signer of a message that does not count."""
     remarks: list[str] = field(default_factory=list)
     requests: list[_Judged] = field(default_factory=list)
 
     def without_confirmation(self) -> _Taken:
         """Return the message without what was kept of it: there are thousands of robots."""
         if self.verified is None:
-            return self
+            return replace(self, crl=None, stranger=None)
         return replace(
             self,
             enclave=self.verified.enclave,
             sequence=self.verified.confirmation.sequence,
             verified=None,
             received=None,
+            crl=None,
         )
 
     def result(self) -> CollectedMessage:
@@ -321,17 +328,28 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Tak
         ) from error
     with folder:
         for robot in fleet.robots.values():
-            if verifier.was_revoked(robot):
-                there = folder.state(robot.name) is not None
-                why = "all its enclaves were revoked; its message is not read" if there else ""
-                yield _Taken(robot, "revoked", why)
-                continue
+            is_revoked, file = verifier.was_revoked(robot), None
             try:
                 file = _read_message(folder, robot.name)
-                taken = verifier.take(robot, file) if file else _Taken(robot, "missing")
+                if not is_revoked:
+                    yield verifier.take(robot, file) if file else _Taken(robot, "missing")
+                    continue
+                taken = _Taken(robot, "revoked")
             except _RefusedError as refusal:
-                taken = _Taken(robot, "refused", refusal.what)
+                taken = _Taken(robot, "revoked" if is_revoked else "refused", refusal.what)
+            if is_revoked and folder.state(robot.name) is not None:
+                taken.why = "all its enclaves were revoked; its message does not count"
+            if file:
+                _add_signed_by_others(taken, file.data)
             yield taken
+
+
+def _add_signed_by_others(taken: _Taken, message: bytes) -> None:
+    """Add what CAs signed in a message that does not count: revocation list and certificate."""
+    with suppress(SrosError):
+        signed = smime.parse_new(message)
+        taken.stranger = signed.signer()
+        taken.crl = parse_confirmation(signed.text, "it").crl
 
 
 def _read_message(inbox: Folder, robot: str) -> _File | None:
@@ -487,7 +505,10 @@ class _Verifier:
             raise _RefusedError(f"its certificate, {signer.serial_number:x}, was revoked")
         issued = self._issued(digest(signer))
         if issued is None:
-            raise _RefusedError("its certificate is not in the ledger of the keystore")
+            raise _RefusedError(
+                "its certificate is not in the ledger of the keystore, though its identity CA "
+                "issued it: `sros fleet status` says what to do"
+            )
         owner = robot_of(self._fleet, issued.enclave)
         if owner != robot:
             whose = f"an enclave of {owner.name}" if owner else "which is of no robot"
@@ -498,17 +519,18 @@ class _Verifier:
         """Return the ledger's entry of a certificate (SHA-256 of its DER), or None."""
         if self._searched < _FEW or self._keystore.ledger_file.is_indexed:
             self._searched += 1
-            entries = self._keystore.ledger_with("sha256", sha256).entries
-            entry = next((entry for entry in entries if entry.sha256 == sha256), None)
+            entries: Sequence[Entry] = self._keystore.ledger_with("sha256", sha256).entries
         else:
-            entry = self._certificates.get(sha256)
-        return entry if entry and entry.what == "certificate" and entry.enclave else None
+            entries = self._certificates.get(sha256, ())
+        return next((entry for entry in entries if _proves(entry, sha256)), None)
 
     @cached_property
-    def _certificates(self) -> Mapping[str, Entry]:
+    def _certificates(self) -> Mapping[str, Sequence[Entry]]:
         """The entries of all certificates, by the SHA-256 of the certificate."""
-        entries = self._keystore.ledger_with("what", "certificate").entries
-        return {entry.sha256: entry for entry in entries if entry.what == "certificate"}
+        by_digest: dict[str, list[Entry]] = {}
+        for entry in self._keystore.ledger_with("what", "certificate").entries:
+            by_digest.setdefault(entry.sha256, []).append(entry)
+        return by_digest
 
     @cached_property
     def _revoked(self) -> Collection[int]:
@@ -522,6 +544,12 @@ class _Verifier:
             yield f"its certificate expired {late} ago, at {iso(validity.not_after)}"
         elif self._now < validity.not_before:
             yield f"its certificate is valid only from {iso(validity.not_before)}"
+
+
+def _proves(entry: Entry, sha256: str) -> bool:
+    """Return whether a line of the ledger shows that the keystore issued a certificate."""
+    is_issued = entry.what == "certificate" and entry.reason != REPORTED
+    return is_issued and entry.sha256 == sha256 and bool(entry.enclave)
 
 
 # ── requests for renewal ───────────────────────────────────────────────────────────────────
@@ -659,7 +687,7 @@ class _Renewals:
 
 def _revoke_again(
     root: Path,
-    forgotten: ForgottenLists,
+    forgotten: Forgotten,
     telling: Sequence[str],
     taken: Sequence[_Taken],
     *,
@@ -669,40 +697,41 @@ def _revoke_again(
 ) -> tuple[str, list[Note], list[FileChange]]:
     """Revoke what lists of robots revoke and the keystore does not; refuse what they vouched for.
 
-    ``telling`` are robots with such lists.  If it fails, nothing is signed; a note says it of the
-    list of a CA service, which alone can sign another.  Return as `_sign`.
+    ``telling`` are robots with such lists.  Certificates that the ledger lacks are recorded.  If
+    the lists cannot be signed, nothing is signed; a note says it of the list of a CA service, which
+    alone can sign another, and knows its certificates.  Return as `_sign`.
     """
-    if not forgotten.lists:
+    if not (forgotten.lists or forgotten.unknown(Keystore(root))):
         return "", [], []
     again = {entry.serial for crl in forgotten.lists for entry in crl.revoked}
     requests = [request for message in taken for request in message.requests if request.request]
     for request in requests:
         if again & {*request.vouching}:
             request.done("refused", "its certificate was revoked")
-    have = "has" if len(telling) == 1 else "have"
+    have = f"{first_few(telling, _SHOWN)} {'has' if len(telling) == 1 else 'have'}"
     if keyring.ca_service(root, IDENTITY, Keystore(root).template):
         # Its list is for all sites, and everybody can have it: nobody else has to wait.
         text = (
-            f"{first_few(telling, _SHOWN)} {have} a revocation list of the CA service that the "
-            f"keystore does not know: take it with `sros crl {quote(str(root))} --refresh "
-            "--crl FILE`"
+            f"{have} a revocation list of the CA service that the keystore does not know: take it "
+            f"with `sros crl {quote(str(root))} --refresh --crl FILE`"
         )
-        return "", [Note("fleet.later-list", text)], []
+        return "", [Note("fleet.later-list", text)] if telling else [], []
     try:
-        restored = restore_revocations(
-            root, forgotten.lists, now=now, keyring=keyring, dry_run=dry_run
-        )
+        restored = restore_revocations(root, forgotten, now=now, keyring=keyring, dry_run=dry_run)
     except SrosError as error:
+        if not telling:
+            text = f"a certificate that the ledger lacks cannot be recorded: {error.what}"
+            return "", [Note("fleet.certificates-restored", text)], []
         why = (
-            f"{first_few(telling, _SHOWN)} {have} a revocation list that the keystore signed and "
-            f"does not know, and it cannot sign another: {error.what}"
+            f"{have} a revocation list that the keystore signed and does not know, and it cannot "
+            f"sign another: {error.what}"
         )
         for request in requests:
             if request.request:
                 request.done("not_signed", why)
         return why, [], []
-    note = restored_note(restored, f"{first_few(telling, _SHOWN)} {have}")
-    return "", [note, *restored.notes], [*changes_below(root, restored.changes)]
+    notes = [restored_note(restored, have)] if telling else []
+    return "", [*notes, *restored.notes], [*changes_below(root, restored.changes)]
 
 
 def _sign(

@@ -12,7 +12,7 @@ import json
 import os
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from datetime import datetime, timedelta
 from functools import lru_cache, partial
 from pathlib import Path
@@ -27,7 +27,7 @@ from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.files import remove_file, staged_file
 from sros_tool.fleet.robots import Fleet
 from sros_tool.folders import Folder, make_folders
-from sros_tool.keystore.delivery.archive import listed_digests
+from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, listed_digests
 from sros_tool.keystore.delivery.export import released_enclave, released_files
 from sros_tool.keystore.delivery.published import (
     BEGIN_AGAIN,
@@ -45,6 +45,7 @@ from sros_tool.keystore.delivery.release import (
     check_tuf,
     pack_release,
     read_release,
+    seal_problem,
     seal_releases,
 )
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
@@ -54,6 +55,7 @@ from sros_tool.keystore.layout import (
     CRL_FILE,
     FLEET_ROOT,
     IDENTITY_CA_FILE,
+    PERMISSIONS,
     PUBLISHED,
     enclave_folder,
     enclave_path,
@@ -61,12 +63,13 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
-from sros_tool.keystore.lifecycle.revocation_list import ForgottenLists
+from sros_tool.keystore.lifecycle.revocation_list import Forgotten
 from sros_tool.keystore.lifecycle.revoke import restore_revocations, restored_note
 from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction.recovery import KeystoreLock
 from sros_tool.parallel import map_slices, tick
+from sros_tool.pki.certificates import load_certificates
 from sros_tool.pki.crl import lists_as_revoked, read_list
 from sros_tool.validity import iso
 from sros_tool.values import (
@@ -577,8 +580,11 @@ class _Run:
         )
 
     def _revoke_again(self, keyring: Keyring) -> None:
-        """Revoke what the last releases revoke, and the restored keystore does not."""
-        forgotten = ForgottenLists(self.keystore)
+        """Revoke what the last releases revoke and the restored keystore does not.
+
+        Certificates in releases that the keystore sealed are recorded, so that `revoke` knows them.
+        """
+        forgotten = Forgotten(self.keystore, self._now)
         problem = ""
         # Only these have the last list: others may have been refused since, and still have earlier.
         last = (robot for robot in self._there.items() if robot[1].number == self._number)
@@ -603,17 +609,35 @@ class _Run:
                 "Put it there from a copy of the folder, or from the robot, whose agent has it as "
                 "FOLDER/.agent/release.tar.gz.",
             )
+        for certificate in self._sealed_certificates():
+            forgotten.add_certificate(certificate)
+        revocation = restore_revocations(
+            self.keystore.root,
+            forgotten,
+            now=self._now,
+            keyring=keyring,
+            dry_run=self._dry_run,
+        )
+        self.keystore = Keystore(self.keystore.root)
         if forgotten.lists:
-            revocation = restore_revocations(
-                self.keystore.root,
-                forgotten.lists,
-                now=self._now,
-                keyring=keyring,
-                dry_run=self._dry_run,
-            )
-            self.keystore = Keystore(self.keystore.root)
             whence = f"the last release in '{self._folder}' has"
-            self._notes += [restored_note(revocation, whence), *revocation.notes]
+            self._notes.append(restored_note(revocation, whence))
+        self._notes += revocation.notes
+
+    def _sealed_certificates(self) -> Iterator[x509.Certificate]:
+        """Yield the certificates in all archives that a permissions CA of the keystore sealed."""
+        authorities = self.keystore.authority(PERMISSIONS)
+        for path in self._paths():
+            if not path.startswith(f"{_ARCHIVES}/"):
+                continue
+            with suppress(SrosError):
+                data = read_bytes(self._folder / path, "archive", most=OF_ONE_ROBOT.packed)
+                release = read_release(data)
+                if seal_problem(release, authorities):
+                    continue
+                for file, content in release.files.items():
+                    if file.endswith(f"/{CERTIFICATE_FILE}"):
+                        yield from load_certificates(content, file)[:1]
 
     # ── which robots ───────────────────────────────────────────────────────────────────────
 

@@ -29,7 +29,14 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     revoked_certificates,
 )
-from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
+from sros_tool.keystore.ledger import (
+    REPORTED,
+    RESTORED,
+    SAME_KEY,
+    Entry,
+    certificate_entry,
+    document_entry,
+)
 from sros_tool.keystore.lifecycle.replaced import Superseded
 from sros_tool.keystore.lifecycle.rotation import (
     Replacement,
@@ -40,6 +47,7 @@ from sros_tool.keystore.lifecycle.rotation import (
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import (
     authority_text,
     common_name_of,
@@ -69,20 +77,56 @@ def revoked_serials(keystore: Keystore) -> frozenset[int]:
     return frozenset(recorded | listed)
 
 
-class ForgottenLists:
-    """Lists of a keystore that it does not know any more, as after a backup was restored.
+class Forgotten:
+    """What a keystore signed and does not know any more, as after a backup was restored.
 
-    An identity CA of the keystore signed them, so they are true wherever they come from.
+    An identity CA of the keystore signed these ``lists`` and ``certificates``, so they are true
+    wherever they come from.  Certificates map serial numbers (hexadecimal) to ledger entries.
     """
 
-    def __init__(self, keystore: Keystore) -> None:
+    def __init__(self, keystore: Keystore, now: datetime) -> None:
         self.lists: list[RevocationList] = []
+        self.certificates: dict[str, Entry] = {}
+        self._now = now
         self._issuing = keystore.ca_certificate(IDENTITY)
         self._authorities = keystore.authority(IDENTITY)
         self._revoked = set(revoked_serials(keystore))
         own = keystore.revocation_list
         self._latest = own if own and signed_by(own.list, self._issuing) else None
         self._seen: set[bytes] = set()
+
+    def add_certificate(self, certificate: x509.Certificate, reason: str = "") -> bool:
+        """Add the certificate of an enclave, unless it has expired; return whether it counts.
+
+        `restore_revocations` records it if the ledger lacks it.  ``reason`` is `REPORTED` if the
+        keystore's own seal does not show that it belongs to this keystore.
+        """
+        try:
+            name = check_enclave_name(common_name_of(certificate.subject))
+            entry = certificate_entry(self._now, "certificate", certificate, name, reason)
+            ours = any(issued_by(certificate, authority) for authority in self._authorities)
+        except (SrosError, ValueError):
+            return False
+        if not ours or entry.not_after < iso(self._now) or not entry.serial.strip("-0"):
+            return False
+        self.certificates.setdefault(entry.serial, entry)
+        return True
+
+    def unknown(self, keystore: Keystore) -> dict[str, Entry]:
+        """Return the certificates that ``keystore`` neither issued nor revoked, as far as it knows.
+
+        A certificate that only a message showed is recorded again if a seal shows it.
+        """
+        recorded = keystore.ledger_file.with_values("serial", self.certificates).entries
+        known = {
+            entry.serial
+            for entry in recorded
+            if entry.what == "certificate"
+            and entry.serial in self.certificates
+            and not (entry.reason == REPORTED != self.certificates[entry.serial].reason)
+        }
+        known |= {f"{serial:x}" for serial in revoked_serials(keystore)}
+        return {serial: entry for serial, entry in self.certificates.items() if serial not in known}
 
     def add(self, document: bytes) -> bool:
         """Add the lists in a PEM file that tell more than what is known; return whether any does.
@@ -332,6 +376,8 @@ class RevocationListSigner:
         )
         if unknown := sorted(lacking):
             why.append(f"it does not have the present certificate of {', '.join(unknown)}")
+        if restored := self._restored():
+            why.append(f"the keystore was restored from a backup ({restored})")
         if why:
             text = (
                 f"The ledger of '{self._root}' may lack earlier certificates: {'; '.join(why)}. "
@@ -339,6 +385,18 @@ class RevocationListSigner:
                 "`sros rotate_ca`."
             )
             self.remarks.append(Note("ledger.may-lack-certificates", text))
+
+    def _restored(self) -> str:
+        """Return when the keystore was restored with an identity CA that it trusts; "" if never."""
+        file = self._keystore.identity_file
+        trusted = {digest(ca) for ca in (self._keystore.certificates_of(file) if file else ())}
+        ledger = self._keystore.ledger_file.with_values("what", (RESTORED, "ca"))
+        for entry in reversed(ledger.entries):
+            if entry.what == RESTORED and trusted:
+                return entry.time
+            if entry.what == "ca" and entry.reason != SAME_KEY:
+                trusted.discard(entry.sha256)
+        return ""
 
     # ── the lists ──────────────────────────────────────────────────────────────────────────
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import count
@@ -24,15 +24,15 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     has_enclave,
 )
-from sros_tool.keystore.ledger import Entry, certificate_entry
+from sros_tool.keystore.ledger import RESTORED, Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
-from sros_tool.keystore.lifecycle.revocation_list import revoked_serials
+from sros_tool.keystore.lifecycle.revocation_list import Forgotten, revoked_serials
 from sros_tool.keystore.selection import no_such_enclave
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import issued_by
-from sros_tool.pki.crl import REASONS, SUPERSEDED, RevocationList
+from sros_tool.pki.crl import REASONS, SUPERSEDED
 from sros_tool.validity import iso
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 
 _FILES = (
     *REQUIRED_FILES,
@@ -129,17 +129,19 @@ def revoke(
 
 def restore_revocations(
     root: Path,
-    forgotten: Sequence[RevocationList],
+    forgotten: Forgotten,
     *,
     now: datetime,
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
-) -> Revocation:
+) -> Changed:
     """Revoke again what lists of the keystore revoke that it does not know any more.
 
     The next list has a higher number than these.  Enclaves that they revoke are moved to
     ``revoked``, as they were before, also if they were renewed since; those of which only an
-    earlier certificate was replaced stay.
+    earlier certificate was replaced stay.  Certificates that the ledger lacks are recorded, so that
+    they can be revoked, and are revoked at once if their enclaves were.  The ledger records that
+    the keystore was restored, with a number that it did not give before: the seconds since 1970.
 
     Raises:
         KeystoreError: as `revoke`; or a present certificate was replaced after the backup.
@@ -149,14 +151,17 @@ def restore_revocations(
         lists, known = change.revocation_lists(), revoked_serials(change.keystore)
         reasons = {
             f"{entry.serial:x}": entry.reason
-            for crl in forgotten
+            for crl in forgotten.lists
             for entry in crl.revoked
             if entry.serial not in known
         }
+        # A CA service knows its certificates, also those of other sites.
+        unknown = {} if change.identity.service else forgotten.unknown(change.keystore)
+        reasons = _of_revoked(change, unknown) | reasons
         recorded = change.keystore.ledger_file.with_values("serial", reasons).entries
         issued = {
             entry.serial: entry
-            for entry in recorded
+            for entry in (*recorded, *unknown.values())
             if entry.what == "certificate" and entry.serial in reasons
         }
         again = {
@@ -188,27 +193,67 @@ def restore_revocations(
                 entry = Entry(iso(now), "revocation", serial=serial, reason=reason)
                 if (of := issued.get(serial)) and reason != SUPERSEDED:
                     entry = entry._replace(subject=of.subject, key=of.key)
+                    if serial in unknown:
+                        entry = entry._replace(enclave=of.enclave, not_after=of.not_after)
                 revocations.append(entry)
         gone = frozenset(again)
-        change.restart = tuple(name for name in change.names if name not in gone)
-        next_update, change.entries = lists.sign(
-            revocations,
-            change.restart,
-            incomplete=True,
-            least=max(crl.number for crl in forgotten) + 1,
-        )
+        number = max(change.keystore.ledger_file.next_number(), int(now.timestamp()))
+        change.entries = [Entry(iso(now), RESTORED, number=number), *unknown.values()]
+        if revocations or forgotten.lists:
+            change.restart = tuple(name for name in change.names if name not in gone)
+            _, entries = lists.sign(
+                revocations,
+                change.restart,
+                incomplete=True,
+                least=max((crl.number for crl in forgotten.lists), default=0) + 1,
+            )
+            change.entries += entries
         change.remarks += lists.remarks
         _drop_routers(change, gone)
         change.keep_zenoh({}, gone=gone)
         change.record()
         change.finish(aim="revoke")
-    return change.result(
-        Revocation, outcomes=dict.fromkeys(again, "revoked"), next_update=next_update
+    if unknown:
+        change.notes.append(_unknown_note(change, unknown))
+    return change.result(Changed, outcomes=dict.fromkeys(again, "revoked"))
+
+
+def _of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) -> dict[str, str]:
+    """Map the serial numbers of certificates of revoked enclaves to the reasons of these."""
+    enclaves = {entry.enclave for entry in unknown.values()}
+    reasons = {
+        entry.enclave: entry.reason
+        for entry in change.keystore.ledger_file.with_values("enclave", enclaves).entries
+        if entry.what == "revocation" and entry.reason != SUPERSEDED
+    }
+    gone = change.known.revoked_before(enclaves)
+    return {
+        serial: reasons.get(entry.enclave, "unspecified")
+        for serial, entry in unknown.items()
+        if entry.enclave in gone and not has_enclave(change.root, entry.enclave)
+    }
+
+
+def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
+    """Return a note on certificates that are recorded now, or would be."""
+    would = "would be" if change.dry_run else "are"
+    text = (
+        f"the keystore issued {counted(len(unknown), 'certificate')} that its ledger lacks: it was "
+        f"restored from a backup, or is a copy. They {would} in the ledger again, so that `sros "
+        "revoke` revokes them"
     )
+    revoked = {entry.serial for entry in change.entries if entry.what == "revocation"}
+    valid = sorted({entry.enclave for entry in unknown.values() if entry.serial not in revoked})
+    if missing := [name for name in valid if not has_enclave(change.root, name)]:
+        text += (
+            f". The keystore lacks {first_few(missing, _SHOWN)}, whose certificates stay valid: "
+            "create these enclaves again and revoke them, or replace the CA with `sros rotate_ca`"
+        )
+    return Note("fleet.certificates-restored", f"{text}.")
 
 
-def restored_note(restored: Revocation, whence: str) -> Note:
-    """Return a note on revocations that `restore_revocations` took from ``whence``."""
+def restored_note(restored: Changed, whence: str) -> Note:
+    """Return a note on lists that `restore_revocations` took from ``whence``."""
     again = "would be revoked again" if restored.dry_run else "is revoked again"
     text = (
         f"{whence} a revocation list that the keystore signed and does not know: it was restored "
