@@ -780,14 +780,14 @@ def doctor(report: Path | None, force: bool, advisories: Path | None, as_json: b
 
     Example:
       $ sros doctor
+      DDS Security can be enforced here, by Cyclone DDS (libddsc), but NOT by ROS
+      nodes: rmw_fastrtps_cpp does not enforce it. The ROS 2 packages of ...
       rclpy with rmw_fastrtps_cpp  does not enforce   Fast DDS 2.14.5
           a secured participant fails: RCLError: error creating node: This Fast
           DDS version doesn't have the security libraries
       Cyclone DDS (libddsc)        enforces security  Cyclone DDS 0.10.2
           with an enclave made by sros, it created the allowed writer on /chatter
           and refused the denied writer and reader on /sros_not_allowed: ...
-      DDS Security can be enforced here, by Cyclone DDS (libddsc), but NOT by ROS
-      nodes: rmw_fastrtps_cpp does not enforce it. The ROS 2 packages of ...
       $ sros doctor --report support.md
 
     Exit status: 1 if the RMW that ROS nodes use here does not enforce security (without

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
@@ -182,6 +183,12 @@ def view(
         raise UsageError("--hops is for --focus only", "", "Add --focus NAME.")
     moment = now()
     written = _format("json" if as_json else form, output, graphviz)
+    if written in ("html", "svg") and not (output or show or dry_run) and _on_terminal():
+        raise UsageError(
+            "a page or picture would be written to this terminal",
+            "",
+            "Name a file, `-o robot.html`, or let a browser show it: `--open`.",
+        )
     if output:
         check_output(output, force=force or dry_run)
     drawing = Drawing(
@@ -230,6 +237,10 @@ def view(
     echo(save(output, document.encode("utf-8", "replace")), err=True)
     if show:
         click.launch(output.absolute().as_uri())
+
+
+def _on_terminal() -> bool:
+    return sys.stdout is not None and sys.stdout.isatty()
 
 
 def _format(form: str | None, output: Path | None, graphviz: bool) -> str:

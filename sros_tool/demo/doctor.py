@@ -115,14 +115,14 @@ def examine(now: datetime) -> Diagnosis:
 
 
 def diagnosis_text(diagnosis: Diagnosis) -> str:
-    """Return the diagnosis as text: one line for each stack, then evidence and advice."""
+    """Return the diagnosis as text: the conclusion, then each stack with evidence and advice."""
     width = max(len(stack.name) for stack in diagnosis.stacks)
-    lines: list[str] = []
+    lines = [diagnosis.conclusion, ""]
     for stack in diagnosis.stacks:
         identity = f"{stack.dds} {stack.version}".strip() if stack.present else ""
         lines.append(f"{stack.name:<{width}}  {_answer(stack):<19}  {identity}".rstrip())
-        lines += _indented([stack.evidence, stack.where, stack.advice])
-    lines += ["", diagnosis.conclusion]
+        said = stack.advice in diagnosis.conclusion
+        lines += _indented([stack.evidence, stack.where, "" if said else stack.advice])
     return "\n".join(lines)
 
 

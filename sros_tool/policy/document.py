@@ -729,7 +729,9 @@ class _Reader:
         for name in required:
             if name not in present:
                 raise PolicyError(
-                    f"{self._where(element, place)}: <{tag_of(element)}> lacks its {name}="
+                    f"{self._where(element, place)}: <{tag_of(element)}> lacks its {name}=",
+                    "",
+                    'Write <policy version="0.2.0">.' if name == "version" else "",
                 )
 
     def _source(self, element: etree._Element, place: IncludedFile) -> Source:

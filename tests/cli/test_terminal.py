@@ -15,6 +15,7 @@ import pytest
 
 from sros_tool.cli import common as showing
 from sros_tool.cli import main
+from sros_tool.files import policies_dir
 from sros_tool.parallel import map_slices, tick
 from sros_tool.terminal import Coloured, echo, echo_document
 from tests.support.harness import sros
@@ -90,6 +91,14 @@ def test_the_time_that_is_left_is_shown(monkeypatch: pytest.MonkeyPatch) -> None
     assert [showing._rounded(each) for each in (1.2, 119.4, 121, 3600)] == [
         "1 s", "119 s", "2 min", "60 min",
     ]  # fmt: skip
+
+
+def test_no_page_is_written_to_a_terminal() -> None:
+    """It has 150,000 characters; DOT, Mermaid and a file are shown."""
+    policy = policies_dir() / "talker_listener.xml"
+    said = on_terminal(lambda: main(["view", str(policy)]))
+    assert "-o robot.html" in said and len(said) < 300
+    assert "digraph" in on_terminal(lambda: main(["view", str(policy), "--format", "dot"]))
 
 
 def test_short_work_shows_nothing() -> None:

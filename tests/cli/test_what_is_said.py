@@ -191,6 +191,17 @@ def test_a_keystore_with_another_number_is_no_typing_error(tmp_path: Path) -> No
     sros("create_keystore", tmp_path / "ks").ok()
     sros("generate_artifacts", "-k", tmp_path / "ks2", "-e", "/a").ok()
     assert "typo" in sros("generate_artifacts", "-k", tmp_path / "kss", "-e", "/a").err
+    sros("create_keystore", tmp_path / "arm2").ok()
+    sros("generate_artifacts", "-k", tmp_path / "leg2", "-e", "/a").ok()
+
+
+def test_what_is_asked_in_vain_names_what_to_ask(tmp_path: Path) -> None:
+    policy = tmp_path / "p.xml"
+    policy.write_text(policy_text({"/a": publish("/x")}))
+    revision = sros("diff_policy", "git:HEAD:p.xml", policy)
+    assert revision.status == 2 and "only be compared with --no-new-access" in revision.err
+    policy.write_text("<policy><enclaves/></policy>")
+    assert 'Write <policy version="0.2.0">.' in sros("check", "policy", policy).out
 
 
 def test_nobody_is_advised_to_create_what_is_to_be_revoked(tmp_path: Path) -> None:

@@ -124,7 +124,8 @@ TIME_FORMAT = FindingKind(
     "and years from 2263 on.",
     "DDS-Security 1.1, 9.4.1.3.2.2; Fast DDS 2.6 to 3.6 (mktime), Cyclone DDS 0.10 and 11.0; "
     "measured.",
-    "Write CCYY-MM-DDThh:mm:ssZ.",
+    "Sign the permissions again: all with renew --all, or those of one enclave with `sros "
+    "create_permission KEYSTORE ENCLAVE POLICY_FILE`. Others write CCYY-MM-DDThh:mm:ssZ.",
 )
 TIME_WINDOW = FindingKind(
     "portable.validity-window",
@@ -261,10 +262,13 @@ def _form(grant: Grant, name: str, file: str) -> Iterator[Finding]:
         yield DEFAULT_ALLOW.found(name, "<default> is ALLOW", file)
     if grant.default_first:
         yield DEFAULT_FIRST.found(name, "<default> stands before a rule", file)
-    for moment in (grant.not_before, grant.not_after):
-        match = _MOMENT.match(moment)
-        if not match or int(match[1]) > _LAST_YEAR:
-            yield TIME_FORMAT.found(name, f"the date is {moment!r}", file)
+    dates = [
+        repr(moment)
+        for moment in (grant.not_before, grant.not_after)
+        if not (match := _MOMENT.match(moment)) or int(match[1]) > _LAST_YEAR
+    ]
+    if dates:
+        yield TIME_FORMAT.found(name, f"of its validity: {' and '.join(dates)}", file)
     allow_rules = sum(rule.allow for rule in grant.rules)
     if allow_rules > 1:
         yield ALLOW_RULES.found(name, f"the grant has {allow_rules} allow rules", file)

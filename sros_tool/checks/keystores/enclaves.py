@@ -42,6 +42,8 @@ from sros_tool.pki.token import TokenUri, pin_file_problem, pin_line_break
 from sros_tool.translate import allows_everything
 from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
 
+_SAME_DAY = timedelta(days=1)
+"""ros2/sros2 gives a CA and its certificates ten years each, so these expire seconds later."""
 _NOT_LOADABLE = "enclave.not-loadable"
 """The group id of all faults, for `--include` and `--exclude`."""
 
@@ -305,7 +307,7 @@ def _certificate(enclave: CheckedEnclave, certificate: x509.Certificate) -> Iter
         if isinstance(value, x509.BasicConstraints) and value.ca:
             yield IS_A_CA.found(name, "its BasicConstraints say CA:TRUE", file)
     ca = enclave.state.identity_ca
-    if ca and validity_of(certificate).not_after > validity_of(ca).not_after:
+    if ca and validity_of(certificate).not_after > validity_of(ca).not_after + _SAME_DAY:
         text = (
             f"it expires at {iso(validity_of(certificate).not_after)}, its CA at "
             f"{iso(validity_of(ca).not_after)}"

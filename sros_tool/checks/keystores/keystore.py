@@ -71,8 +71,8 @@ from sros_tool.policy.rights import Right
 from sros_tool.wording import first_few
 
 _NAMES_SHOWN = 3
-_OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
-"""Ids of findings that a setting of the keystore causes in all enclaves."""
+_OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id, TIME_FORMAT.id})
+"""Ids of findings with one cause in all enclaves: a setting, or who signed them."""
 _OF_SEVERAL_FILES = frozenset(
     {REFUSED.id, SOME_REFUSE.id, CRL_MISSING.id, *(kind.id for kind in upgrade.OF_ENCLAVES)}
 )

@@ -497,7 +497,7 @@ def _check_typo(root: Path) -> None:
         return
     import difflib
 
-    close = difflib.get_close_matches(root.name, siblings, n=3, cutoff=0.5)
+    close = difflib.get_close_matches(root.name, siblings, n=3, cutoff=0.75)
     for name in close:
         if _without_digits(name) == _without_digits(root.name):
             continue  # ks2 next to ks is no typo
