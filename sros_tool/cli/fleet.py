@@ -380,7 +380,13 @@ _VALIDITIES = {
     "--restored",
     is_flag=True,
     help="Go on although PUB has later releases than the keystore, which was restored; what these "
-    "releases revoke is revoked again.",
+    "releases revoke is revoked again, and numbers go on from those that nobody gave before.",
+)
+@click.option(
+    "--new-folder",
+    is_flag=True,
+    help="Go on although PUB has nothing of what the keystore published before: it is a further "
+    "folder, or the folder was lost.",
 )
 @dry_run_option
 @json_option
@@ -389,6 +395,7 @@ def _publish(
     root_key: Path | None,
     rotated: tuple[str, ...],
     restored: bool,
+    new_folder: bool,
     dry_run: bool,
     as_json: bool,
     **validities: str | None,
@@ -434,6 +441,7 @@ def _publish(
             root_key=root_key,
             rotate=rotated,
             restored=restored,
+            new_folder=new_folder,
             keyring=keyring(),
             dry_run=dry_run,
         )

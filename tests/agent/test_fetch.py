@@ -179,7 +179,7 @@ def test_versions_that_ran_ahead_are_mended_by_new_keys(publisher: Home) -> None
     robot.gets()
     (publisher.pub / "metadata" / f"{2**31}.snapshot.json").unlink()
     shutil.rmtree(publisher.pub)
-    publisher.publish()
+    publisher.publish(new_folder=True)
     robot.refuses(FetchProblem.ROLLED_BACK)
     publisher.publish(rotate=("timestamp", "snapshot"))
     robot.gets()

@@ -689,7 +689,7 @@ def test_a_thief_with_all_keys_who_counts_versions_up(publisher: Home, version: 
         publisher.publish()
     assert snapshot(publisher.root) == before
     shutil.rmtree(publisher.pub)
-    publisher.publish()
+    publisher.publish(new_folder=True)
 
 
 def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:
@@ -698,9 +698,42 @@ def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:
     publisher.publish(rotate=("timestamp",))
     robot.gets()
     shutil.rmtree(publisher.pub)
-    assert publisher.publish().names("published") == ["r1", "r2", "r5"]
+    kept = snapshot(publisher.root)
+    for restored in (False, True):
+        with pytest.raises(KeystoreError, match="has nothing that the keystore") as refused:
+            publisher.publish(restored=restored)
+        assert "--new-folder" in refused.value.remedy
+    assert snapshot(publisher.root) == kept
+    assert publisher.publish(new_folder=True).names("published") == ["r1", "r2", "r5"]
     assert all(number > before[robot] for robot, number in numbers(publisher).items())
     assert robot.gets() == publisher.robot().gets()
+    assert not publisher.publish(new_folder=True).names("published")
+
+
+def test_keystore_and_folder_that_were_lost(publisher: Home) -> None:
+    """What home gave after the backup, and nobody there knows, is never given twice."""
+    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    robot = publisher.robot()
+    for _ in range(3):
+        publisher.run("renew", "ks", "--all")
+        publisher.publish()
+    latest = robot.gets()
+    shutil.rmtree(publisher.pub)
+    for again in (False, True):
+        shutil.rmtree(publisher.root)
+        shutil.copytree(backup, publisher.root, symlinks=True)
+        if again:  # numbers would come to those of the first home
+            (publisher.root / "published.json").unlink()
+        publisher.run("revoke", "ks", "--robot", "r5")
+        publisher.publish(restored=True, new_folder=True)
+        publisher.run("renew", "ks", "--all")
+        publisher.publish()
+        release = robot.gets()
+        assert release.number > latest.number + 1000 * (not again), "in one step"
+        latest = release
+        publisher.robot("r5").refuses(FetchProblem.NOT_FOR_ROBOT)
+        assert [e.what for e in Keystore(publisher.root).ledger.entries].count("restored") == 1
+        shutil.rmtree(publisher.pub)
 
 
 @pytest.mark.parametrize("at", ["metadata", "targets", "targets/robots", "metadata/timestamp.json"])

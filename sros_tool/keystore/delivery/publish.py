@@ -155,6 +155,7 @@ def publish(
     root_key: Path | None = None,
     rotate: Collection[str] = (),
     restored: bool = False,
+    new_folder: bool = False,
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> PublishedFleet:
@@ -168,12 +169,14 @@ def publish(
         root_key: the file of the root key; None: in the keystore.  It is made if there is none yet.
         rotate: the roles that get new keys.
         restored: go on although the folder has later releases than the keystore knows.
+        new_folder: go on although the folder has nothing of what the keystore published before.
         keyring: opens the keys of the CAs.
         dry_run: write nothing.
 
     Raises:
         KeystoreError: the keystore has no fleet, ``folder`` is not its own or is in the way, or
-            it has later releases (without ``restored``), or a key is missing.
+            it has later releases (without ``restored``) or nothing of what was published before
+            (without ``new_folder``), or a key is missing.
         UnavailableError: the package ``tuf`` is not installed.
     """
     check_tuf()
@@ -192,7 +195,7 @@ def publish(
             stack.callback(lock.release)
             lock.acquire()
         run = _Run(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
-        run.check_restored(restored, keyring)
+        run.check_restored(restored, new_folder, keyring)
         keys = _Keys(run.roots, root, root_key)
         keys.recover(dry_run)
         keys.open(rotate, now, run.expiry)
@@ -498,6 +501,7 @@ class _Run:
         if keystore.has(FLEET_ROOT):
             documents = parse_json(keystore.read(FLEET_ROOT, "root metadata"))["roots"]
         self.roots = Roots(documents)
+        self._published_before = bool(self.roots.versions)
         self.roots.follow(folder)
         self._folder = folder
         self._now = now
@@ -509,33 +513,53 @@ class _Run:
         self._removed: list[str] = []
         self._damaged: set[str] = set()
         self._number = 0
+        self._least = 0
         self._changes: Sequence[FileChange] = ()
         self._notes: list[Note] = []
 
-    def check_restored(self, restored: bool, keyring: Keyring) -> None:
-        """Refuse a folder with later news than the keystore knows.
+    def check_restored(self, restored: bool, new_folder: bool, keyring: Keyring) -> None:
+        """Refuse a folder with later news than the keystore knows, and one that may have had some.
 
         If it is said that the keystore was ``restored``, later releases are not refused, and what
-        they revoke is revoked again.
+        they revoke is revoked again.  A folder without anything that was published has to be said
+        to be a ``new_folder``.  In both cases, numbers and versions go on from the seconds since
+        1970: nobody knows which were given before.
 
         Raises:
             DocumentError: the list of what is published has numbers that were never given.
             KeystoreError: the keystore was restored from a backup, or it cannot be told what the
                 later releases revoke.
         """
-        if self._has_later_releases(restored):
-            self._revoke_again(keyring)
-        if not (self._number and self._dry_run):  # which has not revoked again
+        is_lost = self._published_before and not self._present.timestamp
+        if is_lost and not new_folder:
+            raise self._nothing_published()
+        is_later = self._has_later_releases(restored)
+        if restored and not is_later:
             self._check_removed()
-        if self._number:
+        if restored:
+            self._restore(self._forgotten() if is_later else None, keyring)
+        if not (is_later and self._dry_run):  # which has not revoked again
+            self._check_removed()
+        if is_lost or restored:
+            self._least = int(self._now.timestamp())
             self.list.robots.clear()
+
+    def _nothing_published(self) -> KeystoreError:
+        return KeystoreError(
+            f"'{self._folder}' has nothing that the keystore '{self.keystore.root}' published",
+            "The keystore has published before. If it was restored from a backup and the folder "
+            "was lost, too, robots that were revoked since would get releases again.",
+            "Name the folder in which it publishes. If that is lost, or this is a further one, add "
+            "--new-folder; if the keystore was restored, first revoke again what was revoked, and "
+            "add --restored as well.",
+        )
 
     def _has_later_releases(self, restored: bool) -> bool:
         """Return whether the folder has later releases; refuse that unless ``restored``."""
         if self.list.number >= (unused := self.keystore.ledger_file.next_number()):
             why = f"It has release {self.list.number}, and the ledger none after {unused - 1}."
             raise damaged_list(self.keystore, why)
-        latest = max((release.number for release in self._there.values()), default=0)
+        latest = self._latest
         # Not by the next number of the ledger: a restored keystore may have issued files since.
         entries = self.keystore.ledger_with("what", "release").entries if latest else ()
         if latest <= self.list.number or any(
@@ -579,11 +603,13 @@ class _Run:
             f"Restore a later backup. If there is none, {remedy}.",
         )
 
-    def _revoke_again(self, keyring: Keyring) -> None:
-        """Revoke what the last releases revoke and the restored keystore does not.
+    @property
+    def _latest(self) -> int:
+        """The highest number of a release in the folder; 0 without one."""
+        return max((release.number for release in self._there.values()), default=0)
 
-        Certificates in releases that the keystore sealed are recorded, so that `revoke` knows them.
-        """
+    def _forgotten(self) -> Forgotten:
+        """Return what the last releases revoke and the restored keystore does not."""
         forgotten = Forgotten(self.keystore, self._now)
         problem = ""
         # Only these have the last list: others may have been refused since, and still have earlier.
@@ -609,6 +635,14 @@ class _Run:
                 "Put it there from a copy of the folder, or from the robot, whose agent has it as "
                 "FOLDER/.agent/release.tar.gz.",
             )
+        return forgotten
+
+    def _restore(self, forgotten: Forgotten | None, keyring: Keyring) -> None:
+        """Record that the keystore was restored, and revoke again what is ``forgotten``.
+
+        Certificates in releases that the keystore sealed are recorded, so that `revoke` knows them.
+        """
+        forgotten = forgotten or Forgotten(self.keystore, self._now)
         for certificate in self._sealed_certificates():
             forgotten.add_certificate(certificate)
         revocation = restore_revocations(
@@ -699,7 +733,8 @@ class _Run:
         ``found`` are the robots that seemed changed before the keystore was locked.
         """
         changed = self.changed(found)
-        number = max(change.keystore.ledger_file.next_number(), self._number + 1)
+        unused = change.keystore.ledger_file.next_number()
+        number = max(unused, self._number + 1, self._least)
         if number > MOST_NUMBER:
             raise KeystoreError(
                 f"no release can have the number {number}",
@@ -780,6 +815,7 @@ class _Run:
             self._present,
             keys.signers,
             known=self.list.versions,
+            least=self._least,
             expiry=self.expiry,
             now=self._now,
         )

@@ -268,7 +268,7 @@ def _not_ours(folder: Path, why: str) -> KeystoreError:
         f"'{folder}' has metadata that this keystore did not write",
         f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
         "Name another folder; or, if it is the folder of this keystore and was damaged, remove its "
-        f"folder {_METADATA}, and publish again.",
+        f"folder {_METADATA}, and publish again with --new-folder.",
     )
 
 
@@ -330,6 +330,7 @@ class Composer:
         signers: Mapping[str, Sequence[CryptoSigner]],
         *,
         known: Mapping[str, int],
+        least: int = 0,
         expiry: MetadataExpiry,
         now: datetime,
     ) -> None:
@@ -339,9 +340,11 @@ class Composer:
             present: what is in the publishing folder.
             signers: by role, the present one first.
             known: the versions that were published before, as far as the keystore knows.
+            least: what new versions have to be higher than.
             expiry: how long new metadata is valid.
             now: the present time.
         """
+        self._least = least
         self._present = present
         self._signers = signers
         self._now = now.replace(microsecond=0)
@@ -398,7 +401,7 @@ class Composer:
 
     def _add(self, name: str, content: _Content, signers: Sequence[CryptoSigner]) -> None:
         """Add a file with a new version of the metadata ``name``."""
-        content.version = self.versions[name] = self.versions.get(name, 0) + 1
+        content.version = self.versions[name] = max(self.versions.get(name, 0), self._least) + 1
         if content.version > MOST_NUMBER:
             raise KeystoreError(
                 f"the version {content.version} of {name}.json is too high",
