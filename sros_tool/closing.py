@@ -1,9 +1,10 @@
 """From an open robot to a closed one: the steps, what each process needs, the proof, the way back.
 
 A process of Fast DDS shows its process id in the identifier of its DDS participant (two bytes of
-the GUID prefix; Fast DDS 2.6 to 3.6, ``GuidUtils.hpp``).  Other processes are known by the name
-that their command gives the node, or by the name of their program.  A wrong guess is safe: the
-middleware denies the process what its enclave may not do.
+the GUID prefix; Fast DDS 2.6 to 3.6, ``GuidUtils.hpp``), and one of Cyclone DDS says it in a
+property of its participant (``__Pid``; Cyclone DDS 0.10 to 11.0).  Other processes are known by
+the name that their command gives the node, or by the name of their program.  A wrong guess is safe:
+the middleware denies the process what its enclave may not do.
 
 The steps are verbs of sros, which the caller runs (`Shell`); nothing is printed here.
 """
@@ -16,9 +17,11 @@ import re
 import shlex
 import stat
 import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, tzinfo
 from itertools import chain
@@ -256,11 +259,15 @@ class Closing(NamedTuple):
 
 
 def assign(
-    nodes: Iterable[ObservedNode], running: Iterable[Process], domain: int
+    nodes: Iterable[ObservedNode],
+    running: Iterable[Process],
+    domain: int,
+    told: Mapping[str, int] | None = None,
 ) -> ObservedProcesses:
     """Return the enclave of each running process, by the nodes that the graph shows of it.
 
-    Processes of other domains or networks are left out.
+    Processes of other domains or networks are left out.  ``told`` maps participants of Cyclone DDS
+    to the process ids that they say.
     """
     left = {
         process.pid: process
@@ -294,7 +301,7 @@ def assign(
             processes = [
                 process
                 for process in left.values()
-                if any(shows_node(process, node) for node in of_enclave)
+                if any(shows_node(process, node, told or {}) for node in of_enclave)
             ]
             if len(processes) <= len({node.participant for node in of_enclave}):
                 for process in processes:
@@ -318,29 +325,40 @@ def _process_of(node: ObservedNode) -> str:
     return node.participant[:12] if is_fast else node.participant
 
 
-def _shows_its_id(process: Process, node: ObservedNode) -> bool:
+def _shows_its_id(process: Process, node: ObservedNode, told: Mapping[str, int]) -> bool:
+    if not node.participant.startswith(_FAST_DDS):
+        return told.get(node.participant) == process.pid
     low, high = process.pid & 0xFF, process.pid >> 8 & 0xFF
-    return (
-        node.participant.startswith(_FAST_DDS)
-        and node.participant[8:12] == f"{low:02x}{high:02x}"
-        and bool(process.libraries & {"libfastrtps", "libfastdds"})
-    )
+    is_fast = bool(process.libraries & {"libfastrtps", "libfastdds"})
+    return is_fast and node.participant[8:12] == f"{low:02x}{high:02x}"
 
 
-def _is_named(process: Process, node: ObservedNode) -> bool:
+def _is_named(process: Process, node: ObservedNode, _told: object) -> bool:
     return node_argument(process.command) == (node.ns, node.name)
 
 
-def _is_its_program(process: Process, node: ObservedNode) -> bool:
+def _is_its_program(process: Process, node: ObservedNode, _told: object) -> bool:
     return program_of(process.command).removesuffix(".py") == node.name
 
 
-_KNOWN_BY: dict[str, Callable[[Process, ObservedNode], bool]] = {
+_KNOWN_BY: dict[str, Callable[[Process, ObservedNode, Mapping[str, int]], bool]] = {
     "process id": _shows_its_id,
     "node name": _is_named,
     "program": _is_its_program,
-    "elimination": lambda _process, _node: True,
+    "elimination": lambda _process, _node, _told: True,
 }
+
+
+def _process_ids_of_cyclone(pids: Sequence[int], domain: int) -> Mapping[str, int]:
+    """Return the process ids that participants of Cyclone DDS say; none if it cannot be loaded."""
+    if not pids:
+        return {}
+    asking = [sys.executable, "-P", "-m", "sros_tool.runtime.cyclone", f"{domain}", *map(str, pids)]
+    with suppress(ValueError, subprocess.TimeoutExpired):
+        ended = subprocess.run(asking, capture_output=True, check=False, timeout=_RESTART_SECONDS)
+        value: Mapping[str, int] = json.loads(ended.stdout)
+        return value
+    return {}
 
 
 def read_processes(path: Path) -> ObservedProcesses:
@@ -372,7 +390,7 @@ def read_processes(path: Path) -> ObservedProcesses:
 def access_lines(policy: Policy, folder: Path) -> list[str]:
     """Return a line for each name in a policy, with who uses it on either side.
 
-    Rights that every node needs are left out; they are those of the common parts.
+    Names that nobody uses but as every node does are left out: those of the common parts.
     """
     common = common_parts(folder, policies_dir())
     parts = [part for part in _NODE_PARTS if part in common.rights]
@@ -383,19 +401,23 @@ def access_lines(policy: Policy, folder: Path) -> list[str]:
         for right in common.given(parts, profile.ns, profile.node)
     }
     sides: dict[tuple[str, str], dict[str, list[str]]] = {}
+    shown: set[tuple[str, str]] = set()
     for right in sorted(policy_rights(policy)):
-        if right.kind in RIGHTS and (right.enclave, right.right, right.name) not in ordinary:
-            of_name = sides.setdefault((right.kind, right.name), {})
-            of_name.setdefault(right.right, []).append(right.enclave)
+        if right.kind in RIGHTS:
+            name = right.kind, right.name
+            sides.setdefault(name, {}).setdefault(right.right, []).append(right.enclave)
+            if (right.enclave, right.right, right.name) not in ordinary:
+                shown.add(name)
     kinds = [*RIGHTS]
     lines = [
         f"{kind.removesuffix('s')} {name}: {' -> '.join(_users(of_name, e) for e in RIGHTS[kind])}"
         for (kind, name), of_name in sorted(
             sides.items(), key=lambda side: (-len(side[1]), kinds.index(side[0][0]), side[0][1])
         )
+        if (kind, name) in shown
     ]
     more = len(lines) - _MOST_LINES
-    return [*lines[:_MOST_LINES], *([f"and {more} more names"] if more > 0 else [])]
+    return [*lines[:_MOST_LINES], *([f"and {counted(more, 'more name')}"] if more > 0 else [])]
 
 
 def _users(of_name: Mapping[str, Sequence[str]], right: str) -> str:
@@ -533,7 +555,11 @@ class OpenRobot:
         self._shell.say(f"$ {step.command}")
         status, output, messages = self._shell.run(step.words, bool(step.into))
         if watches and status:
-            raise UnavailableError("there is no robot to close: no node was observed")
+            raise UnavailableError(
+                "there is no robot to close: no node was observed",
+                "",
+                "Start the robot open, and run this again.",
+            )
         if status:
             for line in () if step.into else f"{output}{messages}".splitlines():
                 self._shell.say(line)
@@ -571,7 +597,9 @@ class OpenRobot:
         replace_file(self.observer, (policies_dir() / "observer.xml").read_bytes())
         nodes = [node for node in self._observation().nodes if not is_tool(node)]
         running = ProcessTable().look(self._shell.now()).processes
-        observed = assign(nodes, running, self.domain)
+        of_cyclone = [process.pid for process in running if "libddsc" in process.libraries]
+        told = _process_ids_of_cyclone(of_cyclone, self.domain)
+        observed = assign(nodes, running, self.domain, told)
         processes = [_as_its_unit_starts(process) for process in observed.processes]
         self.observed = observed._replace(processes=processes)
         replace_file(self.processes, f"{json.dumps(as_plain(self.observed), indent=2)}\n".encode())
@@ -683,13 +711,16 @@ class OpenRobot:
                 )
         if partial:
             return
-        for text in observed.unknown:
-            yield f"no node is known of {text}; it would not be heard any more (accept: --partial)"
-        for enclave in observed.elsewhere:
+        silent = "they would not be heard any more (accept: --partial)"
+        if observed.unknown:
+            named = first_few(observed.unknown, _MOST_NAMES)
             yield (
-                f"nodes of {enclave} are of no known process of this machine; they would not be "
-                "heard any more (accept: --partial)"
+                f"no node is known of {counted(len(observed.unknown), 'process', 'processes')}: "
+                f"{named}; start them with -r __node:=NAME, or {silent}"
             )
+        if observed.elsewhere:
+            named = first_few(observed.elsewhere, _MOST_NAMES)
+            yield f"nodes of {named} are of no known process of this machine; {silent}"
 
     # ── applying ────────────────────────────────────────────────────────────────────────────
 
@@ -775,6 +806,8 @@ class OpenRobot:
     def _proofs(self, observed: ObservedProcesses, patience: float) -> list[Proof]:
         """Wait until each process runs in its enclave, and prove that the robot is closed."""
         expected = {process.enclave for process in observed.processes}
+        if not expected:
+            return [Proof(_CLAIM, False, "no process of the robot is known")]
         table, end = ProcessTable(), time.monotonic() + patience
         while True:
             running = table.look(self._shell.now())

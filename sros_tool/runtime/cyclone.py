@@ -6,6 +6,10 @@ enclaves in one domain: in Cyclone DDS 0.10 the second one gets the permissions 
 
 libddsc is not loaded at import: `load_cyclone` finds and loads it on the first call.  The functions
 that sros calls are declared here as in ``dds/dds.h`` of Cyclone DDS 0.10 and 11.0, which agree.
+
+``python -P -m sros_tool.runtime.cyclone DOMAIN PID...`` prints a JSON object that maps participants
+of Cyclone DDS on this machine to the ids of their processes, as they say themselves; it looks for
+these processes for three seconds at most.
 """
 
 from __future__ import annotations
@@ -13,8 +17,12 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import functools
+import json
 import os
 import re
+import socket
+import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -54,7 +62,7 @@ STRING_TYPE = "std_msgs::msg::dds_::String_"
 
 _NOT_ALLOWED_BY_SECURITY = -13
 _ANY_STATE = 0x7F
-_BUILTIN_PUBLICATIONS = 0x7FFF0000 + 3
+_BUILTIN_PARTICIPANTS, _BUILTIN_PUBLICATIONS = 0x7FFF0000 + 1, 0x7FFF0000 + 3
 _KEEP_LAST, _RELIABLE, _XCDR1 = 0, 1, 0
 _STRING_OPS = (ctypes.c_uint32 * 3)(0x01 << 24 | 0x05 << 16, 0, 0)
 _NO_OPTIMIZE = 1
@@ -138,14 +146,36 @@ class Participant:
 
     def publications(self) -> tuple[Publication, ...]:
         """Return this participant's writers and the discovered writers, sorted by topic."""
-        api = self._library.api
-        reader = api.dds_create_reader(self.handle, _BUILTIN_PUBLICATIONS, None, None)
+        return tuple(sorted(self._discovered(_BUILTIN_PUBLICATIONS, _publication_of)))
+
+    def process_ids(self) -> dict[str, int]:
+        """Map the discovered participants of this machine that tell it to their process ids.
+
+        A participant is the first 12 bytes of its identifier, in hexadecimal.
+        """
+        qget = self._library.api.dds_qget_prop
+
+        def told(address: int) -> tuple[str, int]:
+            sample = ctypes.cast(address, ctypes.POINTER(_ParticipantSample)).contents
+            values = []
+            for name in (b"__Hostname", b"__Pid"):
+                value = ctypes.c_char_p()
+                there = sample.qos and qget(sample.qos, name, ctypes.byref(value))
+                values.append(_text(value.value) if there else "")
+            is_here = values[0] == socket.gethostname() and values[1].isdecimal()
+            return bytes(sample.key[:12]).hex(), int(values[1]) if is_here else 0
+
+        return {of: pid for of, pid in self._discovered(_BUILTIN_PARTICIPANTS, told) if pid}
+
+    def _discovered(self, topic: int, copy: Callable[[int], _Value]) -> list[_Value]:
+        """Return the samples of a topic on what was discovered."""
+        reader = self._library.api.dds_create_reader(self.handle, topic, None, None)
         if reader < 0:
-            raise self._failure(reader, "cannot read the discovered publications")
+            raise self._failure(reader, "cannot read what was discovered")
         try:
-            return tuple(sorted(_take(self._library, reader, 1000, _publication_of)))
+            return _take(self._library, reader, 1000, copy)
         finally:
-            api.dds_delete(reader)
+            self._library.api.dds_delete(reader)
 
     @property
     def log(self) -> tuple[str, ...]:
@@ -605,6 +635,12 @@ class _EndpointSample(ctypes.Structure):
     ]
 
 
+class _ParticipantSample(ctypes.Structure):
+    """The C struct ``dds_builtintopic_participant_t``: a discovered participant."""
+
+    _fields_ = [("key", ctypes.c_uint8 * 16), ("qos", ctypes.c_void_p)]
+
+
 _ENTITY = ctypes.c_int32
 _QOS = ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
@@ -612,6 +648,10 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "dds_create_qos": (_QOS, []),
     "dds_delete_qos": (None, [_QOS]),
     "dds_qset_prop": (None, [_QOS, ctypes.c_char_p, ctypes.c_char_p]),
+    "dds_qget_prop": (
+        ctypes.c_bool,
+        [_QOS, ctypes.c_char_p, ctypes.POINTER(ctypes.c_char_p)],
+    ),
     "dds_qset_reliability": (None, [_QOS, ctypes.c_int, ctypes.c_int64]),
     "dds_qset_history": (None, [_QOS, ctypes.c_int, ctypes.c_int32]),
     "dds_qset_data_representation": (
@@ -657,3 +697,23 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     ),
     "dds_delete": (ctypes.c_int32, [_ENTITY]),
 }
+
+
+_LOOK_SECONDS = 3.0
+
+
+def main() -> int:
+    """Print the process ids of participants; return the exit status."""
+    domain, wanted = int(sys.argv[1]), {int(pid) for pid in sys.argv[2:]}
+    with Participant(domain) as participant:
+        end = time.monotonic() + _LOOK_SECONDS
+        while not wanted <= {*(told := participant.process_ids()).values()}:
+            if time.monotonic() > end:
+                break
+            time.sleep(0.05)
+    sys.stdout.write(json.dumps(told))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

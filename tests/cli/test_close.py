@@ -389,7 +389,7 @@ def test_units_that_do_not_restart_are_named(robot: Robot) -> None:
 def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     robot.units = UNITS
     robot.more = (Process(5, ("other", "--ros-args"), {}, datetime.now(UTC)),)
-    assert "first:\n  no node is known of process 5 (other)" in robot.close(status=1).out
+    assert "first:\n  no node is known of 1 process: process 5 (other)" in robot.close(status=1).out
     assert "would not be heard any more (accept: --partial)" in robot.close("--apply", status=1).out
     assert robot.restarts == []
     robot.more = (replace(robot.more[0], pid=6, environment={"ROS_DOMAIN_ID": "1"}),)
@@ -530,6 +530,15 @@ def test_the_enclave_of_a_process(
     observed = assign(nodes, processes, 0)
     assert {each.enclave: each.known_by for each in observed.processes} == known
     assert set(observed.elsewhere) == {each.enclaves[0] for each in nodes} - known.keys()
+
+
+def test_a_process_of_cyclone_dds_is_known_by_what_it_says() -> None:
+    """Not by the two bytes in which Fast DDS has the id."""
+    nodes = [node("a", "01107f01a530"), node("b", "0110")]
+    processes = [process(0x130A5, "x"), process(2, "y")]
+    observed = assign(nodes, processes, 0, {"0110": 0x130A5, "01107f01a530": 2})
+    known = {each.enclave: (each.pid, each.known_by) for each in observed.processes}
+    assert known == {"/a": (2, "process id"), "/b": (0x130A5, "process id")}
 
 
 def test_nodes_of_the_same_name_elsewhere_are_told() -> None:

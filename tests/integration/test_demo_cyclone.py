@@ -137,9 +137,10 @@ def test_what_is_written_is_read_and_seen(child: Callable[[Identity, str], list[
             print(heard)
             print(p.publications() == (
                 Publication("rt/chatter", "std_msgs::msg::dds_::String_"),))
+            print([*p.process_ids().values()] == [os.getpid()])
         """,
     )
-    assert lines == ["['Grüße', '']", "True"]
+    assert lines == ["['Grüße', '']", "True", "True"]
 
 
 @pytest.mark.parametrize("broken", ["permissions.p7s", "governance.p7s", "cert.pem", "key.pem"])
