@@ -31,6 +31,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.files import unpacked_dds_dir
+from sros_tool.terminal import echo
 
 _Value = TypeVar("_Value")
 
@@ -711,7 +712,7 @@ def main() -> int:
             if time.monotonic() > end:
                 break
             time.sleep(0.05)
-    sys.stdout.write(json.dumps(told))
+    echo(json.dumps(told))
     return 0
 
 
