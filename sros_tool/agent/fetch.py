@@ -8,6 +8,8 @@ Whether the permissions CA sealed the release is verified where it is installed.
 from __future__ import annotations
 
 import hashlib
+import stat
+from contextlib import suppress
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
@@ -210,6 +212,7 @@ def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datet
     with Folder(state) as folder:
         if not folder.is_folder(_METADATA):
             folder.mkdir(_METADATA, 0o700)
+    _drop_endless(state)
     updater = Updater(
         str(state / _METADATA),
         f"{transport.base}/metadata/",
@@ -221,6 +224,16 @@ def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datet
     # The present time is passed in; the client would ask the clock of the machine.
     updater._trusted_set.reference_time = now
     return updater
+
+
+def _drop_endless(state: Path) -> None:
+    """Remove pipes, devices and huge files, which the client of TUF would read without end."""
+    for path in (state / _FETCHED, *(state / _METADATA).rglob("*")):
+        with suppress(OSError):
+            there = path.stat()
+            is_file = stat.S_ISREG(there.st_mode) and there.st_size <= OF_ONE_ROBOT.packed
+            if not (is_file or stat.S_ISDIR(there.st_mode)):
+                path.unlink()
 
 
 def _number(target: TargetFile | None, source: str, robot: str) -> int:

@@ -5,6 +5,7 @@ The Update Framework, 1.5.2: what a client has to withstand.
 
 from __future__ import annotations
 
+import os
 import shutil
 import ssl
 import subprocess
@@ -296,6 +297,23 @@ def test_large_files_in_a_folder(publisher: Home) -> None:
     with (publisher.pub / "metadata/timestamp.json").open("ab") as file:
         file.truncate(1 << 31)
     publisher.robot().refuses(FetchProblem.TOO_LARGE)
+
+
+@pytest.mark.parametrize(
+    "name", ["metadata/timestamp.json", "metadata/root.json", "release.tar.gz"]
+)
+def test_what_has_no_end_in_the_agents_folder_is_fetched_again(publisher: Home, name: str) -> None:
+    robot = publisher.robot()
+    before, path = robot.gets(), robot.state / name
+    for is_huge in (True, False):
+        path.unlink()
+        if is_huge:
+            path.touch()
+            os.truncate(path, 1 << 40)
+        else:
+            os.mkfifo(path)
+        assert robot.gets() == before
+        assert path.is_file() and path.stat().st_size < 1 << 20
 
 
 @pytest.mark.parametrize("begin", [b"", b"HTTP/1.1 200 OK\r\nX: ", b"HTTP/1.1 200 OK\r\n\r\n"])

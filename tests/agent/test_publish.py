@@ -328,6 +328,21 @@ def test_old_files_stay_for_a_while(publisher: Home) -> None:
     publisher.robot().gets()
 
 
+def test_many_files_that_nothing_names(publisher: Home, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As whoever can write to the folder makes them, and a full disk leaves them."""
+    monkeypatch.setattr(publishing, "_MOST_SUPERSEDED", 2)
+    names = ["targets/robots/.x.tar.gz.new", "metadata/.9.snapshot.json.new"]
+    names += [f"targets/robots/{number:064}.r9.tar.gz" for number in range(2)]
+    for name in names:
+        (publisher.pub / name).touch()
+    for run in range(9):
+        there = [name for name in names if (publisher.pub / name).exists()]
+        assert there == names or run > 1
+        publisher.publish(after=3 * DAY)
+        assert len(read_published(Keystore(publisher.root)).superseded) <= 2
+    assert not there
+
+
 def test_two_at_once(publisher: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recovery, "_LOCK_SECONDS", 0.0)
     with Folder(publisher.pub) as folder:

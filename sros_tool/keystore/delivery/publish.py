@@ -15,6 +15,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from datetime import datetime, timedelta
 from functools import lru_cache, partial
+from itertools import islice
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -100,8 +101,11 @@ _KEPT = timedelta(days=2)
 _OURS = re.compile(
     r"metadata/[0-9]+\.(?:targets|snapshot|robots-[0-9a-f]+)\.json"
     r"|targets/robots/[0-9a-f]{64}\.[A-Za-z0-9_]+\.tar\.gz"
+    r"|(?:metadata|targets/robots)/\.[^/]+\.new"
 )
 """Paths in a publishing folder that are removed once nothing names them."""
+_MOST_SUPERSEDED = 500_000
+"""Number of such paths that are remembered: whoever can write to the folder can make many."""
 _BEFORE = "before"
 
 
@@ -824,10 +828,10 @@ class _Run:
         self.list.versions = dict(self._composed.versions)
         needed = {release.path(robot) for robot, release in releases.items()}
         needed |= {f"{_METADATA}/{version}.{n}.json" for n, version in self.list.versions.items()}
+        superseded = (path for path in self._paths() if path not in needed)
         self.list.superseded = {
             path: self.list.superseded.get(path, self._now)
-            for path in self._paths()
-            if path not in needed
+            for path in islice(superseded, _MOST_SUPERSEDED)
         }
 
     def _paths(self) -> Iterator[str]:
