@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.errors import SrosError, UsageError
-from sros_tool.files import replace_file
+from sros_tool.files import remove_file, replace_file
 from sros_tool.fleet.robots import name_problem
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
@@ -233,7 +233,7 @@ def _drop_endless(state: Path) -> None:
             there = path.stat()
             is_file = stat.S_ISREG(there.st_mode) and there.st_size <= OF_ONE_ROBOT.packed
             if not (is_file or stat.S_ISDIR(there.st_mode)):
-                path.unlink()
+                remove_file(path)
 
 
 def _number(target: TargetFile | None, source: str, robot: str) -> int:
