@@ -389,14 +389,16 @@ def _fleet_head(status: Json) -> str:
     )
 
 
+_FLEET_HEADS = (
+    *("robot", "state", "confirmed", "release", "published", "enclaves", "first expiry"),
+    *("CA stage", "to do", "what differs"),
+)
+
+
 def _fleet_table(status: Json) -> str:
     rows = sorted(status["robots"], key=lambda robot: (robot["state"] in _GOOD, robot["robot"]))
-    heads = (
-        *("robot", "state", "confirmed", "release", "published", "enclaves", "first expiry"),
-        *("CA stage", "to do", "what differs"),
-    )
     return (
-        f"<table><thead><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead>"
+        f"<table><thead><tr>{''.join(f'<th>{head}</th>' for head in _FLEET_HEADS)}</tr></thead>"
         f"<tbody>{''.join(map(_fleet_row, rows))}</tbody></table>"
     )
 
@@ -424,7 +426,11 @@ def _fleet_row(robot: Json) -> str:
         escape(robot["to_do"]),
         "<br>".join(map(escape, (*what, *due, *robot["notes"], *(robot["problems"] or ())))),
     )
-    return f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
+    labelled = (
+        f'<td data-label="{head}">{cell}</td>' if cell else "<td></td>"
+        for head, cell in zip(_FLEET_HEADS, cells, strict=True)
+    )
+    return f"<tr>{''.join(labelled)}</tr>"
 
 
 def _fleet_class(state: str) -> str:

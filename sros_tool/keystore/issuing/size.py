@@ -193,7 +193,10 @@ def _scope_notes(policy: Policy, result: MinimizedPolicy, observed: Set[Right]) 
         {right.enclave for right in observed} - {enclave.path for enclave in policy.enclaves}
     )
     if unknown:
-        text = f"enclaves observed, but not in the policy: {', '.join(unknown)}."
+        text = (
+            f"enclaves observed, but not in the policy: {', '.join(unknown)}. If the policy has "
+            "their nodes in another enclave, write its path in the observed file."
+        )
         yield Note("minimize.enclave-not-in-policy", text)
 
 
