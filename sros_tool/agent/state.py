@@ -20,6 +20,7 @@ from sros_tool.agent.settings import agent_folder
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.folders import Folder
+from sros_tool.keystore.delivery.published import MOST_NUMBER
 from sros_tool.keystore.delivery.release import sealed_robot
 from sros_tool.keystore.layout import RELEASE_SEAL
 from sros_tool.names import check_enclave_name
@@ -87,7 +88,7 @@ def _state_from(value: Any) -> AgentState:
     if not isinstance(value, dict) or value.pop("format", None) != _FORMAT:
         raise ValueError("another format")
     for number in ("release", "accepted", "sequence"):
-        if type(value[number]) is not int or value[number] < 0:
+        if type(value[number]) is not int or not 0 <= value[number] <= MOST_NUMBER:
             raise ValueError(number)
     for moment in ("latest", "fetched", "sent"):
         if value[moment] is not None:

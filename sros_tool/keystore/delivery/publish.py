@@ -564,11 +564,11 @@ class _Run:
             why = f"It has release {self.list.number}, and the ledger none after {unused - 1}."
             raise damaged_list(self.keystore, why)
         latest = self._latest
+        if latest <= self.list.number:
+            return False
         # Not by the next number of the ledger: a restored keystore may have issued files since.
-        entries = self.keystore.ledger_with("what", "release").entries if latest else ()
-        if latest <= self.list.number or any(
-            entry.what == "release" and entry.number == latest for entry in entries
-        ):
+        entries = self.keystore.ledger_with("what", "release").entries
+        if any(entry.what == "release" and entry.number == latest for entry in entries):
             return False
         if not restored:
             robots = [robot for robot, there in self._there.items() if there.number == latest]
