@@ -272,8 +272,15 @@ _PHRASES = {
     "close": "close the robot",
     "metrics": "give the metrics",
     "review": "review the change",
-    "agent": "do this for the agent",
-    "fleet": "do this for the fleet",
+    "agent init": "set up the agent",
+    "agent run": "run the agent",
+    "agent status": "show the agent",
+    "fleet collect": "collect what robots sent",
+    "fleet confirm": "store the confirmation",
+    "fleet inventory": "print the inventory",
+    "fleet publish": "publish",
+    "fleet report": "report",
+    "fleet status": "show the fleet",
 }
 
 
@@ -319,7 +326,9 @@ def _prefixed(text: str, arguments: Sequence[str]) -> str:
     verb = _verb(arguments)
     if verb is None:
         return f"sros: {text}"
-    return f"Unable to {_PHRASES.get(verb, verb.replace('_', ' '))}: {text}"
+    words = " ".join([word for word in arguments if not word.startswith("-")][:2])
+    phrase = _PHRASES.get(words) or _PHRASES.get(verb, verb.replace("_", " "))
+    return f"Unable to {phrase}: {text}"
 
 
 def _verb(arguments: Sequence[str]) -> str | None:

@@ -200,6 +200,8 @@ def test_what_is_asked_in_vain_names_what_to_ask(tmp_path: Path) -> None:
     policy.write_text(policy_text({"/a": publish("/x")}))
     revision = sros("diff_policy", "git:HEAD:p.xml", policy)
     assert revision.status == 2 and "only be compared with --no-new-access" in revision.err
+    for words, able in (("fleet status", "show the fleet"), ("agent run", "run the agent")):
+        assert sros(*words.split(), tmp_path).err.startswith(f"Unable to {able}: ")
     policy.write_text("<policy><enclaves/></policy>")
     assert 'Write <policy version="0.2.0">.' in sros("check", "policy", policy).out
 
