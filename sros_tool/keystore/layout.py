@@ -135,6 +135,11 @@ def enclave_folder(name: str) -> str:
     return ENCLAVES + name.rstrip("/")
 
 
+def link_to_list(name: str) -> str:
+    """Return the target of the link ``crl.pem`` in the folder of an enclave."""
+    return "../" * (enclave_folder(name).count("/") + 1) + CRL
+
+
 def enclave_path(root: Path, name: str) -> Path:
     """Return the folder of an enclave of the keystore ``root``."""
     return root / enclave_folder(name)
@@ -372,9 +377,9 @@ def readable_enclaves(root: Path) -> tuple[str, ...]:
     """
     top = os.fspath(root / ENCLAVES)
     unread: list[UnreadPath] = []
-    folders = list(_walk(top, unread))
-    _refuse_unreadable(root, folders, unread)
-    return _names_in(top, folders)
+    names = _names_in(top, _noting_unreadable(_walk(top, unread), unread))
+    _refuse_unreadable(root, unread)
+    return names
 
 
 def check_readable(root: Path, names: Sequence[str]) -> None:
@@ -382,16 +387,23 @@ def check_readable(root: Path, names: Sequence[str]) -> None:
     unread: list[UnreadPath] = []
     walks = (_walk(os.fspath(enclave_path(root, name)), unread) for name in names)
     # The first folder of a walk is that of the enclave itself.
-    folders = list(chain.from_iterable(islice(walk, 1) for walk in walks))
-    _refuse_unreadable(root, folders, unread)
+    folders = chain.from_iterable(islice(walk, 1) for walk in walks)
+    for _ in _noting_unreadable(folders, unread):
+        pass
+    _refuse_unreadable(root, unread)
 
 
-def _refuse_unreadable(root: Path, folders: Iterable[_Walked], unread: list[UnreadPath]) -> None:
+def _noting_unreadable(folders: Iterable[_Walked], unread: list[UnreadPath]) -> Iterator[_Walked]:
+    """Yield ``folders``, and add their files that cannot be read to ``unread``."""
     for folder, files in folders:
         for name in files:
             path = f"{folder}/{name}"
             if name.endswith(_FILE_TYPES) and not os.access(path, os.R_OK):
                 unread += _refused(path)
+        yield folder, files
+
+
+def _refuse_unreadable(root: Path, unread: list[UnreadPath]) -> None:
     if unread:
         raise _unreadable(root, unread, "Enclaves would keep their old files. Nothing was changed.")
 

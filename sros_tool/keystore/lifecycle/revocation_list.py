@@ -24,9 +24,11 @@ from sros_tool.keystore.issuing.authority import Authority, write_bundle
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import (
     CRL,
+    CRL_FILE,
     IDENTITY,
     PRIVATE,
     enclave_folder,
+    link_to_list,
     revoked_certificates,
 )
 from sros_tool.keystore.ledger import (
@@ -668,20 +670,18 @@ class RevocationListSigner:
 
 def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
     """Stage the link ``crl.pem`` to the revocation list for each enclave that lacks the link."""
-
-    def link(part: Sequence[str]) -> None:
-        for name in part:
-            folder = enclave_folder(name)
-            target = "../" * folder.count("/") + f"../{CRL}"
-            # Some ways to copy a keystore replace the link by a file, which would never be updated.
-            try:
-                there = os.readlink(f"{transaction.root}/{folder}/crl.pem")  # noqa: PTH115 - fast
-            except OSError:
-                there = ""
-            if there != target:
-                transaction.link(f"{folder}/crl.pem", target)
-
-    transaction.on_all_cores(names, link)
+    root, is_first = transaction.root, not os.path.lexists(transaction.root / CRL)
+    lacking = []
+    for name in names:
+        folder = f"{root}/{enclave_folder(name)}"
+        path = f"{enclave_folder(name)}/{CRL_FILE}"
+        if is_first and os.path.lexists(folder) and not os.path.lexists(f"{folder}/{CRL_FILE}"):
+            lacking.append(name)
+        # Some ways to copy a keystore replace the link by a file, which would never be updated.
+        elif transaction.target_after(path) != link_to_list(name):
+            transaction.link(path, link_to_list(name))
+    if lacking:
+        transaction.link_to_first_list(lacking)
 
 
 def another_ca(keystore: Keystore, aim: str) -> str:

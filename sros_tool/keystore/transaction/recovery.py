@@ -21,7 +21,19 @@ from typing import Self
 
 from sros_tool.errors import KeystoreError
 from sros_tool.folders import Folder
-from sros_tool.keystore.layout import CERTIFICATE_FILE, ENCLAVES, LOCK, PRIVATE, STAGE, folder_mode
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    CRL,
+    CRL_FILE,
+    ENCLAVES,
+    LOCK,
+    PRIVATE,
+    STAGE,
+    enclave_folder,
+    folder_mode,
+    link_to_list,
+    search_enclaves,
+)
 from sros_tool.keystore.transaction.stage import (
     ADDED,
     AFTER,
@@ -256,6 +268,22 @@ def _undo(folder: Folder, moves: Sequence[Move]) -> None:
             _replace_by_link(folder, before, f"{STAGE}/spare", path)
         else:
             folder.replace(f"{STAGE}/{BEFORE}/{staged_name(path)}", path)
+    if any(move.path == CRL and move.before is None for move in moves):
+        _unlink_from_list(folder)
+
+
+def link_to_first_list(folder: Folder, names: Sequence[str]) -> None:
+    """Make the link ``crl.pem`` for enclaves; it leads nowhere until there is a list."""
+    for name in names:
+        folder.symlink(link_to_list(name), f"{enclave_folder(name)}/{CRL_FILE}")
+
+
+def _unlink_from_list(folder: Folder) -> None:
+    """Remove the links ``crl.pem`` to the list, which is not there."""
+    for name in search_enclaves(folder.path)[0]:
+        path = f"{enclave_folder(name)}/{CRL_FILE}"
+        if folder.link_target(path) == link_to_list(name):
+            folder.unlink(path)
 
 
 def _replace_by_link(folder: Folder, target: str, spare: str, path: str) -> None:

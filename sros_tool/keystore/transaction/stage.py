@@ -29,6 +29,7 @@ from sros_tool.keystore.layout import (
     ENCLAVES,
     REVOKED,
     STAGE,
+    enclave_folder,
     is_layout_path,
 )
 
@@ -70,11 +71,19 @@ class Change:
 
 
 class ChangeRun(NamedTuple):
-    """The same action on several files of a folder; ``folder`` is "" or ends with "/"."""
+    """The same action on several files of a folder; ``folder`` is "" or ends with "/".
+
+    With ``file``, it is the action on this file of each enclave in ``names``.
+    """
 
     action: str
     folder: str
     names: tuple[str, ...]
+    file: str = ""
+
+    def path(self, name: str) -> str:
+        """Return the path of the change for one of the names."""
+        return f"{enclave_folder(name)}/{self.file}" if self.file else f"{self.folder}{name}"
 
 
 class Changes(Sequence[Change]):
@@ -121,11 +130,7 @@ class Changes(Sequence[Change]):
         return self._ends[-1] if self._ends else 0
 
     def __iter__(self) -> Iterator[Change]:
-        return (
-            Change(action, f"{folder}{name}")
-            for action, folder, names in self._runs
-            for name in names
-        )
+        return (Change(run.action, run.path(name)) for run in self._runs for name in run.names)
 
     @overload
     def __getitem__(self, index: int) -> Change: ...
@@ -137,9 +142,9 @@ class Changes(Sequence[Change]):
         if isinstance(index, slice):
             return tuple(self)[index]
         place = range(len(self))[index]
-        run = bisect_right(self._ends, place)
-        action, folder, names = self._runs[run]
-        return Change(action, f"{folder}{names[place - self._ends[run]]}")
+        at = bisect_right(self._ends, place)
+        run = self._runs[at]
+        return Change(run.action, run.path(run.names[place - self._ends[at]]))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sequence) and tuple(self) == tuple(other)

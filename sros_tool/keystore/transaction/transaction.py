@@ -19,7 +19,7 @@ import os
 import secrets
 import stat
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
@@ -29,6 +29,7 @@ from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder, make_folders, remove_folders
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
+    CRL_FILE,
     ENCLAVES,
     KEY_FILE,
     PRIVATE,
@@ -36,10 +37,17 @@ from sros_tool.keystore.layout import (
     REVOKED,
     STAGE,
     folder_mode,
+    link_to_list,
     readable_enclaves,
     search_enclaves,
 )
-from sros_tool.keystore.transaction.recovery import KeystoreLock, complete, lock_new, recover
+from sros_tool.keystore.transaction.recovery import (
+    KeystoreLock,
+    complete,
+    link_to_first_list,
+    lock_new,
+    recover,
+)
 from sros_tool.keystore.transaction.stage import (
     ADDED,
     ADOPT,
@@ -47,6 +55,7 @@ from sros_tool.keystore.transaction.stage import (
     BEFORE,
     CLOSE,
     LIVE,
+    ChangeRun,
     Changes,
     Move,
     Staged,
@@ -96,6 +105,7 @@ class Transaction:
         self._folders: dict[str, bool] = {}  # whether the folder exists in the keystore
         self._parents: set[str] = set()  # of folders that are staged
         self._moves: list[Move] = []
+        self._linked: frozenset[str] = frozenset()
         self._undo: list[Callable[[], None]] = []
         self._after: list[Callable[[], None]] = []
         self._adopts = False
@@ -301,6 +311,8 @@ class Transaction:
         """Return the target of the link at ``path`` after the transaction; None: no link."""
         if not self.is_staged(path):
             return _link_target(f"{self.root}/{path}")
+        if self._links_to_list(path):
+            return link_to_list(path.rpartition("/")[0].removeprefix(ENCLAVES) or "/")
         if self.dry_run:
             kept = self._kept.get(path)
             return kept if isinstance(kept, str) else None
@@ -313,9 +325,14 @@ class Transaction:
         return f"{self._in.path}/{staged}"
 
     def changed_folders(self) -> dict[str, set[str]]:
-        """Map folders ("" is the keystore) to the names of their files that change."""
+        """Map folders ("" is the keystore) to the names of their files that change.
+
+        Links to a first revocation list are left out.
+        """
         found: dict[str, set[str]] = {}
         for run in self.changes.since(0):
+            if run.file:
+                continue
             found.setdefault(run.folder.removesuffix("/"), set()).update(run.names)
         return found
 
@@ -327,6 +344,14 @@ class Transaction:
             self._in.symlink(relocated_target(path, target) if flat else target, staged)
         else:
             self._kept[path] = target
+
+    def link_to_first_list(self, names: Sequence[str]) -> None:
+        """Stage the link ``crl.pem`` for enclaves without one; this transaction writes the list.
+
+        The commit makes the links first: until the list is there, they lead nowhere.
+        """
+        self._linked = frozenset(names)
+        self.changes.extend((ChangeRun("create", "", tuple(names), CRL_FILE),))
 
     def remove(self, path: str) -> None:
         """Stage the removal of a file or link, and of folders that become empty."""
@@ -377,7 +402,11 @@ class Transaction:
     def is_staged(self, path: str) -> bool:
         """Return whether this transaction writes or removes ``path``."""
         folder, _, name = path.rpartition("/")
-        return name in self._staged.get(folder, ())
+        return name in self._staged.get(folder, ()) or self._links_to_list(path)
+
+    def _links_to_list(self, path: str) -> bool:
+        folder, _, name = path.rpartition("/")
+        return name == CRL_FILE and (folder.removeprefix(ENCLAVES) or "/") in self._linked
 
     def _at(self, path: str) -> str | None:
         """Return the present content of a path, as in `Move.before`."""
@@ -445,7 +474,7 @@ class Transaction:
         slices = [(items, work_on(items))] if alone else map_slices(items, work_on)
         for _, (_, staged) in slices:
             if staged:
-                for _, folder, names in staged.changes:
+                for _, folder, names, _ in staged.changes:
                     place = folder.removesuffix("/")
                     self._note_staged(place, (*self._staged.get(place, ()), *names))
                 self.changes.extend(staged.changes)
@@ -485,6 +514,7 @@ class Transaction:
         write_manifest(folder, self._moves)
         folder.flush_file_system(STAGE)
         _bridge(folder, self._moves)
+        map_slices(sorted(self._linked), partial(link_to_first_list, folder))
         point_live(folder, AFTER)
         self._undo.clear()
         with contextlib.suppress(OSError, SrosError):  # already committed; `_end` tries again
