@@ -332,13 +332,14 @@ class LedgerFile:
     def with_values(self, name: str, values: Collection[str]) -> Ledger:
         """Return the ledger with at least the entries whose field ``name`` has one of ``values``.
 
-        Without an index, or for very many values, it is the whole ledger.
+        Without an index, or for very many values, it is the whole ledger, if it is complete.
 
         Raises:
             KeystoreError: the file cannot be read at all.
         """
         index = self._opened().ledger_index
-        if index is None or len(values) * _LINES_PER_LOOKUP > index.state.lines:
+        many = index is None or len(values) * _LINES_PER_LOOKUP > index.state.lines
+        if index is None or (many and self.is_complete):
             return self.ledger()
         terms = [(name, value) for value in values]
         return self._compared(_EVERY, terms).ledger
@@ -373,6 +374,11 @@ class LedgerFile:
         """Whether an index finds entries, so that few of them take little time."""
         return self._opened().ledger_index is not None
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether all sealed parts are there, so that all lines can be read."""
+        return all((self.root / ledger_part(n)).exists() for n in range(1, self._opened().part))
+
     def _opened(self) -> _Files:
         if self._files is None:
             self._files = self._read()
@@ -395,7 +401,8 @@ class LedgerFile:
         if index := self._opened().ledger_index:
             return IndexUpdate(index)
         with _open(self.root, self._follow_link) or io.BytesIO() as file:
-            return self._new_index(file)
+            made, is_sound = self._new_index(file, self._opened().head)
+            return made if is_sound else None
 
     def last_part(self) -> tuple[int, int]:
         """Return the number and the size, in bytes, of the part to which lines are added.
@@ -491,23 +498,15 @@ class LedgerFile:
 
         index = LedgerIndex.open(self.root, head.lines, head.last, head.index_root)
         if index is None and not self._follow_link:
-            made = self._new_index(file)
+            made, is_sound = self._new_index(file, head)
             root = made.root()
-            if root == head.index_root or self._is_sound(file, head):
+            if root == head.index_root or is_sound:
                 made.save(self.root)
                 index = LedgerIndex.open(self.root, head.lines, head.last, root)
         last_size = index.state.size - index.state.sealed_size if index else 0
         ends_so = index and _last_line(file, last_size) == head.last
         file.seek(0)
         return index if ends_so else None
-
-    def _is_sound(self, file: BinaryIO, head: _Head) -> bool:
-        """Return whether all lines of the ledger are the chain that the head signs."""
-        file.seek(0)
-        read = _read_lines(self._every_line(file), _NONE, head.lines, _MOST_LINES, _MOST_BYTES)
-        if read is None or read.faults or read.unchained:
-            return False
-        return not _head_fault(head, read.lines, read.signed, chained=read.chained)
 
     def _found(self, files: _Files, terms: _Terms | None) -> _Lines | None:
         """Return the lines that the index finds; None if it is not there or finds none of them.
@@ -611,8 +610,11 @@ class LedgerFile:
             "Copy it back from your archive.",
         )
 
-    def _new_index(self, last: BinaryIO) -> IndexUpdate:
-        """Return the index of all lines of the ledger, the last part of which is open.
+    def _new_index(self, last: BinaryIO, head: _Head | None) -> tuple[IndexUpdate, bool]:
+        """Return the index of all lines, and whether they are the chain that ``head`` signs.
+
+        ``last`` is the last part.  Both are said of the same reading: another process that can
+        write to the keystore could exchange a part between two.
 
         Raises:
             KeystoreError: as `_every_line`.
@@ -620,11 +622,19 @@ class LedgerFile:
         from sros_tool.keystore.ledger_index import IndexUpdate
 
         index = IndexUpdate(None)
-        for line in self._every_line(last, index.seal):
-            text = line.removesuffix(b"\n")
-            if entry := _parse(text):
-                index.add(entry, text)
-        return index
+
+        def indexed() -> Iterator[bytes]:
+            for line in self._every_line(last, index.seal):
+                text = line.removesuffix(b"\n")
+                if entry := _parse(text):
+                    index.add(entry, text)
+                yield line
+
+        stated = head.lines if head else 0
+        read = _read_lines(indexed(), _NONE, stated, _MOST_LINES, _MOST_BYTES)
+        if read is None or read.faults or read.unchained:
+            return index, False
+        return index, not _head_fault(head, read.lines, read.signed, chained=read.chained)
 
     def _compared_with_head(self, files: _Files, read: _Lines) -> _Reading:
         if not read.lines:

@@ -594,10 +594,14 @@ class RecordedRights:
 
     def _of(self, name: str) -> _OfLedger:
         """Return the part of the ledger about an enclave, and perhaps about others."""
-        is_first = len(self._looked_up) < _MOST_LOOKUPS and "_of_all" not in self.__dict__
-        if self._whole or not is_first or not self._keystore.ledger_file.is_indexed:
+        file, are_few = self._keystore.ledger_file, len(self._looked_up) < _MOST_LOOKUPS
+        if self._whole or "_of_all" in self.__dict__ or not file.is_indexed:
+            return self._of_all
+        if not are_few and file.is_complete:
             return self._of_all
         if name not in self._looked_up:
+            if not are_few:
+                self._looked_up.clear()
             ledger = self._keystore.ledger_with("enclave", name)
             self._looked_up[name] = _OfLedger(ledger, self._keystore)
         return self._looked_up[name]

@@ -17,6 +17,7 @@ import pytest
 
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore import ledger as ledger_module
+from sros_tool.keystore import rights
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.describe import history
 from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, LEDGER_INDEX, ledger_part
@@ -111,7 +112,9 @@ def test_parts_are_sealed_and_read_as_one_ledger(root: Path) -> None:
     sros(*CHECK, root).ok()
 
 
-def test_without_its_sealed_parts_changes_go_on(root: Path, tmp_path: Path) -> None:
+def test_without_its_sealed_parts_changes_go_on(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     key = load_key((root / "enclaves/b/key.pem").read_bytes(), "of the test")
     revoke(root, ["/b"], now=NOW)
     archive = tmp_path / "archive"
@@ -120,6 +123,11 @@ def test_without_its_sealed_parts_changes_go_on(root: Path, tmp_path: Path) -> N
         shutil.move(root / name, archive / name)
     renew(root, ["/a"], now=NOW, new_key=True, revoke_old=True)
     create_enclaves(root, ["/new"], now=NOW)
+    with monkeypatch.context() as patched:  # as of very many enclaves
+        patched.setattr(ledger_module, "_LINES_PER_LOOKUP", 1 << 30)
+        patched.setattr(rights, "_MOST_LOOKUPS", 1)
+        done = renew(root, ["/new", "/a"], now=NOW, revoke_old=True)
+        assert (len(done.outcomes), done.revoked) == (2, 2)
     shutil.rmtree(root / "revoked")
     with pytest.raises(KeystoreError, match="was revoked"):
         sign_request(root, make_request(key, "/other"), now=NOW)
@@ -342,3 +350,26 @@ def test_an_index_of_another_version_is_made_again_first(
     create_enclaves(root, ["/more"], now=NOW)
     assert not is_indexed(root)
     assert any("changed" in gap for gap in Keystore(root).ledger.gaps)
+
+
+def test_an_index_is_proven_by_the_reading_that_it_was_made_of(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever can write to the keystore could show other lines to one of two readings."""
+    every_line, readings = LedgerFile._every_line, 0
+
+    def other_lines_first(file: LedgerFile, *given: Any) -> Any:
+        nonlocal readings
+        readings += 1
+        is_first = readings == 1
+        for line in every_line(file, *given):
+            yield line.replace(b'"enclave":"/b"', b'"enclave":"/x"') if is_first else line
+
+    (root / LEDGER_INDEX).unlink()
+    monkeypatch.setattr(ledger_module._Head, "index_root", property(lambda _: "0" * 64))
+    monkeypatch.setattr(LedgerFile, "_every_line", other_lines_first)
+    create_enclaves(root, ["/spare"], now=NOW)
+    monkeypatch.undo()
+    assert readings > 1
+    assert is_indexed(root)
+    assert Keystore(root).ledger_file.recorded_enclaves() == ["/a", "/b", "/spare"]
