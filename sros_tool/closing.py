@@ -376,11 +376,13 @@ def read_processes(path: Path) -> ObservedProcesses:
             if not all(isinstance(text, str) for text in texts):
                 raise ValueError(f"{texts} are not all text")
             if process.unit and not re.fullmatch(SERVICE_NAME, process.unit, re.A):
-                raise ValueError(f"{process.unit!r} is no service")
+                raise ValueError(f"{process.unit!r} is not a service")
         return ObservedProcesses(**value)._replace(processes=processes)
     except (ValueError, TypeError, KeyError) as error:
         raise DocumentError(
-            f"'{path}' is no list of processes", f"{error}", "Remove it, to watch the robot again."
+            f"'{path}' is not a list of processes",
+            f"{error}",
+            "Remove it, to watch the robot again.",
         ) from error
 
 
@@ -622,7 +624,9 @@ class OpenRobot:
             return make_observation(node for node in nodes if names.issuperset(node.enclaves))
         except (ValueError, TypeError, KeyError) as error:
             raise DocumentError(
-                f"'{self.seen}' is no observation", f"{error}", "Watch the robot again: --for 1m."
+                f"'{self.seen}' is not an observation",
+                f"{error}",
+                "Watch the robot again: --for 1m.",
             ) from error
 
     def _variables(self, enclave: str, rmw: str = "") -> dict[str, str]:

@@ -184,8 +184,8 @@ def test_a_checkout_below_the_workspace_is_reviewed(origin: Origin, tmp_path: Pa
         ({"base": "refs/heads/none"}, "git finds no reference 'refs/heads/none'"),
         ({"renew-within": "soon"}, "soon"),
         ({"policy": "robot/none.xml"}, "'robot/none.xml' is not in the commit"),
-        ({"policy": "../robot.xml"}, "is no path from the top of the repository"),
-        ({"policy": "/robot.xml"}, "is no path from the top of the repository"),
+        ({"policy": "../robot.xml"}, "is not a path from the top of the repository"),
+        ({"policy": "/robot.xml"}, "is not a path from the top of the repository"),
         ({"policy": ""}, "no policy and no keystore is named"),
         ({"requirements": "robot/none.toml"}, "'robot/none.toml' is not in the commit"),
         ({"fleet": "robot/none.toml"}, "'robot/none.toml' is not in the commit"),
@@ -194,7 +194,7 @@ def test_a_checkout_below_the_workspace_is_reviewed(origin: Origin, tmp_path: Pa
         ({"sarif": "robot/../.git/x"}, "'robot/../.git/x' is in the repository"),
         ({"head": "main"}, "neither the full id of a commit nor a full reference"),
         ({"base": "refs/heads/same"}, "both commits are the same"),
-        ({"keystore": "robot/common"}, "'robot/common' is no keystore"),
+        ({"keystore": "robot/common"}, "'robot/common' is not a keystore"),
     ],
 )
 def test_what_cannot_be_decided(origin: Origin, inputs: dict[str, str], said: str) -> None:
@@ -231,7 +231,7 @@ def test_the_action_compares_with_what_is_merged_into(origin: Origin, tmp_path: 
 def test_only_a_merge_says_what_it_is_merged_into(origin: Origin) -> None:
     """A commit of the pull request would name its own parent as the base."""
     for name, said in (
-        (f"{origin.git('rev-parse', 'wider')}^1", "is no merge"),
+        (f"{origin.git('rev-parse', 'wider')}^1", "is not a merge"),
         ("refs/heads/merged/wider^1", "is not the full id of a commit"),
     ):
         ended = sros("review", "--base", name, "--policy", POLICY, cwd=origin.folder)

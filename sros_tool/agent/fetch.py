@@ -206,7 +206,7 @@ def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datet
         raise FetchError(
             FetchProblem.NOT_SIGNED,
             f"'{state}' has no {_PINNED_ROOT}",
-            "Nothing says which keys sign what is published.",
+            "Without it, no key for the published files is known.",
             "Name it to `sros agent init` with --root.",
         )
     with Folder(state) as folder:
@@ -293,14 +293,14 @@ def _explained(error: Exception, source: str, now: datetime) -> FetchError:
     if isinstance(error, exceptions.ExpiredMetadataError):
         return FetchError(
             FetchProblem.EXPIRED,
-            f"what is published in {source} expired",
+            f"the metadata in {source} has expired",
             f"{why} It is {iso(now)} here. Home publishes no more, or somebody withholds it.",
             f"Run `sros fleet publish` at home; {_CLOCK}.",
         )
     if isinstance(error, exceptions.BadVersionNumberError):
         return FetchError(
             FetchProblem.ROLLED_BACK,
-            f"what is published in {source} is older than what this robot has seen",
+            f"the files in {source} are older than files that this robot has seen",
             why,
             "Nothing was changed. Bring the publishing folder, or the keystore at home, up to date "
             "again.",
@@ -314,13 +314,13 @@ def _explained(error: Exception, source: str, now: datetime) -> FetchError:
     if isinstance(error, OSError):
         return FetchError(
             FetchProblem.NOT_KEPT,
-            "what is fetched cannot be kept",
+            "the fetched files cannot be stored",
             why,
             "Make room on the disk, and let the agent write in its folder.",
         )
     return FetchError(
         FetchProblem.NOT_SIGNED,
-        f"what is published in {source} is not what the trusted keys signed",
+        f"the files in {source} are not signed with the trusted keys",
         why,
         "Nothing was changed.",
     )

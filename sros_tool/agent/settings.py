@@ -194,7 +194,7 @@ def settings_from(value: Mapping[str, Any], what: str) -> AgentSettings:
         elif key == "unit" and isinstance(entry, list):
             fields["units"] = tuple(_unit(unit, what) for unit in entry)
         else:
-            raise _wrong(what, f"{key} is no key of it, or not of the right form")
+            raise _wrong(what, f"{key} is not a key of it, or not of the right form")
     if missing := [key for key in ("robot", "from", "inbox") if _TEXTS[key] not in fields]:
         raise _wrong(what, f"it lacks {', '.join(missing)}")
     settings = AgentSettings(**fields)

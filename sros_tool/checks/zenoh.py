@@ -94,9 +94,9 @@ EVERYBODY = FindingKind(
     "zenoh.subject-of-everybody",
     ERROR,
     "a subject without a name",
-    "A property that a subject does not state matches every process, an interface and a protocol "
-    "are not identities, and a process chooses its zid itself. So the rules hold for everybody "
-    "who gets a connection.",
+    "A subject matches every process by properties that it does not state; interfaces and "
+    "protocols are not identities, and a process chooses its own zid. So the rules hold for "
+    "everyone who gets a connection.",
     "Zenoh 1.9 (authorization.rs); 1.10.2 measured.",
     'Name each enclave by "cert_common_names".',
 )

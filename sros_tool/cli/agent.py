@@ -82,15 +82,16 @@ def agent() -> None:
 )  # fmt: skip
 @click.option(
     "--tls-ca", metavar="FILE", type=PATH,
-    help="CA certificates of the servers. [default: those of the system]",
+    help="CA certificates of the servers. [default: the system's]",
 )  # fmt: skip
 @click.option(
     "--new-key", is_flag=True, help="Make a new key for each renewal, instead of keeping it."
 )
 @click.option(
     "--restart", is_flag=True,
-    help="Restart units of changed enclaves: those of --unit, and active ones of `sros units`. "
-    "[default: only say what is due]",
+    help=(
+        "Restart units of changed enclaves: those of --unit, and active ones of `sros units`. "
+        "[default: only report which restarts are due]"),
 )  # fmt: skip
 @click.option(
     "--unit", "units", metavar="UNIT=ENCLAVE,...", multiple=True,

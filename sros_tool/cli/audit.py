@@ -204,8 +204,8 @@ def audit(
 
 
 _NOT_ALL = (
-    "the exit status is 1 for what was not seen or not judged: --watch finds nodes that start "
-    "later, and --partial accepts it"
+    "the exit status is 1, because something was not seen or could not be decided: --watch finds "
+    "nodes that start later, and --partial accepts it"
 )
 _NO_PATCH = "no patch was written: no added right would allow what is denied"
 

@@ -132,7 +132,7 @@ _VENDORS = (*(vendor.value for vendor in MEASURED), _ZENOH)
     type=PATH,
     multiple=True,
     metavar="FILE",
-    help="Check that the policy or keystore fulfils the requirements in this TOML file.",
+    help="Check that the requirements in this TOML file hold for the policy or keystore.",
 )
 @click.option(
     "--requirements-before",
@@ -152,7 +152,7 @@ _VENDORS = (*(vendor.value for vendor in MEASURED), _ZENOH)
 @click.option(
     "--suggest",
     is_flag=True,
-    help="Print, as TOML, requirements that the policy fulfils now: keep those that you want.",
+    help="Print, as TOML, requirements that hold now: keep the ones that you want.",
 )
 @click.option(
     "--vendor",
@@ -169,8 +169,8 @@ _VENDORS = (*(vendor.value for vendor in MEASURED), _ZENOH)
 )
 @all_distros_option("Report the findings for all supported distributions of ROS 2.")
 @distro_option(
-    "Report only what the update to this ROS 2 distribution changes, from the one of --distro, of "
-    "the keystore's settings, or $ROS_DISTRO.",
+    "Report only the differences after an update to this ROS 2 distribution, from the present "
+    "one: --distro, else the keystore's settings, else $ROS_DISTRO.",
     "--upgrade-to",
 )
 @click.option(

@@ -171,7 +171,11 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
             echo(f"  {problem}")
         echo(f"next: sros close {folder}{' --apply' if applies else ''}", err=True)
     elif holds:
-        left = "" if all(proof.holds for proof in closed.proofs) else ", but for what was not asked"
+        left = (
+            ""
+            if all(proof.holds for proof in closed.proofs)
+            else (", except for what was not asked")
+        )
         keys = f"bring {folder}/keystore to another machine: it has the CA keys"
         echo(f"the robot is closed{left}; next: {keys}", err=True)
     elif closed.proofs:
@@ -186,7 +190,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
     elif any(process.unit for process in observed.processes):
         echo(f"nothing is closed yet; next: sros close {folder} --apply", err=True)
     else:
-        how = f"start each process as {robot.start / COMMANDS} says"
+        how = f"start each process by the commands in {robot.start / COMMANDS}"
         echo(f"nothing is closed yet; next: stop the robot, {how}, and ask", err=True)
         echo(f"sros close {folder} --proof", err=True)
 

@@ -153,7 +153,8 @@ def demo(
 
     With talker, listener or router, run only this node until Ctrl-C, with the environment variables
     that are set, to see by hand who hears whom: on Cyclone DDS, rclpy, or Zenoh, which also needs a
-    router. The node says at once whether it is secured. Only --backend and --topic go with it.
+    router. The node says at once whether it is secured. Of the options, only --backend and --topic
+    apply.
 
     Example:
       $ sros demo --topic /camera/image

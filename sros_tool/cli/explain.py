@@ -250,9 +250,9 @@ def explain(
     r"""Show whether DDS or Zenoh lets an enclave do something, by which rule, and how to change it.
 
     call and serve are about services, execute is about actions. If the rights name an action NAME
-    and no service NAME, call and serve are about the action; --type decides. KEYSTORE is a
+    but no service NAME, call and serve are about the action; use --type to choose. KEYSTORE is a
     keystore, here or on a robot; ENCLAVE can also be an enclave's folder. With --policy and no
-    keystore, sros decides by the policy alone, before anything is signed.
+    keystore, sros decides by the policy alone, as it would be signed.
 
     The exit status is 0 if it is allowed (with --who: to any enclave), and 1 if it is denied; with
     --log, 1 if the log reports a fault.
@@ -404,8 +404,8 @@ def _policy_alone(root: Path | None, asked: AskedEnclave, policy: Path | None) -
     if not default or root is not None or asked.enclave.signed or policy is None:
         return []
     text = (
-        f"this is what the policy '{policy}' says. To ask what is signed, name the keystore: "
-        f"`sros explain {quote(default)} {asked.enclave.name} ...`."
+        f"this is decided by the policy '{policy}'. For the signed permissions, name the "
+        f"keystore: `sros explain {quote(default)} {asked.enclave.name} ...`."
     )
     return [Note("explain.policy-alone", text)]
 
@@ -851,9 +851,9 @@ def _show_log(
 
 _ZENOH_TESTS = "caching permissions for `"
 _ONLY_TESTS = (
-    "Zenoh's access control logged tests of declared keys: they do not tell which message was "
+    "the log only has Zenoh's tests of declared keys, which do not show which message was "
     "dropped. `sros explain KEYSTORE ENCLAVE publish|subscribe|call|serve NAME --vendor zenoh` "
-    "shows whether one is denied."
+    "shows whether a message is denied."
 )
 
 

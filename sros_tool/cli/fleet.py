@@ -352,10 +352,10 @@ def _durations(function: Decorated) -> Decorated:
 
 
 _VALIDITIES = {
-    "timestamp": "How long robots accept what is published without hearing more (1d).",
+    "timestamp": "How long robots accept the metadata before you publish again (1d).",
     "snapshot": "How long the list of versions is valid (7d).",
     "targets": "How long the lists of releases are valid (90d).",
-    "root": "How long the names of the keys are valid (365d).",
+    "root": "How long the list of the keys is valid (365d).",
 }
 """Roles of the metadata of what is published → help of the options for their validity."""
 
@@ -379,13 +379,14 @@ _VALIDITIES = {
 @click.option(
     "--restored",
     is_flag=True,
-    help="Go on although PUB has later releases than the keystore, which was restored; what these "
-    "releases revoke is revoked again, and numbers go on from those that nobody gave before.",
+    help="Publish although PUB has later releases than the keystore, because the keystore was "
+    "restored; enclaves that these releases revoke are revoked again, and numbers go on from those "
+    "that nobody gave before.",
 )
 @click.option(
     "--new-folder",
     is_flag=True,
-    help="Go on although PUB has nothing of what the keystore published before: it is a further "
+    help="Publish although PUB has nothing that the keystore published before: it is another "
     "folder, or the folder was lost.",
 )
 @dry_run_option

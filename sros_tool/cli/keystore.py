@@ -748,7 +748,8 @@ def update_keystore(
     if take_edits and next_stage:
         raise UsageError(
             "--take-edits has no stages",
-            "The first stage would write sros.toml, and so undo the edits of the second one.",
+            "The first stage would write sros.toml, and so undo the edits that belong to the "
+            "second stage.",
             "Copy sros.toml elsewhere, undo the edits with --discard-edits, and name the copy with "
             "--template.",
         )

@@ -49,7 +49,7 @@ _crl_option = click.option(
     "--crl",
     "crl_file",
     type=PATH,
-    help="Revocation list (PEM) that the CA service signed, in a keystore with one.",
+    help="Revocation list (PEM) that the CA service signed, for a keystore with a CA service.",
 )
 
 
@@ -150,8 +150,8 @@ def _replaced_lines(result: Changed) -> Iterator[str]:
         published = publish_command(result.root)
         deliver = f"publish ({published}) or export again" if published else "export again"
         yield (
-            "exports and running processes still have the earlier certificates and permissions: "
-            f"{deliver}, and restart, before those expire"
+            "exports and running processes still have the earlier certificates and "
+            f"permissions: {deliver}, and restart the processes, before these expire"
         )
 
 

@@ -192,9 +192,10 @@ def diff_policy(
     With --no-new-access, A and B can also be folders of policies, and policies at a revision of
     git, as git:REVISION:PATH. The exit status is 0 only if B gives no enclave any access that A
     does not give, with no vendor, in no domain and for no name, and protects nothing less; it is 2
-    if that cannot be decided. A policy counts as signed with access control of everything: if A is
-    a policy, a keystore B that protects less gives more; if B is a policy, it lowers no protection.
-    The last line says what is assumed and what is left out, such as dates.
+    if that cannot be decided. sros assumes that a policy is signed with access control of
+    everything. If A is a policy, a keystore B with less protection than the template production
+    gives more access; if B is a policy, it lowers no protection. The last line says what is assumed
+    and what is left out, such as dates.
 
     Example:
       $ sros diff_policy robot.xml keystore
@@ -619,9 +620,9 @@ def _convert(
         if not complete:
             again = f"{quote(str(earlier))} -o {quote(str(output))} --force"
             echo(
-                "the rights are the old ones; nodes of a later ROS 2 need more, such as to publish "
-                "/rosout from a namespace: add it with `sros policies --convert "
-                f"{again} --with-node-rights`",
+                "no rights were added; nodes of a later ROS 2 need more, such as publishing "
+                f"/rosout from a namespace: add them with `sros policies --convert {again} "
+                "--with-node-rights`",
                 err=True,
             )
         echo(f"look at the result with `sros check {quote(str(output))}`", err=True)

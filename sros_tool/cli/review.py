@@ -200,7 +200,7 @@ def review(
             "Name a commit with --base, or write --base none.",
         )
     if not folder.is_dir():
-        raise UsageError(f"'{folder}' is no folder", "", "Name the folder of the repository.")
+        raise UsageError(f"'{folder}' is not a folder", "", "Name the folder of the repository.")
     policies, requirement_files, keystores, left_out = (
         tuple(dict.fromkeys(path for part in parts for path in part))
         for parts in (policy, requirements, keystore, leave_out)

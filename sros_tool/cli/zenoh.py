@@ -71,16 +71,21 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     "crossing",
     multiple=True,
     metavar="NAME",
-    help="Let only these topics and services pass between routers, such as '/fleet/*'; by default "
-    "all to which enclaves at both ends have rights. May be repeated; '' restores the default.",
+    help=(
+        "Let only these topics and services pass between routers, such as '/fleet/*'; by default "
+        "all names for which enclaves at both ends have rights. May be repeated; '' restores the "
+        "default."
+    ),
 )
 @click.option(
     "--mode",
     type=click.Choice(["client", "peer"]),
-    help="client (default): sessions connect to the router alone. peer: also to each other, on one "
-    "host.",
+    help=(
+        "client (default): sessions connect only to the router. peer: also to each other, on one "
+        "host."
+    ),
 )
-@click.option("--domain", metavar="IDS", help="ROS domains; by default those of the keystore.")
+@click.option("--domain", metavar="IDS", help="ROS domains; by default the keystore's.")
 @click.option(
     "--off",
     is_flag=True,
@@ -99,7 +104,10 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     "existing",
     type=PATH,
     metavar="FILE",
-    help="Show what an existing Zenoh configuration allows to whom, and where it lets anybody in.",
+    help=(
+        "Show what an existing Zenoh configuration allows each subject, and where it is open to "
+        "everybody."
+    ),
 )
 @output_option("With --from: write the allowed rights to FILE, as a policy.")
 @force_option
@@ -256,9 +264,9 @@ def _with_router(network: ZenohNetwork, name: str, endpoint: str) -> ZenohNetwor
     if name not in known and not folder:
         raise UsageError(
             f"it is not known which enclaves connect to the router {name}",
-            "A router with an endpoint is for the enclaves next to it, such as /r1/* for "
-            "/r1/router, and not for those of all hosts.",
-            "Name one such as /r1/router, or state its enclaves in sros.toml, at "
+            "A router with an endpoint serves the enclaves in its folder, such as /r1/* for "
+            "/r1/router, not the enclaves of all hosts.",
+            "Name a router such as /r1/router, or state its enclaves in sros.toml, at "
             f'[zenoh.routers."{name}"].',
         )
     router = known.get(name) or ZenohRouter(name, (), (), (f"{folder}/*",))

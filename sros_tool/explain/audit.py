@@ -149,7 +149,7 @@ def audited_enclaves(
     if fleet and rights.kind != "policy":
         raise UsageError(
             "--fleet is for the placeholders of a policy",
-            f"'{path}' is no policy.",
+            f"'{path}' is not a policy.",
             "Omit --fleet.",
         )
     if rights.kind == "keystore":

@@ -546,7 +546,10 @@ class ZenohEvaluator:
             for check in (*delivery.checks, *delivery.replies)
             if check.enforcer != own.name
         )
-        text = "sessions believe whoever has the router's key about what passes through the router"
+        text = (
+            "sessions trust anyone with the router's key about everything that passes through the "
+            "router"
+        )
         return replace(
             answer,
             outcome=_Outcome.ALLOWED,
@@ -723,9 +726,9 @@ def _closed(enclave: str, file: str, problem: str) -> ZenohFile:
 
 _ROUTERS_KEY = Note(
     "explain.zenoh-router",
-    "whoever has the router's key may send and receive whatever passes through the router, "
-    "whatever its permissions say, because forwarding needs that. In peer mode every session also "
-    "believes a second process with that key, next to the router. Keep the key from all other "
+    "anyone with the router's key may send and receive everything that passes through the router, "
+    "whatever its permissions say, because forwarding needs that. In peer mode, every session "
+    "also trusts a second process with that key, next to the router. Keep the key from all other "
     "processes.",
 )
 
@@ -776,9 +779,9 @@ class ZenohOfKeystore:
             yield _ROUTERS_KEY
         if any(outcome.mode is Mode.PEER for outcome in outcomes):
             text = (
-                "peers decide by their own files, but this answer is by the router's file, which "
-                "has the same rights if `sros zenoh --check` says so; a question about one enclave "
-                "also reads the files of the other end."
+                "peers decide by their own files, but this answer uses only the router's file, "
+                "which has the same rights if `sros zenoh --check` says so; a question about one "
+                "enclave also reads the files at the other end."
             )
             yield Note("explain.zenoh-by-router", text)
 

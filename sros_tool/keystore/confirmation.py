@@ -213,7 +213,7 @@ def make_confirmation(
 
     Raises:
         DocumentError: ``robot`` is not a robot's name.
-        KeystoreError: ``root`` is no keystore, or a file in it is a link that leads out of it.
+        KeystoreError: ``root`` is not a keystore, or a file in it is a link that leads out of it.
         OSError: a file cannot be read; a confirmation without that file would be false.
     """
     if problem := name_problem(robot):
@@ -492,7 +492,9 @@ def _confirmation_from(value: Any, what: str) -> Confirmation:
     certificates = {}
     for path, digests in _entries({"certificates": {}, **value}, "certificates", what):
         if path not in files or path.rpartition("/")[2] not in _CERTIFICATE_FILES:
-            raise _refused(what, f"it lists certificates of {path}, which is no certificate file")
+            raise _refused(
+                what, f"it lists certificates of {path}, which is not a certificate file"
+            )
         listed = isinstance(digests, list) and len(digests) <= _MOST_CERTIFICATES
         if not listed or not all(_is_digest(digest) for digest in digests):
             raise _refused(what, f"the certificates of {path} are not a list of SHA-256 digests")
@@ -511,7 +513,7 @@ def _restart_from(value: Any, what: str) -> tuple[str, ...]:
         DocumentError: it is not a list of such names.
     """
     if not isinstance(value, list):
-        raise _refused(what, "its restart is no list")
+        raise _refused(what, "its restart is not a list")
     return tuple(sorted({_enclave_from(name, what) for name in value}))
 
 
@@ -532,13 +534,13 @@ def _enclave_from(name: Any, what: str) -> str:
 
 def _sequence_from(value: Any, what: str) -> int:
     if type(value) is not int or not 1 <= value <= _MOST_NUMBER:
-        raise _refused(what, "its sequence is no positive number")
+        raise _refused(what, "its sequence is not a positive number")
     return value
 
 
 def _release_from(value: Any, what: str) -> int:
     if type(value) is not int or not 0 <= value <= _MOST_NUMBER:
-        raise _refused(what, "its release is no number")
+        raise _refused(what, "its release is not a number")
     return value
 
 
@@ -578,7 +580,7 @@ def _problems_from(value: Any, what: str) -> tuple[str, ...]:
     for text in value:
         if not (isinstance(text, str) and text.isprintable() and 0 < len(text) <= LONGEST_PROBLEM):
             raise _refused(
-                what, f"a problem is no printable text of at most {LONGEST_PROBLEM} characters"
+                what, f"a problem is not printable text of at most {LONGEST_PROBLEM} characters"
             )
     return tuple(value)
 
@@ -620,7 +622,7 @@ def _dds_from(value: Any, what: str) -> RobotDds:
         raise _refused(what, "its dds has not the keys libraries and unseen")
     listed, unseen = value["libraries"], value["unseen"]
     if type(unseen) is not int or not 0 <= unseen <= _MOST_UNSEEN:
-        raise _refused(what, "its number of unseen processes is no number")
+        raise _refused(what, "its number of unseen processes is not a number")
     if not isinstance(listed, list) or len(listed) > _MOST_LIBRARIES:
         raise _refused(what, f"its libraries of DDS are no list of at most {_MOST_LIBRARIES}")
     libraries = []
@@ -629,7 +631,7 @@ def _dds_from(value: Any, what: str) -> RobotDds:
             raise _refused(what, "a library of its DDS has not the keys product, version, ...")
         product, version, path, seen = (library[key] for key in RobotLibrary._fields)
         if product not in PRODUCTS:
-            raise _refused(what, f"{_short(product)} is no DDS that confirmations name")
+            raise _refused(what, f"{_short(product)} is not a DDS that confirmations name")
         if not isinstance(version, str) or (version and not _LIBRARY_VERSION.match(version)):
             raise _refused(what, f"{_short(version)} is not the version of a DDS")
         if not isinstance(path, str) or not _LIBRARY_PATH.match(path):

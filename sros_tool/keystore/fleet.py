@@ -138,7 +138,7 @@ def recorded_fleet(keystore: Keystore) -> Fleet:
     """Return the fleet of a keystore, which has to have one.
 
     Raises:
-        KeystoreError: it is no keystore, or the keystore has no fleet.
+        KeystoreError: it is not a keystore, or the keystore has no fleet.
         DocumentError: the fleet file cannot be read, or is not a fleet.
     """
     keystore.check()

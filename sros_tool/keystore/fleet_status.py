@@ -342,7 +342,7 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
     """Return the deployment status of the named robots, or of the whole fleet.
 
     Raises:
-        KeystoreError: it is no keystore, has no fleet, or some of its enclaves may be missing.
+        KeystoreError: it is not a keystore, has no fleet, or some of its enclaves may be missing.
         DocumentError: the fleet has no such robot.
     """
     root, fleet = keystore.root, recorded_fleet(keystore)

@@ -106,7 +106,7 @@ class KnownKeys:
                 enclaves.add(entry.enclave)
         for path in files:
             if path.parent.name not in recorded:
-                with suppress(SrosError):  # a file that is no certificate
+                with suppress(SrosError):  # a file that is not a certificate
                     certificate = self._keystore.certificate(path)
                     if certificate.serial_number in self._revoked_serials:
                         enclaves.add(common_name_of(certificate.subject))

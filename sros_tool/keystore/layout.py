@@ -479,7 +479,7 @@ def list_enclaves(root: Path) -> tuple[str, ...]:
     """Return the names of the enclaves of a keystore, sorted.
 
     Raises:
-        KeystoreError: ``root`` is no keystore, or a folder of it cannot be read.
+        KeystoreError: ``root`` is not a keystore, or a folder of it cannot be read.
     """
     check_keystore(root)
     return enclave_names(root)
@@ -502,7 +502,7 @@ def refuse_earlier(root: Path) -> None:
 
 
 def check_keystore(root: Path) -> None:
-    """Raise `KeystoreError` if ``root`` is no keystore."""
+    """Raise `KeystoreError` if ``root`` is not a keystore."""
     if not is_keystore(root):
         refuse_earlier(root)
         if root.is_file():

@@ -413,7 +413,7 @@ def _connect(path: Path, mode: str, *, is_new: bool = False) -> sqlite3.Connecti
                 connection.execute(table)
         found = connection.execute("SELECT sql FROM sqlite_schema ORDER BY name").fetchall()
         if found != [(table,) for table in _SCHEMA]:
-            raise IndexDamagedError(f"'{path}' is no index of a ledger")
+            raise IndexDamagedError(f"'{path}' is not an index of a ledger")
     except BaseException:
         connection.close()
         raise

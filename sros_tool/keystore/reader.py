@@ -256,7 +256,7 @@ class Keystore:
     # ── what it is ──
 
     def check(self) -> None:
-        """Raise `KeystoreError` if the folder is no keystore."""
+        """Raise `KeystoreError` if the folder is not a keystore."""
         self.once("check", lambda: check_keystore(self.root))
 
     @property

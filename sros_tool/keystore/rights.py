@@ -280,7 +280,7 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
     if unclear := access.unclear():
         notes.append(Note("rights.zenoh-conditions", f"{path}: {unclear}."))
     if document.namespace:
-        text = f"{path}: it puts a namespace before the keys, which is not taken into account here."
+        text = f"{path}: it puts a namespace before the keys, which this answer ignores."
         notes.append(Note("rights.zenoh-namespace", text))
     if rules.left_out:
         text = f"{path}: {len(rules.left_out)} key expressions are no names of ROS, and left out, "
@@ -426,9 +426,9 @@ def _left_out(grants: Iterable[Grant]) -> Iterator[Note]:
             text = "<default> allows all topics that no rule names, except with Fast DDS."
             yield Note("rights.default-allow", text)
         if any(c.partitions for r in grant.rules for c in (*r.publish, *r.subscribe)):
-            yield Note("rights.partitions", "its partitions are not taken into account here.")
+            yield Note("rights.partitions", "this answer ignores its partitions.")
         if len({rule.domains for rule in grant.rules}) > 1:
-            text = "its rules are for different domains, which are not taken into account here."
+            text = "its rules are for different domains, which this answer ignores."
             yield Note("rights.domains", text)
         kinds = [rule.allow for rule in grant.rules]
         if False in kinds[kinds.index(True) if True in kinds else len(kinds) :]:
@@ -649,8 +649,8 @@ class RecordedRights:
         last, trust = recorded.last.get(name), ""
         if last and last.sha256 != digest:
             why = (
-                f"The ledger has others, signed at {last.time}. Perhaps older ones were put back, "
-                "with rights that were taken away since."
+                f"The ledger has others, signed at {last.time}. Perhaps older permissions were "
+                "put back, with rights that were removed since."
             )
         elif recorded.gaps and name not in recorded.certain:
             why = f"The ledger has gaps ({'; '.join(recorded.gaps)}), so later ones may be missing."

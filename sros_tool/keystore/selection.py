@@ -167,7 +167,7 @@ def _of_robots(
     fleet = checked_fleet(keystore) if checked else load_fleet(keystore)
     if fleet is None and not any(map(keystore.has, (PRIVATE, SETTINGS))):
         raise KeystoreError(
-            f"'{root}' is no keystore with a fleet, so it has no robot {robots[0]!r}",
+            f"'{root}' is not a keystore with a fleet, so it has no robot {robots[0]!r}",
             "An export for a robot has the enclaves of that robot alone, and not the fleet.",
             "Leave --robot out, choose enclaves with --match, or name the keystore from which it "
             "was exported.",

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _COMMENT = """\
 # The settings of this keystore; sros uses them for each enclave that is added.
-# To change them, run `sros update_keystore`: it also signs what follows from them.
+# To change them, run `sros update_keystore`: it also signs the affected files again.
 """
 
 
@@ -118,7 +118,7 @@ class PresentSettings(NamedTuple):
             raise KeystoreError(
                 "the governance of the keystore has rules that settings cannot express",
                 "It has several domain rules, no rule for * at its end, or a rule for a DDS topic "
-                "that is no topic, service or action of ROS. A single change would replace it.",
+                "that is not a topic, service or action of ROS. A single change would replace it.",
                 "Replace all settings with --template; --dry-run shows the changes.",
             )
         return self.settings
@@ -128,7 +128,7 @@ def present_settings(keystore: Keystore) -> PresentSettings:
     """Return the settings that are in force in a keystore.
 
     Raises:
-        KeystoreError: it is no keystore, or its governance cannot be used.
+        KeystoreError: it is not a keystore, or its governance cannot be used.
         DocumentError: its settings are malformed, and the ledger has no earlier settings.
     """
     keystore.check()

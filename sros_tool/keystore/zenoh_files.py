@@ -467,8 +467,8 @@ def zenoh_documents(
         if change.stated.get(router):
             raise UsageError(
                 f"a policy has rights for {router}, the enclave of the Zenoh router",
-                "The router passes on what all others say, so it would have the rights of all "
-                "there.",
+                "The router forwards all messages, so an enclave in both roles would have the "
+                "rights of all enclaves.",
                 "Give the node an enclave of its own.",
             )
         names.remove(router)
@@ -492,8 +492,8 @@ def zenoh_documents(
             "A message passes between routers if an enclave on one side may send it and an enclave "
             "on the other side may receive it. The wildcards in the rights of these enclaves "
             "combine in too many ways.",
-            "Use fewer wildcards in the policies, or list what may pass between routers: `sros "
-            "zenoh --cross NAME`.",
+            "Use fewer wildcards in the policies, or list the names that may pass between "
+            "routers: `sros zenoh --cross NAME`.",
         ) from None
     direct = network.mode is Mode.PEER
     listen = (_ANY_PORT_HERE,) if direct else ()

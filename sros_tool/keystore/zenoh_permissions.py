@@ -105,7 +105,7 @@ def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
     if grant.default_allow:
         raise PolicyError(
             f"{source}: <default>ALLOW</default> cannot be expressed in Zenoh",
-            "It allows what no rule names, on some vendors of DDS and not on others.",
+            "It allows by default, which some DDS vendors follow and others ignore.",
             _REMEDY,
         )
     rules = [rule for rule in grant.rules if domain in rule.domains.closed()]

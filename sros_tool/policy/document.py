@@ -833,7 +833,9 @@ def copy_policies(source: Path, target: Path, *, dry_run: bool = False) -> list[
     files = {str(file.relative_to(source)): read_bytes(file, "file") for file in shipped}
     exists = os.path.lexists(target)
     if exists and not target.is_dir():
-        raise UsageError(f"'{target}' is no folder", "", "Name a new folder, or an existing one.")
+        raise UsageError(
+            f"'{target}' is not a folder", "", "Name a new folder, or an existing one."
+        )
     present = [name for name in files if os.path.lexists(target / name)]
     for name in present:
         path = target / name

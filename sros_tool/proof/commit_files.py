@@ -40,7 +40,7 @@ def checked_path(text: str) -> str:
     path = os.path.normpath(text) if text else ""
     if not text or path.startswith(("/", "../")) or path in ("..", ".") or not path.isprintable():
         raise UsageError(
-            f"'{text}' is no path from the top of the repository",
+            f"'{text}' is not a path from the top of the repository",
             "",
             "Write a path such as robot/robot.policy.xml.",
         )

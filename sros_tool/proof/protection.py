@@ -133,7 +133,7 @@ def less_protection(
         text = "nothing enforces on Zenoh what its files enforced"
         yield SettingChange(Effect.LOOSER, "files of Zenoh", "present", "missing", text)
     if old.routers and not {*new.routers} <= {*old.routers}:
-        text = "whoever plays the router reads and changes all that passes"
+        text = "anyone who poses as the router reads and changes everything that passes"
         before, after = (", ".join(side.routers) for side in (old, new))
         yield SettingChange(Effect.LOOSER, "router of Zenoh", before, after, text)
     if new.zenoh_files:

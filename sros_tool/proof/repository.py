@@ -209,7 +209,7 @@ class Repository:
         ``name`` is the name that the user gave, for errors.
 
         Raises:
-            DocumentError: the object is missing, or is no commit.
+            DocumentError: the object is missing, or is not a commit.
         """
         for _ in range(_MOST_TAGS):
             kind, content = self._objects([digits]).get(digits, ("", b""))
@@ -224,7 +224,7 @@ class Repository:
                 f"It is {digits}.",
                 "In a shallow clone, such as on a server for tests, fetch it first.",
             )
-        raise DocumentError(f"'{name}' is no commit", f"It is a {kind}.")
+        raise DocumentError(f"'{name}' is not a commit", f"It is a {kind}.")
 
     # ── objects ────────────────────────────────────────────────────────────────────────────
 
@@ -264,14 +264,14 @@ class Repository:
 
         Raises:
             UsageError: ``merge`` is not a full id.
-            DocumentError: it is no merge, or not in the repository.
+            DocumentError: it is not a merge, or not in the repository.
         """
         if not _HASH.match(merge):
             raise UsageError(f"'{merge}' is not the full id of a commit")
         parents = self.parents(self._peeled(merge, merge))
         if len(parents) < 2:
             raise DocumentError(
-                f"the commit {merge} is no merge",
+                f"the commit {merge} is not a merge",
                 "The base follows only from the parents of a merge commit.",
                 "Name the base itself, or check out the merge commit of the code host.",
             )
@@ -311,13 +311,13 @@ class Repository:
         """Return the entry at a path of a commit ("" is the root), or None if there is none.
 
         Raises:
-            DocumentError: a part of the path before its end is no folder, such as a link.
+            DocumentError: a part of the path before its end is not a folder, such as a link.
         """
         entry = _top(self, commit)
         gone: list[str] = []
         for part in path.split("/") if path else ():
             if entry.mode != FOLDER:
-                raise DocumentError(f"'{'/'.join(gone)}' is no folder of the revision")
+                raise DocumentError(f"'{'/'.join(gone)}' is not a folder of the revision")
             tree_entry = _folder(self, entry.id).get(part)
             if tree_entry is None:
                 return None
@@ -410,14 +410,16 @@ class Repository:
         credentials.
 
         Raises:
-            UsageError: ``digits`` is no full id, ``remote`` is no remote of the repository, or git
-                would read settings in the work tree.
+            UsageError: ``digits`` is not a full id, ``remote`` is not one of the repository, or
+                git would read settings in the work tree.
             DocumentError: the commit cannot be fetched.
         """
         if not _HASH.match(digits):
             raise UsageError(f"'{digits}' is not the full id of a commit")
         if remote not in self._ask("remote").split():
-            raise UsageError(f"'{remote}' is no remote of the repository", "", "See `git remote`.")
+            raise UsageError(
+                f"'{remote}' is not a remote of the repository", "", "See `git remote`."
+            )
         if self.sizes([digits]):
             return
         self._refuse_settings_inside()

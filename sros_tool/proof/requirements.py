@@ -386,7 +386,7 @@ class _Table:
             if not problem and name[0] not in "/*?[":
                 problem = "An enclave begins with '/'."
             if problem:
-                raise self.error(key, f"{_short(enclave)} is no enclave in {key}", problem)
+                raise self.error(key, f"{_short(enclave)} is not an enclave in {key}", problem)
         if all(enclave.startswith(EXCEPT) for enclave in enclaves):
             raise self.error(key, f"{key} only excepts enclaves", 'Write "*" before them for all.')
         return enclaves
@@ -425,7 +425,7 @@ def _must(table: _Table) -> Must:
     if enclave != "/" and (problem or not enclave.startswith("/")):
         raise table.error(
             "enclave",
-            f"{_short(enclave)} is no enclave",
+            f"{_short(enclave)} is not an enclave",
             problem or "An enclave begins with '/'.",
         )
     return Must(**own, rights=table.rights(), enclave=enclave)

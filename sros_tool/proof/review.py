@@ -396,7 +396,7 @@ class _Review:
                 if not folder:
                     raise self._missing(path)
                 if not is_keystore(folder):
-                    raise DocumentError(f"'{path}' is no keystore", "It has no enclaves in it.")
+                    raise DocumentError(f"'{path}' is not a keystore", "It has no enclaves in it.")
                 keystores[path] = folder
             except (SrosError, OSError) as error:
                 known = error if isinstance(error, SrosError) else DocumentError(str(error))

@@ -151,7 +151,7 @@ def signed_files(
     """Return the enclaves of a keystore with their signed files.
 
     Raises:
-        KeystoreError: the folder is no keystore.
+        KeystoreError: the folder is not a keystore.
         DocumentError: rights in it cannot be read.
     """
     keystore.check()

@@ -45,7 +45,7 @@ _OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...
         "transport/link/tls/verify_name_on_connect",
         lambda each: each.tls.verifies_name,
         False,
-        "another host with a certificate of the CA is taken for the one it connects to",
+        "another host with a certificate of the CA can pose as the host that it connects to",
     ),
     (
         "transport/link/tls/close_link_on_expiration",
@@ -88,7 +88,7 @@ _OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...
         "access_control/default_permission",
         lambda each: each.access.allows_by_default,
         True,
-        "it lets pass what no rule denies",
+        "it allows by default",
     ),
 )
 """Settings with two values: path, function that reads it, value that permits more, and a clause."""
@@ -112,11 +112,11 @@ _GIVING = (
     (re.compile(r"plugins_loading(?:/.*)?"), "it loads plugins, which answer others"),
     (
         re.compile(r"transport/auth(?:/.*)?"),
-        "whoever has what it now asks for, a password or key, is let in",
+        "anyone with the password or key that it now asks for gets a connection",
     ),
     (
         re.compile(r"transport/link/tls/root_ca_certificate(?:_base64)?"),
-        "whoever has a certificate of that CA is let in",
+        "anyone with a certificate of that CA gets a connection",
     ),
 )
 """Expressions for paths of settings whose change may give access, each with a clause."""

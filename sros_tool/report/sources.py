@@ -382,7 +382,7 @@ def _with_requirements(
 
 
 def _pictured(finding: Finding, enclaves: Container[str]) -> PicturedFinding:
-    """Return a finding for the picture; if its subject is no enclave, the text names it."""
+    """Return a finding for the picture; if its subject is not an enclave, the text names it."""
     known = finding.subject in enclaves
     about = "" if known or finding.subject == finding.file else finding.subject
     text = _finding_text(finding, about)

@@ -138,7 +138,7 @@ _PEER_OF_CYCLONE = r"remote participant (?P<peer>[0-9a-f]{1,8}(?::[0-9a-f]{1,8})
 _REFUSED_PEER = rf"(?:permissions for {_PEER} \()?"
 _RENEW_PEER = (
     "`sros inspect KEYSTORE` shows how long each enclave is valid, and `sros renew KEYSTORE PEER` "
-    "renews that of the peer; then restart the peer."
+    "renews the peer's enclave; then restart the peer."
 )
 _OTHER_SIGNER = (
     "its permissions are not signed by a permissions CA that this process has loaded. This process "
@@ -215,8 +215,9 @@ LOG_TEXTS: tuple[LogText, ...] = (
     ),
     _text(
         "peer-governance", _CYCLONE, r"security_attributes mismatch",
-        "a PEER was refused: its governance protects other things than that of this process. Both "
-        "have enclaves of different keystores, or one was started before the governance changed",
+        "a PEER was refused: its governance has other protection than the governance of this "
+        "process. The processes have enclaves of different keystores, or one was started before "
+        "the governance changed",
         f"{_PEERS} It also shows the governance. Export the enclaves again, and restart both.",
     ),
     _text(
@@ -368,9 +369,9 @@ LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "peer-permissions-ca", _FAST,
         rf"{_REFUSED_PEER}Remote participant PermissionsCA differs from local",
-        "a PEER was refused: its permissions CA is not that of this process. Both have enclaves of "
-        "different keystores, or one of them was started before the CA was replaced and the other "
-        "after it",
+        "a PEER was refused: it has another permissions CA than this process. The processes have "
+        "enclaves of different keystores, or one was started before the CA was replaced and the "
+        "other after it",
         _PEERS + " Restart both after each stage of `sros rotate_ca KEYSTORE`.",
     ),
     _text(
@@ -886,7 +887,7 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
         r"Default permission `Deny`",
         "a PEER is connected, and may do nothing: no rule here has the name of its certificate",
         "`sros zenoh KEYSTORE --check` shows whether the files are up to date; restart the "
-        "processes that it names. If the peer is the router, its enclave is not the one that the "
+        "processes that it names. If the peer is the router, it runs in another enclave than the "
         "keystore names.",
     ),
     _zenoh_text(
@@ -921,7 +922,7 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
     ),
     _zenoh_text(
         "key-mismatch", r"Bad certificate/key: keys may not be consistent",
-        "the private key is not that of the certificate",
+        "the private key does not belong to the certificate",
         "Restore the key, or give the enclave a new one: `sros renew KEYSTORE ENCLAVE --new-key`.",
     ),
     _zenoh_text(

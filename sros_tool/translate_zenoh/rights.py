@@ -316,7 +316,7 @@ def _names_of(
             subtract_all(_forms({wide: place}), _forms({name: denying}))
         except CannotSubtract as error:
             if error.denied:
-                why = "text between two wildcards leaves names of which there is no such list"
+                why = "for text between two wildcards there is no such list"
                 raise _cannot_deny(right, name, denying, wide, place, why) from None
     why = f"that takes more than {MOST_EXPRESSIONS} key expressions here"
     wide, place = min(allowed.items(), key=lambda item: (len(item[0]), item[0]))
@@ -332,8 +332,8 @@ def _cannot_deny(
     allows = f"line {allowing.line} of '{allowing.file}' allows" if allowing.line else "they allow"
     return PolicyError(
         f"{denying}: DENY {right} {denied} cannot be expressed in Zenoh, because {allows} {wide}",
-        "A denial inside a wildcard does not hold in Zenoh against whoever asks or publishes with "
-        f"a wildcard. So sros lists what is left allowed, and {why}.",
+        "In Zenoh, a query or a put with a wildcard gets past a denial inside a wildcard. So sros "
+        f"lists the names that remain allowed, and {why}.",
         f"List the names to {right} in place of {wide}.",
     )
 

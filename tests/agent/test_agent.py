@@ -488,7 +488,7 @@ def test_units_restart_in_their_order(home: Home, r1: Robot) -> None:
 def test_a_round_waits_until_restarted_processes_are_seen(
     patience: float, home: Home, r1: Robot
 ) -> None:
-    """A process of /r1/c, which is no node, is never seen, and not waited for."""
+    """A process of /r1/c, which is not a node, is never seen, and not waited for."""
     units = (Unit("a.service", ("/r1/a",)), Unit("script.service", ("/r1/c",)))
     r1.settings = replace(r1.settings, restart=True, units=units)
     r1.round()

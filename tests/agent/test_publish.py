@@ -585,7 +585,7 @@ def test_a_keystore_that_was_restored_from_before_its_keys_were_replaced(publish
     backup.rename(publisher.root)
     foreign = publisher.pub / "metadata/3.root.json"
     foreign.write_bytes((publisher.pub / "metadata/1.root.json").read_bytes())
-    with pytest.raises(KeystoreError, match="is not the timestamp key of what"):
+    with pytest.raises(KeystoreError, match="is not the timestamp key with which"):
         publisher.publish()
     foreign.unlink()
     assert publisher.publish(rotate=("timestamp",)).root.name == "3.root.json"
@@ -795,7 +795,7 @@ def test_damaged_metadata_and_lists_are_said(publisher: Home) -> None:
 
 def test_keystore_and_folder_in_one_another(publisher: Home) -> None:
     for pub in (publisher.root / "pub", publisher.folder, publisher.root):
-        with pytest.raises(KeystoreError, match="in one another"):
+        with pytest.raises(KeystoreError, match="overlap"):
             publishing.publish(publisher.root, pub, now=publisher.now)
     assert not (publisher.root / "pub").exists()
 

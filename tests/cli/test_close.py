@@ -318,7 +318,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     robot.nodes = (TALKER, LISTENER)
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
     assert "not asked: every process runs in its enclave" in robot.close("--proof", status=1).out
-    assert "closed, but for what was not asked" in robot.close("--proof", "--partial").err
+    assert "closed, except for what was not asked" in robot.close("--proof", "--partial").err
 
 
 # ── interrupted ────────────────────────────────────────────────────────────────────────────
@@ -455,7 +455,7 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     other_unit = text.replace('"unit": ""', '"unit": "../x.service"')
     for wrong in (other_unit, text.replace('"enclave": "/talker"', '"enclave": 5'), "{}"):
         file.write_text(wrong)
-        assert "is no list of processes" in robot.close(status=2).err
+        assert "is not a list of processes" in robot.close(status=2).err
 
 
 def test_a_dry_run_changes_nothing(robot: Robot) -> None:

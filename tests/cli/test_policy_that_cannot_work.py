@@ -64,7 +64,7 @@ def test_nothing_is_copied_over_a_file_that_differs(tmp_path: Path) -> None:
     assert "'common/node.xml' differs" in ended.err
     assert [each.name for each in (tmp_path / "common").iterdir()] == ["node.xml"]
     (tmp_path / "file").write_text("")
-    assert "is no folder" in sros("policies", "--copy", "file", cwd=tmp_path).err
+    assert "is not a folder" in sros("policies", "--copy", "file", cwd=tmp_path).err
 
 
 # ── one paragraph ──────────────────────────────────────────────────────────────────────────

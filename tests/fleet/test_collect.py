@@ -686,7 +686,7 @@ def test_requests_that_are_refused(home: Home) -> None:
     named_r2 = home.request("r2", key=home.key("r1", "/r1/base"))
     assert refused(home, "r1", requests=(named_r2,)) == "/r2/base is an enclave of r2"
     stranger = make_request(new, "/dispatcher").decode()
-    assert refused(home, "r1", requests=(stranger,)) == "/dispatcher is no enclave of a robot"
+    assert refused(home, "r1", requests=(stranger,)) == "/dispatcher is not an enclave of a robot"
     home.run("revoke", "ks", "/r1/arm")
     gone = home.request("r1", "/r1/arm")
     assert "or it was revoked" in refused(home, "r1", requests=(gone,))
@@ -714,7 +714,7 @@ def test_a_key_that_was_replaced_vouches_for_no_other(home: Home) -> None:
     later = DUE + timedelta(days=95)
     for key in (generate_key(), home.key("r1", "/r1/base")):
         why = refused(home, "r1", later, requests=(home.request("r1", key=key),))
-        assert "an earlier one signed the message" in why
+        assert "an earlier key signed the message" in why
 
 
 def test_the_grace_after_expiry(home: Home) -> None:

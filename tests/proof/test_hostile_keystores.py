@@ -396,7 +396,7 @@ OPEN_SETTINGS = [
     ("transport/link/tls/enable_mtls", False, "it asks for no certificate"),
     ("transport/link/tls/close_link_on_expiration", False, LESS),
     ("transport/link/tls/verify_name_on_connect", False, ""),
-    ("transport/link/tls/root_ca_certificate", "/tmp/ca.pem", "a certificate of that CA is let in"),
+    ("transport/link/tls/root_ca_certificate", "/tmp/ca.pem", "a certificate of that CA gets a"),
     ("transport/link/protocols", ["tls", "quic"], "without -> with quic"),
     ("transport/shared_memory/enabled", True, LESS),
     ("scouting/multicast/enabled", True, LESS),

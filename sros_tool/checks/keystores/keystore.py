@@ -108,7 +108,7 @@ def keystore_findings(
         vendors: the DDS vendors of its nodes, or ``zenoh``; () if they may use any.
 
     Raises:
-        KeystoreError: the path of ``opened`` is no keystore.
+        KeystoreError: the path of ``opened`` is not a keystore.
     """
     opened.check()
     root = opened.root

@@ -48,7 +48,7 @@ def keystore_metrics(
         each_enclave: also give the expiry of each enclave's files, not only the earliest.
 
     Raises:
-        KeystoreError: the path is no keystore, or some enclaves cannot be listed.
+        KeystoreError: the path is not a keystore, or some enclaves cannot be listed.
     """
     lifetimes, unreadable = survey(keystore)
     expiries = [*_shared(keystore), *_of_enclaves(keystore, lifetimes)]

@@ -133,7 +133,7 @@ def ros_name_problem(text: str) -> str:
         return "" if possible else f"{name!r} matches no name of ROS{_meant(name)}"
     if _TYPE.match(name):
         return f"{name!r} is the name of a type: write the name of the topic"
-    return f"{name!r} is no name of ROS{_meant(name)}"
+    return f"{name!r} is not a name of ROS{_meant(name)}"
 
 
 def has_foreign_letters(name: str) -> bool:

@@ -194,7 +194,7 @@ def collect(
     Raises:
         KeystoreError: the keystore has no fleet, or cannot be read; another process takes in
             messages, too.
-        DocumentError: ``restored`` names no robot of the fleet; the inbox is no folder.
+        DocumentError: ``restored`` names no robot of the fleet; the inbox is not a folder.
     """
     recorded_fleet(Keystore(root))
     with nullcontext() if dry_run else locked_confirmations(root):
@@ -430,9 +430,9 @@ class _Verifier:
             return _Taken(robot, "unchanged", verified=verified, remarks=remarks)
         if before and sequence <= before.sequence and robot.name not in self._restored:
             raise _RefusedError(
-                f"its sequence number {sequence} is not higher than {before.sequence}, that of the "
-                "last message: it is an old one, or the disk of the robot was restored (then add "
-                f"--restored {robot.name})"
+                f"its sequence number {sequence} is not higher than {before.sequence}, the number "
+                "of the last message: this is an old message, or the disk of the robot was "
+                f"restored (then add --restored {robot.name})"
             )
         received = Received(
             replace(verified.confirmation, requests=None, crl=None),
@@ -613,7 +613,7 @@ class _Renewals:
         name, keystore = request.name, self._keystore
         owner = robot_of(self._fleet, name)
         if owner != robot:
-            whose = f"an enclave of {owner.name}" if owner else "no enclave of a robot"
+            whose = f"an enclave of {owner.name}" if owner else "not an enclave of a robot"
             raise _RefusedError(f"{name} is {whose}")
         if not has_enclave(keystore.root, name):
             raise _RefusedError("the keystore does not have this enclave, or it was revoked")
@@ -646,8 +646,8 @@ class _Renewals:
             )
         if not same_key and message.certificate.public_key() != present.public_key():
             raise _RefusedError(
-                f"it has a new key, which only the present key of {name} can vouch for, and an "
-                "earlier one signed the message"
+                f"it has a new key, which only the present key of {name} can vouch for, but an "
+                "earlier key signed the message"
             )
         for certificate in (message.certificate, present):
             self._check_grace(robot, validity_of(certificate))

@@ -226,8 +226,8 @@ def _check_apart(root: Path, folder: Path) -> None:
     inner, outer = (Path(os.path.realpath(path)) for path in (folder, root))
     if inner.is_relative_to(outer) or outer.is_relative_to(inner):
         raise KeystoreError(
-            f"'{folder}' and the keystore '{root}' are in one another",
-            "What is published is for everybody, and the keystore has private keys.",
+            f"'{folder}' and the keystore '{root}' overlap",
+            "Anybody may read the published files, and the keystore has private keys.",
             "Choose another folder.",
         )
 
@@ -574,8 +574,8 @@ class _Run:
             robots = [robot for robot, there in self._there.items() if there.number == latest]
             raise self._restored(
                 f"has later releases: {first_few(robots, 3)} with the number {latest}",
-                "repeat what was changed, and then add --restored, which revokes again what these "
-                "releases revoke",
+                "repeat the later changes, and then add --restored, which revokes again the "
+                "enclaves that these releases revoke",
             )
         self._number = latest
         return True
@@ -595,15 +595,15 @@ class _Run:
                 revoke = f"sros revoke {quote(str(self.keystore.root))} --robot {removed[0]}"
                 raise self._restored(
                     f"was published later without {first_few(removed, 3)}",
-                    f"revoke again what was revoked (`{revoke}`), take out of the fleet file what "
-                    "left the fleet, and publish again",
+                    f"repeat the revocations (`{revoke}`), remove robots that left the fleet from "
+                    "the fleet file, and publish again",
                 )
 
     def _restored(self, what: str, remedy: str) -> KeystoreError:
         return KeystoreError(
             f"'{self._folder}' {what}, which the keystore '{self.keystore.root}' does not know",
-            "The keystore was restored from a backup, or is a copy. What was changed since, such "
-            "as a revocation, would be undone.",
+            "The keystore was restored from a backup, or is a copy. Publishing would undo later "
+            "changes, such as a revocation.",
             f"Restore a later backup. If there is none, {remedy}.",
         )
 
@@ -742,7 +742,7 @@ class _Run:
         if number > MOST_NUMBER:
             raise KeystoreError(
                 f"no release can have the number {number}",
-                f"One before it has {number - 1}, which somebody with the targets key has written.",
+                f"The version before it is {number - 1}, written by somebody with the targets key.",
                 BEGIN_AGAIN,
             )
         authority = None if self._dry_run or not changed else change.permissions

@@ -73,7 +73,7 @@ def check_tuf() -> None:
     except ImportError as error:
         raise UnavailableError(
             "the Python package tuf is not installed",
-            "It signs and verifies what robots fetch.",
+            "It signs and verifies the files that robots fetch.",
             "Install it: `pip install 'tuf>=6'`.",
         ) from error
 

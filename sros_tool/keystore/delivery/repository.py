@@ -166,8 +166,8 @@ class Roots:
         """Raise `KeystoreError` unless the key of ``signer``, at ``path``, is that of ``role``."""
         if not self.has_key(role, signer):
             raise KeystoreError(
-                f"'{path}' is not the {role} key of what this keystore publishes",
-                "Robots would refuse what it signs.",
+                f"'{path}' is not the {role} key with which this keystore publishes",
+                "Robots would refuse its signatures.",
                 _NAME_ROOT if role == _ROOT else replaced_key(role),
             )
 
@@ -405,7 +405,7 @@ class Composer:
         if content.version > MOST_NUMBER:
             raise KeystoreError(
                 f"the version {content.version} of {name}.json is too high",
-                "Somebody who has its key counted the versions up.",
+                "Somebody with its key has used up the version numbers.",
                 BEGIN_AGAIN,
             )
         content.expires = self._now + self._expiry.of(name)

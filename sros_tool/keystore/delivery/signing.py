@@ -292,8 +292,7 @@ def _check_asked(requests: Sequence[SigningRequest], only: Sequence[str]) -> Non
         if request.name != name:
             raise KeystoreError(
                 f"request number {number} is for enclave {request.name}, and should be for {name}",
-                "Whoever made the request asks for the identity of another enclave. Nothing was "
-                "signed.",
+                "The request asks for the identity of another enclave. Nothing was signed.",
                 "Examine the robot that the request comes from.",
             )
 

@@ -160,7 +160,7 @@ class KeystoreChange:
         """Recover and lock the keystore.
 
         Raises:
-            KeystoreError: it is no keystore, is busy, or cannot be read.
+            KeystoreError: it is not a keystore, is busy, or cannot be read.
         """
         if not self.dry_run:
             tidy(self.root)

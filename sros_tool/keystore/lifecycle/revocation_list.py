@@ -217,7 +217,7 @@ def _moved_away(keystore: Keystore, known: Container[str] = ()) -> Iterator[x509
     file = keystore.identity_file
     trusted = keystore.certificates_of(file) if file else ()
     for path in revoked_certificates(keystore.root, known):
-        with suppress(SrosError):  # a file that is no certificate
+        with suppress(SrosError):  # a file that is not a certificate
             certificate = keystore.certificate(path)
             if any(issued_by(certificate, authority) for authority in trusted):
                 yield certificate

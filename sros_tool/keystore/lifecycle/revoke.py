@@ -93,7 +93,7 @@ def revoke(
         )
     if reason == SUPERSEDED:
         raise UsageError(
-            f"{SUPERSEDED} is no reason to revoke an enclave",
+            f"{SUPERSEDED} is not a reason to revoke an enclave",
             "It marks earlier certificates of renewed enclaves, which keep their rights: machines "
             "that have only an export would still accept Zenoh files from before the revocation.",
             "Choose another reason, such as cessation_of_operation; or replace the certificate "
@@ -324,7 +324,8 @@ def _is_router(change: KeystoreChange, router: str) -> KeystoreError:
     other = next(n for at in count(2) if (n := f"{router}{at}") not in change.names)
     return KeystoreError(
         f"{router} is the enclave of the Zenoh router",
-        "Without a router no node on Zenoh finds the others, and every session believes its key.",
+        "Without a router, no node on Zenoh finds the others; and every session trusts the "
+        "router's key.",
         f"Move the router first: `sros zenoh {where} --router {other}`. Stop the router in "
         f"{router}, start one in {other}, restart the processes that the verb names, and revoke "
         f"{router} then.",

@@ -239,8 +239,9 @@ def _would_cut_off(root: Path, rotation: Rotation, robots: Sequence[str]) -> Key
     return KeystoreError(
         f"not every robot has confirmed {stage}: {first_few(robots, _SHOWN)}",
         "After the next stage, they could not communicate with the other robots.",
-        "Deliver the present files, restart what runs with earlier ones, and confirm it; see `sros "
-        f"fleet status {quote(str(root))}`. --allow-unconfirmed goes on without them.",
+        "Deliver the present files, restart processes that run with earlier files, and confirm "
+        f"both; see `sros fleet status {quote(str(root))}`. --allow-unconfirmed goes on without "
+        "them.",
     )
 
 

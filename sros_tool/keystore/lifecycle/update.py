@@ -182,7 +182,7 @@ def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, Dom
         raise KeystoreError(
             f"'{path}' has rules that the settings of a keystore cannot express",
             "It has several domain rules, no rule for * at its end, or a rule for a DDS topic that "
-            "is no topic, service or action of ROS.",
+            "is not a topic, service or action of ROS.",
             f"State the protection in {SETTINGS} instead: "
             f"`sros update_keystore {quote(str(root))} --discard-edits` restores the file.",
         )
@@ -214,7 +214,7 @@ def _checked_target(root: Path, present: PresentSettings, target: Template) -> T
             )
     if not target.separate_authorities and len(Keystore(root).authority_files) > 1:
         raise UsageError(
-            "a keystore with separate CAs does not go back to one CA for both",
+            "a keystore with separate CAs cannot change back to one CA for both",
             "With one CA, every enclave can sign its own permissions (Cyclone DDS 0.10.2, Fast DDS "
             "2.9.1).",
             "Add --set authorities.layout=separate to keep them, or create another keystore.",
@@ -362,9 +362,9 @@ def _signed_payloads(before: DomainProtection, after: DomainProtection) -> list[
     if not new - old:
         return []
     text = (
-        f"With data=SIGN, Fast DDS up to 2.14.5 loses messages of {', '.join(sorted(new - old))}: "
-        "those whose length is not a multiple of four. Take data=NONE with metadata=SIGN, which "
-        "signs the payload with its submessage, or data=ENCRYPT."
+        f"With data=SIGN, Fast DDS up to 2.14.5 loses messages of {', '.join(sorted(new - old))} "
+        "whose length is not a multiple of four. Use data=NONE with metadata=SIGN, which signs "
+        "the payload with its submessage, or data=ENCRYPT."
     )
     return [Note("governance.signed-payload", text)]
 
@@ -669,9 +669,9 @@ class _Updater:
         if any(e.effect is Effect.TIGHTER and e.key.startswith("protection") for e in changes):
             role = "" if shared else f" --{PERMISSIONS}"
             text = (
-                "The previous governance is still validly signed: whoever changes the files of a "
-                "robot can put it back there. That ends when the CA that signed it is replaced: "
-                f"{self._rotation(role)}."
+                "The signature of the previous governance stays valid: anyone who can change the "
+                "files of a robot can put it back there, until the CA that signed it is "
+                f"replaced: {self._rotation(role)}."
             )
             return [Note("keystore.earlier-governance", text)]
         return []
@@ -730,7 +730,7 @@ def trust_records(
         if others:
             raise KeystoreError(
                 f"the permissions of {', '.join(others)} are not the last ones in the ledger",
-                "Perhaps older ones were put back, with rights that were taken away since.",
+                "Perhaps older permissions were put back, with rights that were removed since.",
                 f"State their rights with `sros create_permission {quote(str(root))} "
                 f"{' '.join(map(quote, others))} POLICY_FILE`, and try again.",
             )
@@ -739,9 +739,9 @@ def trust_records(
         change.record()
         change.transaction.commit()
     text = (
-        f"taken on trust: the rights of {counted(len(names), 'enclave')}, as the ledger has them "
-        "in lines without a chain. If somebody removed one of these lines, older permissions may "
-        "be in force again: compare them with your policy (`sros diff_policy`)."
+        f"taken on trust: the rights of {counted(len(names), 'enclave')}, as the ledger "
+        "has them in lines without a chain. If somebody removed one of these lines, older "
+        "permissions may be in force again: compare them with your policy (`sros diff_policy`)."
     )
     change.remarks.append(Note("keystore.taken-on-trust", text))
     name = change.template.name
@@ -819,8 +819,8 @@ def _with_routers_of_robots(change: KeystoreChange, network: ZenohNetwork) -> Ze
 def _router_moved(old: str, new: str) -> Note:
     return Note(
         "zenoh.router-moved",
-        f"the router is now in enclave {new}: stop the one that runs in {old}, and start it in "
-        f"{new}. Only sessions that were not restarted still accept {old} as the router.",
+        f"the router is now in enclave {new}: stop the router that runs in {old}, and start it "
+        f"in {new}. Only sessions that were not restarted still accept {old} as the router.",
     )
 
 
@@ -831,8 +831,8 @@ def _check_settings(change: KeystoreChange, *, edited: bool) -> None:
         raise KeystoreError(
             f"keystore '{root}' was made by ros2/sros2 and has no settings",
             "Without settings, no command would update the Zenoh files.",
-            f"Run `sros update_keystore {where} --template sros2 --dry-run`, which shows what "
-            "settings change, and then without --dry-run.",
+            f"Run `sros update_keystore {where} --template sros2 --dry-run`, which shows the "
+            "changed settings, and then without --dry-run.",
         )
     if edited:
         edits = found_edits(change.keystore, change.governance)

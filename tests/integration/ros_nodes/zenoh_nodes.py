@@ -1,7 +1,7 @@
 """A node on Zenoh as rmw_zenoh has it: ``zenoh_nodes.py REPORT ROLE NAME --ros-args ...``.
 
 A role of the demo, with what every ROS node has: /rosout, /parameter_events and its services.
-Started by the name ``rmw_zenohd``, it is the router, which is no node.
+Started by the name ``rmw_zenohd``, it is the router, which is not a node.
 """
 
 from __future__ import annotations
