@@ -72,7 +72,7 @@ from sros_tool.runtime.processes import (
 )
 from sros_tool.runtime.rmw import RMW, chosen_vendor
 from sros_tool.runtime.units import unit_changes, unit_instance, unit_words, write_units
-from sros_tool.runtime.variables import ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_of
+from sros_tool.runtime.variables import ENABLE, ENCLAVE, domain_of
 from sros_tool.values import DryRun, FileChange, FileChanges, Words, as_plain, shows
 from sros_tool.wording import counted, first_few
 from sros_tool.xml import read_bytes
@@ -137,34 +137,32 @@ class ClosedProcess(NamedTuple):
             return "docker compose up -d"
         return f"cd {shlex.quote(self.folder)} && {shlex.join(self.launch or self.command)}"
 
-    def secured_command(self, folder: Path) -> str:
+    def secured_command(self, folder: Path, of_launch: str = "") -> str:
         """Return the shell command that starts the process, its launch or all containers secured.
 
-        ``folder`` is that of the closed robot.
+        ``folder`` is that of the closed robot, and ``of_launch`` the enclave of the node that its
+        `ros2 launch` has.
         """
         if self.container:
             overlay = shlex.quote(str(folder / "start" / _SERVICES))
             return f"docker compose -f compose.yaml -f {overlay} up -d"
+        words = self.command
         if self.launch:
-            after = launch_verb(tuple(self.launch)) + 1
-            words = _launch_words(folder, self.launch[:after], self.launch[after:], self.rmw)
-        else:
-            run = ("sros", "run", str(folder / "export"), self.enclave)
-            words = shlex.join((*run, *_rmw_option(self.rmw), "--", *self.command))
-        return f"cd {shlex.quote(self.folder)} && {words}"
+            after = launch_verb(self.launch) + 1
+            words = _launch_words(folder, self.launch[:after], self.launch[after:])
+        enclave = of_launch if self.launch else self.enclave
+        if enclave:
+            run = ("sros", "run", str(folder / "export"), enclave)
+            words = (*run, *(("--rmw", self.rmw) if self.rmw else ()), "--", *words)
+        elif self.rmw:
+            words = ("env", f"{RMW}={self.rmw}", *words)
+        return f"cd {shlex.quote(self.folder)} && {shlex.join(words)}"
 
 
-def _launch_words(folder: Path, before: Sequence[str], after: Sequence[str], rmw: str) -> str:
+def _launch_words(folder: Path, before: Sequence[str], after: Sequence[str]) -> Sequence[str]:
     """Return a command of ``ros2 launch`` whose processes run in the enclaves of a closed robot."""
-    run = ("sros", "run", str(folder / "export"), "--policy", str(folder / "policy.xml"))
-    prefix = shlex.join((*run, *_rmw_option(rmw), "--"))
-    words = shlex.join((*before, "--launch-prefix", prefix, *after))
-    # A node to which the launch file gives a prefix of its own does not start.
-    return f"{ENABLE}=true {STRATEGY}=Enforce {KEYSTORE}= {words}"
-
-
-def _rmw_option(rmw: str) -> Sequence[str]:
-    return ("--rmw", rmw) if rmw else ()
+    secured = ("--secured", str(folder / "export"), str(folder / "policy.xml"))
+    return (*before, *secured, *after)
 
 
 class ObservedProcesses(NamedTuple):
@@ -179,11 +177,6 @@ class ObservedProcesses(NamedTuple):
     elsewhere: Sequence[str] = ()
     """Enclaves with nodes that no process of this machine is known to have: also if another process
     has nodes of the same names."""
-
-    @property
-    def rmw(self) -> str:
-        """rmw_zenoh_cpp for a robot on Zenoh; empty on DDS."""
-        return next((process.rmw for process in self.processes if process.rmw), "")
 
     @property
     def units(self) -> dict[str, str]:
@@ -203,10 +196,16 @@ class ObservedProcesses(NamedTuple):
 
         A router of Zenoh comes first: nodes wait for it.
         """
+        launches = {
+            tuple(process.launch): process.enclave
+            for process in self.processes
+            if launch_verb(process.command)
+        }
         commands: dict[str, list[ClosedProcess]] = {}
         for process in sorted(self.processes, key=lambda process: process.enclave != _ROUTER):
             if not process.unit:
-                commands.setdefault(process.secured_command(folder), []).append(process)
+                command = process.secured_command(folder, launches.get(tuple(process.launch), ""))
+                commands.setdefault(command, []).append(process)
         return commands
 
 
@@ -672,8 +671,8 @@ class OpenRobot:
         ]
         for command, processes in observed.by_hand(folder).items():
             lines += ["", f"# {', '.join(process.enclave for process in processes)}", command]
-        launch = _launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE"), observed.rmw)
-        lines += ["", "# Any launch file; its nodes need a name in it.", launch]
+        launch = shlex.join(_launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
+        lines += ["", "# Any launch file; each process needs name= in it.", launch]
         files |= {COMMANDS: _text(lines), _SERVICES: _text(services)}
         changes = unit_changes(self.start, files, force=True)
         write_units(self.start, files, changes)
@@ -712,6 +711,14 @@ class OpenRobot:
                 yield (
                     f"processes run as user {user}, and only user {owner} can read the enclaves: "
                     f"chown -R {user} {shlex.quote(str(self.export))}"
+                )
+        for process in observed.processes:
+            command = process.command
+            if process.launch and not (node_argument(command) or launch_verb(command)):
+                prefix = f"prefix='sros run {export} {process.enclave} --'"
+                yield (
+                    f"the process of {process.enclave} has no name= in its launch file, and would "
+                    f"not start: give it one, or {prefix}"
                 )
         if partial:
             return

@@ -28,7 +28,7 @@ from sros_tool.terminal import echo
 from sros_tool.wording import enumerated
 
 if TYPE_CHECKING:
-    from sros_tool.closing import Closing, OpenRobot
+    from sros_tool.closing import ClosedProcess, Closing, OpenRobot
 
 
 def _run(words: Sequence[str], live: bool) -> tuple[int, str, str]:
@@ -183,8 +183,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
         echo(f"the robot is not proved closed; {again}", err=True)
     elif applies:
         for command, processes in observed.by_hand(robot.folder.absolute()).items():
-            pids = enumerated([str(process.pid) for process in processes])
-            echo(f"stop process {pids}, and start it by:")
+            echo(f"stop {_together(processes)}, and start it by:")
             echo(f"  {command}")
         echo(f"next: these commands, and then sros close {folder} --proof", err=True)
     elif any(process.unit for process in observed.processes):
@@ -193,6 +192,15 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
         how = f"start each process by the commands in {robot.start / COMMANDS}"
         echo(f"nothing is closed yet; next: stop the robot, {how}, and ask", err=True)
         echo(f"sros close {folder} --proof", err=True)
+
+
+def _together(processes: Sequence[ClosedProcess]) -> str:
+    """Return what is stopped and started by one command: a process, a launch, the containers."""
+    first = processes[0]
+    if first.launch or first.container:
+        names = enumerated([process.enclave for process in processes])
+        return f"{'the containers' if first.container else 'the launch'} of {names}"
+    return f"process {enumerated([str(process.pid) for process in processes])}"
 
 
 _ANSWERS = {True: "yes", False: "no", None: "not asked"}

@@ -21,7 +21,7 @@ import os
 import re
 import stat
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
@@ -501,10 +501,10 @@ def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
     return ProcessOrigin(unit, folder, (), container)
 
 
-def launch_verb(command: tuple[str, ...]) -> int:
+def launch_verb(command: Sequence[str]) -> int:
     """Return the index of the word ``launch`` in a command of ``ros2 launch``, else 0."""
     for index in (1, 2):
-        if command[index : index + 1] == ("launch",) and Path(command[index - 1]).name == "ros2":
+        if [*command[index : index + 1]] == ["launch"] and Path(command[index - 1]).name == "ros2":
             return index
     return 0
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from sros_tool import closing
 from sros_tool.cli import close
@@ -71,6 +72,8 @@ class Robot:
     unseen: tuple[UnseenProcess, ...] = ()
     by_hand: set[str] = field(default_factory=set)
     launch: tuple[str, ...] = ()
+    container: str = ""
+    named: bool = False
     nodes: tuple[Any, ...] = (TALKER, LISTENER)
     remaining: tuple[Any, ...] = (TALKER, LISTENER)
     """What an observer with an enclave sees."""
@@ -81,7 +84,9 @@ class Robot:
         return log.read_text().splitlines() if log.exists() else []
 
     def process(self, enclave: str, *, is_secured: bool) -> Process:
-        command = ("/opt/run", enclave.strip("/"))
+        command: tuple[str, ...] = ("/opt/run", enclave.strip("/"))
+        if self.named:
+            command += ("--ros-args", "-r", f"__node:={enclave.strip('/')}")
         libraries, now = frozenset({"libfastrtps"}), datetime.now(UTC)
         process = Process(PID[enclave], command, {}, now, libraries=libraries, user=os.geteuid())
         if not is_secured:
@@ -136,7 +141,9 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     units = {PID[enclave]: enclave for enclave in PID}
     monkeypatch.setattr(
         "sros_tool.closing.process_origin",
-        lambda pid: ProcessOrigin(robot.units.get(units.get(pid, ""), ""), "/opt", robot.launch),
+        lambda pid: ProcessOrigin(
+            robot.units.get(units.get(pid, ""), ""), "/opt", robot.launch, robot.container
+        ),
     )
     monkeypatch.setattr(closing, "_SYSTEMD", tmp_path / "systemd")
     for number in ("_RESTART_SECONDS", "_START_SECONDS"):
@@ -551,6 +558,32 @@ def test_nodes_of_the_same_name_elsewhere_are_told() -> None:
         assert observed.elsewhere == ["/a"]
 
 
+def test_containers_are_started_with_the_files_of_their_enclaves(robot: Robot) -> None:
+    robot.container = "0123456789ab"
+    robot.close()
+    place = robot.folder / "robot"
+    services = yaml.safe_load((place / "start/compose.yaml").read_text())["services"]
+    assert services["talker"]["environment"]["ROS_SECURITY_ENCLAVE_OVERRIDE"] == "/talker"
+    assert services["listener"]["volumes"][0]["source"] == f"{place}/export/enclaves/listener"
+    up = f"docker compose -f compose.yaml -f {place}/start/compose.yaml up -d"
+    said = robot.close("--apply", status=1).out
+    assert f"stop the containers of /listener and /talker, and start it by:\n  {up}\n" in said
+    assert "restart it open: docker compose up -d\n" in robot.close("--undo", status=1).err
+
+
+def test_a_node_on_zenoh_gets_an_argument_from_its_unit(robot: Robot) -> None:
+    """If its unit starts the command of the process, and no script."""
+    systemctl = robot.folder / "bin/systemctl"
+    systemctl.write_text("#!/bin/sh\necho '{ path=/opt/talk ; argv[]=/opt/talk a ; x }'\n")
+    start = "/talker", 1, ("python3", "/opt/talk", "a"), "/opt", 0, "talker.service", "program"
+    on_zenoh = closing.ClosedProcess(*start, rmw="rmw_zenoh_cpp")
+    assert closing._as_its_unit_starts(on_zenoh).command == ("/opt/talk", "a")
+    script = on_zenoh._replace(command=("/opt/talk", "b"))
+    assert closing._as_its_unit_starts(script).unit == ""
+    for other in (script._replace(rmw=""), script._replace(enclave="/router")):
+        assert closing._as_its_unit_starts(other) == other
+
+
 @pytest.mark.parametrize(
     ("text", "unit"),
     [
@@ -565,6 +598,12 @@ def test_the_unit_of_a_process(tmp_path: Path, text: str, unit: str) -> None:
     made_up(tmp_path, 7, "/opt/talker", parent=1, cgroup=text)
     assert process_origin(7, tmp_path) == ProcessOrigin(unit, "/opt")
     assert process_origin(8, tmp_path) == ProcessOrigin()
+
+
+@pytest.mark.parametrize("path", ["system.slice/docker-{}.scope", "docker/{}"])
+def test_the_container_of_a_process(tmp_path: Path, path: str) -> None:
+    made_up(tmp_path, 7, "/opt/talker", parent=1, cgroup=f"0::/{path.format('0af' * 21 + '0')}\n")
+    assert process_origin(7, tmp_path) == ProcessOrigin("", "/opt", (), "0af0af0af0af")
 
 
 def made_up(proc: Path, pid: int, *command: str, parent: int, cgroup: str = "0::/\n") -> None:
@@ -589,15 +628,16 @@ def test_a_process_that_was_launched_is_launched_secured(tmp_path: Path, robot: 
     assert not any(map(launch_verb, [("ros2", "run", "launch"), ("launch",), ()]))
 
     robot.launch = LAUNCH
-    robot.close()
+    assert "has no name= in its launch file, and would not start" in robot.close(status=1).out
+    robot.named = True
+    robot.close("--for", "1s")
     place = robot.folder / "robot"
     command = (
-        "cd /opt && ROS_SECURITY_ENABLE=true ROS_SECURITY_STRATEGY=Enforce ROS_SECURITY_KEYSTORE= "
-        "/usr/bin/python3 /opt/ros/jazzy/bin/ros2 launch --launch-prefix 'sros run "
-        f"{place}/export --policy {place}/policy.xml --' my_robot all.py 'a:=b c'\n"
+        "cd /opt && /usr/bin/python3 /opt/ros/jazzy/bin/ros2 launch --secured "
+        f"{place}/export {place}/policy.xml my_robot all.py 'a:=b c'\n"
     )
     said = robot.close("--apply", status=1).out
-    assert f"stop process 4712 and 4711, and start it by:\n  {command}" in said
+    assert f"stop the launch of /listener and /talker, and start it by:\n  {command}" in said
     assert f"\n# /listener, /talker\n{command}" in (place / "start/commands.txt").read_text()
     undone = robot.close("--undo", status=1).err
     assert undone.count("restart it open: cd /opt && /usr/bin/python3 /opt/ros/jazzy/bin/ros2") == 1
