@@ -273,7 +273,7 @@ def _collect(
             dry_run=dry_run,
         )
     published = None
-    problem: SrosError | None = None
+    problem: SrosError | OSError | None = None
     if folder:
         from sros_tool.keystore.delivery.publish import publish
 
@@ -282,7 +282,7 @@ def _collect(
                 published = publish(root, folder, now=now(), keyring=keyring(), dry_run=dry_run)
             new, refused = published.names("published"), published.names("refused")
             collected = collected._replace(published=PublishedAnswers(folder, new, refused))
-        except SrosError as error:
+        except (SrosError, OSError) as error:
             problem = error  # what was collected is printed first
     if as_json:
         print_json(collected)

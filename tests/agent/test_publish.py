@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
 import hashlib
 import json
@@ -306,6 +307,27 @@ def test_a_kill_after_the_keystore_changed_keeps_the_number(
     number = read_published(Keystore(publisher.root)).robots["r1"].release.number
     assert not publisher.publish().names("published")
     assert publisher.robot().gets().number == number
+
+
+def test_a_disk_that_is_full_after_the_keystore_changed(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put, robot = publishing._put, publisher.robot()
+    before = robot.gets()
+
+    def full(folder: Folder, path: str, data: bytes) -> None:
+        if path.startswith("metadata/"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+        put(folder, path, data)
+
+    publisher.run("renew", "ks", "/r1/base")
+    with monkeypatch.context() as patched:
+        patched.setattr(publishing, "_put", full)
+        with pytest.raises(KeystoreError, match=r"No space left on device\. Robots find what"):
+            publisher.publish()
+    assert robot.gets() == before
+    publisher.publish()
+    assert robot.gets().number > before.number
 
 
 def _raise_killed(*_words: object) -> None:

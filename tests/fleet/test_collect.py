@@ -791,4 +791,7 @@ def test_what_was_renewed_is_published_at_once(home: Home) -> None:
     home.send("r1", datetime.now(UTC), release=number)
     ended = sros("fleet", "collect", "ks", "inbox", "--publish", "ks", cwd=home.folder)
     assert ended.status == 2 and "1 kept" in ended.out, "what was collected stays"
+    (home.folder / "file").touch()
+    ended = sros("fleet", "collect", "ks", "inbox", "--publish", "file/pub", cwd=home.folder)
+    assert ended.status == 2 and "1 unchanged" in ended.out
     assert "not published yet" in sros("fleet", "status", "ks", cwd=home.folder).out

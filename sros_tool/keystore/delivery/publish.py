@@ -217,7 +217,14 @@ def publish(
             run.compose(keys)
             run.keep_list()
         if not dry_run:
-            run.write(keys)
+            try:
+                run.write(keys)
+            except OSError as error:  # such as of a full disk
+                raise KeystoreError(
+                    f"not all files could be written in '{folder}'",
+                    f"{error.strerror}. Robots find what was there before, or all that is new.",
+                    "Publish again once that is mended.",
+                ) from error
         return run.result(keys)
 
 
