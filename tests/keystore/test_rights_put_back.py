@@ -76,7 +76,7 @@ def test_older_permissions_are_not_signed_again(work: Callable[[Path], object], 
     before = snapshot(root / "public"), (root / "enclaves/a/cert.pem").read_bytes()
     with pytest.raises(KeystoreError, match="not certain that") as caught:
         work(root)
-    assert "older ones were put back" in caught.value.why
+    assert "older permissions were put back" in caught.value.why
     assert "create_permission" in caught.value.remedy
     assert before == (snapshot(root / "public"), (root / "enclaves/a/cert.pem").read_bytes())
 
