@@ -499,12 +499,12 @@ def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
     file = Path(lacking[0].finding.file)
     nodes = list(dict.fromkeys(gap.node for gap in lacking))
     lines = list(dict.fromkeys(gap.finding.line or 0 for gap in lacking))
-    counted = Counter(gap.finding.kind for gap in lacking)
+    kinds = Counter(gap.finding.kind for gap in lacking)
     plural = len(nodes) > 1
     what = [
-        verb if counted[kind] == len(nodes) else f"{verb} ({_nodes(counted[kind])})"
+        verb if kinds[kind] == len(nodes) else f"{verb} ({_nodes(kinds[kind])})"
         for kind, verb in _STARTING.items()
-        if counted[kind]
+        if kinds[kind]
     ]
     copied = (file.parent / COMMON / "node.xml").exists()
     target = quote(str(file.parent / COMMON))

@@ -641,8 +641,8 @@ def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
 
 def _reached_lines(answer: ZenohAnswer) -> Iterator[str]:
     does, wide_does = _DOES[answer.question.word]
-    able = [reached.enclave for reached in answer.reached if not reached.problem]
-    yield _row(does, _names(able))
+    reachable = [reached.enclave for reached in answer.reached if not reached.problem]
+    yield _row(does, _names(reachable))
     for reached in [reached for reached in answer.reached if reached.problem][:_MOST_SHOWN]:
         yield _row("", f"not {reached.enclave}, which has the right: {reached.problem}")
     for wildcard, enclaves in answer.wildcards:

@@ -81,16 +81,16 @@ _FLAG_WORDS = {
         "participants without a certificate are refused",
     ),
     "enable_join_access_control": (
-        "whoever has a certificate may join, whatever its permissions",
+        "any participant with a certificate may join, whatever its permissions",
         "joining needs permissions",
     ),
     "enable_discovery_protection": (
-        "who publishes and subscribes {} is announced unprotected",
-        "who publishes and subscribes {} is announced with protection",
+        "publishers and subscriptions of {} are announced unprotected",
+        "publishers and subscriptions of {} are announced with protection",
     ),
     "enable_liveliness_protection": (
-        "who is alive on {} is said unprotected",
-        "who is alive on {} is said with protection",
+        "liveliness messages of {} are unprotected",
+        "liveliness messages of {} are protected",
     ),
     "enable_read_access_control": (
         "every enclave may read {}",

@@ -402,11 +402,11 @@ class _Draft:
         self._enclaves: dict[str, tuple[str, ...]] = {}
         self._names: dict[tuple[str, str], tuple[str, ...]] = {}
         self._alike: dict[object, list[str]] | None = None
-        different, odd = self._differing()
-        edges = tuple(sorted(set(self._edges(odd)), key=edge_order))
+        different, differing_parts = self._differing()
+        edges = tuple(sorted(set(self._edges(differing_parts)), key=edge_order))
         picture = replace(
             self._picture,
-            enclaves=tuple(self._folded_enclaves(odd)),
+            enclaves=tuple(self._folded_enclaves(differing_parts)),
             names=tuple(self._folded_names(edges)),
             edges=edges,
             focus=tuple(map(self._focus, self._picture.focus)),
@@ -445,10 +445,10 @@ class _Draft:
         text, unit = self._owner(enclave), self._of.get(enclave)
         path = text.fill(self._label)
         if unit in self._inside and path not in self._enclaves:
-            self._enclaves[path] = tuple(self._each(text, self._inside[unit]))
+            self._enclaves[path] = tuple(self._per_unit(text, self._inside[unit]))
         return path
 
-    def _each(self, text: UnitText, colour: int) -> Iterator[str]:
+    def _per_unit(self, text: UnitText, colour: int) -> Iterator[str]:
         """Yield the text once for each unit of a class, with that unit's name."""
         for unit in self._classes[colour]:
             yield text.fill(partial(self._instead, unit))
@@ -456,7 +456,7 @@ class _Draft:
     def _instead(self, unit: int, _unit: int, position: int) -> str:
         return self._word(unit, position)
 
-    def _edges(self, odd: Set[Edge | str]) -> Iterator[Edge]:
+    def _edges(self, differing_parts: Set[Edge | str]) -> Iterator[Edge]:
         """Yield the rights to draw: of drawn units, and of enclaves that belong to no unit."""
         others = self._others()
         for edge in self._picture.edges:
@@ -475,7 +475,7 @@ class _Draft:
                 self._names[edge.kind, shown] = tuple(self._named(edge.kind, name))
             by = tuple(dict.fromkeys(self._text(wildcard).fill(word) for wildcard in edge.by))
             path = self._path(edge.enclave)
-            yield replace(edge, enclave=path, name=shown, by=by, differs=edge in odd)
+            yield replace(edge, enclave=path, name=shown, by=by, differs=edge in differing_parts)
 
     def _is_counted(self, unit: int, other: int) -> bool:
         """Return whether ``unit`` shows only a number for ``other`` and similar units."""
@@ -518,7 +518,7 @@ class _Draft:
     def _named(self, kind: str, name: UnitText) -> Iterable[str]:
         """Yield the real names that a drawn name with labels stands for."""
         if len(name.named) == 1 and name.units[0] in self._inside:
-            return self._each(name, self._inside[name.units[0]])
+            return self._per_unit(name, self._inside[name.units[0]])
         if self._alike is None:
             self._alike = defaultdict(list)
             for real in self._picture.names:
@@ -535,8 +535,8 @@ class _Draft:
             if found := self._names_of.get((kind, real)):
                 yield replace(found, name=shown, namespace=namespace_of(shown))
 
-    def _folded_enclaves(self, odd: Set[Edge | str]) -> Iterator[PicturedEnclave]:
-        differing = {what if isinstance(what, str) else what.enclave for what in odd}
+    def _folded_enclaves(self, differing_parts: Set[Edge | str]) -> Iterator[PicturedEnclave]:
+        differing = {what if isinstance(what, str) else what.enclave for what in differing_parts}
         for enclave in self._picture.enclaves:
             unit = self._of.get(enclave.path)
             if unit is None:
@@ -585,13 +585,13 @@ class _Draft:
             for unit in seen.keys() & set(units):
                 seen[unit].setdefault((kind, self._around(units, unit)), what)
         different: list[DifferentUnit] = []
-        odd: set[Edge | str] = set()
+        differing_parts: set[Edge | str] = set()
         for n in sorted(near, key=self._by_name):
             own, other = seen[n], seen[near[n]]
             if _alike(own, other):
                 more = [what for key, what in own.items() if key not in other]
                 fewer = [what for key, what in other.items() if key not in own]
-                odd.update(more)
+                differing_parts.update(more)
                 different.append(
                     DifferentUnit(
                         self._label(n),
@@ -600,7 +600,7 @@ class _Draft:
                         tuple(self._said(fewer, n, near[n])),
                     )
                 )
-        return tuple(different), odd
+        return tuple(different), differing_parts
 
     def _said(
         self, drawn: Sequence[Edge | str], unit: int, instead: int | None = None

@@ -491,7 +491,7 @@ def test_rights_of_a_policy_stay_even_if_they_are_the_default(root: Path) -> Non
 
 def test_two_cas_do_not_become_one(root: Path) -> None:
     before = snapshot(root)
-    with pytest.raises(UsageError, match="does not go back"):
+    with pytest.raises(UsageError, match="cannot change back"):
         to(root, "sros2")
     assert snapshot(root) == before
     kept = with_values(load_template("sros2"), [("authorities.layout", "separate")])
