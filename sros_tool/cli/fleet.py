@@ -599,7 +599,9 @@ def _status(
         from sros_tool.report.pages import render_fleet_page
         from sros_tool.values import as_plain
 
-        text = render_fleet_page(as_plain(compared))
+        text = render_fleet_page(
+            as_plain(compared), _WORDS, list(_facts(status)), list(_page_rows(compared, robots))
+        )
     else:
         lines = _lines(compared, robots, findings=advisories is not None)
         text = "".join(f"{visible_line(line)}\n" for line in lines)
@@ -636,16 +638,7 @@ def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) ->
     status = compared.status
     counts = ", ".join(f"{number} {_word(state)}" for state, number in status.counts.items())
     yield f"{counted(len(status.robots), 'robot')}: {counts}"
-    if status.stage != "complete":
-        behind = sum(robot.stage != status.stage for robot in status.robots if robot.enclaves)
-        yield f"CA rotation: {status.stage}; {counted(behind, 'robot')} not there yet"
-    lists = [robot.crl_in_force for robot in status.robots if robot.crl_in_force is not None]
-    if lists:
-        number = f"all {len(lists)}" if all(lists) else f"{sum(lists)} of {len(lists)}"
-        yield f"the revocation list is in force on {number} robots"
-    if status.unassigned:
-        whom = "it" if status.unassigned == 1 else "them"
-        yield f"{counted(status.unassigned, 'enclave')} of no robot: nothing is known of {whom}"
+    yield from _facts(status)
     rows = list(_rows(compared, robots))
     widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
     for row in rows:
@@ -659,11 +652,36 @@ def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) ->
         yield from _dds_counts(compared)
 
 
-def _rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield the head of a table and its rows, if something is to be said of a robot.
+def _facts(status: FleetStatus) -> Iterator[str]:
+    """Yield what is to be said of the fleet as a whole."""
+    if status.stage != "complete":
+        behind = sum(robot.stage != status.stage for robot in status.robots if robot.enclaves)
+        yield f"CA rotation: {status.stage}; {counted(behind, 'robot')} not there yet"
+    lists = [robot.crl_in_force for robot in status.robots if robot.crl_in_force is not None]
+    if lists:
+        number = f"all {len(lists)}" if all(lists) else f"{sum(lists)} of {len(lists)}"
+        yield f"the revocation list is in force on {number} robots"
+    if status.unassigned:
+        whom = "it" if status.unassigned == 1 else "them"
+        yield f"{counted(status.unassigned, 'enclave')} of no robot: nothing is known of {whom}"
 
-    Unless ``robots`` are named, those of which the same is to be said share a row, and the last row
-    has those that are current.
+
+class _Group(NamedTuple):
+    """Robots of which the same is to be said."""
+
+    robots: Sequence[RobotStatus]
+    state: str
+    to_do: str
+    what: str
+
+    def confirmed(self, at: datetime) -> RobotStatus:
+        """Return the robot whose last confirmation is the oldest."""
+        return min(self.robots, key=lambda robot: robot.received or at)
+
+
+def _groups(compared: ComparedFleet, robots: Sequence[str]) -> list[_Group]:
+    """Return the robots in groups, each robot alone if ``robots`` are named; the last group has
+    those that are current.
     """
     status, places = compared.status, _places(compared.status)
     alike: dict[tuple[str, ...], list[RobotStatus]] = {}
@@ -671,20 +689,52 @@ def _rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str,
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
         if robots or robot.state not in ("current", "none") or robot.notes or robot.problems:
             what = _unnamed("; ".join(_summary(robot, status.stage)), robot.robot)
-            row = (_word(robot.state), robot.to_do, what)
+            row = (robot.state.value, robot.to_do, what)
             alike.setdefault((*row, robot.robot if robots else ""), []).append(robot)
         elif robot.state == "current":
             current.append(robot)
-    if not alike:
+    groups = [
+        _Group(
+            group, state, to_do, what.replace(_ROBOT, group[0].robot) if len(group) == 1 else what
+        )
+        for (state, to_do, what, _), group in alike.items()
+    ]
+    return [*groups, _Group(current, "current", "", "")] if current else groups
+
+
+def _rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """Yield the head of a table and its rows, if something is to be said of a robot."""
+    groups, places = _groups(compared, robots), _places(compared.status)
+    if not robots and all(group.state == "current" for group in groups):
+        groups = [group for group in groups if group.what]
+    if not groups:
         return
-    if current and any(robot.state != "current" for group in alike.values() for robot in group):
-        alike["current", "", "", ""] = current
     yield "robot", "state", "confirmed", "to do", "what"
-    for (state, to_do, what, _), group in alike.items():
-        last = min(group, key=lambda robot: robot.received or compared.at)
-        names = _runs((robot.robot for robot in group), places)
-        text = what.replace(_ROBOT, group[0].robot) if len(group) == 1 else what
-        yield names, state, _age(last, compared.at), to_do, text
+    for group in groups:
+        names = _runs((robot.robot for robot in group.robots), places)
+        age = _age(group.confirmed(compared.at), compared.at)
+        yield names, _word(group.state), age, group.to_do, group.what
+
+
+def _page_rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """Yield the state of each group of robots, their names, when the first of them confirmed and
+    when the first of their files expires, what to do, and why.
+    """
+    from sros_tool.validity import iso
+
+    places = _places(compared.status)
+    for group in _groups(compared, robots):
+        names = _runs((robot.robot for robot in group.robots), places, len(group.robots))
+        received = group.confirmed(compared.at).received
+        expiry = [moment for robot in group.robots for moment in robot.expiry.values()]
+        yield (
+            group.state,
+            names,
+            iso(received) if received else "",
+            iso(min(expiry)) if expiry else "",
+            group.to_do,
+            group.what,
+        )
 
 
 _ROBOT = "{robot}"
@@ -707,8 +757,8 @@ def _places(status: FleetStatus) -> dict[str, int]:
     return {name: place for place, name in enumerate(names)}
 
 
-def _runs(names: Iterable[str], places: Mapping[str, int]) -> str:
-    """Return robots in words, of which neighbours in the fleet share some."""
+def _runs(names: Iterable[str], places: Mapping[str, int], most: int = _MOST_GROUPS) -> str:
+    """Return robots in words, of which neighbours in the fleet share some, at most ``most``."""
     runs: list[list[str]] = []
     for name in sorted(names, key=places.__getitem__):
         if runs and places[name] == places[runs[-1][-1]] + 1:
@@ -719,7 +769,7 @@ def _runs(names: Iterable[str], places: Mapping[str, int]) -> str:
     for run in runs:
         words += [f"{run[0]} to {run[-1]}"] if len(run) > _MOST_GROUPS else run
     number = sum(map(len, runs))
-    shown = ", ".join(words[:_MOST_GROUPS]) + (", ..." if len(words) > _MOST_GROUPS else "")
+    shown = ", ".join(words[:most]) + (", ..." if len(words) > most else "")
     return f"{shown} ({number} robots)" if number > _MOST_GROUPS else shown
 
 

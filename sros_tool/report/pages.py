@@ -12,7 +12,6 @@ import base64
 import hashlib
 import html
 import json
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from itertools import groupby
@@ -28,6 +27,7 @@ from sros_tool.report.picture import Bundle, Picture, PicturedEnclave, fold, lac
 from sros_tool.terminal import visible_json, visible_line
 from sros_tool.validity import iso
 from sros_tool.values import as_plain
+from sros_tool.wording import counted
 
 _ASSETS = Path(__file__).with_name("assets")
 _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
@@ -260,11 +260,16 @@ def _demo_head(result: Json) -> str:
         for kind, number, text in tiles
         if number != "0"
     )
-    why = f'<p class="soft">{escape(result["why"])}</p>' if result.get("why") else ""
-    why += f"<p>{escape(result['vulnerabilities'])}</p>"
+    chosen = f"Why {escape(result['backend'])}: {escape(result['why'])}."
+    why = f'<p class="soft">{chosen}</p>' if result["why"] else ""
+    known = escape(result["vulnerabilities"])
+    number = sum(len(used["vulnerabilities"] or ()) for used in result.get("libraries") or ())
+    if number:
+        summary = counted(number, "known vulnerability", "known vulnerabilities")
+        known = f"<details><summary>{summary}</summary>{known}</details>"
     return (
-        f"<header><h1>Attempts and their results</h1><p>{', '.join(facts)}.</p>{why}"
-        f'<ul class="tiles">{shown}</ul></header>'
+        f"<header><h1>What was tried on a real middleware</h1><p>{', '.join(facts)}.</p>"
+        f'<ul class="tiles">{shown}</ul>{why}<div>{known}</div></header>'
     )
 
 
@@ -310,7 +315,7 @@ def _demo_table(rows: Sequence[Json]) -> str:
     lines = [
         '<table class="rows"><thead><tr><th scope="col"><span class="hidden">Result</span></th>'
         '<th scope="col">Tried</th><th scope="col">Expected</th><th scope="col">Seen</th>'
-        '<th scope="col">Mechanism</th></tr></thead>'
+        '<th scope="col">Why</th></tr></thead>'
     ]
     for attack, found in groupby(rows, key=lambda row: row.get("attack", "")):
         lines.append("<tbody>")
@@ -352,7 +357,7 @@ def _demo_row(row: Json) -> Iterator[str]:
         f'<th scope="row" data-label="Tried">{tried}</th>'
         f'<td data-label="Expected">{escape(row["expected"])}</td>'
         f'<td data-label="Seen">{escape(row["observed"])}</td>'
-        f'<td data-label="Mechanism">{mechanism}</td></tr>'
+        f'<td data-label="Why">{mechanism}</td></tr>'
     )
 
 
@@ -362,75 +367,63 @@ _GOOD = ("current", "none")
 _OUT_OF_DATE = ("restart", "earlier", "different", "missing", "offline", "never")
 
 
-def render_fleet_page(status: Json) -> str:
-    """Return the HTML page of a fleet's status."""
+def render_fleet_page(
+    status: Json, words: Mapping[str, str], facts: Sequence[str], rows: Sequence[Sequence[str]]
+) -> str:
+    """Return the HTML page of a fleet's status.
+
+    Args:
+        status: what ``sros fleet status --json`` prints.
+        words: state → its words, where they differ from its name.
+        facts: what is to be said of the fleet as a whole.
+        rows: of robots with the same state: this state, their names, when they confirmed, their
+            first expiry, what to do, and why.
+    """
+    tiles = "".join(
+        f'<li class="tile {_fleet_class(state)}"><b>{number}</b> {words.get(state, state)}</li>'
+        for state, number in status["counts"].items()
+    )
+    if outdated := len(status["outdated_dds"]):
+        tiles += f'<li class="tile warning"><b>{outdated}</b> with a DDS to upgrade</li>'
+    said = "".join(f"<br>{_sentence(fact)}" for fact in facts)
+    head = (
+        f"<header><h1>Status of the fleet</h1>"
+        f"<p>Keystore <code>{escape(status['keystore'])}</code>, {len(status['robots'])} robots, "
+        f"as of {_minute(status['at'])} UTC.{said}</p>"
+        f'<ul class="tiles">{tiles}</ul></header>'
+    )
+    heads = "".join(f'<th scope="col">{name}</th>' for name in _FLEET_COLUMNS)
+    worst_first = sorted(rows, key=lambda row: _FLEET_CLASSES.index(_fleet_class(row[0])))
+    lines = "".join(_fleet_row(row, words) for row in worst_first)
+    table = (
+        f'<table class="rows fleet"><thead><tr>{heads}</tr></thead><tbody>{lines}</tbody></table>'
+    )
     findings = "".join(
         f"<li>{escape(finding['subject'])}: {escape(finding['text'])}</li>"
         for finding in status["findings"]
     )
     listed = f"<h2>Vulnerabilities of the DDS</h2><ul>{findings}</ul>" if findings else ""
-    body = f"{_fleet_head(status)}<section>{_fleet_table(status)}{listed}</section>"
-    return _document(f"Fleet of {status['keystore']}", f"<main>{body}</main>", _asset("demo.css"))
+    body = f"<main>{head}<section>{table}{listed}</section></main>"
+    return _document(f"Fleet of {status['keystore']}", body, _asset("demo.css"))
 
 
-def _fleet_head(status: Json) -> str:
-    tiles = "".join(
-        f'<li class="tile {_fleet_class(state)}"><b>{number}</b> {escape(state)}</li>'
-        for state, number in status["counts"].items()
+_FLEET_COLUMNS = ("State", "Robots", "To do", "Details", "Confirmed (UTC)", "First expiry")
+_FLEET_CLASSES = ("error", "warning", "good")
+
+
+def _minute(moment: str) -> str:
+    return moment[:16].replace("T", " ")
+
+
+def _fleet_row(row: Sequence[str], words: Mapping[str, str]) -> str:
+    state, robots, confirmed, expiry, to_do, why = row
+    chip = f'<span class="chip {_fleet_class(state)}">{words.get(state, state)}</span>'
+    texts = (to_do, why, confirmed and _minute(confirmed), expiry[:10])
+    cells = "".join(
+        f'<td data-label="{label}">{escape(text)}</td>' if text else "<td></td>"
+        for label, text in zip(_FLEET_COLUMNS[2:], texts, strict=True)
     )
-    facts = [f"keystore <code>{escape(status['keystore'])}</code>", f"as of {status['at']}"]
-    if status["stage"] != "complete":
-        facts.append(f"CA rotation at the stage {escape(status['stage'])}")
-    if status["unassigned"]:
-        facts.append(f"{status['unassigned']} enclaves of no robot")
-    return (
-        f"<header><h1>Status of the fleet</h1><p>{', '.join(facts)}.</p>"
-        f'<ul class="tiles">{tiles}</ul></header>'
-    )
-
-
-_FLEET_HEADS = (
-    *("robot", "state", "confirmed", "release", "published", "enclaves", "first expiry"),
-    *("CA stage", "to do", "what differs"),
-)
-
-
-def _fleet_table(status: Json) -> str:
-    rows = sorted(status["robots"], key=lambda robot: (robot["state"] in _GOOD, robot["robot"]))
-    return (
-        f"<table><thead><tr>{''.join(f'<th>{head}</th>' for head in _FLEET_HEADS)}</tr></thead>"
-        f"<tbody>{''.join(map(_fleet_row, rows))}</tbody></table>"
-    )
-
-
-def _fleet_row(robot: Json) -> str:
-    differences = Counter(
-        (each["kind"], each["state"], each["robot"] or each["enclave"] or "", each["since"] or "")
-        for each in robot["pending"]
-    )
-    what = [
-        f"{number} {kind} {state}{f' of {whose}' if whose else ''}{f', {since}' if since else ''}"
-        for (kind, state, whose, since), number in differences.items()
-    ]
-    due = [f"processes of {name} may run with earlier files" for name in robot["restart"] or ()]
-    if robot["crl_in_force"] is False and robot["received"]:
-        due.append("the revocation list is not in force")
-    cells = (
-        f"<code>{escape(robot['robot'])}</code>",
-        f'<span class="{_fleet_class(robot["state"])}">{escape(robot["state"])}</span>',
-        escape(robot["received"] or ""),
-        *("" if robot[key] is None else str(robot[key]) for key in ("release", "published")),
-        str(robot["enclaves"]),
-        escape(min(robot["expiry"].values(), default="")),
-        escape(robot["stage"] or ""),
-        escape(robot["to_do"]),
-        "<br>".join(map(escape, (*what, *due, *robot["notes"], *(robot["problems"] or ())))),
-    )
-    labelled = (
-        f'<td data-label="{head}">{cell}</td>' if cell else "<td></td>"
-        for head, cell in zip(_FLEET_HEADS, cells, strict=True)
-    )
-    return f"<tr>{''.join(labelled)}</tr>"
+    return f'<tr><td>{chip}</td><th scope="row">{escape(robots)}</th>{cells}</tr>'
 
 
 def _fleet_class(state: str) -> str:

@@ -10,7 +10,7 @@ import pytest
 from lxml import html
 
 from sros_tool.cli.demo import _write_report
-from sros_tool.report.pages import render_demo_page, without_folders
+from sros_tool.report.pages import render_demo_page, render_fleet_page, without_folders
 from sros_tool.terminal import visible_line
 from tests.report.pictures import HOSTILE, new_page
 
@@ -124,25 +124,39 @@ def test_no_place_of_the_machine_is_written(tmp_path: Path) -> None:
     assert [place for place in places if str(place) in text] == []
 
 
+def fleet_page() -> str:
+    """A fleet's status with long and hostile names, in a state of each class."""
+    name = HOSTILE[0]
+    finding = {"subject": name, "text": "/opt/" + 60 * "library"}
+    states = ("revoked", "earlier", "current")
+    status: dict[str, Any] = {"keystore": name, "at": "2027-01-01T00:00:00Z", "counts": {}}
+    rows = [(state, name, "2027-01-01T00:00:00Z", "", "deliver", 60 * "file") for state in states]
+    status |= {"robots": states, "outdated_dds": ["r1"], "findings": [finding]}
+    return render_fleet_page(status, {"earlier": "an earlier one"}, [name], rows)
+
+
 @pytest.mark.browser
-def test_it_opens_from_disk_and_runs_nothing(browser: Browser, built: Path, tmp_path: Path) -> None:
+def test_they_open_from_disk_and_run_nothing(browser: Browser, built: Path, tmp_path: Path) -> None:
     rows = [row(text, mechanism=text, attack=text, detail=text) for text in HOSTILE]
-    path = tmp_path / "demo.html"
-    path.write_text(render_demo_page(result(*rows)))
+    axe = (built / "node_modules/axe-core/axe.min.js").read_text()
     said: list[str] = []
-    page = new_page(browser)
-    page.on("console", lambda message: said.append(message.text))
-    page.goto(path.as_uri())
-    assert not said
-    shown = page.locator("tbody th[scope=row]").all_text_contents()
-    assert shown == [*map(visible_line, HOSTILE)]
-    assert page.evaluate("window.broken") is None
-    page.evaluate((built / "node_modules/axe-core/axe.min.js").read_text())
-    for scheme in ("light", "dark"):
-        page.emulate_media(color_scheme=scheme)
-        found = page.evaluate("axe.run(document)")["violations"]
-        assert [each["id"] for each in found] == []
-    for width in (1280, 390):
-        page.set_viewport_size({"width": width, "height": 800})
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-    page.close()
+    names = {"demo": HOSTILE, "fleet": 3 * HOSTILE[:1]}
+    for kind, text in {"demo": render_demo_page(result(*rows)), "fleet": fleet_page()}.items():
+        path = tmp_path / f"{kind}.html"
+        path.write_text(text)
+        page = new_page(browser)
+        page.on("console", lambda message: said.append(message.text))
+        page.goto(path.as_uri())
+        assert not said
+        shown = page.locator("tbody th[scope=row]").all_text_contents()
+        assert shown == [*map(visible_line, names[kind])]
+        assert page.evaluate("window.broken") is None
+        page.evaluate(axe)
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)
+            found = page.evaluate("axe.run(document)")["violations"]
+            assert [each["id"] for each in found] == []
+        for width in (1280, 390):
+            page.set_viewport_size({"width": width, "height": 800})
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+        page.close()

@@ -36,7 +36,10 @@ def test_two_runs_write_the_same_bytes(form: str, robot_keystore: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "options"),
-    [("mobile_robot.svg", ("--template", "production")), ("drive.svg", ("--focus", "/cmd_vel"))],
+    [
+        ("mobile_robot.svg", ("--template", "production")),
+        ("drive.svg", ("--focus", "/cmd_vel", "--hops", "1")),
+    ],
 )
 def test_the_pictures_of_the_docs_are_what_their_commands_write(
     tmp_path: Path, name: str, options: tuple[str, ...]

@@ -121,7 +121,7 @@ def test_an_enclave_tells_its_rights_certificate_validity_and_findings(
             "Denied: subscribe (3)",
             "/front_camera/image_raw",
             "by /*",
-            "subscribe /* reaches",
+            "subscribe /* fits",
         ):
             assert wanted in text, wanted
         # What has nothing to do with it fades.
@@ -526,7 +526,7 @@ def test_the_table_has_every_name_and_those_that_only_one_side_may_use(
     sros("view", policy, "-o", path).ok()
     with opened(browser, path) as page:
         page.click("#tab-names")
-        assert "1 name that only one side may use." in page.inner_text("#names")
+        assert "1 name may be used by one side only." in page.inner_text("#names")
         rows = page.locator("#names tbody tr")
         assert ["/lost" in each for each in rows.all_inner_texts()] == [True, False]
         page.check("#only-lacking")

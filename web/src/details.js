@@ -137,7 +137,7 @@ export function enclaveDetails(model, path, act) {
         "li",
         {},
         el("code", { text: `${each.deny ? "DENY " : ""}${each.right} ${each.name}` }),
-        ` reaches ${each.reaches} known here, and whatever else is called so`,
+        ` fits ${counted(each.reaches, "name")} on this page, and every other name of this form`,
       ),
     );
     parts.push(section("Wildcards as written", el("ul", { class: "plain" }, items)));

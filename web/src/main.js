@@ -56,10 +56,9 @@ function showMap() {
   state.shown = scene;
   state.drawing = drawScene(byId("map"), scene, { overlay: model.overlay, problems, choose });
   byId("legend").replaceChildren(...legend(scene, model.overlay, model.equal, { el, svg }));
-  const are = scene.hidden === 1 ? "is" : "are";
-  const left = scene.id === "essential" ? `that only every node needs ${are} left out` : `${are} not in this view`;
+  const why = scene.id === "essential" ? " that every node needs" : "";
   const summary = scene.shown
-    ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${scene.hidden ? `; ${scene.hidden} more ${left}` : ""}`
+    ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${scene.hidden ? `; not drawn: ${counted(scene.hidden, "name")}${why}` : ""}`
     : scene.title;
   byId("summary").textContent = scene.cards.length ? summary : "Nothing fits.";
   byId("back").hidden = !(state.flow || filtering());
@@ -76,7 +75,11 @@ function showFocus() {
   const asked = id === "focus" && cards.find((card) => card.chosen);
   if (!asked) return;
   const canvas = byId("canvas");
-  canvas.scrollLeft = (asked.x + asked.width / 2) * state.zoom - canvas.clientWidth / 2;
+  const middle = (asked.x + asked.width / 2) * state.zoom - canvas.clientWidth / 2;
+  // Where not all fits, who may send is in sight: their frame stands out by 8.
+  const links = state.shown.links.filter((link) => link.target === asked.id);
+  const senders = cards.filter((card) => links.some((link) => link.source === card.id));
+  canvas.scrollLeft = Math.min(middle, ...senders.map((card) => (card.x - 12) * state.zoom));
   canvas.scrollTop = (asked.y + asked.height / 2) * state.zoom - canvas.clientHeight / 2;
 }
 

@@ -32,8 +32,8 @@ export function namesTable(rows, lacking, opens) {
   show();
   const head = ["Name", "May send", "May receive", "Protection"].map((text) => el("th", { scope: "col", text }));
   return [
-    el("p", {}, lacking ? `${counted(lacking, "name")} that only one side may use.` : "Every name has a sender and a receiver."),
-    el("p", { class: "choices" }, el("label", {}, only, " only these"), el("label", {}, basics, " also what every node needs")),
+    el("p", {}, lacking ? `${counted(lacking, "name")} may be used by one side only.` : "Every name has a sender and a receiver."),
+    el("p", { class: "choices" }, el("label", {}, only, " only names without a sender or a receiver"), el("label", {}, basics, " also names that every node needs")),
     status,
     el("table", { class: "names" }, el("thead", {}, el("tr", {}, head)), body),
   ];
@@ -60,6 +60,6 @@ function line(row, opens) {
     ),
     el("td", { "data-head": "May send" }, list(row.senders, "nobody")),
     el("td", { "data-head": "May receive" }, list(row.receivers, "nobody"), denied),
-    el("td", { "data-head": "Protection" }, LEVELS[row.level]),
+    el("td", { "data-head": "Protection" }, LEVELS[row.level].replace("protection ", "")),
   );
 }

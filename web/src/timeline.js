@@ -53,7 +53,7 @@ export function timeline(validities, onEnclave) {
   head.push(el("th", { scope: "col", class: "bars" }, el("span", { class: "hidden", text: "Time" }), axis));
   const body = rows(validities).map((each) => row(each, scale, onEnclave));
   return [
-    el("p", { class: "soft", text: "The first to expire stands first; the line is today. A bar with an arrow continues beyond the chart." }),
+    el("p", { class: "soft" }, "The first to expire comes first. ", el("span", { class: "bars" }, "The line is today; a bar with an arrow continues beyond the chart.")),
     el("table", { class: "timeline" }, el("thead", {}, el("tr", {}, head)), el("tbody", {}, body)),
   ];
 }
