@@ -136,7 +136,7 @@ def fleet_page() -> str:
 
 
 @pytest.mark.browser
-def test_they_open_from_disk_and_run_nothing(browser: Browser, built: Path, tmp_path: Path) -> None:
+def test_it_opens_from_disk_and_runs_nothing(browser: Browser, built: Path, tmp_path: Path) -> None:
     rows = [row(text, mechanism=text, attack=text, detail=text) for text in HOSTILE]
     axe = (built / "node_modules/axe-core/axe.min.js").read_text()
     said: list[str] = []
