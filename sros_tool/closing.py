@@ -923,7 +923,7 @@ def _needs_argument(process: ClosedProcess) -> bool:
 def _as_its_unit_starts(process: ClosedProcess) -> ClosedProcess:
     """Return a process with the command of its unit, to which an argument can be added.
 
-    Without the unit if that starts another command, such as a script.
+    Without the unit if it starts another command, such as a script.
     """
     if not (process.unit and _needs_argument(process)):
         return process
@@ -932,9 +932,10 @@ def _as_its_unit_starts(process: ClosedProcess) -> ClosedProcess:
         shown = subprocess.run(asking, capture_output=True, check=False).stdout
     except OSError:
         shown = b""
-    for words in (process.command, process.command[1:]):
-        if f"; argv[]={' '.join(words)} ;".encode() in shown:
-            return process._replace(command=words)
+    with suppress(UsageError):  # some words cannot be written in a unit
+        for words in (process.command, process.command[1:]):
+            if f"; argv[]={' '.join(words)} ;".encode() in shown and [*unit_words(words)]:
+                return process._replace(command=words)
     return process._replace(unit="")
 
 
