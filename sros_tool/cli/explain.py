@@ -518,6 +518,10 @@ def _to_do_lines(answer: Answer) -> Iterator[str]:
         yield _row("remedy", answer.remedy)
     for number, command in enumerate(answer.commands):
         yield _row("run" if not number else "", command)
+    if answer.commands:
+        yield _row(
+            "then", "export the enclave again if its processes use an export, and restart them"
+        )
 
 
 def _shown(source: Source) -> str:
