@@ -42,7 +42,8 @@ def page() -> str:
 
 
 def _verb(name: str, command: click.Command) -> Iterator[str]:
-    context = click.Context(command, info_name=name)
+    # Click keeps the help option that a command first has, also for those who call it later.
+    context = click.Context(command, info_name=name, help_option_names=["-h", "--help"])
     yield f".SS {_roff(' '.join([name, *command.collect_usage_pieces(context)]))}\n"
     for part in (command.help or "").replace("\b", "").split("\n\n"):
         yield f"{_roff(part)}\n.PP\n"

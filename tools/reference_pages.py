@@ -49,7 +49,8 @@ def _options() -> str:
 
 
 def _verb(name: str, command: click.Command) -> Iterator[str]:
-    context = click.Context(command, info_name=name)
+    # Click keeps the help option that a command first has, also for those who call it later.
+    context = click.Context(command, info_name=name, help_option_names=["-h", "--help"])
     usage = " ".join([name, *command.collect_usage_pieces(context)])
     yield f"### {name}"
     yield f"```text\n{usage}\n```"

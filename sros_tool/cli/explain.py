@@ -518,10 +518,6 @@ def _to_do_lines(answer: Answer) -> Iterator[str]:
         yield _row("remedy", answer.remedy)
     for number, command in enumerate(answer.commands):
         yield _row("run" if not number else "", command)
-    if answer.commands:
-        yield _row(
-            "then", "export the enclave again if its processes use an export, and restart them"
-        )
 
 
 def _shown(source: Source) -> str:
@@ -572,7 +568,8 @@ def _change_lines(answer: Answer) -> Iterator[str]:
             yield f"    add at {place}, with placeholders for the robot's name and namespace"
         else:
             yield f"    save as {ADDITION}"
-        yield from (f"      {line}" for line in change.document.splitlines())
+        lines = change.document.splitlines()  # without the XML declaration, which is the default
+        yield from (f"      {line}" for line in lines if not line.startswith("<?xml"))
 
 
 def _table_lines(compared: Comparison) -> Iterator[str]:

@@ -337,6 +337,8 @@ def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
     published = "" if as_json or result.dry_run else publish_command(result.root)
     if published and (result.changed or result.completed):
         yield f"robots that fetch get the change by {published}"
+    elif result.changed and not (as_json or result.dry_run):
+        yield "to take effect: export it where its processes use an export, and restart them"
     if result.kept:
         yield f"unchanged: {counted(len(result.kept), 'enclave')}: {shown_names(result.kept)}"
 
