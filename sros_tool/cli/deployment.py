@@ -283,8 +283,8 @@ def create_request(
 ) -> None:
     """On a robot: create the key of ENCLAVE in the folder DIR, and a signing request.
 
-    The key never leaves DIR. With --key, it is made on the robot's PKCS#11 token, which it never
-    leaves; DIR then holds only its URI. The PIN comes from the URI's pin-source=, from
+    The key never leaves DIR. With --key, the key is made on the robot's PKCS#11 token, and never
+    leaves it; DIR then holds only the key's URI. The PIN comes from the URI's pin-source=, from
     $SROS_PKCS11_PIN or from a prompt.
 
     Send the request to the keystore, where `sros sign_request` answers it; `sros import` installs

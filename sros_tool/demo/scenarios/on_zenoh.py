@@ -1055,7 +1055,7 @@ _OPEN_ROWS = (
                 part="router",
             ),
             "TLS ends at the router, and sessions believe what it passes on",
-            "run the router as a user of its own, with its key readable to it alone",
+            "run the router as a separate user, and let only that user read its key",
         )
         for reads in (False, True)
     ),
