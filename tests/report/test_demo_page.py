@@ -156,7 +156,7 @@ def test_it_opens_from_disk_and_runs_nothing(browser: Browser, built: Path, tmp_
             page.emulate_media(color_scheme=scheme)
             found = page.evaluate("axe.run(document)")["violations"]
             assert [each["id"] for each in found] == []
-        for width in (1280, 390):
+        for width in (1280, 760, 390):
             page.set_viewport_size({"width": width, "height": 800})
             assert page.evaluate("document.documentElement.scrollWidth") <= width
         page.close()
