@@ -112,7 +112,7 @@ class ClosedProcess(NamedTuple):
     enclave: str
     """The enclave of the process."""
     pid: int
-    """Its id when it was observed."""
+    """Its id; 0 if the process that was observed does not run any more."""
     command: Sequence[str]
     """Its command with the arguments."""
     folder: str
@@ -540,8 +540,16 @@ class OpenRobot:
         return Closing(self.folder, observed, steps, said, problems, (), dry_run, changes)
 
     def _current(self) -> ObservedProcesses:
-        """Return the processes of the enclaves that the policy has."""
+        """Return the processes of the enclaves that the policy has, as they run now."""
         observed = self.observed or ObservedProcesses(self.domain)
+        now = {each.pid: each for each in ProcessTable().look(self._shell.now()).processes}
+        processes = [
+            process
+            if process.pid in now and now[process.pid].command == tuple(process.command)
+            else process._replace(pid=0)
+            for process in observed.processes
+        ]
+        observed = observed._replace(processes=processes)
         return observed.within(read_policy(self.policy)) if self.policy.exists() else observed
 
     def _do(self, step: _Step) -> tuple[str, str]:
@@ -826,9 +834,7 @@ class OpenRobot:
             if not missing:
                 break
             if time.monotonic() > end:
-                named = first_few(missing, 5)
-                reason = f"none with the present files of {named}; start it as {self.start} says"
-                return [Proof(_CLAIM, False, reason)]
+                return [Proof(_CLAIM, False, self._why_missing(missing, running))]
             time.sleep(0.2)
         before = self._observation()
         return [
@@ -836,6 +842,23 @@ class OpenRobot:
             self._proof_of_talk(before),
             self._proof_of_silence(before),
         ]
+
+    def _why_missing(self, missing: Sequence[str], running: RunningProcesses) -> str:
+        """Return which enclaves have no process, and which have one with earlier files."""
+        export = str(self.export.absolute())
+        earlier = {
+            process.enclave.name: process.pid
+            for process in running.processes
+            if process.enclave and process.enclave.keystore == export
+        }
+        absent = [name for name in missing if name not in earlier]
+        old = [f"{name} (process {earlier[name]})" for name in missing if name in earlier]
+        reasons = [
+            f"no secured process of {first_few(absent, 5)}; start it as {self.start} says"
+        ] * bool(absent)
+        if old:
+            reasons.append(f"earlier files in the processes of {first_few(old, 5)}; restart them")
+        return "; ".join(reasons)
 
     def _in_their_enclaves(self, running: RunningProcesses) -> set[str]:
         """Return the enclaves in which a process runs with the present files of the export."""

@@ -153,7 +153,8 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
         how = "by its launch, by hand" if process.launch else "by hand"
         how = "by Docker Compose, by hand" if process.container else how
         how = f"--apply restarts {process.unit}" if process.unit else how
-        echo(f"  {process.enclave}: process {process.pid}, known by its {process.known_by}: {how}")
+        pid = f"process {process.pid}, known by its {process.known_by}"
+        echo(f"  {process.enclave}: {pid if process.pid else 'not running as observed'}: {how}")
     for right in closed.denied:
         echo(f"looks wrong: seen, and denied from now on: {right}")
 
@@ -183,7 +184,8 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
         echo(f"the robot is not proved closed; {again}", err=True)
     elif applies:
         for command, processes in observed.by_hand(robot.folder.absolute()).items():
-            echo(f"stop {_together(processes)}, and start it by:")
+            stop = _together(processes)
+            echo(f"stop {stop}, and start it by:" if stop else "start again by:")
             echo(f"  {command}")
         echo(f"next: these commands, and then sros close {folder} --proof", err=True)
     elif any(process.unit for process in observed.processes):
@@ -195,12 +197,16 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
 
 
 def _together(processes: Sequence[ClosedProcess]) -> str:
-    """Return what is stopped and started by one command: a process, a launch, the containers."""
+    """Return what is stopped and started by one command: a process, a launch, the containers.
+
+    Returns "" if no process runs any more.
+    """
     first = processes[0]
     if first.launch or first.container:
         names = enumerated([process.enclave for process in processes])
         return f"{'the containers' if first.container else 'the launch'} of {names}"
-    return f"process {enumerated([str(process.pid) for process in processes])}"
+    pids = [str(process.pid) for process in processes if process.pid]
+    return f"process {enumerated(pids)}" if pids else ""
 
 
 _ANSWERS = {True: "yes", False: "no", None: "not asked"}

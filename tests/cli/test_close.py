@@ -286,7 +286,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     assert "stop process 4711, and start it by:\n  cd /opt && sros run " in ended.out
     assert ended.err.endswith("next: these commands, and then sros close robot --proof\n")
     assert (
-        "no: every process runs in its enclave: none with the present files of /listener, /talker; "
+        "no: every process runs in its enclave: no secured process of /listener, /talker; "
         in robot.close("--proof", status=1).out
     )
     robot.by_hand = {"/talker", "/listener"}

@@ -109,7 +109,7 @@ def test_a_robot_is_closed(tmp_path: Path) -> None:
 
     assert said["not yet"].status == 1
     (first,) = proofs(said["not yet"]).values()
-    assert first["reason"].startswith("none with the present files of /listener, /talker; ")
+    assert first["reason"].startswith("no secured process of /listener, /talker; ")
 
     assert said["closed"].status == 0, said["closed"]
     processes, talk, silence = proofs(said["closed"]).values()
