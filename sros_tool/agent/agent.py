@@ -301,8 +301,9 @@ class _Round:
         settings, state = self._settings, self._state
         if release.number == state.accepted and self._differs_from_accepted(release):
             self._problems.append(
-                f"There are two releases with the number {release.number}: the ledger at home was "
-                "reset, or somebody else publishes. Nothing was changed."
+                f"Another release with the number {release.number}, which is installed here, is "
+                "published: the keystore at home comes from a backup, or somebody else publishes. "
+                "Nothing was changed. At home: `sros fleet publish KEYSTORE PUB --restored`."
             )
             return Installation()
         names = tuple({*release.enclaves(), *search_enclaves(self._folder)[0]})

@@ -41,6 +41,8 @@ _PINNED_ROOT = "root.json"
 """The file in the agent's folder with the root metadata that `pin_root` trusted first."""
 _FETCHED = "release.tar.gz"
 """The file in the agent's folder with the release that was transferred last."""
+_NOT_LATER = "not-later.tar.gz"
+"""The file in the agent's folder with a release that is not later than the installed one."""
 _MOST_METADATA = 8 * 1024 * 1024
 
 
@@ -134,7 +136,8 @@ def fetch_release(
 ) -> Release | None:
     """Return the release that is published for ``robot``; None if it is the installed one.
 
-    The release is not verified against the CAs of the robot: its seal has to be, by
+    Another release with the number of the installed one is returned, too.  The release is not
+    verified against the CAs of the robot: its seal has to be, by
     `sros_tool.keystore.delivery.release.seal_problem`.  A release that was fetched before is not
     transferred again.  Not for two processes at once in the same ``state``.
 
@@ -163,10 +166,16 @@ def fetch_release(
             updater = _updater(state, transport, now)
             target = updater.get_targetinfo(release_target(robot))
             number = _number(target, source, robot)
-            if target is None or number == installed:
+            if target is None:
                 return None
             path = state / _FETCHED
-            if updater.find_cached_target(target, str(path)) is None:
+            is_here = updater.find_cached_target(target, str(path)) is not None
+            if number == installed and is_here:
+                return None
+            if not is_here and number <= installed and path.exists():
+                path = state / _NOT_LATER
+                is_here = updater.find_cached_target(target, str(path)) is not None
+            if not is_here:
                 updater.download_target(target, str(path))
     except (DownloadError, RepositoryError, OSError, ValueError) as error:
         raise _explained(error, source, now) from error
@@ -302,8 +311,8 @@ def _explained(error: Exception, source: str, now: datetime) -> FetchError:
             FetchProblem.ROLLED_BACK,
             f"the files in {source} are older than files that this robot has seen",
             why,
-            "Nothing was changed. Bring the publishing folder, or the keystore at home, up to date "
-            "again.",
+            "Nothing was changed. If home or the folder comes from a backup: `sros fleet publish "
+            "KEYSTORE PUB --restored` at home.",
         )
     if isinstance(error, exceptions.DownloadLengthMismatchError):
         return FetchError(

@@ -218,7 +218,7 @@ def _check_release(
         raise KeystoreError(
             f"release {release.number} is older than release {installed}, which this robot had",
             "The keystore at home may come from a backup. Nothing was changed.",
-            "Publish again at home with the newest ledger (`sros fleet publish` says how).",
+            "At home: `sros fleet publish KEYSTORE PUB --restored`.",
         )
 
 
@@ -267,8 +267,8 @@ def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) ->
                 f"The present list has the number {number}, the release has {has}: revoked "
                 "enclaves would be trusted again. The keystore at home may come from a backup. "
                 "Nothing was changed.",
-                f"Copy '{folder.path / path}' to public/identity_ca.crl.pem at home, revoke what "
-                "`sros crl` then shows, and publish again.",
+                "At home: `sros fleet collect KEYSTORE INBOX`, which takes the list from the "
+                "message of this robot, then publish again.",
             )
 
 
@@ -368,7 +368,8 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
     if same_authority and newer:
         raise KeystoreError(
             "it has newer files than the release",
-            f"{newer[0]}; publish again at home",
+            f"{newer[0]}; if home comes from a backup, `sros renew KEYSTORE --all` and publish "
+            "there",
         )
 
 

@@ -298,7 +298,9 @@ def _round_lines(folder: Path, done: Round) -> Iterator[str]:
     release = f"release {done.release}" if done.release else "no release"
     changes = [f"changed {counted(len(done.changed), 'enclave')}"] if done.changed else []
     changes += [f"removed {counted(len(done.removed), 'enclave')}"] if done.removed else []
-    nothing = "nothing new" if done.fetched else "nothing could be fetched"
+    nothing = "nothing could be fetched"
+    if done.fetched:
+        nothing = "nothing changed" if done.problems else "nothing new"
     yield f"{release}: {', '.join(changes) or nothing}"
     yield from _due_lines(folder, done.restart, done.unseen)
     if done.requests:

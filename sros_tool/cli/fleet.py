@@ -621,6 +621,7 @@ _WORDS = {
     "broken": "broken in the keystore",
     "never": "never confirmed",
     "later": "claims a later release",
+    "refused": "message refused",
     "unknown": "unknown files",
     "another": "another's files",
 }
@@ -638,6 +639,14 @@ def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) ->
     status = compared.status
     counts = ", ".join(f"{number} {_word(state)}" for state, number in status.counts.items())
     yield f"{counted(len(status.robots), 'robot')}: {counts}"
+    command = (
+        f"`sros fleet publish {quote(str(status.keystore))} {quote(status.folder or 'PUB')} "
+        "--restored`; docs/howto/home_is_lost.md says what else"
+    )
+    if status.older:
+        yield f"home is older than its robots: {status.older}. Publish with {command}"
+    elif any(robot.state == "later" for robot in status.robots):
+        yield f"home may be older than its robots: if the keystore was restored, {command}"
     yield from _facts(status)
     rows = list(_rows(compared, robots))
     widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
@@ -822,7 +831,8 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     if robot.fetches and (robot.published or 0) != (robot.release or 0):
         yield f"release {robot.release or 'none'}, published is {robot.published or 'none'}"
     elif robot.fetches and robot.pending:
-        yield "not published yet"
+        other = f"not the files of release {robot.release}, which is published"
+        yield other if robot.is_published else "not published yet"
     if robot.restart:
         yield f"processes of {first_few(robot.restart, _MOST_GROUPS)} may run with earlier files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):

@@ -33,6 +33,7 @@ from sros_tool.keystore.layout import (
     KEY_FILE,
     OPTIONAL_FILES,
     PERMISSIONS_CA_FILE,
+    REFUSED,
     REQUIRED_FILES,
     ZENOH_FILES,
     confirmation_file,
@@ -429,6 +430,43 @@ def keep(root: Path, received: Received) -> str:
     with staged_file(root / path, _json(value), mode=0o644) as put_in_place:
         put_in_place()
     return path
+
+
+class RefusedMessage(NamedTuple):
+    """Why the last message of a robot's agent was refused, as a clause, and since when."""
+
+    time: datetime
+    why: str
+
+
+def keep_refusals(root: Path, refused: Mapping[str, str], *, now: datetime) -> None:
+    """Write why the last messages of robots were refused, by robot.
+
+    The caller holds `locked_confirmations`.
+    """
+    before = refusals(root)
+    if {robot: refusal.why for robot, refusal in before.items()} == refused:
+        return
+    value = {
+        robot: {
+            "time": iso(before[robot].time if before.get(robot, ("", ""))[1] == why else now),
+            "why": why,
+        }
+        for robot, why in sorted(refused.items())
+    }
+    with staged_file(root / REFUSED, _json(value), mode=0o644) as put_in_place:
+        put_in_place()
+
+
+def refusals(root: Path) -> dict[str, RefusedMessage]:
+    """Return why the last messages of robots were refused; empty if the file is damaged."""
+    with suppress(SrosError, ValueError, TypeError, KeyError, AttributeError):
+        value = parse_json(read_bytes(root / REFUSED, "refused messages", most=2 * MAX_BYTES))
+        return {
+            robot: RefusedMessage(parse_iso(refusal["time"]), str(refusal["why"]))
+            for robot, refusal in value.items()
+        }
+    return {}
 
 
 def last_confirmation(root: Path, robot: str) -> Received | None:

@@ -33,6 +33,7 @@ from sros_tool.keystore.confirmation import (
     certificate_digests,
     enclave_of,
     last_confirmation,
+    refusals,
 )
 from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.fleet import enclaves_of_robot, recorded_fleet
@@ -49,14 +50,14 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     has_enclave,
 )
-from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.ledger import RESTORED, Entry
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import Keystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import digest
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.prometheus import Metric, Sample
-from sros_tool.validity import parse_iso
+from sros_tool.validity import iso, parse_iso
 from sros_tool.values import NamedKeystore, Words, shows
 
 
@@ -82,6 +83,8 @@ class State(StrEnum):
     """The file in the keystore is missing or cannot be read, so no export can be made."""
     NEVER = "never"
     """The robot has sent no confirmation."""
+    REFUSED = "refused"
+    """The last message of the robot was refused, so that what it has now is not known."""
     LATER = "later"
     """The robot says that it has installed a later release than was ever published for it."""
     UNKNOWN = "unknown"
@@ -116,6 +119,7 @@ _TO_DO = {
     State.OFFLINE: "find out why",
     State.BROKEN: "sros check",
     State.NEVER: "deliver",
+    State.REFUSED: "find out why",
     State.LATER: "find out why",
     State.UNKNOWN: "find out why",
     State.ANOTHER: "find out why",
@@ -174,7 +178,9 @@ class ConfirmedFile:
 class RobotStatus:
     """The deployment status of a robot, by its last confirmation.
 
-    ``others`` are enclaves of the robot that the fleet does not record.
+    ``others`` are enclaves of the robot that the fleet does not record.  ``is_published`` says of a
+    robot with other files than the keystore that the release which it says it has was published
+    with the present files of the keystore.
     """
 
     robot: str
@@ -184,7 +190,8 @@ class RobotStatus:
     (``enclaves`` is 0); ``restart``: they are current, but processes still run with earlier ones;
     ``offline``: its last confirmation is too old (`overdue`); ``later``: it says that it has a
     later release than was ever published for it, so that nothing it says can be relied on;
-    ``never``: it sent no confirmation; ``none``: it has no enclave in the keystore."""
+    ``refused``: its last message was refused; ``never``: it sent no confirmation; ``none``: it has
+    no enclave in the keystore."""
     enclaves: int
     """Number of the robot's enclaves in the keystore."""
     revoked: tuple[str, ...]
@@ -230,6 +237,7 @@ class RobotStatus:
     """Remarks, as clauses, such as on the robot's clock."""
     to_do: str = ""
     """What is to be done with the robot, in few words; empty if nothing is."""
+    is_published: bool = False
 
     @property
     def unrecorded(self) -> tuple[str, ...]:
@@ -282,12 +290,15 @@ class RobotStatus:
         if not self.fetches:
             return "deliver"
         if (self.published or 0) == (self.release or 0):
-            return "publish"
+            return "find out why" if self.is_published else "publish"
         is_silent = self.received is None or now - self.received > _SILENCE
         return "see whether it is on" if is_silent else "wait: it fetches"
 
 
-@shows("keystore", "complete", "stage", "counts", "unassigned", "overdue", "robots")
+@shows(
+    *("keystore", "complete", "stage", "counts", "unassigned", "overdue", "older", "robots"),
+    null_if_empty=("older",),
+)
 @dataclass(frozen=True, slots=True)
 class FleetStatus:
     """The robots of a fleet, and the stage of the keystore's CA rotation."""
@@ -303,6 +314,10 @@ class FleetStatus:
     overdue: frozenset[str] = frozenset()
     """The robots whose last confirmation is older than --max-age, sorted by name; without that
     option, the robots that fetch and were not heard of for more than a day."""
+    older: str = ""
+    """Why the keystore is older than its robots, as a clause: it was restored from a backup, or is
+    a copy, and has not published since as one that was restored. Null if nothing shows it."""
+    folder: str = ""
 
     @property
     def counts(self) -> Mapping[State, int]:
@@ -316,7 +331,7 @@ class FleetStatus:
         that is due; if not, the exit status is 1. Robots of which all enclaves were revoked do not
         count.
         """
-        return not self.overdue and all(robot.settled for robot in self.robots)
+        return not (self.overdue or self.older) and all(robot.settled for robot in self.robots)
 
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
         """Return a copy with what is to be done, in which robots not heard of for long are offline.
@@ -356,7 +371,14 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
     statuses = tuple(
         _status(robot, known, stages, unrecorded[robot.robot.name]) for robot in compared
     )
-    return FleetStatus(root, stages.at_home, statuses, unassigned)
+    return FleetStatus(
+        root,
+        stages.at_home,
+        statuses,
+        unassigned,
+        older=known.older(),
+        folder=known.folder,
+    )
 
 
 # ── comparing a confirmation with the files at home ────────────────────────────────────────
@@ -558,10 +580,12 @@ class _Known:
         self._root = keystore.root
         self.has_list = keystore.has(CRL)
         """Whether the keystore has a revocation list."""
-        self.published = {
-            name: robot.release.number for name, robot in read_published(keystore).robots.items()
-        }
+        published = read_published(keystore)
+        self.published = {name: robot.release.number for name, robot in published.robots.items()}
         """Robots with the numbers of their releases that were published last."""
+        self.folder = published.folder
+        self.refusals = refusals(keystore.root)
+        """Why the last messages of robots were refused, by robot."""
         self._fleet = fleet
         self._issued: dict[str, Entry] = {}
         self._revoked_serials: set[str] = set()
@@ -589,6 +613,27 @@ class _Known:
         """Return whether no release with so high a number was ever published for a robot."""
         last = self.published.get(robot)
         return release > (self._last_release if last is None else last)
+
+    def is_published(self, compared: _ComparedRobot) -> bool:
+        """Return whether a robot says it has the last release, which has the present files."""
+        release, robot = compared.confirmed and compared.confirmed.release, compared.robot.name
+        if not release or release != self.published.get(robot):
+            return False
+        from sros_tool.keystore.delivery.publish import is_all_published  # few robots need it
+
+        return is_all_published(self._keystore, robot, compared.enclaves)
+
+    def older(self) -> str:
+        """Return why the keystore is older than its robots, as a clause; "" if nothing shows it."""
+        entries = self._keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
+        marks = [entry for entry in entries if entry.what in (RESTORED, "release")]
+        if marks and marks[-1].what == RESTORED:
+            return "robots have what it signed and does not know"
+        if not self.folder:
+            return ""
+        from sros_tool.keystore.delivery.publish import later_in_folder  # few folders are later
+
+        return later_in_folder(self._keystore)
 
     @cached_property
     def _last_release(self) -> int:
@@ -692,9 +737,14 @@ def _status(
     )
     if is_later:
         state = max(state, State.LATER, key=_BADNESS.__getitem__)
+    refusal = known.refusals.get(compared.robot.name) if compared.enclaves else None
+    if refusal and (received is None or received.time <= refusal.time):
+        state = max(state, State.REFUSED, key=_BADNESS.__getitem__)
+        text = f"its last message was refused since {iso(refusal.time)}: {refusal.why}"
+        compared = compared._replace(notes=(*compared.notes, text))
     in_force = (
         received is not None
-        and not (restart or is_later)
+        and not (restart or state in (State.REFUSED, State.LATER))
         and set(counts.get("crl", ())) <= {State.CURRENT}
     )
     return RobotStatus(
@@ -718,6 +768,7 @@ def _status(
         confirmed.dds if confirmed else None,
         confirmed.problems if confirmed else None,
         compared.notes,
+        is_published=bool(different) and known.is_published(compared),
     )
 
 

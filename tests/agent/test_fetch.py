@@ -60,6 +60,18 @@ def test_what_is_installed_is_not_fetched_again(publisher: Home) -> None:
     assert publisher.robot().refuses(FetchProblem.UNREACHABLE)
 
 
+def test_another_release_with_the_number_of_the_installed_one(publisher: Home) -> None:
+    """A home that was restored gives a number again, and the robot must not take it for its own."""
+    robot = publisher.robot()
+    release = robot.gets()
+    (seal,) = seal_releases([("r1", release.number, release.files)], publisher.permissions_ca())
+    other = replace(release, seal=seal)
+    Thief(publisher, publisher.pub, *ROLES).put("r1", pack_release(other), release.number)
+    for _ in range(2):
+        assert robot.gets(installed=release.number) == other
+    assert read_release((robot.state / "release.tar.gz").read_bytes()) == release
+
+
 # ── older ──────────────────────────────────────────────────────────────────────────────────
 
 

@@ -95,7 +95,7 @@ class Field:
             or (each["state"], each["enclaves"]) == ("revoked", 0)
             for each in found["robots"]
         )
-        assert found["complete"] == all(good)
+        assert found["complete"] == (all(good) and not found["older"])
         assert ended.status == (0 if found["complete"] and not found["outdated_dds"] else 1)
         found["robots"] = {each["robot"]: each for each in found["robots"]}
         return found
@@ -568,6 +568,69 @@ def test_a_robot_that_says_it_has_a_release_that_was_never_published(field: Fiel
     assert ": r2. " in field.run("rotate_ca", "ks", "--next", status=2).err
     field.send("r2", release=number)
     field.run("rotate_ca", "ks", "--next")
+
+
+def test_a_robot_whose_last_message_was_refused_is_not_current(field: Field) -> None:
+    field.send("r1")
+    assert field.states()["r1"] == "current"
+    file = field.folder / "inbox/r1" / MESSAGE_FILE
+    good = file.read_bytes()
+    file.write_bytes(good[:-1000])
+    field.run("fleet", "collect", "ks", "inbox", status=1)
+    found = field.status()["robots"]["r1"]
+    assert found["state"] == "refused" and "its last message was refused since" in found["notes"][0]
+    file.unlink()
+    field.run("fleet", "collect", "ks", "inbox")
+    rows = field.run("fleet", "status", "ks", status=1).out
+    assert re.search(r"\nr1 +message refused +.* ago +find out why +its last message", rows), rows
+    field.send("r1")
+    assert field.states()["r1"] == "current"
+    assert "[keystore." not in sros("check", "ks", cwd=field.folder).out
+
+
+def test_home_is_older_than_its_robots(field: Field) -> None:
+    """By what a robot has, and by what is published next to the keystore."""
+    field.run("fleet", "publish", "ks", "pub")
+    backup = shutil.copytree(field.root, field.folder / "backup", symlinks=True)
+    field.run("renew", "ks", "--all")
+    field.deliver(*ROBOTS)
+    field.run("fleet", "publish", "ks", "pub")
+    assert field.status()["older"] is None
+    kept = field.folder / "kept"
+    for away in (False, True):
+        shutil.rmtree(field.root)
+        shutil.copytree(backup, field.root, symlinks=True)
+        if away:
+            (field.folder / "pub").rename(kept)
+            assert "home is older" not in sros("fleet", "status", "ks", cwd=field.folder).out
+            assert field.send("r1").status == 1
+        rows = field.run("fleet", "status", "ks", status=1).out
+        why = "robots have what it signed" if away else "'.*/pub' has later releases"
+        command = rf"`sros fleet publish ks {field.folder}/pub --restored`"
+        assert re.search(rf"home is older than its robots: {why}.*{command}", rows), rows
+        assert not field.status()["complete"]
+    kept.rename(field.folder / "pub")
+    field.run("fleet", "publish", "ks", "pub", "--restored")
+    assert field.status()["older"] is None
+    timestamp = field.folder / "pub/metadata/timestamp.json"
+    for damaged in (b'{"signed": {"version": 9999999999}}', b"[]", b"x", b"{" * 9999):
+        timestamp.write_bytes(damaged)
+        assert field.status()["older"] is None, "anybody can write this"
+
+
+def test_a_robot_with_other_files_than_the_release_that_it_has(field: Field) -> None:
+    """It cannot wait for what is published already."""
+    field.run("fleet", "publish", "ks", "pub")
+    number = field.status()["robots"]["r1"]["published"]
+    field.run("renew", "ks", "/r1/base")
+    field.send("r1", release=number)
+    assert "not published yet" in field.run("fleet", "status", "ks", status=1).out
+    field.run("fleet", "publish", "ks", "pub")
+    number = field.status()["robots"]["r1"]["published"]
+    field.send("r1", release=number)
+    rows = field.run("fleet", "status", "ks", status=1).out
+    assert f"not the files of release {number}, which is published" in rows
+    assert field.status()["robots"]["r1"]["to_do"] == "find out why"
 
 
 def test_the_module_on_the_robot_confirms_the_same(field: Field) -> None:

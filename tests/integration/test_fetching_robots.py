@@ -54,6 +54,7 @@ def home(tmp_path: Path) -> Iterator[Home]:
     for line in (
         "create_keystore keystore --template production",
         GENERATE,
+        "crl keystore --refresh",
         "fleet publish keystore srv/pub",
     ):
         sros(*line.split(), cwd=tmp_path).ok()

@@ -27,13 +27,14 @@ http {{
 
 
 def certify_server(folder: Path, keystore: Path, address: str = "127.0.0.1") -> Path:
-    """Make ``folder/etc`` with the certificates of the server and of its clients' CA.
+    """Make ``folder/etc`` with the server's certificate, its clients' CA, and that CA's list.
 
     Return the file with the certificate of the server.
     """
     etc = folder / "etc"
     etc.mkdir()
-    shutil.copy(keystore / "public/identity_ca.cert.pem", etc)
+    for file in ("identity_ca.cert.pem", "identity_ca.crl.pem"):
+        shutil.copy(keystore / "public" / file, etc)
     certificate = etc / "server.cert.pem"
     subprocess.run(
         [
@@ -53,7 +54,6 @@ def nginx_of_page(
     place: Path,
     *,
     listen: str = "443",
-    with_list: bool = False,
     log: str = "access_log off;",
     main: str = "",
 ) -> list[str]:
@@ -63,7 +63,6 @@ def nginx_of_page(
         folder: has ``etc``, as `certify_server` makes it, and ``srv`` in place of /srv/fleet.
         place: the folder of the process.
         listen: where it listens.
-        with_list: whether it has the revocation list.
         log: its lines on what it logs.
         main: further lines.
     """
@@ -73,8 +72,6 @@ def nginx_of_page(
         "/srv/fleet": f"{folder}/srv",
         "listen 443": f"listen {listen}",
     }
-    if with_list:
-        edits["#ssl_crl"] = "ssl_crl"
     for before, after in edits.items():
         assert before in text, before
         text = text.replace(before, after)

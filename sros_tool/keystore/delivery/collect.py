@@ -35,9 +35,11 @@ from sros_tool.keystore.confirmation import (
     LastMessage,
     Received,
     keep,
+    keep_refusals,
     last_confirmation,
     locked_confirmations,
     parse_confirmation,
+    refusals,
 )
 from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.expiry import read_credentials
@@ -225,6 +227,8 @@ def collect(
                     # If this run is killed now, the next one judges the same requests.
                     keep(root, message.received)
             taken.append(message.without_confirmation())
+        if not dry_run:
+            keep_refusals(root, _refused(root, taken), now=now)
         not_signed, notes, signed = _revoke_again(
             root, forgotten, telling, taken, now=now, keyring=keyring, dry_run=dry_run
         )
@@ -248,6 +252,19 @@ def collect(
         [*changes, *signed],
         [*_unknown_names(inbox, fleet), *notes],
     )
+
+
+def _refused(root: Path, taken: Sequence[_Taken]) -> dict[str, str]:
+    """Map robots to why their last messages were refused; a missing message changes nothing."""
+    before = refusals(root)
+    refused = {}
+    for message in taken:
+        name = message.robot.name
+        if message.outcome == "refused":
+            refused[name] = message.why
+        elif message.outcome == "missing" and name in before:
+            refused[name] = before[name].why
+    return refused
 
 
 # ── reading the inbox ──────────────────────────────────────────────────────────────────────

@@ -13,7 +13,7 @@ import os
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
@@ -107,6 +107,7 @@ _OURS = re.compile(
 _MOST_SUPERSEDED = 500_000
 """Number of such paths that are remembered: whoever can write to the folder can make many."""
 _BEFORE = "before"
+_SMALL = 64 * 1024
 
 
 class RobotRelease(NamedTuple):
@@ -226,6 +227,33 @@ def publish(
                     "Publish again once that is mended.",
                 ) from error
         return run.result(keys)
+
+
+def later_in_folder(keystore: Keystore) -> str:
+    """Return how the folder in which a keystore publishes is later than the keystore, as a clause.
+
+    "" if it is not, or this cannot be told here.  Only what keys of the keystore signed counts.
+    """
+    with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
+        known = read_published(keystore)
+        folder = Path(known.folder)
+        timestamp = read_bytes(folder / _METADATA / "timestamp.json", "timestamp", most=_SMALL)
+        version = parse_json(timestamp)["signed"]["version"]
+        if known.folder and version > known.versions.get("timestamp", 0):
+            check_tuf()
+            never = datetime.min.replace(tzinfo=UTC)
+            run = _Run(keystore, folder, never, MetadataExpiry(), dry_run=True)
+            try:
+                run.check_restored(restored=False, new_folder=False, keyring=IN_KEYSTORE)
+            except KeystoreError as error:
+                return error.what
+    return ""
+
+
+def is_all_published(keystore: Keystore, robot: str, enclaves: Sequence[str]) -> bool:
+    """Return whether the files of a robot are as they were when they were published last."""
+    published = read_published(keystore).robots.get(robot)
+    return published is not None and published.files == _state(keystore.root, enclaves)
 
 
 def _check_apart(root: Path, folder: Path) -> None:
@@ -515,6 +543,7 @@ class _Run:
         self._published_before = bool(self.roots.versions)
         self.roots.follow(folder)
         self._folder = folder
+        self.list.folder = os.path.abspath(folder)  # noqa: PTH100 - keeps a link as it is named
         self._now = now
         self._dry_run = dry_run
         self._present = read_present(folder, self.roots)

@@ -94,12 +94,13 @@ class Published:
     """What was published last: by robot, and the versions of the metadata by name.
 
     ``superseded`` maps paths in the publishing folder that nothing names any more to the time when
-    that was first seen.
+    that was first seen.  ``folder`` is the absolute path of the publishing folder, "" if unknown.
     """
 
     robots: dict[str, PublishedRobot] = field(default_factory=dict)
     versions: dict[str, int] = field(default_factory=dict)
     superseded: dict[str, datetime] = field(default_factory=dict)
+    folder: str = ""
 
     @property
     def number(self) -> int:
@@ -113,6 +114,7 @@ class Published:
         value = {
             "format": _FORMAT,
             "time": iso(now),
+            "folder": self.folder,
             "versions": dict(sorted(self.versions.items())),
         }
         return json.dumps({**value, "superseded": superseded, "robots": robots}).encode()
@@ -133,6 +135,7 @@ def read_published(keystore: Keystore) -> Published:
             {name: _robot(each) for name, each in value["robots"].items()},
             {name: check_count(version) for name, version in value["versions"].items()},
             {path: parse_iso(time) for path, time in value["superseded"].items()},
+            str(value.get("folder", "")),
         )
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise damaged_list(keystore) from error
