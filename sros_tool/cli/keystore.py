@@ -338,7 +338,10 @@ def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
     if published and (result.changed or result.completed):
         yield f"robots that fetch get the change by {published}"
     elif result.changed and not (as_json or result.dry_run):
-        yield "to take effect: export it where its processes use an export, and restart them"
+        yield (
+            "running processes keep the earlier files: restart them, after a new export if they "
+            "use one"
+        )
     if result.kept:
         yield f"unchanged: {counted(len(result.kept), 'enclave')}: {shown_names(result.kept)}"
 

@@ -147,7 +147,7 @@ def test_a_program_of_dds_alone_is_no_error(bench: Bench) -> None:
         ("rt/$(env ROBOT)/chatter", "fill in the template"),
         ("rt/~/chatter", "in place of ~"),
         ("rt/a, rt/b", "a <topic> for every name"),
-        ("rt/2nd", "no name of ROS"),
+        ("rt/2nd", "is not a name of ROS"),
         ("rt//*", "no name of ROS"),
         ("rt/café", "é"),
         ("chatter*", "write rt/chatter*"),

@@ -261,7 +261,7 @@ def test_without_the_package_it_says_what_to_install(
         raise metadata.PackageNotFoundError
 
     monkeypatch.setattr(metadata, "version", missing)
-    with pytest.raises(UnavailableError, match=r"pip install 'sros_tool\[zenoh\]'"):
+    with pytest.raises(UnavailableError, match=r"pip install 'eclipse-zenoh>="):
         backend.zenoh_backend()
     ended = sros("demo", "--backend", "zenoh", cwd=tmp_path)
     assert ended.status == 2
