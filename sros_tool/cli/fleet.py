@@ -639,14 +639,6 @@ def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) ->
     status = compared.status
     counts = ", ".join(f"{number} {_word(state)}" for state, number in status.counts.items())
     yield f"{counted(len(status.robots), 'robot')}: {counts}"
-    command = (
-        f"`sros fleet publish {quote(str(status.keystore))} {quote(status.folder or 'PUB')} "
-        "--restored`; docs/howto/home_is_lost.md says what else"
-    )
-    if status.older:
-        yield f"home is older than its robots: {status.older}. Publish with {command}"
-    elif any(robot.state == "later" for robot in status.robots):
-        yield f"home may be older than its robots: if the keystore was restored, {command}"
     yield from _facts(status)
     rows = list(_rows(compared, robots))
     widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
@@ -663,6 +655,14 @@ def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) ->
 
 def _facts(status: FleetStatus) -> Iterator[str]:
     """Yield what is to be said of the fleet as a whole."""
+    command = (
+        f"`sros fleet publish {quote(str(status.keystore))} {quote(status.folder or 'PUB')} "
+        "--restored`; docs/howto/home_is_lost.md says what else"
+    )
+    if status.older:
+        yield f"home is older than its robots: {status.older}. Publish with {command}"
+    elif any(robot.state == "later" for robot in status.robots):
+        yield f"home may be older than its robots: if the keystore was restored, {command}"
     if status.stage != "complete":
         behind = sum(robot.stage != status.stage for robot in status.robots if robot.enclaves)
         yield f"CA rotation: {status.stage}; {counted(behind, 'robot')} not there yet"
