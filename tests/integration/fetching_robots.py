@@ -193,10 +193,13 @@ class Home:
 
     def states(self) -> dict[str, str]:
         """Take in what robots sent; return the state of each, after comparing it with the truth."""
-        trusted = self.folder / "keystore/public/identity_ca.cert.pem"
-        clients = self.folder / "etc/identity_ca.cert.pem"
-        if trusted.read_bytes() != clients.read_bytes():
-            shutil.copy(trusted, clients)
+        copies = {
+            self.folder / "keystore/public" / name: self.folder / "etc" / name
+            for name in ("identity_ca.cert.pem", "identity_ca.crl.pem")
+        }
+        if any(file.read_bytes() != copy.read_bytes() for file, copy in copies.items()):
+            for file, copy in copies.items():
+                shutil.copy(file, copy)
             self.nginx("-s", "reload")
         self.sros("fleet", "collect", "keystore", "srv/inbox", "--publish", "srv/pub")
         said: dict[str, Any] = json.loads(self.sros("fleet", "status", "keystore", "--json").out)
