@@ -120,13 +120,19 @@ def _is_ambiguous(word: str, words: Collection[str]) -> bool:
     )
 
 
+_UNIQUE = re.compile(",OU=[0-9a-f]{16}(?=</subject_name>)")
+"""What makes the subject of a certificate unique; it says nothing about rights."""
+
+
 def _digest_of(
     keystore: Keystore, enclaves: Sequence[str], unit: DrawnUnit, names: UnitNames
 ) -> str:
     """Return a digest of the permissions of a unit without its name; "" if they are unusual."""
     texts = {path: _signed_text(keystore, path) for path in enclaves}
     hidden = [
-        hashlib.sha256(f"{_hidden(path, unit, names)}\n{_hidden(text, unit, names)}".encode())
+        hashlib.sha256(
+            f"{_hidden(path, unit, names)}\n{_hidden(_UNIQUE.sub('', text), unit, names)}".encode()
+        )
         for path, text in texts.items()
         if text and not any(mark in text for mark in _MARKS)
     ]
