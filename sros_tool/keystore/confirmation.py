@@ -50,6 +50,10 @@ from sros_tool.xml import read_bytes
 _FORMAT = 1
 MAX_BYTES = 4 * 1024 * 1024
 """Largest size of a confirmation in bytes; enough for a robot with 4,000 enclaves."""
+_LONGEST_REASON = 400
+_MOST_REFUSALS = 64 * 1024 * 1024
+"""Largest size of the file of refused messages, in bytes: of 100,000 robots with the longest
+reasons."""
 MESSAGE_FILE = "confirmation.p7s"
 """Name of a robot's signed message, in the folder of the robot in an inbox."""
 CONFIRMED_FILES = (
@@ -439,34 +443,48 @@ class RefusedMessage(NamedTuple):
     why: str
 
 
-def keep_refusals(root: Path, refused: Mapping[str, str], *, now: datetime) -> None:
-    """Write why the last messages of robots were refused, by robot.
+def keep_refusals(
+    root: Path, before: Mapping[str, RefusedMessage], refused: Mapping[str, str], *, now: datetime
+) -> None:
+    """Write why the last messages of robots were refused, by robot, if it is not as ``before``.
 
     The caller holds `locked_confirmations`.
     """
-    before = refusals(root)
-    if {robot: refusal.why for robot, refusal in before.items()} == refused:
+    reasons = {robot: why[:_LONGEST_REASON] for robot, why in refused.items()}
+    if {robot: refusal.why for robot, refusal in before.items()} == reasons:
         return
     value = {
         robot: {
             "time": iso(before[robot].time if before.get(robot, ("", ""))[1] == why else now),
             "why": why,
         }
-        for robot, why in sorted(refused.items())
+        for robot, why in sorted(reasons.items())
     }
     with staged_file(root / REFUSED, _json(value), mode=0o644) as put_in_place:
         put_in_place()
 
 
 def refusals(root: Path) -> dict[str, RefusedMessage]:
-    """Return why the last messages of robots were refused; empty if the file is damaged."""
-    with suppress(SrosError, ValueError, TypeError, KeyError, AttributeError):
-        value = parse_json(read_bytes(root / REFUSED, "refused messages", most=2 * MAX_BYTES))
+    """Return why the last messages of robots were refused, by robot.
+
+    Raises:
+        DocumentError: the file cannot be read, or is damaged: it cannot be told who is current.
+    """
+    path = root / REFUSED
+    if not os.path.lexists(path):
+        return {}
+    data = read_bytes(path, "refused messages", most=_MOST_REFUSALS)
+    try:
         return {
             robot: RefusedMessage(parse_iso(refusal["time"]), str(refusal["why"]))
-            for robot, refusal in value.items()
+            for robot, refusal in parse_json(data).items()
         }
-    return {}
+    except (SrosError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DocumentError(
+            f"'{path}' is damaged",
+            "It has the robots whose last message was refused: what these have is not known.",
+            "Remove it, and run `sros fleet collect`, which writes it again.",
+        ) from error
 
 
 def last_confirmation(root: Path, robot: str) -> Received | None:

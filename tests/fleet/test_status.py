@@ -22,7 +22,7 @@ from sros_tool.keystore.confirmation import (
     Seen,
     parse_confirmation,
 )
-from sros_tool.keystore.layout import ENCLAVES
+from sros_tool.keystore.layout import ENCLAVES, REFUSED
 from sros_tool.keystore.reader import Keystore, read_certificate
 from sros_tool.pki.certificates import digest
 from sros_tool.validity import iso, parse_iso
@@ -571,6 +571,8 @@ def test_a_robot_that_says_it_has_a_release_that_was_never_published(field: Fiel
 
 
 def test_a_robot_whose_last_message_was_refused_is_not_current(field: Field) -> None:
+    field.run("rotate_ca", "ks", "--next")
+    field.deliver(*ROBOTS)
     field.send("r1")
     assert field.states()["r1"] == "current"
     file = field.folder / "inbox/r1" / MESSAGE_FILE
@@ -583,8 +585,15 @@ def test_a_robot_whose_last_message_was_refused_is_not_current(field: Field) -> 
     field.run("fleet", "collect", "ks", "inbox")
     rows = field.run("fleet", "status", "ks", status=1).out
     assert re.search(r"\nr1 +message refused +.* ago +find out why +its last message", rows), rows
+    assert ": r1. " in field.run("rotate_ca", "ks", "--next", status=2).err
+    kept = field.root / REFUSED
+    kept.write_bytes(kept.read_bytes()[:-3])
+    for verb in (("fleet", "status", "ks"), ("fleet", "collect", "ks", "inbox")):
+        assert f"'ks/{REFUSED}' is damaged. " in field.run(*verb, status=2).err
+    kept.unlink()
     field.send("r1")
     assert field.states()["r1"] == "current"
+    field.run("rotate_ca", "ks", "--next")
     assert "[keystore." not in sros("check", "ks", cwd=field.folder).out
 
 

@@ -34,6 +34,7 @@ from sros_tool.keystore.confirmation import (
     Confirmation,
     LastMessage,
     Received,
+    RefusedMessage,
     keep,
     keep_refusals,
     last_confirmation,
@@ -200,6 +201,7 @@ def collect(
     """
     recorded_fleet(Keystore(root))
     with nullcontext() if dry_run else locked_confirmations(root):
+        refused_before = refusals(root)
         keystore = Keystore(root)
         fleet = checked_fleet(keystore)
         assert fleet
@@ -228,7 +230,7 @@ def collect(
                     keep(root, message.received)
             taken.append(message.without_confirmation())
         if not dry_run:
-            keep_refusals(root, _refused(root, taken), now=now)
+            keep_refusals(root, refused_before, _refused(refused_before, taken), now=now)
         not_signed, notes, signed = _revoke_again(
             root, forgotten, telling, taken, now=now, keyring=keyring, dry_run=dry_run
         )
@@ -254,9 +256,8 @@ def collect(
     )
 
 
-def _refused(root: Path, taken: Sequence[_Taken]) -> dict[str, str]:
+def _refused(before: Mapping[str, RefusedMessage], taken: Sequence[_Taken]) -> dict[str, str]:
     """Map robots to why their last messages were refused; a missing message changes nothing."""
-    before = refusals(root)
     refused = {}
     for message in taken:
         name = message.robot.name

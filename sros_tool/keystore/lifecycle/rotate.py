@@ -189,8 +189,9 @@ def robots_cut_off(
 
     These are the robots with enclaves that have not confirmed the stage before: first that they
     trust the new CA, then that they have the files it issued; those where processes still run with
-    earlier files; and those that fetch and are offline, or say that they have what was never
-    published.  Without a fleet, or by the first stage, no robot is cut off.
+    earlier files; those that fetch and are offline, or say that they have what was never
+    published; and those whose last message was refused.  Without a fleet, or by the first stage, no
+    robot is cut off.
 
     Raises:
         KeystoreError: the fleet file is not the file that sros wrote last.
@@ -216,7 +217,7 @@ def robots_cut_off(
         if robot.received is None
         or robot.restart
         or robot.robot in status.overdue
-        or robot.state is State.LATER
+        or robot.state in (State.LATER, State.REFUSED)
         or any(file.kind in needed and not file.surplus for file in robot.pending)
     )
 
