@@ -112,7 +112,7 @@ class ClosedProcess(NamedTuple):
     enclave: str
     """The enclave of the process."""
     pid: int
-    """Its id; 0 if the process that was observed does not run any more."""
+    """Its id; 0 if it is restarted by hand, and no process with its command runs any more."""
     command: Sequence[str]
     """Its command with the arguments."""
     folder: str
@@ -129,6 +129,18 @@ class ClosedProcess(NamedTuple):
     """The id of the Docker container in which it runs; empty outside of containers."""
     rmw: str = ""
     """rmw_zenoh_cpp for a process on Zenoh; empty on DDS."""
+
+    def as_it_runs(self, running: RunningProcesses) -> ClosedProcess:
+        """Return a copy with the id that a process with this command has now.
+
+        A process that may run, but could not be examined, keeps its id, and so does a process
+        that its unit restarts.
+        """
+        pids = [process.pid for process in running.processes if process.command == (*self.command,)]
+        unseen = {process.pid for process in running.unseen}
+        if self.unit or running.hidden or self.pid in unseen or self.pid in pids:
+            return self
+        return self._replace(pid=pids[0] if pids else 0)
 
     @property
     def open_command(self) -> str:
@@ -542,13 +554,8 @@ class OpenRobot:
     def _current(self) -> ObservedProcesses:
         """Return the processes of the enclaves that the policy has, as they run now."""
         observed = self.observed or ObservedProcesses(self.domain)
-        now = {each.pid: each for each in ProcessTable().look(self._shell.now()).processes}
-        processes = [
-            process
-            if process.pid in now and now[process.pid].command == tuple(process.command)
-            else process._replace(pid=0)
-            for process in observed.processes
-        ]
+        running = ProcessTable().look(self._shell.now())
+        processes = [process.as_it_runs(running) for process in observed.processes]
         observed = observed._replace(processes=processes)
         return observed.within(read_policy(self.policy)) if self.policy.exists() else observed
 

@@ -539,6 +539,21 @@ def test_the_enclave_of_a_process(
     assert set(observed.elsewhere) == {each.enclaves[0] for each in nodes} - known.keys()
 
 
+def test_a_process_to_stop_is_named_by_the_id_that_it_has_now() -> None:
+    talker = closing.ClosedProcess("/talker", 7, ("talk", "a"), "/opt", 0, "", "program")
+    again, other = process(8, "talk", "a"), process(7, "talk", "b")
+    unseen = UnseenProcess(7, (), "another user's", speaks=False)
+    for running, pid in (
+        (RunningProcesses((process(7, "talk", "a"), again)), 7),
+        (RunningProcesses((other, again)), 8),
+        (RunningProcesses((other,)), 0),
+        (RunningProcesses((other,), hidden="those of other users"), 7),
+        (RunningProcesses(unseen=(unseen,)), 7),
+    ):
+        assert talker.as_it_runs(running).pid == pid
+    assert talker._replace(unit="talker.service").as_it_runs(RunningProcesses()).pid == 7
+
+
 def test_a_process_of_cyclone_dds_is_known_by_what_it_says() -> None:
     """Not by the two bytes in which Fast DDS has the id."""
     nodes = [node("a", "01107f01a530"), node("b", "0110")]
