@@ -64,6 +64,7 @@ from sros_tool.runtime.environment import (
 from sros_tool.runtime.processes import (
     SERVICE_NAME,
     Process,
+    ProcessEnclave,
     ProcessTable,
     RunningProcesses,
     launch_verb,
@@ -852,12 +853,7 @@ class OpenRobot:
 
     def _why_missing(self, missing: Sequence[str], running: RunningProcesses) -> str:
         """Return which enclaves have no process, and which have one with earlier files."""
-        export = str(self.export.absolute())
-        earlier = {
-            process.enclave.name: process.pid
-            for process in running.processes
-            if process.enclave and process.enclave.keystore == export
-        }
+        earlier = {enclave.name: process.pid for process, enclave in self._secured(running)}
         absent = [name for name in missing if name not in earlier]
         old = [f"{name} (process {earlier[name]})" for name in missing if name in earlier]
         reasons = [
@@ -869,14 +865,19 @@ class OpenRobot:
 
     def _in_their_enclaves(self, running: RunningProcesses) -> set[str]:
         """Return the enclaves in which a process runs with the present files of the export."""
-        export = str(self.export.absolute())
         return {
-            process.enclave.name
-            for process in running.processes
-            if process.asks_for_security and self._is_neighbour(process)
-            if process.enclave and process.enclave.keystore == export
-            if process.enclave.is_there and not [*newer_files(process, process.enclave)]
+            enclave.name
+            for process, enclave in self._secured(running)
+            if enclave.is_there and not [*newer_files(process, enclave)]
         }
+
+    def _secured(self, running: RunningProcesses) -> Iterator[tuple[Process, ProcessEnclave]]:
+        """Yield the processes of the robot's domain that run in enclaves of the export."""
+        export = str(self.export.absolute())
+        for process in filter(self._is_neighbour, running.processes):
+            enclave = process.enclave
+            if process.asks_for_security and enclave and enclave.keystore == export:
+                yield process, enclave
 
     def _proof_of_processes(self, number: int, running: RunningProcesses) -> Proof:
         """Look for processes that are open, or that something is wrong with."""

@@ -71,6 +71,8 @@ class Robot:
     more: tuple[Process, ...] = ()
     unseen: tuple[UnseenProcess, ...] = ()
     by_hand: set[str] = field(default_factory=set)
+    outdated: set[str] = field(default_factory=set)
+    """The enclaves whose processes started before their files changed."""
     launch: tuple[str, ...] = ()
     container: str = ""
     named: bool = False
@@ -95,7 +97,7 @@ class Robot:
         process = replace(
             process,
             environment=secured_environment(export, enclave, 0),
-            started=now + timedelta(seconds=1),
+            started=now + timedelta(days=-1 if enclave in self.outdated else 1),
         )
         root = os.open("/", os.O_PATH | os.O_DIRECTORY)
         try:
@@ -307,6 +309,11 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
         in robot.close("--proof", status=1).out
     )
     robot.more = ()
+    robot.outdated = {"/talker"}
+    named = f"earlier files in the processes of /talker (process {PID['/talker']}); restart them\n"
+    out = robot.close("--proof", status=1).out
+    assert f"no: every process runs in its enclave: {named}" in out
+    robot.outdated = set()
     robot.remaining = (TALKER,)
     assert (
         "no: everything that talked still talks: gone: /listener "
