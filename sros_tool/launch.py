@@ -46,9 +46,6 @@ def _prepare_labelled(self: Any, context: LaunchContext, action: Action) -> None
         self._Executable__final_name = f"{own}-{number}"
 
 
-Executable.prepare = _prepare_labelled
-
-
 @expose_action("secured_nodes")
 class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where it is missing
     """Launch action that starts every later process with ``sros run --policy``, in its enclave.
@@ -114,6 +111,7 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
         own = [*_RUN, root, "--policy", file, "--"]
         prefix = context.launch_configurations.get(_PREFIX, "")
         context.launch_configurations[_PREFIX] = f"{shlex.join(own)} {prefix}".rstrip()
+        Executable.prepare = _prepare_labelled  # not where launch only looks for this action
 
 
 def _of_launch(keystore: Path, policy: Path, enclave: str) -> EnclaveEnvironment | None:
