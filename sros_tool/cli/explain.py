@@ -563,7 +563,7 @@ def _change_lines(answer: Answer) -> Iterator[str]:
         if is_expression(right.name):
             yield f"    this also removes the denial of all other names in {right.name}"
     if change.document:
-        if answer.is_for_a_fleet and policy:
+        if answer.enclave.has_placeholders and policy:
             place = _shown(policy.source)
             yield f"    add at {place}, with placeholders for the robot's name and namespace"
         else:

@@ -29,7 +29,6 @@ from sros_tool.keystore.participant import JoinContext, LoadedEnclave, VendorPar
 from sros_tool.keystore.reader import Keystore, Problem
 from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Profile, Qualifier, Source
-from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.policy.rights import PlacedRight, Right, placed_rights
 from sros_tool.values import Words, shows
 
@@ -310,19 +309,13 @@ class Answer(NamedTuple):
         )
 
     @property
-    def is_for_a_fleet(self) -> bool:
-        """Whether the policy has placeholders for robots, so that no addition can be merged."""
-        file = self.enclave.policy_file
-        return file is not None and has_placeholder(file.read_text("utf-8", "replace"))
-
-    @property
     def commands(self) -> list[str]:
         """The commands that apply the change of the policy."""
         if not self.change and not self.sign:
             return []
         file = str(self.enclave.policy_file or "POLICY")
         root = str(self.enclave.root or "KEYSTORE")
-        if self.is_for_a_fleet:
+        if self.enclave.has_placeholders:
             recorded = self.enclave.root and (self.enclave.root / FLEET).exists()
             robots = f"{root}/{FLEET}" if recorded else "FLEET_FILE"
             return [f"sros generate_artifacts -k {root} -p {file} --fleet {robots}"]

@@ -130,12 +130,15 @@ def open_to_ask(
         KeystoreError: the keystore does not have the enclave.
         PolicyError: the policy does not have the enclave.
     """
-    policy = own = None
+    policy = own = stated = None
     keystore = Keystore(root) if root else None
     if policy_file:
-        from sros_tool.fleet.expansion import read_policy_for
+        from sros_tool.fleet.expansion import FleetPolicy
+        from sros_tool.policy.document import read_policy
 
-        policy = read_policy_for(policy_file, fleet_of(asking.fleet_file, keystore))
+        fleet = fleet_of(asking.fleet_file, keystore)
+        stated = read_policy(policy_file, placeholders=fleet is not None)
+        policy = FleetPolicy(stated, fleet).policy() if fleet else stated
         own = policy.enclave(name)
         if own is None and not is_enclave(Path(name)):
             raise _not_in_policy(policy, name, policy_file)
@@ -147,7 +150,12 @@ def open_to_ask(
         own = policy.enclave(enclave.name)
         if own is None and not is_enclave(Path(enclave.name)):
             raise _not_in_policy(policy, enclave.name, policy_file)
-    enclave = enclave._replace(keystore=keystore, policy=own, policy_file=policy_file)
+    enclave = enclave._replace(
+        keystore=keystore,
+        policy=own,
+        policy_file=policy_file,
+        has_placeholders=policy != stated,
+    )
     return AskedEnclave(enclave, policy)
 
 

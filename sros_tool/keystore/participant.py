@@ -85,9 +85,9 @@ class LoadedEnclave(NamedTuple):
     the robot that generated it.
 
     ``keystore`` is the keystore of the enclave, and ``policy`` its part of ``policy_file``, if
-    known.  ``portable`` are its permissions if all vendors read them alike, because sros wrote
-    them.  An enclave that is only planned has no XML: ``portable`` and ``plain_governance`` replace
-    it.
+    known; with ``has_placeholders``, the file is for the robots of a fleet.  ``portable`` are its
+    permissions if all vendors read them alike, because sros wrote them.  An enclave that is only
+    planned has no XML: ``portable`` and ``plain_governance`` replace it.
     """
 
     name: str
@@ -103,6 +103,7 @@ class LoadedEnclave(NamedTuple):
     keystore: Keystore | None = None
     policy: Enclave | None = None
     policy_file: Path | None = None
+    has_placeholders: bool = False
     portable: Permissions | None = None
     plain_governance: Governance | None = None
 

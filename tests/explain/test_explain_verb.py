@@ -117,6 +117,10 @@ def test_the_policy_of_a_fleet_is_changed_where_it_is_and_issued_for_all(tmp_pat
     for command in answer(*asked[:-2], "--policy", policy)["commands"]:
         sros(*command.split()[1:]).ok()
     assert explain(*asked).status == 0
+    single = tmp_path / "single.xml"
+    single.write_text(policy_text({"/z": publish("/a"), "/r1/base": publish("/r1/odom", "/b")}))
+    found = explain(*asked[:3], "/r1/other", "--policy", single)
+    assert f"sros merge_policy {single} allow.xml --in-place" in found.out, "it has no placeholders"
 
 
 def test_everything_that_an_enclave_may_do_is_shown_by_inspect(keystore: Path) -> None:
