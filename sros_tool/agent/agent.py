@@ -54,7 +54,7 @@ from sros_tool.keystore.confirmation import (
     render_confirmation,
 )
 from sros_tool.keystore.delivery.archive import listed_digests
-from sros_tool.keystore.delivery.release import Release
+from sros_tool.keystore.delivery.release import Release, sealed_robot
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
@@ -282,19 +282,13 @@ class _Round:
             return False
         try:
             text = smime.parse(read_seal(self._folder)).text
-        except SrosError:
+            with Folder(self._folder) as opened:
+                for line in text.splitlines():
+                    digest, mark, path = line.decode(errors="replace").partition("  ")
+                    if mark and hashlib.sha256(opened.read_inside(path)).hexdigest() != digest:
+                        return False
+        except (SrosError, OSError):
             return False
-        with Folder(self._folder) as opened:
-            for line in text.splitlines():
-                digest, mark, path = line.decode(errors="replace").partition("  ")
-                if not mark:
-                    continue
-                try:
-                    data = opened.read_inside(path)
-                except (SrosError, OSError):
-                    return False
-                if hashlib.sha256(data).hexdigest() != digest:
-                    return False
         return True
 
     def _install(self, release: Release, certain: datetime) -> Installation:
@@ -362,10 +356,14 @@ class _Round:
         return max(certain, made) if made else certain
 
     def _differs_from_accepted(self, release: Release) -> bool:
-        """Return whether the accepted release with the same number has other files."""
+        """Return whether the accepted release with the same number has other files.
+
+        The seal is an earlier one if there was no room for that of the accepted release.
+        """
+        seal = read_seal(self._folder)
         with suppress(SrosError):
-            text = smime.parse(read_seal(self._folder)).text
-            return not text.endswith(b"\n" + listed_digests(release.files))
+            if sealed_robot(seal).number == release.number:
+                return not smime.parse(seal).text.endswith(b"\n" + listed_digests(release.files))
         return False
 
     def _record_due(self, names: Sequence[str]) -> None:

@@ -224,8 +224,8 @@ class RobotStatus:
     confirmation; null if it does not say it."""
     crl_in_force: bool | None
     """Whether the robot has the present revocation list, and no process that runs with earlier
-    files, as far as it says it, and is not ``offline``; null if the keystore has no list, or the
-    robot has no enclave."""
+    files, as far as it says it, and is not ``offline``; false if the keystore is older than its
+    robots; null if the keystore has no list, or the robot has no enclave."""
     expiry: Mapping[Annotated[str, Words(_EXPIRING)], datetime]
     """The first expiry of the robot's files, by kind, in UTC, as the ledger has it for the files
     that the robot confirmed."""
@@ -273,8 +273,11 @@ class RobotStatus:
     def offline(self) -> RobotStatus:
         """Return the status after nothing was heard of the robot for too long."""
         state = max(self.state, State.OFFLINE, key=_BADNESS.__getitem__)
-        in_force = None if self.crl_in_force is None else False
-        return replace(self, state=state, crl_in_force=in_force)
+        return replace(self.without_list(), state=state)
+
+    def without_list(self) -> RobotStatus:
+        """Return the status if it is not known whether the last revocation list is in force."""
+        return self if self.crl_in_force is None else replace(self, crl_in_force=False)
 
     def with_to_do(self, now: datetime) -> RobotStatus:
         """Return the status with what is to be done at ``now``."""
@@ -371,14 +374,9 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
     statuses = tuple(
         _status(robot, known, stages, unrecorded[robot.robot.name]) for robot in compared
     )
-    return FleetStatus(
-        root,
-        stages.at_home,
-        statuses,
-        unassigned,
-        older=known.older(),
-        folder=known.folder,
-    )
+    if older := known.older():  # there may be a later list, which it does not have
+        statuses = tuple(status.without_list() for status in statuses)
+    return FleetStatus(root, stages.at_home, statuses, unassigned, older=older, folder=known.folder)
 
 
 # ── comparing a confirmation with the files at home ────────────────────────────────────────

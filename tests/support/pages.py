@@ -139,6 +139,8 @@ def blocks(text: str) -> Iterator[Block]:
 def alike(line: str) -> str:
     """Return a line without what differs between two runs."""
     line = re.sub(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d:\d\dZ?)?", "<moment>", line)
+    line = re.sub(r"\b(\d+ (h|min|s) )+ago\b", "<age>", line)
+    line = re.sub(r"(<age>|\bconfirmed)  +", r"\1  ", line)  # the width of the column of ages
     line = re.sub(r"\b[0-9a-f]{7,64}\b(\.\.\.)?", "<digest>", line)
     line = re.sub(r"\b\d+(\.\d+)? (s|ms|bytes|B|kB|MB)\b", r"<number> \2", line)
     return line.rstrip()
