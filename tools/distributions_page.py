@@ -38,9 +38,9 @@ def distributions_page() -> str:
         written[0].rstrip(),
         MADE,
         shipped,
-        "The versions are the latest as of November 2026; sros assumes that patches of a release decide "
-        "alike. For a release that is *not measured*, sros uses the rules of another release, and "
-        "does not see how the two differ.",
+        "The versions are the latest as of November 2026; sros assumes that patches of a release "
+        "decide alike. For a release that is *not measured*, sros uses the rules of another "
+        "release, and does not see how the two differ.",
         "The rules in which two measured releases differ:",
         table_text("rule", "where it holds", rows=_rules()),
         "What an update changes is reported as:",

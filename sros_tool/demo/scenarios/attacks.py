@@ -1064,7 +1064,7 @@ def _misspelt(name: str, keystore: KeystoreChoice, variable: str, value: str, wh
     return known_open(
         _misconfigured(name, identity, RowStatus.HEARD, mechanism),
         "rcl ignores every other spelling, and the node does not warn",
-        "start nodes with `sros run`, which sets the variables; `sros doctor` finds misspelt ones",
+        "start nodes with `sros run`, which sets the variables; `sros doctor` finds wrong ones",
     )
 
 

@@ -399,7 +399,7 @@ _CONNECTION_ROWS = (
         _outsider(
             "a certificate of another CA",
             zenoh_forger.identity_of_another_ca,
-            "it says the talker's name, but the identity CA has not signed it",
+            "the certificate has the talker's name, but the identity CA has not signed it",
             "UnknownIssuer",
         ),
         _let_in(
@@ -634,7 +634,7 @@ def _rogue(
         RowStatus.HEARD if succeeds else RowStatus.NOT_HEARD,
         "sessions believe this router"
         if succeeds
-        else "a session believes only the router's name, and nobody else what passes the router",
+        else "a session accepts data from the router only if the certificate has the router's name",
         hears(rogue.name, "talker") if reads else hears("listener", rogue.name),
         (rogue, *_topic_pair(keystore)[1:]),
         () if part == "router" else _CHATTER,
@@ -776,8 +776,8 @@ _WILDCARD_ROWS = (
                 attack,
                 party,
                 denied,
-                "a rule applies only to what it includes as a whole, and sros writes no denials"
-                " inside wildcards",
+                "a rule applies to a wildcard only if it covers all of it, and sros writes no"
+                " denials inside wildcards",
                 OWN,
                 _PEERS,
             ),
@@ -820,7 +820,7 @@ class _FalseToken(NamedTuple):
 _TOKENS = (
     _FalseToken(
         "spoofed graph token",
-        "a token passes only with the enclave of its sender's certificate",
+        "a token passes only if it names the enclave of its sender's certificate",
         "guest",
         "/spoofed",
         "talker",
@@ -952,7 +952,7 @@ def _earlier(name: str, keystore: KeystoreChoice, expected: RowStatus, removed: 
         expected,
         "the file decides what its own process may do, and nobody else does"
         if removed
-        else "a session file limits only others: what this enclave may do, they decide",
+        else "a session file limits only the others, which decide what this enclave may do",
         hears("listener", guest.name),
         (*_topic_pair(keystore), guest),
         _CHATTER,
@@ -998,7 +998,7 @@ _EARLIER_ROWS = (
             "revoked identity",
             zenoh_forger.revoked_talker,
             RowStatus.NOT_HEARD,
-            "it still gets a connection, but its name is in no rule any more",
+            "the enclave still gets a connection, but no rule has its name any more",
         ),
         _thief(
             "revoked identity, the rules not written again",
