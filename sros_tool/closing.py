@@ -30,6 +30,7 @@ from typing import Annotated, Any, NamedTuple
 
 from sros_tool.checks.kind import NOTE
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, newer_files, process_findings
+from sros_tool.checks.requirements import VIOLATED
 from sros_tool.enclave_environment import loadable_environment
 from sros_tool.errors import DocumentError, SrosError, UnavailableError, UsageError
 from sros_tool.explain.audit import DeniedRight, audit, audited_enclaves
@@ -196,6 +197,21 @@ class ObservedProcesses(NamedTuple):
         """The units of systemd that start a process alone, by its enclave."""
         return {process.enclave: process.unit for process in self.processes if process.unit}
 
+    def as_they_run(self, running: RunningProcesses) -> ObservedProcesses:
+        """Return a copy with the ids and the unknown processes of now."""
+        pids = {process.pid for process in self.processes}
+        commands = {tuple(process.command) for process in self.processes}
+        unknown = [
+            _described(process)
+            for process in running.processes
+            if _is_in_domain(process, self.domain)
+            and not (process.is_daemon or process.asks_for_security)
+            and process.pid not in pids
+            and process.command not in commands
+        ]
+        processes = [process.as_it_runs(running) for process in self.processes]
+        return self._replace(processes=processes, unknown=unknown)
+
     def within(self, policy: Policy) -> ObservedProcesses:
         """Return a copy without enclaves that the policy does not have any more."""
         names = {_ROUTER, *(enclave.path for enclave in policy.enclaves)}
@@ -257,14 +273,33 @@ class Closing(NamedTuple):
     observed: ObservedProcesses
     steps: Sequence[CloseStep]
     """The steps in their order."""
+    secured: Mapping[str, bool]
+    """The enclaves in which a process of the robot runs now, and whether with the present files;
+    otherwise it has to be restarted."""
     denied: Sequence[str]
     """What the observed nodes do and the keystore denies them, as sentences."""
     problems: Sequence[str]
-    """Reasons why the robot is not closed yet, with what to do."""
+    """Reasons why the robot is not closed yet, or not open again, with what to do."""
     proofs: Sequence[Proof]
     """The proof that the robot is closed; empty before."""
     dry_run: DryRun
     changes: FileChanges
+
+    @property
+    def left(self) -> Sequence[str]:
+        """The enclaves of which no process runs with the present files, and one should."""
+        names = {process.enclave for process in self.observed.processes} | self.secured.keys()
+        return sorted(name for name in names if not self.secured.get(name))
+
+    @property
+    def left_by_hand(self) -> Mapping[str, Sequence[ClosedProcess]]:
+        """The commands by hand of these enclaves, with their processes."""
+        by_hand = self.observed.by_hand(self.folder.absolute())
+        return {
+            command: processes
+            for command, processes in by_hand.items()
+            if any(process.enclave in self.left for process in processes)
+        }
 
 
 # ── processes ───────────────────────────────────────────────────────────────────────────────
@@ -284,7 +319,7 @@ def assign(
     left = {
         process.pid: process
         for process in running
-        if process.domain == str(domain) and not process.network and not process.is_daemon
+        if _is_in_domain(process, domain) and not process.is_daemon
     }
     origins = {pid: process_origin(pid) for pid in left}
     units = Counter(origin.unit for origin in origins.values())
@@ -321,7 +356,7 @@ def assign(
     return ObservedProcesses(
         domain,
         sorted(assigned),
-        [f"{process.label}: {shlex.join(process.command)}" for process in left.values()],
+        [*map(_described, left.values())],
         sorted(
             enclave
             for enclave, of_enclave in by_enclave.items()
@@ -329,6 +364,14 @@ def assign(
             > sum(process.enclave == enclave for process in assigned)
         ),
     )
+
+
+def _is_in_domain(process: Process, domain: int) -> bool:
+    return process.domain == str(domain) and not process.network
+
+
+def _described(process: Process) -> str:
+    return f"{process.label}: {shlex.join(process.command)}"
 
 
 def _process_of(node: ObservedNode) -> str:
@@ -543,22 +586,26 @@ class OpenRobot:
                 state, problem = self._do(step)
                 problems += [problem] if problem else []
             steps.append(CloseStep(step.command, state))
-        observed = self._current()
+        closing = self._closing()._replace(steps=steps, dry_run=dry_run)
         if dry_run:
-            return Closing(self.folder, observed, steps, (), (), (), dry_run, ())
-        changes = self._write_starts(observed)
-        denied = self._denied()
-        problems += self._problems(observed, partial=partial)
-        said = [str(right) for right in denied]
-        return Closing(self.folder, observed, steps, said, problems, (), dry_run, changes)
+            return closing
+        changes = self._write_starts(closing.observed)
+        denied = [str(right) for right in self._denied()]
+        problems += self._problems(closing.observed, partial=partial)
+        return closing._replace(denied=denied, problems=problems, changes=changes)
 
-    def _current(self) -> ObservedProcesses:
+    def _closing(self) -> Closing:
         """Return the processes of the enclaves that the policy has, as they run now."""
-        observed = self.observed or ObservedProcesses(self.domain)
         running = ProcessTable().look(self._shell.now())
-        processes = [process.as_it_runs(running) for process in observed.processes]
-        observed = observed._replace(processes=processes)
-        return observed.within(read_policy(self.policy)) if self.policy.exists() else observed
+        observed = ObservedProcesses(self.domain)
+        if self.observed:
+            observed = self.observed.as_they_run(running)
+        if self.policy.exists():
+            observed = observed.within(read_policy(self.policy))
+        present = self._in_their_enclaves(running)
+        names = {enclave.name for _, enclave in self._secured(running)} - {_OBSERVER}
+        secured = {name: name in present for name in sorted(names)}
+        return Closing(self.folder, observed, (), secured, (), (), (), False, ())
 
     def _do(self, step: _Step) -> tuple[str, str]:
         """Do a step; return its state, and why the robot is not closed yet, or "".
@@ -580,7 +627,11 @@ class OpenRobot:
         if status:
             for line in () if step.into else f"{output}{messages}".splitlines():
                 self._shell.say(line)
-            return "findings", f"findings of `{step.command}`"
+            mend = ""
+            if VIOLATED.id in output:
+                needed = shlex.quote(str(self.requirements))
+                mend = f"; if you want the change, edit {needed}, or remove it and sros suggests it again"
+            return "findings", f"findings of `{step.command}`{mend}"
         if step.into:
             replace_file(step.into, output.encode())
         return "done", self._keep_processes(output) if watches else ""
@@ -594,7 +645,15 @@ class OpenRobot:
                 "",
                 f"Unset {ENABLE}.",
             )
-        for process in ProcessTable().look(self._shell.now()).processes:
+        running = ProcessTable().look(self._shell.now())
+        if secured := [process.label for process, _ in self._secured(running)]:
+            raise UsageError(
+                f"the robot runs closed: {first_few(secured, _MOST_NAMES)}",
+                "Only an open robot can be watched.",
+                f"Go back by `sros close {shlex.quote(str(self.folder))} --undo` and watch again, "
+                f"or add what is missing to '{self.policy}' by hand.",
+            )
+        for process in running.processes:
             if process.is_zenoh and named.get(RMW) != RMW_ZENOH and self._is_neighbour(process):
                 raise UsageError(
                     f"{process.label} speaks Zenoh, and this shell does not",
@@ -604,7 +663,7 @@ class OpenRobot:
         make_folders(self.folder)
 
     def _is_neighbour(self, process: Process) -> bool:
-        return process.domain == str(self.domain) and not process.network
+        return _is_in_domain(process, self.domain)
 
     def _keep_processes(self, document: str) -> str:
         """Write which process has which nodes, and the policy of the observer.
@@ -623,12 +682,15 @@ class OpenRobot:
         number = counted(len(self.observed.processes), "process", "processes")
         self._shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
         learned = json.loads(document)
-        if not (learned["dry_run"] and learned["added"]):
+        lacking = learned["added"] if learned["dry_run"] else ()
+        if not lacking:
             return ""
-        add = f"sros generate_policy {shlex.quote(str(self.policy))} --enclave-per-node"
+        policy = shlex.quote(str(self.policy))
+        add = f"sros generate_policy {policy} --enclave-per-node --domain {self.domain}"
+        rights = [f"{right['enclave']} {right['right']} {right['name']}" for right in lacking]
         return (
-            f"'{self.policy}' stays as it is, and lacks {counted(len(learned['added']), 'right')} "
-            f"seen now; if they are right, add them: {add}"
+            f"'{self.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "
+            f"({first_few(rights, _MOST_NAMES)}); if they are right, add them: {add}"
         )
 
     def _observation(self) -> Observation:
@@ -743,7 +805,8 @@ class OpenRobot:
             named = first_few(observed.unknown, _MOST_NAMES)
             yield (
                 f"no node is known of {counted(len(observed.unknown), 'process', 'processes')}: "
-                f"{named}; start them with -r __node:=NAME, or {silent}"
+                f"{named}; watch again while they run (--for 1m), start them with "
+                f"-r __node:=NAME, or {silent}"
             )
         if observed.elsewhere:
             named = first_few(observed.elsewhere, _MOST_NAMES)
@@ -751,7 +814,7 @@ class OpenRobot:
 
     # ── applying ────────────────────────────────────────────────────────────────────────────
 
-    def apply(self, prepared: Closing, *, dry_run: bool) -> Closing:
+    def apply(self, prepared: Closing, *, partial: bool, dry_run: bool) -> Closing:
         """Restart the units of systemd that do not run in their enclaves, with drop-ins.
 
         Proves that the robot is closed, if nothing is left to do by hand.
@@ -765,12 +828,12 @@ class OpenRobot:
             self._shell.say(f"{'would ' if dry_run else ''}{action} {_SYSTEMD / path}")
         if not dry_run:
             write_units(_SYSTEMD, files, changes)
-        closed = self._in_their_enclaves(ProcessTable().look(self._shell.now()))
-        open_units = [unit for enclave, unit in observed.units.items() if enclave not in closed]
+        secured = prepared.secured
+        open_units = [unit for enclave, unit in observed.units.items() if not secured.get(enclave)]
         self._restart(sorted(open_units), dry_run=dry_run)
         done = [FileChange(action, str(_SYSTEMD / path)) for path, action in changes.items()]
-        by_hand = dry_run or observed.by_hand(self.folder)
-        proofs = () if by_hand else self._proofs(observed, _RESTART_SECONDS)
+        by_hand = dry_run or prepared.left_by_hand
+        proofs = () if by_hand else self._proofs(observed, _RESTART_SECONDS, partial=partial)
         return prepared._replace(proofs=proofs, changes=[*prepared.changes, *done])
 
     def _restart(self, units: Sequence[str], *, dry_run: bool) -> None:
@@ -816,21 +879,42 @@ class OpenRobot:
                 remove_file(path)
         of_drop_ins = {path.parent.name.removesuffix(".d") for path in drop_ins}
         self._restart(sorted({*observed.units.values()} | of_drop_ins), dry_run=dry_run)
-        by_hand = chain.from_iterable(observed.by_hand(self.folder).values())
-        for command in dict.fromkeys(process.open_command for process in by_hand):
-            self._shell.say(f"by hand, restart it open: {command}")
         changes = [FileChange("remove", str(path)) for path in drop_ins]
-        return Closing(self.folder, observed, (), (), (), (), dry_run, changes)
+        closing = self._closing()._replace(dry_run=dry_run, changes=changes)
+        return closing if dry_run else closing._replace(problems=[*self._not_open(observed)])
+
+    def _not_open(self, observed: ObservedProcesses) -> Iterator[str]:
+        """Yield how each process is started open that does not run open."""
+        running = ProcessTable().look(self._shell.now())
+        are_open = {
+            process.command
+            for process in filter(self._is_neighbour, running.processes)
+            if not process.asks_for_security
+        }
+        secured = {enclave.name: process for process, enclave in self._secured(running)}
+        commands = dict.fromkeys(
+            process.open_command
+            for process in chain.from_iterable(observed.by_hand(self.folder).values())
+            if process.enclave in secured or tuple(process.command) not in are_open
+        )
+        for command in commands:
+            yield f"restart it open: {command}"
+        for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
+            yield f"{name} started later; restart it open: {_described(secured[name])}"
 
     # ── the proof ───────────────────────────────────────────────────────────────────────────
 
-    def prove(self, *, dry_run: bool) -> Closing:
-        """Prove that the robot is closed."""
-        observed = self._current()
-        proofs = () if dry_run else self._proofs(observed, _START_SECONDS)
-        return Closing(self.folder, observed, (), (), (), proofs, dry_run, ())
+    def prove(self, *, partial: bool, dry_run: bool) -> Closing:
+        """Prove that the robot is closed; ``partial`` accepts processes that do not run."""
+        closing = self._closing()._replace(dry_run=dry_run)
+        if dry_run:
+            return closing
+        proofs = self._proofs(closing.observed, _START_SECONDS, partial=partial)
+        return closing._replace(proofs=proofs)
 
-    def _proofs(self, observed: ObservedProcesses, patience: float) -> list[Proof]:
+    def _proofs(
+        self, observed: ObservedProcesses, patience: float, *, partial: bool
+    ) -> list[Proof]:
         """Wait until each process runs in its enclave, and prove that the robot is closed."""
         expected = {process.enclave for process in observed.processes}
         if not expected:
@@ -842,14 +926,18 @@ class OpenRobot:
             if not missing:
                 break
             if time.monotonic() > end:
-                return [Proof(_CLAIM, False, self._why_missing(missing, running))]
+                earlier = {enclave.name for _, enclave in self._secured(running)}
+                if not partial or earlier.intersection(missing) or expected == {*missing}:
+                    return [Proof(_CLAIM, False, self._why_missing(missing, running))]
+                break
             time.sleep(0.2)
-        before = self._observation()
-        return [
-            self._proof_of_processes(len(expected), running),
-            self._proof_of_talk(before),
-            self._proof_of_silence(before),
-        ]
+        nodes = self._observation().nodes
+        before = make_observation(node for node in nodes if node.enclaves[0] not in missing)
+        proof = self._proof_of_processes(len(expected) - len(missing), running)
+        if missing and proof.holds:
+            without = f"{proof.reason}, but no process of {first_few(missing, 5)}"
+            proof = proof._replace(holds=None, reason=without)
+        return [proof, self._proof_of_talk(before, missing), self._proof_of_silence(before)]
 
     def _why_missing(self, missing: Sequence[str], running: RunningProcesses) -> str:
         """Return which enclaves have no process, and which have one with earlier files."""
@@ -898,11 +986,16 @@ class OpenRobot:
             return Proof(_CLAIM, False if wrong else None, f"{first.subject}: {first.text}")
         return Proof(_CLAIM, True, f"{counted(number, 'enclave')}, and no open process")
 
-    def _proof_of_talk(self, before: Observation) -> Proof:
-        """Compare what an observer in an enclave sees now with what was seen before."""
+    def _proof_of_talk(self, before: Observation, missing: Sequence[str]) -> Proof:
+        """Compare what an observer in an enclave sees now with what was seen before.
+
+        Processes of the enclaves ``missing`` do not run.
+        """
         claim, denied = "everything that talked still talks", self._denied()
         words = ("audit", str(self._rights), "--keystore", str(self.export), "--enclave", _OBSERVER)
-        step = _Step((*words, "--domain", str(self.domain), "--json"))
+        step = _Step(
+            (*words, "--domain", str(self.domain), "--json", *["--partial"] * bool(missing))
+        )
         for _ in range(_TRIES):  # nodes may still be starting
             try:
                 status, value = self._asked(step)
@@ -912,7 +1005,11 @@ class OpenRobot:
                 "gone": _lost_endpoints(before, from_json(value), denied),
                 "denied": [f"{right['enclave']} {right['name']}" for right in value["denied"]],
                 "refused": [refused["enclave"] for refused in value["refused"]],
-                "not seen": [unseen["node"] or unseen["enclave"] for unseen in value["unseen"]],
+                "not seen": [
+                    unseen["node"] or unseen["enclave"]
+                    for unseen in value["unseen"]
+                    if unseen["enclave"] not in missing
+                ],
                 "not judged": value["unjudged"],
                 "not done": ["the ROS graph kept changing"] if status else [],
             }

@@ -25,7 +25,7 @@ from sros_tool.cli.common import (
 )
 from sros_tool.errors import UsageError
 from sros_tool.terminal import echo
-from sros_tool.wording import enumerated
+from sros_tool.wording import enumerated, first_few
 
 if TYPE_CHECKING:
     from sros_tool.closing import ClosedProcess, Closing, OpenRobot
@@ -121,22 +121,24 @@ def close(
     if undoes:
         closed = robot.undo(dry_run=dry_run)
     elif proves:
-        closed = robot.prove(dry_run=dry_run)
+        closed = robot.prove(partial=partial, dry_run=dry_run)
     else:
         closed = robot.prepare(duration, partial=partial, dry_run=dry_run)
         if applies and not closed.problems:
-            closed = robot.apply(closed, dry_run=dry_run)
+            closed = robot.apply(closed, partial=partial, dry_run=dry_run)
     holds = bool(closed.proofs) and all(
         proof.holds or (partial and not proof.fails) for proof in closed.proofs
     )
     if as_json:
         print_json(closed)
-    elif not (dry_run or undoes):
+    elif undoes and not dry_run:
+        _show_undone(robot, closed)
+    elif not dry_run:
         if not (applies or proves):
             _show(robot, closed)
         _show_end(robot, closed, applies=applies, holds=holds)
-    if dry_run or undoes:
-        return int(undoes and not dry_run and bool(closed.observed.by_hand(folder)))
+    if dry_run:
+        return 0
     return int(bool(closed.problems) or ((applies or proves) and not holds))
 
 
@@ -153,6 +155,10 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
         how = "by its launch, by hand" if process.launch else "by hand"
         how = "by Docker Compose, by hand" if process.container else how
         how = f"--apply restarts {process.unit}" if process.unit else how
+        if closed.secured.get(process.enclave):
+            how = "closed"
+        elif process.enclave in closed.secured:
+            how = f"closed {_EARLIER}: {how}"
         pid = f"process {process.pid}, known by its {process.known_by}"
         echo(f"  {process.enclave}: {pid if process.pid else 'not running as observed'}: {how}")
     for right in closed.denied:
@@ -167,33 +173,55 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
     for proof in closed.proofs:
         echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}")
     if closed.problems:
-        echo(f"nothing {'was closed' if applies else 'is closed yet'}; fix this first:")
+        echo(f"{_state(closed, applies=applies)}; fix this first:")
         for problem in closed.problems:
             echo(f"  {problem}")
         echo(f"next: sros close {folder}{' --apply' if applies else ''}", err=True)
     elif holds:
-        left = (
-            ""
-            if all(proof.holds for proof in closed.proofs)
-            else (", except for what was not asked")
-        )
+        asked = all(proof.holds for proof in closed.proofs)
+        but = "" if asked else ", except for what was not asked"
         keys = f"bring {folder}/keystore to another machine: it has the CA keys"
-        echo(f"the robot is closed{left}; next: {keys}", err=True)
+        echo(f"the robot is closed{but}; next: {keys}", err=True)
     elif closed.proofs:
         again = f"next: ask again with sros close {folder} --proof, or go back with --undo"
         echo(f"the robot is not proved closed; {again}", err=True)
     elif applies:
-        for command, processes in observed.by_hand(robot.folder.absolute()).items():
+        for command, processes in closed.left_by_hand.items():
             stop = _together(processes)
             echo(f"stop {stop}, and start it by:" if stop else "start again by:")
             echo(f"  {command}")
         echo(f"next: these commands, and then sros close {folder} --proof", err=True)
-    elif any(process.unit for process in observed.processes):
-        echo(f"nothing is closed yet; next: sros close {folder} --apply", err=True)
     else:
-        how = f"start each process by the commands in {robot.start / COMMANDS}"
-        echo(f"nothing is closed yet; next: stop the robot, {how}, and ask", err=True)
-        echo(f"sros close {folder} --proof", err=True)
+        ask = f"sros close {folder} --proof"
+        steps = f"stop the robot, start each process by the commands in {robot.start / COMMANDS}"
+        if closed.secured:
+            steps = f"restart these by the commands in {robot.start / COMMANDS}"
+        if not closed.left:
+            following = ask
+        elif any(name in observed.units for name in closed.left):
+            following = f"sros close {folder} --apply"
+        else:
+            following = f"{steps}, and ask\n{ask}"
+        echo(f"{_state(closed, applies=applies)}; next: {following}", err=True)
+
+
+def _show_undone(robot: OpenRobot, closed: Closing) -> None:
+    """Print what still has to be done until the robot is open."""
+    for problem in closed.problems:
+        echo(problem)
+    if closed.problems:
+        ask = f"ask again with sros close {shlex.quote(str(robot.folder))} --undo"
+        echo(f"the robot is not open yet; next: restart these, and {ask}", err=True)
+    else:
+        echo("the robot is open: sros sees no process in an enclave of this folder", err=True)
+
+
+def _state(closed: Closing, *, applies: bool) -> str:
+    """Return how far the processes run closed."""
+    if not closed.secured:
+        return "nothing was closed" if applies else "nothing is closed yet"
+    but = [f"{name} ({_EARLIER if name in closed.secured else 'open'})" for name in closed.left]
+    return f"the robot runs closed{', except for ' if but else ''}{first_few(but, 3)}"
 
 
 def _together(processes: Sequence[ClosedProcess]) -> str:
@@ -210,3 +238,4 @@ def _together(processes: Sequence[ClosedProcess]) -> str:
 
 
 _ANSWERS = {True: "yes", False: "no", None: "not asked"}
+_EARLIER = "with earlier files"

@@ -193,7 +193,11 @@ def _watch(
     with _until_signalled() as stopped:
         until = f"for {seconds:.0f} s, or {_FOREVER}" if seconds else _FOREVER
         echo(f"watching {until}; then {then}", err=True)
-        return watch(graph, seconds, time.monotonic, stop=stopped, report=report)
+        begin = time.monotonic()
+        snapshot = watch(graph, seconds, time.monotonic, stop=stopped, report=report)
+        if stopped():
+            echo(f"stopped watching after {time.monotonic() - begin:.0f} s", err=True)
+        return snapshot
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -76,6 +77,8 @@ class Robot:
     launch: tuple[str, ...] = ()
     container: str = ""
     named: bool = False
+    absent: set[str] = field(default_factory=set)
+    """The enclaves whose processes do not run."""
     nodes: tuple[Any, ...] = (TALKER, LISTENER)
     remaining: tuple[Any, ...] = (TALKER, LISTENER)
     """What an observer with an enclave sees."""
@@ -99,6 +102,9 @@ class Robot:
             environment=secured_environment(export, enclave, 0),
             started=now + timedelta(days=-1 if enclave in self.outdated else 1),
         )
+        return self.with_its_files(process)
+
+    def with_its_files(self, process: Process) -> Process:
         root = os.open("/", os.O_PATH | os.O_DIRECTORY)
         try:
             return with_files(process, ProcessRoot(root, FileReader()), "/")
@@ -115,12 +121,15 @@ class Robot:
             and any("restart" in line and unit in line for line in self.restarts)
         }
         processes = tuple(
-            self.process(enclave, is_secured=enclave in restarted | self.by_hand) for enclave in PID
+            self.process(enclave, is_secured=enclave in restarted | self.by_hand)
+            for enclave in PID
+            if enclave not in self.absent
         )
         return RunningProcesses((*processes, *self.more), self.unseen)
 
     def close(self, *words: str, status: int = 0, **environment: str) -> Ended:
-        now_open = [node for node in self.nodes if f"/{node[2]}" not in self._closed()]
+        not_open = self._closed() | self.absent
+        now_open = [node for node in self.nodes if f"/{node[2]}" not in not_open]
         seen = graph(*now_open) | {"secured": graph(*secured(*self.remaining))}
         if "--apply" in words:
             seen["until"] = str(self.folder / "systemd/talker.service.d/sros-close.conf")
@@ -208,7 +217,8 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     again = robot.close("--for", "1s", status=1)
     assert policy.read_text() == changed
     assert "nothing is closed yet; fix this first:\n  'robot/policy.xml' stays as it " in again.out
-    assert "lacks 1 right seen now; if they are right, add them: sros gener" in again.out
+    assert "lacks 1 right seen now (/listener subscribe /chatter); if they are " in again.out
+    assert "generate_policy robot/policy.xml --enclave-per-node --domain 0\n" in again.out
     robot.remaining = (TALKER, ros_node("listener", "04"))
     said = robot.close("--apply").out
     assert "36 endpoints as before, but for 1 right that the policy denies now\n" in said
@@ -291,12 +301,81 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
         "no: every process runs in its enclave: no secured process of /listener, /talker; "
         in robot.close("--proof", status=1).out
     )
+    robot.by_hand = {"/talker"}
+    ended = robot.close()
+    assert "/talker: process 4711, known by its process id: closed\n" in ended.out
+    assert "the robot runs closed, except for /listener (open); next: restart these" in ended.err
+    assert "start it by" in (said := robot.close("--apply", status=1).out)
+    assert "process 4712" in said and "process 4711" not in said
     robot.by_hand = {"/talker", "/listener"}
-    robot.close("--proof")
-    assert (
-        "by hand, restart it open: cd /opt && /opt/run talker\n"
-        in robot.close("--undo", status=1).err
+    assert robot.close().err.endswith("the robot runs closed; next: sros close robot --proof\n")
+    for words in ("--apply", "--proof"):
+        assert "the robot is closed; next: " in robot.close(words).err
+    robot.by_hand = {"/talker"}
+    undone = robot.close("--undo", status=1)
+    assert undone.out == "restart it open: cd /opt && /opt/run talker\n"
+    assert undone.err == (
+        "the robot is not open yet; next: restart these, and ask again with sros close robot "
+        "--undo\n"
     )
+    robot.by_hand = set()
+    assert robot.close("--undo").err.startswith("the robot is open: ")
+
+
+def test_processes_that_started_after_the_watch(robot: Robot) -> None:
+    """Open ones have no enclave; secured ones are asked for, named, and restarted by --undo."""
+    robot.close()
+    late = Process(7, ("/opt/late", "--ros-args"), {}, datetime.now(UTC))
+    robot.more = (late,)
+    said = robot.close(status=1).out
+    assert "no node is known of 1 process: process 7 (late): /opt/late --ros-args; watch ag" in said
+    robot.close("--partial")
+    robot.more = ()
+    robot.close()
+    robot.by_hand = set(PID)
+    merged = robot.folder / "robot/policy.xml"
+    merged.write_text(
+        re.sub(
+            r' *<enclave path="/talker">.*?</enclave>\n',
+            lambda enclave: enclave[0].replace("talker", "late") + enclave[0],
+            merged.read_text(),
+            flags=re.DOTALL,
+        )
+    )
+    said = robot.close(status=1).out
+    assert "; if you want the change, edit robot/requirements.toml, or remove it and sros " in said
+    (robot.folder / "robot/requirements.toml").unlink()
+    robot.close()
+    export = robot.folder / "robot/export"
+    environment = secured_environment(export, "/late", 0)
+    late = robot.with_its_files(replace(late, environment=environment))
+    robot.more = (replace(late, started=datetime.now(UTC) - timedelta(days=1)),)
+    assert "closed, except for /late (with earlier files); next: restart" in robot.close().err
+    robot.more = (replace(late, started=datetime.now(UTC) + timedelta(days=1)),)
+    assert "the robot runs closed; next: sros close robot --proof" in robot.close().err
+    watching = robot.close("--for", "1s", status=2).err
+    assert "the robot runs closed: process 4711 (run), process 4712 (run), process 7" in watching
+    assert "/late started later; restart it open: process 7 (late): /opt/late" in (
+        robot.close("--undo", status=1).out
+    )
+
+
+def test_a_node_that_does_not_run_always(robot: Robot) -> None:
+    robot.close()
+    robot.by_hand, robot.absent, robot.remaining = {"/talker"}, {"/listener"}, (TALKER,)
+    ended = robot.close("--proof", status=1)
+    assert "no: every process runs in its enclave: no secured process of /listener; st" in ended.out
+    ended = robot.close("--proof", "--partial")
+    assert (
+        "not asked: every process runs in its enclave: 1 enclave, and no open process, but no "
+        "process of /listener\n"
+    ) in ended.out
+    assert "yes: everything that talked still talks: 1 node with 18 endpoints as bef" in ended.out
+    assert "the robot is closed, except for what was not asked" in ended.err
+    robot.absent = set()
+    assert "process 4712 (run): in domain 0" in robot.close("--proof", "--partial", status=1).out
+    robot.absent = {"/listener", "/talker"}
+    assert "no secured process" in robot.close("--proof", "--partial", status=1).out
 
 
 def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
@@ -590,7 +669,8 @@ def test_containers_are_started_with_the_files_of_their_enclaves(robot: Robot) -
     up = f"docker compose -f compose.yaml -f {place}/start/compose.yaml up -d"
     said = robot.close("--apply", status=1).out
     assert f"stop the containers of /listener and /talker, and start it by:\n  {up}\n" in said
-    assert "restart it open: docker compose up -d\n" in robot.close("--undo", status=1).err
+    robot.by_hand = set(PID)
+    assert robot.close("--undo", status=1).out == "restart it open: docker compose up -d\n"
 
 
 def test_a_node_on_zenoh_gets_an_argument_from_its_unit(robot: Robot) -> None:
@@ -661,5 +741,6 @@ def test_a_process_that_was_launched_is_launched_secured(tmp_path: Path, robot: 
     said = robot.close("--apply", status=1).out
     assert f"stop the launch of /listener and /talker, and start it by:\n  {command}" in said
     assert f"\n# /listener, /talker\n{command}" in (place / "start/commands.txt").read_text()
-    undone = robot.close("--undo", status=1).err
+    robot.by_hand = set(PID)
+    undone = robot.close("--undo", status=1).out
     assert undone.count("restart it open: cd /opt && /usr/bin/python3 /opt/ros/jazzy/bin/ros2") == 1

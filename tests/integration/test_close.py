@@ -183,10 +183,11 @@ def play_on_zenoh(folder: Path) -> dict[str, Any]:
     with all_running(folder, starts):
         said["closed"] = close("--proof", "--partial", "--json")
     said["undone"] = close("--undo")
-    mark = "by hand, restart it open: "
-    lines = said["undone"].err.splitlines()
-    with all_running(folder, [line.removeprefix(mark) for line in lines if mark in line]):
+    mark = "restart it open: "
+    starts = [line.removeprefix(mark) for line in said["undone"].out.splitlines()]
+    with all_running(folder, starts):
         said["open again"] = close("--proof", "--partial", "--json")
+        said["undone again"] = close("--undo")
     return said
 
 
@@ -206,3 +207,4 @@ def test_a_robot_on_zenoh_is_closed_and_opened_again(tmp_path: Path) -> None:
     assert silence["holds"] is True, silence
     (first,) = proofs(said["open again"]).values()
     assert first["holds"] is False
+    assert said["undone again"].status == 0, said["undone again"]
