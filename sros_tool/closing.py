@@ -630,7 +630,7 @@ class OpenRobot:
             mend = ""
             if VIOLATED.id in output:
                 needed = shlex.quote(str(self.requirements))
-                mend = f"; if you want the change, edit {needed}, or remove it and sros suggests it again"
+                mend = f"; if you want the change, edit {needed}, or remove it for a new suggestion"
             return "findings", f"findings of `{step.command}`{mend}"
         if step.into:
             replace_file(step.into, output.encode())

@@ -343,7 +343,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
         )
     )
     said = robot.close(status=1).out
-    assert "; if you want the change, edit robot/requirements.toml, or remove it and sros " in said
+    assert "; if you want the change, edit robot/requirements.toml, or remove it for " in said
     (robot.folder / "robot/requirements.toml").unlink()
     robot.close()
     export = robot.folder / "robot/export"
