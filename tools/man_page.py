@@ -27,7 +27,7 @@ sros \\- security toolkit for ROS 2 robots
 """
 _END = """\
 .SH EXIT STATUS
-0 for yes or done, 1 for no, denied, different or findings, 2 for what could not be asked or done.
+0 for yes or done, 1 for no, denied, different or findings, 2 if sros could not answer or do it.
 """
 
 

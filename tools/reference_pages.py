@@ -39,7 +39,7 @@ def pages() -> Mapping[str, str]:
 def _options() -> str:
     parts = [
         "What `sros VERB --help` prints, of all verbs. The exit status of every verb is 0 for yes "
-        "or done, 1 for no, denied, different or findings, 2 for what could not be asked or done.",
+        "or done, 1 for no, denied, different or findings, 2 if sros could not answer or do it.",
     ]
     for family, verbs in families():
         parts.append(f"## {family}")

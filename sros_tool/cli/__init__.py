@@ -24,7 +24,7 @@ from types import FrameType
 
 
 def main(arguments: list[str] | None = None, *, name: str = "sros") -> None:
-    """Run ``sros`` and exit with 0 (yes or done), 1 (no, or findings) or 2 (not asked or done).
+    """Run ``sros`` and exit with 0 (yes or done), 1 (no, or findings) or 2 (not answered or done).
 
     ``arguments`` are those of the process by default; ``name`` is what usage and help call it.
     """

@@ -68,13 +68,13 @@ def agent() -> None:
 )  # fmt: skip
 @click.option(
     "--inbox", metavar="PLACE", required=True,
-    help="Where the robot's messages go: a URL that takes PUT, or a folder.",
+    help="Where the robot's messages go: a URL that accepts PUT, or a folder.",
 )  # fmt: skip
 @click.option(
     "--root", "root_file", metavar="FILE", required=True, type=PATH,
     help=(
-        "The first root metadata (root.json) that home published; the agent verifies everything "
-        "by it."),
+        "The first root metadata (root.json) that home published; with it, the agent verifies "
+        "everything else."),
 )  # fmt: skip
 @click.option(
     "--ca", "authorities", metavar="SHA256|FILE", multiple=True,
@@ -90,7 +90,7 @@ def agent() -> None:
 @click.option(
     "--restart", is_flag=True,
     help=(
-        "Restart units of changed enclaves: those of --unit, and active ones of `sros units`. "
+        "Restart units of changed enclaves: the units of --unit, and active units by `sros units`. "
         "[default: only report which restarts are due]"),
 )  # fmt: skip
 @click.option(
@@ -129,7 +129,7 @@ def _init(
     """Set up the agent of the security folder FOLDER: FOLDER/.agent/agent.toml.
 
     FOLDER is where `sros import` or a play installs this robot's enclaves. The agent runs as its
-    owner. Compare the SHA-256 of the root metadata that is printed with the one that `sros fleet
+    owner. Compare the printed SHA-256 of the root metadata with the SHA-256 that `sros fleet
     publish` printed at home.
 
     Example:

@@ -773,10 +773,10 @@ _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
 def doctor(report: Path | None, force: bool, advisories: Path | None, as_json: bool) -> None:
     """Find out which DDS stacks and RMWs of this machine enforce security.
 
-    Each one is tried in a separate process, in a temporary enclave: its name and version do not
-    show whether it was built with security. Also names their known vulnerabilities, and reports
-    the findings of `sros check runtime`, such as misspelt ROS_SECURITY_* values, missing files or a
-    wrong clock.
+    Each DDS and RMW is tried in a separate process, in a temporary enclave, because its name and
+    version do not show whether it was built with security. Also names the known vulnerabilities of
+    each DDS, and reports the findings of `sros check runtime`, such as misspelled ROS_SECURITY_*
+    values, missing files or a wrong clock.
 
     Example:
       $ sros doctor

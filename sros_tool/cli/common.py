@@ -650,7 +650,7 @@ def enclave_environment(
     accept_key: bool = False,
     target: Path | None = None,
 ) -> EnclaveEnvironment:
-    """Return the environment of an enclave for a process that this one could start now."""
+    """Return the environment of an enclave for a process that this process could start now."""
     from sros_tool.enclave_environment import loadable_environment
 
     return loadable_environment(
@@ -998,8 +998,8 @@ _ESTIMATED = 3.0
 class _Line:
     """A progress line on the terminal that a timer redraws.
 
-    The timer is a signal: unlike a thread, it does not get in the way of the processes that are
-    forked for the work, and they do not inherit it.
+    The timer is a signal: unlike a thread, it does not disturb the processes that are forked for
+    the work, and they do not inherit the timer.
     """
 
     def __init__(self, label: str, total: int, tally: Tally) -> None:

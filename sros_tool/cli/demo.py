@@ -145,16 +145,16 @@ def demo(
 ) -> None:
     """Show on a real DDS or Zenoh that nodes without permission cannot talk to secured nodes.
 
-    Creates keystores, starts nodes with and without them, and compares expected and observed
+    Creates keystores, starts nodes with and without enclaves, and compares expected and observed
     results. The scenario `isolation` takes about 10 s on Cyclone DDS and 20 s on rclpy. The
     scenario `attacks` tries all attacks that sros knows, also without the defences that stop them;
     it takes about 30 s on Cyclone DDS and 60 s on rclpy. On Zenoh (--backend zenoh), all scenarios
     run, in about 25 s.
 
-    With talker, listener or router, run only this node until Ctrl-C, with the environment variables
-    that are set, to see by hand who hears whom: on Cyclone DDS, rclpy, or Zenoh, which also needs a
-    router. The node says at once whether it is secured. Of the options, only --backend and --topic
-    apply.
+    With talker, listener or router, run only this node until Ctrl-C, with the present environment
+    variables, so that you can see who hears whom. The node runs on Cyclone DDS, rclpy, or Zenoh,
+    which also needs a router. The node says at once whether it is secured. Of the options, only
+    --backend and --topic apply.
 
     Example:
       $ sros demo --topic /camera/image

@@ -133,7 +133,7 @@ def _report(folder: Path, robot: str) -> None:
 
 
 def _dds_here(moment: datetime) -> RobotDds:
-    """Return the DDS libraries that processes of this machine have loaded, or that it has."""
+    """Return the loaded and the installed DDS libraries of this machine."""
     from sros_tool.agent.running import robot_dds
     from sros_tool.runtime.processes import ProcessTable
 
@@ -309,7 +309,7 @@ def _collect(
 
 
 def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
-    """Yield the counts, and in their order what is to be said of messages and of requests."""
+    """Yield the counts, then lines on messages and on requests, sorted by outcome."""
     from sros_tool.keystore.delivery.collect import MESSAGE_OUTCOMES, REQUEST_OUTCOMES
 
     would = "would be " if collected.dry_run else ""
@@ -339,7 +339,7 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
 
 
 def _numbers(numbers: Mapping[str, int], outcomes: Sequence[str], would: str) -> str:
-    """Return how many have each outcome, in words."""
+    """Return the number of messages or requests with each outcome, in words."""
     there = (outcome for outcome in outcomes if numbers.get(outcome))
     return ", ".join(f"{numbers[name]} {would}{name.replace('_', ' ')}" for name in there)
 
@@ -380,8 +380,8 @@ _VALIDITIES = {
     "--restored",
     is_flag=True,
     help="Publish although PUB has later releases than the keystore, because the keystore was "
-    "restored; enclaves that these releases revoke are revoked again, and numbers go on from those "
-    "that nobody gave before.",
+    "restored; enclaves that these releases revoke are revoked again, and new releases get numbers "
+    "that were never used.",
 )
 @click.option(
     "--new-folder",
@@ -532,8 +532,8 @@ def _status(
     earlier (issued for this enclave before); another's (issued for another enclave); revoked;
     missing; or unknown (never issued by this keystore). Processes use new files only after a
     restart: confirmations by the Ansible collection and `sros agent` say which restarts are due,
-    those by `sros fleet report` do not. A robot without a recent confirmation is offline. A robot
-    that claims a release which was never published is named, whatever files it has. Robots with the
+    those by `sros fleet report` do not. A robot without a recent confirmation is offline. Whatever
+    files a robot has, it is named if it claims a release that was never published. Robots with the
     same state share a line. The last line counts known vulnerabilities of the robots' DDS, by the
     advisories of sros; --robot and --advisories name them.
 
@@ -632,7 +632,7 @@ _MOST_LINES, _MOST_GROUPS = 50, 3
 
 
 def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) -> Iterator[str]:
-    """Yield the counts, what is to be done with which robots, and findings on their DDS.
+    """Yield the counts, the table of robots with what to do, and findings on their DDS.
 
     Without ``findings``, or named robots, the findings are only counted.
     """
@@ -654,7 +654,7 @@ def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) ->
 
 
 def _facts(status: FleetStatus) -> Iterator[str]:
-    """Yield what is to be said of the fleet as a whole."""
+    """Yield sentences about the fleet as a whole."""
     command = (
         f"`sros fleet publish {quote(str(status.keystore))} {quote(status.folder or 'PUB')} "
         "--restored`; docs/howto/home_is_lost.md says what else"
@@ -676,7 +676,7 @@ def _facts(status: FleetStatus) -> Iterator[str]:
 
 
 class _Group(NamedTuple):
-    """Robots of which the same is to be said."""
+    """Robots that share a row of the status."""
 
     robots: Sequence[RobotStatus]
     state: str
@@ -712,7 +712,7 @@ def _groups(compared: ComparedFleet, robots: Sequence[str]) -> list[_Group]:
 
 
 def _rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield the head of a table and its rows, if something is to be said of a robot."""
+    """Yield the head and the rows of a table, or nothing if no robot needs a row."""
     groups, places = _groups(compared, robots), _places(compared.status)
     if not robots and all(group.state == "current" for group in groups):
         groups = [group for group in groups if group.what]
@@ -761,13 +761,13 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def _places(status: FleetStatus) -> dict[str, int]:
-    """Map the robots of a fleet to their places in it, r2 before r10."""
+    """Map the robots of a fleet to their positions, r2 before r10."""
     names = sorted((robot.robot for robot in status.robots), key=_natural)
     return {name: place for place, name in enumerate(names)}
 
 
 def _runs(names: Iterable[str], places: Mapping[str, int], most: int = _MOST_GROUPS) -> str:
-    """Return robots in words, of which neighbours in the fleet share some, at most ``most``."""
+    """Return at most ``most`` names of robots; many neighbors in the fleet become "r4 to r50"."""
     runs: list[list[str]] = []
     for name in sorted(names, key=places.__getitem__):
         if runs and places[name] == places[runs[-1][-1]] + 1:
@@ -783,7 +783,7 @@ def _runs(names: Iterable[str], places: Mapping[str, int], most: int = _MOST_GRO
 
 
 def _dds_findings(compared: ComparedFleet) -> Iterator[str]:
-    """Yield the findings on the DDS of robots, but for notes that need no attention."""
+    """Yield the findings on the DDS of robots, except notes that need no attention."""
     from sros_tool.checks.kind import WARNING
     from sros_tool.checks.vulnerabilities import NOTES_ON_LIBRARIES
 
@@ -793,7 +793,7 @@ def _dds_findings(compared: ComparedFleet) -> Iterator[str]:
 
 
 def _dds_counts(compared: ComparedFleet) -> Iterator[str]:
-    """Yield the robots with an outdated DDS, and where the findings on the DDS of robots are."""
+    """Yield the robots with an outdated DDS, or the number of findings on the DDS of robots."""
     status, outdated = compared.status, compared.outdated_dds
     if outdated:
         yield (

@@ -159,7 +159,7 @@ _ORDER = "Write them in this order: `sros create_permission KEYSTORE ENCLAVE... 
 
 
 def _check_order(root: Path, names: Sequence[str], file: Path) -> None:
-    """Raise `UsageError` if a keystore, enclave or policy stands where another one belongs."""
+    """Raise `UsageError` if a keystore, enclave or policy is in the place of another word."""
     from sros_tool.keystore.layout import is_keystore
 
     paths = [

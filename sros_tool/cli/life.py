@@ -441,7 +441,7 @@ def rotate_ca(
     Stage 1, distribute: enclaves trust the new CA as well as the old one. Stage 2, reissue: the new
     CA issues all certificates, governance and permissions again. Stage 3, retire: enclaves no
     longer trust the old CA. Processes load the new files only when they start: after each stage,
-    export the exported enclaves again, and restart all processes.
+    export all enclaves to their robots again, and restart all processes.
 
     With Fast DDS (2.9.1), all processes can talk to each other at every moment of a rotation.
     Cyclone DDS (0.10.2) trusts one CA at a time: after stage 2, restart all its processes

@@ -564,8 +564,7 @@ def _propose(
 ) -> int:
     """Show the rights that logs ask for, and the lines; write the rights if they are accepted.
 
-    Raises:
-        SrosError: there is something to write that was not accepted.
+    Raises: SrosError: rights were proposed, and not accepted.
     """
     from sros_tool.files import policies_dir
     from sros_tool.graph.learn import common_parts, draft, render, write

@@ -185,7 +185,7 @@ def diff_policy(
     configurations of Zenoh such as router.json5. Permissions and rules of Zenoh are shown in ROS
     terms; the signature of permissions is verified if the permissions CA is next to them. If A or B
     covers only some enclaves, only these are compared. Lines that differ only in the robot of a
-    fleet are shown as one. Of two policies, the protection that they demand is compared, too.
+    fleet are shown as one. For two policies, the protection that they demand is compared, too.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
 
@@ -358,8 +358,8 @@ def minimize_policy(
     that every node needs. The result is one file: includes are resolved, metadata is kept, and
     comments are lost. A DENY always stays, and an enclave that was never observed does not change.
 
-    With --fleet, what was observed of some robots stays for all robots of the same enclave, and
-    sizes are those of the robot with the longest name.
+    With --fleet, all robots keep the rights that some robots used in the same enclave, and sizes
+    are those of the robot with the longest name.
 
     Example:
       $ sros minimize_policy robot.xml --observed learned.xml -o narrow.xml
@@ -478,7 +478,7 @@ def _as_written(value: Any) -> Any:
     "--with-node-rights",
     "complete",
     is_flag=True,
-    help="With --convert: add what every node of today's ROS 2 needs (common/node.xml).",
+    help="With --convert: add the rights that every node of today's ROS 2 needs (common/node.xml).",
 )
 @output_option("Write the converted policy to FILE.")
 @force_option
@@ -495,8 +495,8 @@ def policies(
 ) -> int:
     """List the policies that ship with sros and their enclaves, or copy the policies.
 
-    --copy adds to an existing folder the files that it lacks, and replaces nothing: where a file
-    differs, nothing is copied.
+    --copy adds missing files to an existing folder, and replaces nothing: if a file differs,
+    nothing is copied.
 
     --convert gives a policy of version 0.1.0 (ROS 2 Crystal to Eloquent) the present format, with
     the same rights: each node becomes an enclave with the node's name. Nodes of a later ROS 2 need

@@ -287,7 +287,7 @@ _PHRASES = {
 def report_error(error: BaseException, arguments: Sequence[str], name: str = "sros") -> int:
     """Print an error with its reason and remedy; return the exit status.
 
-    ``arguments`` are the words of the command line: messages begin with what its verb does.
+    ``arguments`` are the words of the command line: messages begin with the action of its verb.
     ``name`` is what help calls the program.
     """
     if isinstance(error, SystemExit):

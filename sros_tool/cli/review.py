@@ -167,9 +167,9 @@ def review(
 ) -> int:
     r"""Review a change of policies, requirements and keystores, as in a pull request.
 
-    Checks the policies and keystores of the commit HEAD, decides its requirements and the ones that
-    it drops, and compares all access with the commit BASE. PATHs are from the top of the
-    repository.
+    Checks the policies and keystores of the commit HEAD, decides the requirements of HEAD and the
+    requirements that HEAD drops, and compares all access with the commit BASE. PATHs are from the
+    top of the repository.
 
     Both commits are read from git itself: nothing is checked out, files of the work tree are read
     only to report that they differ, no link in a commit is followed, and nothing that the
@@ -278,7 +278,7 @@ class _Outputs:
         self._write(_markdown(result, request), [result.shown_finding(e) for e in result.findings])
 
     def write_unfinished(self) -> None:
-        """Write "could not be decided" first, which stays if the review is killed (time limit)."""
+        """Write "could not be decided" first; it stays if the review is killed (time limit)."""
         self._write("## Review: could not be decided\n\nIt was ended before its result.\n", [])
 
     def write_error(self, error: SrosError) -> None:

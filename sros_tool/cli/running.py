@@ -184,10 +184,10 @@ def env(
 ) -> None:
     r"""Print the environment variables that make a process run in ENCLAVE.
 
-    The strategy is Enforce: a process that cannot run in the enclave does not start. If the
-    variables cannot be given, what is printed instead keeps every node from starting. With
-    rmw_zenoh_cpp, which ignores ROS_SECURITY_*, they also name the configuration that `sros zenoh`
-    wrote, and override variables of Zenoh that are set.
+    The strategy is Enforce: a process that cannot run in the enclave does not start. If the enclave
+    cannot be used, sros prints variables with which no node starts. With rmw_zenoh_cpp, which
+    ignores ROS_SECURITY_*, the variables also name the configuration that `sros zenoh` wrote, and
+    override variables of Zenoh that are set.
 
     A container gets the files of the enclave from an export in DIR (Compose), or from a Secret
     (Kubernetes). Without --image, merge the output with a definition that names an image.
@@ -313,10 +313,11 @@ def run(
     The enclave is checked first, so that problems are reported here and not by an obscure message
     of the middleware. A COMMAND that is known to start a ROS node (`ros2 run`, or an executable of
     a ROS package) gets the arguments `--ros-args --enclave ENCLAVE`, so that the ROS graph shows
-    the enclave; with rmw_zenoh_cpp, others do not accept a node without them into their graph.
+    the enclave; with rmw_zenoh_cpp, other processes do not accept a node without these arguments
+    into their graph.
 
-    With --policy, COMMAND gives its node a name: `--ros-args -r __node:=NAME -r __ns:=NAMESPACE`,
-    as launch files do.
+    With --policy, COMMAND has to name its node: `--ros-args -r __node:=NAME -r __ns:=NAMESPACE`, as
+    launch files do.
 
     Example:
       $ sros run keystore /talker_listener/talker -- \

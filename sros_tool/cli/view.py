@@ -127,7 +127,7 @@ def _complete_focus(
     help="Also draw the rights that every node needs, such as /rosout.",
 )
 @click.option("--graphviz", is_flag=True, help="Lay out the SVG with Graphviz.")
-@robot_option("Read this robot of a large keystore in full, also where it equals others.")
+@robot_option("Read this robot of a large keystore in full, even if it equals other robots.")
 @force_option
 @dry_run_option
 def view(
