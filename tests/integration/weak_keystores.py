@@ -81,7 +81,10 @@ WEAKNESSES: Mapping[str, Weakness] = {
         # Permissions that the ledger does not have are not signed again.
         untried=frozenset({"old permissions put back after renewal"}),
     ),
-    "nothing encrypted": Weakness(frozenset({"payload read on the wire"}), forger.unprotected),
+    "nothing encrypted": Weakness(
+        frozenset({"payload read on the wire", "packets of a secured talker changed"}),
+        forger.unprotected,
+    ),
     "files open to all users": Weakness(
         frozenset({"identity copied by another user of the robot"}), forge=_open_modes
     ),
