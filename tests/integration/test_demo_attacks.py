@@ -137,7 +137,7 @@ def test_a_weakness_makes_its_rows_fail_and_no_others(
     assert skipped <= NEEDS_ROOT | weakness.untried
     assert set(wrong) == broken - skipped, rows
     assert ended.status == bool(wrong)
-    assert set(wrong.values()) <= {"heard", "answered", "readable"}
+    assert set(wrong.values()) <= {"heard", "answered", "readable", "deceived"}
 
 
 @ONLY_LONG
