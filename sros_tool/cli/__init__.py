@@ -26,7 +26,8 @@ from types import FrameType
 def main(arguments: list[str] | None = None, *, name: str = "sros") -> None:
     """Run ``sros`` and exit with 0 (yes or done), 1 (no, or findings) or 2 (not answered or done).
 
-    ``arguments`` are those of the process by default; ``name`` is what usage and help call it.
+    ``arguments`` are by default the arguments of the process; ``name`` is the program's name in
+    help.
     """
     if arguments is None:
         arguments = sys.argv[1:]

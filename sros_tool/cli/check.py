@@ -249,10 +249,10 @@ def check(
       $ sros check keystore --distro jazzy --upgrade-to lyrical
 
     Findings that the keystore's template accepts count as notes and share one line; with --strict,
-    for example in CI, they count like all others. Where security is not enabled at all, `check
+    for example in CI, they count like all others. If security is not enabled at all, `check
     runtime` shows a note, which counts with --fail-on note. Exit status: 1 if a finding of the
-    --fail-on severity or higher is shown; 2 if all of these only say that a process could not be
-    looked at; else 0.
+    --fail-on severity or higher is shown; 2 if all such findings only say that a process could not
+    be examined; else 0.
     """
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import FindingFilter
@@ -950,8 +950,8 @@ def metrics(
       $ sros metrics keystore | grep earliest
       sros_earliest_expiry_timestamp_seconds{keystore="/home/robot/keystore",...
 
-    The exit status is 0 whatever is found. If the keystore cannot be examined it is
-    2 and FILE stays as it is: alert also on an old sros_examined_timestamp_seconds.
+    The exit status is 0 even if there are findings. It is 2 if the keystore cannot be examined;
+    then FILE does not change, so alert also on an old sros_examined_timestamp_seconds.
     """
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.keystores.metrics import keystore_metrics

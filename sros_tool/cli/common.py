@@ -317,9 +317,8 @@ def chosen_enclaves(
 ) -> tuple[str, ...]:
     """Return the enclaves that the arguments and the options of `several_enclaves` name.
 
-    Raises:
-        UsageError: none is named.
-        KeystoreError: a pattern matches none, or a robot has none.
+    Raises: UsageError: none is named. KeystoreError: a pattern matches no enclave, or a robot has
+    none.
     """
     check_chosen(names, patterns, robots, every=every)
     if not (patterns or robots or every):
@@ -422,7 +421,7 @@ def keystore_from_environment() -> Path:
 def keystore_argument(
     name: str = "root", metavar: str = "[KEYSTORE]"
 ) -> Callable[[Decorated], Decorated]:
-    """Add a keystore, by default that of the environment, as argument to a verb."""
+    """Add a keystore as argument to a verb; the default is the keystore of the environment."""
 
     def given(context: click.Context, _argument: click.Parameter, path: Path | None) -> Path | None:
         return path if path or context.resilient_parsing else keystore_from_environment()

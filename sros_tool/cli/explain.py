@@ -733,7 +733,7 @@ def _show_who(
 
 
 def _who_lines(everybody: Everybody, fleet: Fleet | None) -> Iterator[str]:
-    """Yield the allowed enclaves, those whose participant does not start now, and the counts.
+    """Yield the allowed enclaves, the enclaves whose participant does not start now, and counts.
 
     The enclaves of a fleet are folded by robot.
     """

@@ -257,7 +257,8 @@ def _collect(
       $ sros fleet collect keystore inbox --publish pub
 
     The exit status is 0 if nothing was refused, 1 if a message, request or release was refused or
-    the fleet file does not allow a request, and 2 if the CAs cannot sign or it cannot be published.
+    the fleet file does not allow a request, and 2 if the CAs cannot sign, or the releases cannot be
+    published.
     """
     from sros_tool.keystore.delivery.collect import PublishedAnswers, collect
 
@@ -532,10 +533,10 @@ def _status(
     earlier (issued for this enclave before); another's (issued for another enclave); revoked;
     missing; or unknown (never issued by this keystore). Processes use new files only after a
     restart: confirmations by the Ansible collection and `sros agent` say which restarts are due,
-    those by `sros fleet report` do not. A robot without a recent confirmation is offline. Whatever
-    files a robot has, it is named if it claims a release that was never published. Robots with the
-    same state share a line. The last line counts known vulnerabilities of the robots' DDS, by the
-    advisories of sros; --robot and --advisories name them.
+    confirmations by `sros fleet report` do not. A robot without a recent confirmation is offline.
+    Whatever files a robot has, it is named if it claims a release that was never published. Robots
+    with the same state share a line. The last line counts known vulnerabilities of the robots' DDS,
+    by the advisories of sros; --robot and --advisories name them.
 
     Example:
       $ sros fleet status keystore
@@ -548,10 +549,10 @@ def _status(
       $ sros fleet status keystore --max-age 7d
       $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
 
-    The exit status is 0 if every robot that is not revoked confirmed that it has what an export
-    would give it now, and no restart that is due, and 1 if not, or if a robot has a DDS with known
-    vulnerabilities that a later release of the same major version fixes (--no-advisories: this does
-    not count).
+    The exit status is 0 if every robot that is not revoked confirmed that it has the files that an
+    export would give it now, and that no restart is due. Otherwise it is 1. It is also 1 if a robot
+    has a DDS with known vulnerabilities that a later release of the same major version fixes (with
+    --no-advisories, this does not count).
     """
     from sros_tool.checks.vulnerabilities import is_mended_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status

@@ -562,7 +562,7 @@ def _propose(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Show the rights that logs ask for, and the lines; write the rights if they are accepted.
+    """Show the rights that logs report as denied, and the lines; write the rights if accepted.
 
     Raises: SrosError: rights were proposed, and not accepted.
     """

@@ -180,7 +180,7 @@ class _Program(VerbGroup):
         return command
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete verbs without importing them; with hyphens, if one was typed, and aliases."""
+        """Complete verbs and aliases without importing them; with hyphens if the user typed one."""
         from click.shell_completion import CompletionItem
 
         if incomplete.startswith("-"):
@@ -350,7 +350,7 @@ def _os_problem(error: OSError) -> str:
 
 
 def _outdated_dependency() -> str:
-    """Return which package that sros needs is missing or too old, and what to do; else "".
+    """Return which required package is missing or too old, and what to do; else "".
 
     colcon installs sros next to packages of the system without checking their versions.
     """

@@ -445,7 +445,7 @@ class _WithCommandAfterDashes(_WithCommand):
     "--sros",
     "program",
     metavar="FILE",
-    help="Path of sros on the machine of the units; it verifies an enclave before its node"
+    help="Path of sros on the machine of the units, which verifies an enclave before its node"
     " starts. [default: none for nodes, this program for jobs]",
 )
 @click.option(

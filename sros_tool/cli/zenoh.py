@@ -96,7 +96,7 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
     "--check",
     "only_check",
     is_flag=True,
-    help="Write nothing; say which files are missing or out of date, and which enclaves have none, "
+    help="Write nothing; say which files are missing or out of date, which enclaves have no file, "
     "and why.",
 )
 @click.option(
@@ -146,10 +146,10 @@ def zenoh(
       $ sros zenoh keystore --check
       $ sros zenoh --from session.json5 -o policy.xml
 
-    Exit status: 0 written, or up to date; with --check 1 if a file is missing or out of date, or an
-    enclave has none, such as one without permissions; with --from 1 if the configuration lets
-    anybody in or does not work; 2 if it could not be done, such as for rights that Zenoh cannot
-    enforce.
+    Exit status: 0 if the files are written, or up to date. With --check, 1 if a file is missing or
+    out of date, or an enclave has no file, for example without permissions. With --from, 1 if the
+    configuration lets anybody in, or does not work. 2 if sros cannot do it, for example for rights
+    that Zenoh cannot enforce.
     """
     from sros_tool.keystore.layout import ZENOH_FILES, check_keystore
     from sros_tool.keystore.lifecycle.update import set_zenoh

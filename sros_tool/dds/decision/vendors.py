@@ -49,7 +49,7 @@ class Moments(Enum):
 
 
 class OpenRange(Enum):
-    """What a range of domains means that has only a minimum or only a maximum."""
+    """The meaning of a range of domains with only a minimum or only a maximum."""
 
     OPEN = auto()
     """``min N`` alone means N and above; ``max N`` alone means 0 to N."""
@@ -75,7 +75,7 @@ class DenyPartitions(Enum):
     ANY_OR_ALL = auto()
     """One of the endpoint's partitions; a rule without partitions applies to all."""
     ANY_OR_DEFAULT = auto()
-    """One of them; a rule without partitions applies to the default one (Cyclone DDS)."""
+    """One of them; a rule without partitions applies to the default partition (Cyclone DDS)."""
     IGNORED = auto()
     """None: a deny rule applies to all partitions, even if it names some (Fast DDS)."""
 
@@ -157,7 +157,7 @@ class VendorTraits:
     forth.
     """
     crashes_on_empty_subject: bool = False
-    """A certificate with an empty subject crashes its process and those of its peers."""
+    """A certificate with an empty subject crashes its process and the processes of its peers."""
     moments: Moments = Moments.STANDARD
     passes_over_outdated_grants: bool = False
     """A later grant is used if the subject's first grant is not valid now."""
@@ -180,9 +180,9 @@ class VendorTraits:
     """A decision crashes the process if it reads an expression or default without text."""
     topic_names: TopicNames = TopicNames.ANY
     longest_topic_name: int | None = None
-    """Longest name of a topic that is matched, in bytes; a longer one is created all the same."""
+    """Longest name of a topic that is matched, in bytes; topics with longer names are created."""
     creates_topics: bool = False
-    """A topic is created before its endpoint, by a right in either direction.
+    """A topic is created before its endpoint; a right in either direction is enough.
 
     The first rule with the topic decides, whether it is to publish or to subscribe.
     """

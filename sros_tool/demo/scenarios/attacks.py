@@ -808,7 +808,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             "permissions signed by the enclave itself",
             Identity(forger.permissions_signed_by_itself, "guest"),
             RowStatus.NOT_LET_IN,
-            "no enclave's certificate comes from the permissions CA: it signs only documents",
+            "the permissions CA signs only documents, and never the certificate of an enclave",
             Variant(
                 (Condition.EXACT_SIGNER,),
                 RowStatus.NOT_LET_IN,
@@ -1017,7 +1017,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             ),
             "DDS Security 1.1 cannot revoke a governance document",
             "after strengthening the governance (`sros update_keystore`): `sros rotate_ca "
-            "--permissions`, so that nobody trusts the CA that signed the weaker one",
+            "--permissions`, so that nobody trusts the CA of the weaker governance",
         ),
         _injection(
             "weaker governance, signed by the permissions CA",
