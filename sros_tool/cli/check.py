@@ -230,9 +230,10 @@ def check(
 ) -> int:
     r"""Find errors and weaknesses in policies, keystores and the runtime.
 
-    PATH is a policy, a folder of policies, a keystore or an enclave. Its type is detected, unless
-    the first word is `policy` or `keystore`. Without PATH, the keystore of $ROS_SECURITY_KEYSTORE
-    and the runtime are checked. The runtime is the environment and the processes of this machine.
+    PATH is a policy, a folder of policies, a keystore or an enclave. The type of PATH is detected,
+    unless the first word is `policy` or `keystore`. Without PATH, the keystore of
+    $ROS_SECURITY_KEYSTORE and the runtime are checked. The runtime is the environment and the
+    processes of this machine.
 
     Example:
       $ sros check robot.xml keystore
@@ -950,8 +951,8 @@ def metrics(
       $ sros metrics keystore | grep earliest
       sros_earliest_expiry_timestamp_seconds{keystore="/home/robot/keystore",...
 
-    The exit status is 0 even if there are findings. It is 2 if the keystore cannot be examined;
-    then FILE does not change, so alert also on an old sros_examined_timestamp_seconds.
+    The exit status is 0 even if there are findings. The exit status is 2 if the keystore cannot be
+    examined; then FILE does not change, so alert also on an old sros_examined_timestamp_seconds.
     """
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.keystores.metrics import keystore_metrics

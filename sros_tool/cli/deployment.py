@@ -379,7 +379,7 @@ def sign_request(
 ) -> None:
     r"""At the keystore: certify the key in REQUEST (or -), and sign the enclave's permissions.
 
-    The answer is one .tar.gz for `sros import` on the robot.  It contains certificate,
+    The answer is one .tar.gz for `sros import` on the robot.  The answer contains certificate,
     permissions, governance, the certificates of the CAs and revocation lists, and no secret.  The
     keystore then contains the enclave, without its private key.  Compare the key's SHA-256 with the
     one that the robot printed.

@@ -158,7 +158,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     """Store a robot's report of its files in KEYSTORE.
 
     FILE is what `sros fleet report` or the Ansible collection made on the robot; - is standard
-    input. It replaces the last report of the robot. A report is no proof; `sros fleet status`
+    input. FILE replaces the last report of the robot. A report is no proof; `sros fleet status`
     compares it with what the robot should have.
 
     Example:
@@ -550,9 +550,9 @@ def _status(
       $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
 
     The exit status is 0 if every robot that is not revoked confirmed that it has the files that an
-    export would give it now, and that no restart is due. Otherwise it is 1. It is also 1 if a robot
-    has a DDS with known vulnerabilities that a later release of the same major version fixes (with
-    --no-advisories, this does not count).
+    export would give it now, and that no restart is due. Otherwise it is 1. The exit status is also
+    1 if a robot has a DDS with known vulnerabilities that a later release of the same major version
+    fixes (with --no-advisories, this does not count).
     """
     from sros_tool.checks.vulnerabilities import is_mended_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status

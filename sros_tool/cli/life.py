@@ -199,8 +199,8 @@ def revoke(
 ) -> None:
     """Revoke ENCLAVE...: processes that load the new crl.pem refuse them.
 
-    Their files move to the folder "revoked" of the keystore.  Export the other enclaves to their
-    robots again: they need the new crl.pem and, during a CA rotation, the CA files.
+    The files of ENCLAVE... move to the folder "revoked" of the keystore.  Export the other enclaves
+    to their robots again: they need the new crl.pem and, during a CA rotation, the CA files.
 
     During a rotation both CAs revoke, because Fast DDS trusts both. If the key of the old CA is
     gone, its certificates are refused only after `sros rotate_ca --to retire`; --until-retired

@@ -364,8 +364,9 @@ def generate_policy(
     robot that is not secured yet, an attacker's nodes are observed, too.
 
     With --from-log, the rights are those that logs report as denied. Any process can print such a
-    line, so they are shown with the lines that report them, and written only with --accept; without
-    it, the exit status is 2. Without FILE, they are printed as a policy, for merge_policy.
+    line, so the rights are shown with the lines that report them, and written only with --accept;
+    without --accept, the exit status is 2. Without FILE, they are printed as a policy, for
+    merge_policy.
 
     Example:
       $ sros generate_policy robot.xml
