@@ -844,7 +844,10 @@ def _show_log(
     if not explained.findings:
         lines = text.count("\n") + (not text.endswith("\n")) if text else 0
         nothing = "looks like a message of DDS Security, or of a denial by Zenoh"
-        echo(f"of {lines} lines, none {nothing}" if lines else "the log is empty", err=True)
+        echo(
+            f"none of {counted(lines, 'line')} {nothing}" if lines else "the log is empty",
+            err=True,
+        )
         if _ZENOH_TESTS in text:
             echo(_ONLY_TESTS, err=True)
     return 1 if explained.findings else 0

@@ -360,17 +360,13 @@ def list_enclaves(
       /listener
       /talker
     """
-    from sros_tool.errors import KeystoreError
     from sros_tool.keystore.layout import (
+        check_keystore,
         enclave_names,
         hidden_enclaves,
-        is_keystore,
-        refuse_earlier,
     )
 
-    if not is_keystore(root):
-        refuse_earlier(root)
-        raise KeystoreError(f"'{root}' is not a valid keystore")
+    check_keystore(root)
     if patterns or robots:
         from sros_tool.keystore.reader import Keystore
         from sros_tool.keystore.selection import select_enclaves

@@ -658,7 +658,7 @@ def _show_new_access(
     elif form == "markdown":
         echo_document(access_markdown(before, after, growth))
     else:
-        for line in (*_added_lines(after, growth), *_removed_lines(before, growth)):
+        for line in (*added_lines(after, growth), *_removed_lines(before, growth)):
             echo(line)
         echo(access_summary(growth), err=True)
     if form != "json":
@@ -666,7 +666,8 @@ def _show_new_access(
     return int(bool(growth))
 
 
-def _added_lines(head: AccessSource, growth: Growth) -> list[str]:
+def added_lines(head: AccessSource, growth: Growth) -> list[str]:
+    """Return the added access as lines that begin with "+"."""
     return [
         *_folded(head, "+", growth.added, growth),
         *(f"+ less protection: {change}" for change in growth.lost),
@@ -774,7 +775,7 @@ def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> s
 
     rest = "which `sros diff_policy --no-new-access` shows"
     parts = [f"### New access: {plain('yes' if growth else 'none')}", plain(access_summary(growth))]
-    lists = (("added", _added_lines(head, growth)), ("removed", _removed_lines(base, growth)))
+    lists = (("added", added_lines(head, growth)), ("removed", _removed_lines(base, growth)))
     for title, lines in lists:
         if lines:
             parts.append(f"**{len(lines)} {title}**")

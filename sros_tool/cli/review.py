@@ -38,6 +38,8 @@ else:  # generic from click 8.2 on
 
 _MOST = 60_000
 """Maximum length of the Markdown, in characters: a comment on GitHub has at most 65,536."""
+_MOST_REASONS = 20
+"""Maximum number of lines below a failed step."""
 _SIGNS = {0: "🟢", 1: "🔴", 2: "⚪"}
 _WORDS = {0: "nothing found", 1: "found", 2: "could not be decided"}
 _TITLES = {
@@ -179,6 +181,7 @@ def review(
       $ sros review --base refs/remotes/origin/main --policy robot/robot.xml
       policy robot/robot.xml: nothing found
       new-access robot/robot.xml: 1 right is new
+        + /arm publish topic /cmd_vel  (robot/robot.xml:12)
       ...
       $ sros review --base 5d1c0a41c3ec2f2a9d2d1b3c63ff7b6e0aa1d9f4 \
             --policy robot/robot.xml --requirements robot/requirements.toml \
@@ -363,7 +366,29 @@ def _text(result: Review) -> list[str]:
     for step in result.steps:
         subject = f" {result.shown(step.subject)}" if step.subject else ""
         lines.append(f"{step.kind}{subject}: {_sentence(result, step)}")
+        if step.status:
+            said = _reasons(step)
+            more = [f"and {len(said) - _MOST_REASONS} more (--summary FILE has all)"]
+            shown = said[:_MOST_REASONS] + more * (len(said) > _MOST_REASONS)
+            lines += [f"  {result.shown(line)}" for line in shown]
     return [*lines, _verdict(result)]
+
+
+def _reasons(step: ReviewStep) -> list[str]:
+    """Return why a step failed: its findings, or the new access."""
+    from sros_tool.checks.registry import ChosenFindings
+    from sros_tool.cli.policy import added_lines
+    from sros_tool.proof.review import AccessChange, DroppedRequirements
+
+    match step.content:
+        case AccessChange(after=after, growth=growth):
+            return added_lines(after, growth)
+        case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen):
+            return [
+                f"{finding.place}: {finding.severity.word}: {finding.text} [{finding.id}]"
+                for finding in chosen.shown
+            ]
+    return []
 
 
 def _verdict(result: Review) -> str:

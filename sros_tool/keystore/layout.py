@@ -518,8 +518,39 @@ def check_keystore(root: Path) -> None:
             "It does not exist."
             if not root.exists()
             else f"It has no {ENCLAVES} folder, or has neither a CA, a governance nor an enclave.",
-            f"Make one with `sros create_keystore {quote(str(root))}`.",
+            _instead_of(root),
         )
+
+
+def _instead_of(root: Path) -> str:
+    """Return what to do where ``root``, which is no keystore, was named as one."""
+    if around := keystore_around(root):
+        return f"It is a folder in the keystore '{around}': name that keystore."
+    if similar := similar_keystores(root):
+        return f"Perhaps you mean '{similar[0]}'."
+    return f"Make one with `sros create_keystore {quote(str(root))}`."
+
+
+def keystore_around(folder: Path) -> Path | None:
+    """Return the keystore whose folder ``folder`` is in, whether it exists or not, or None."""
+    with suppress(KeystoreError):
+        return next(filter(is_keystore, Path(os.path.realpath(folder)).parents), None)
+    return None
+
+
+def similar_keystores(root: Path) -> list[Path]:
+    """Return the keystores next to ``root`` whose names are similar, without regard to digits."""
+    from difflib import get_close_matches  # for this alone, which is asked last
+
+    def letters(name: str) -> str:
+        return "".join(letter for letter in name if not letter.isdigit())
+
+    with suppress(OSError, KeystoreError):
+        siblings = [path.name for path in root.absolute().parent.iterdir() if path.is_dir()]
+        names = get_close_matches(root.name, siblings, n=3, cutoff=0.75)
+        paths = [root.with_name(name) for name in names if letters(name) != letters(root.name)]
+        return [path for path in paths if is_keystore(path)]
+    return []
 
 
 def locate_enclave(folder: Path) -> tuple[Path, str]:

@@ -153,7 +153,8 @@ _DENIED_ENDPOINT = (
 )
 _ASK_FOR_TOPIC = (
     "Look for an earlier line that names the topic, on standard output or in the file of "
-    "ROS_SECURITY_LOG_FILE; or run `sros explain` for each topic of the node."
+    "ROS_SECURITY_LOG_FILE; or run the node without security, and `sros audit KEYSTORE`, which "
+    "names everything that the node would be denied."
 )
 
 LOG_TEXTS: tuple[LogText, ...] = (
@@ -164,6 +165,13 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "this DDS was built without DDS Security, so no secured node can start with it",
         "Use the ROS 2 packages of the distribution; `sros doctor` shows which DDS enforces.",
         refuses=Refused.ALL_SECURITY,
+    ),
+    _text(
+        "keystore-inside", _ROS,
+        r"SECURITY ERROR: directory '(?P<keystore>[^']*)/enclaves/enclaves(?:/[^']*)?' does not",
+        "ROS_SECURITY_KEYSTORE names the folder `enclaves` of {keystore}, and has to name the "
+        "keystore",
+        "Set it to the folder of the keystore: `sros env KEYSTORE ENCLAVE` prints all variables.",
     ),
     _text(
         "enclave-missing", _ROS,

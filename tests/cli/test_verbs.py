@@ -147,6 +147,20 @@ def test_messages_of_ros2(keystore: Path, tmp_path: Path) -> None:
     assert sros("list_enclaves", keystore).ok().out == "/a\n/b\n"
 
 
+def test_a_folder_that_is_no_keystore_leads_to_the_one_that_was_meant(keystore: Path) -> None:
+    inside, misspelt = keystore / "enclaves", keystore.with_name(f"{keystore.name}x")
+    for path, said in (
+        (inside, f"It is a folder in the keystore '{keystore}': name that keystore."),
+        (misspelt, f"It does not exist. Perhaps you mean '{keystore}'."),
+        (keystore.with_name("other"), "Make one with `sros create_keystore "),
+    ):
+        assert said in sros("list_enclaves", path).err
+        assert said in sros("explain", path, "/a", "publish", "/x").err
+    for verb in (("create_keystore", inside), ("generate_artifacts", "-k", inside, "-e", "/a")):
+        ended = sros(*verb)
+        assert ended.status == 2 and f"is in the keystore '{keystore}'. Two k" in ended.err, ended
+
+
 def test_the_layout_is_that_of_ros2(keystore: Path) -> None:
     for name in REQUIRED_FILES:
         assert (keystore / "enclaves/a" / name).is_file()

@@ -498,6 +498,7 @@ def test_the_access_of_a_keystore_is_compared(
     (line,) = (each for each in ended.out.splitlines() if each.startswith("new-access ks"))
     assert "nobody gets more" not in line
     assert ("requirements ks: 1 error" in ended.out) == (case == "rights")
+    assert ("error: " in ended.out and "  + /" in ended.out) or case != "rights", ended
 
 
 def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(

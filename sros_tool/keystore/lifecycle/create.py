@@ -26,7 +26,15 @@ from sros_tool.keystore.issuing.authority import create_authorities
 from sros_tool.keystore.issuing.enclave import stated_enclave
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import token_places
-from sros_tool.keystore.layout import ENCLAVES, PRIVATE, PUBLIC, is_keystore, refuse_earlier
+from sros_tool.keystore.layout import (
+    ENCLAVES,
+    PRIVATE,
+    PUBLIC,
+    is_keystore,
+    keystore_around,
+    refuse_earlier,
+    similar_keystores,
+)
 from sros_tool.keystore.ledger import certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.enclaves import write_enclaves
@@ -446,6 +454,12 @@ def _check_free(root: Path) -> None:
         raise KeystoreError(
             "the root of the file system cannot be a keystore", "", "Choose another path."
         )
+    if around := keystore_around(root):
+        raise KeystoreError(
+            f"'{root}' is in the keystore '{around}'",
+            "Two keystores would share a folder.",
+            "Choose another path.",
+        )
     if os.path.lexists(root) and not root.is_dir():
         raise KeystoreError(
             f"'{root}' is in the way", "It is not a folder.", "Choose another path."
@@ -485,26 +499,11 @@ def _already_exists(root: Path) -> KeystoreError:
     )
 
 
-def _without_digits(name: str) -> str:
-    return "".join(letter for letter in name if not letter.isdigit())
-
-
 def _check_typo(root: Path) -> None:
-    """Refuse a name that looks like a typo of a sibling keystore."""
-    try:
-        siblings = [p.name for p in root.absolute().parent.iterdir() if p.is_dir()]
-    except OSError:
-        return
-    import difflib
-
-    close = difflib.get_close_matches(root.name, siblings, n=3, cutoff=0.75)
-    for name in close:
-        if _without_digits(name) == _without_digits(root.name):
-            continue  # ks2 next to ks is no typo
-        if is_keystore(root.absolute().parent / name):
-            raise UsageError(
-                f"'{root}' does not exist, and '{name}' next to it is a keystore",
-                "The name may be a typo, so no second keystore is created.",
-                f"Name '{root.with_name(name)}', or run `sros create_keystore "
-                f"{quote(str(root))}` first.",
-            )
+    """Refuse a name that looks like a typo of a keystore next to it."""
+    for similar in similar_keystores(root):
+        raise UsageError(
+            f"'{root}' does not exist, and '{similar.name}' next to it is a keystore",
+            "The name may be a typo, so no second keystore is created.",
+            f"Name '{similar}', or run `sros create_keystore {quote(str(root))}` first.",
+        )
