@@ -617,7 +617,7 @@ _DOMAINS = DomainSet.of((0, 0))
 ROOT_ENCLAVE = FindingKind(
     "policy.root-enclave",
     WARNING,
-    "an enclave / with the rights of several nodes or enclaves",
+    "an enclave / with the rights of a node, or of several nodes or enclaves",
     "Every process that is started without an enclave runs in /, and gets all of its rights; "
     "without an enclave / in the keystore, it does not start.",
     "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",
@@ -627,13 +627,23 @@ ROOT_ENCLAVE = FindingKind(
 
 
 def _check_root_enclave(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield a finding about an enclave / that has the rights of several nodes or enclaves."""
+    """Yield a finding about an enclave / that has the rights of nodes, or of other enclaves.
+
+    A single node counts only if it has a plain name, and rights that not every node needs: tools
+    (``_ros2cli_*``) and a profile for any node have no better enclave.
+    """
     root = checked.policy.enclave("/")
     if root is None:
         return
     nodes = {expand("~", profile.ns, profile.node) for profile in root.all_profiles()}
-    also = within_root(policy_rights(checked.policy))
-    if text := also or (f"/ has the rights of {len(nodes)} nodes" if len(nodes) > 1 else ""):
+    text = within_root(policy_rights(checked.policy))
+    if not text and len(nodes) > 1:
+        text = f"/ has the rights of {len(nodes)} nodes"
+    elif not text and not only_basic(policy_rights(Policy((root,)))):
+        name = root.all_profiles()[0].node
+        if name and name[0] != "_" and not is_expression(name):
+            text = f"/ has the rights of the node {nodes.pop()}"
+    if text:
         yield ROOT_ENCLAVE.found("/", text, root.source.file, root.source.line)
 
 

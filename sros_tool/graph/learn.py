@@ -157,8 +157,9 @@ def learn(observation: Observation, common: CommonParts | None = None) -> Learne
     for _, endpoint in observation.strays:
         notes.add("stray", endpoint.topic)
     unshown = sum(enclave == "/" for enclave, _, _ in seen)
-    if unshown and len(seen) > 1:
-        notes.add("root-enclave", f"{'all' if unshown == len(seen) else unshown} of {len(seen)}")
+    if unshown:
+        share = "1 node" if len(seen) == 1 else f"{unshown} of {len(seen)} nodes"
+        notes.add("root-enclave", share)
     profiles = []
     for place, used in sorted(seen.items()):
         if not used:
@@ -489,11 +490,11 @@ _TEXTS = {
     "odd-node": "left out, because a policy cannot name these nodes or their enclaves: {}",
     "partial-action": "only parts of an action are used, so they are listed as "
     "topics and services: {}",
-    "root-enclave": "the ROS graph shows the enclave / for {} nodes, so the policy gives / the "
-    "rights of all of them; either they were started without an enclave, or "
-    "ROS_SECURITY_ENCLAVE_OVERRIDE (as by sros run and sros env) names one, which the graph does "
-    "not show; --enclave-per-node gives each process an enclave of its own, with the name of its "
-    "node",
+    "root-enclave": "the ROS graph shows the enclave / for {}, so the policy gives all these "
+    "rights to /, and every process without an enclave has them; either the processes were started "
+    "without an enclave, or ROS_SECURITY_ENCLAVE_OVERRIDE (as by sros run and sros env) names one, "
+    "which the graph does not show; --enclave-per-node gives each process an enclave of its own, "
+    "with the name of its node",
     "service-event": "service introspection is on: every subscriber of these topics can read the "
     "requests; remove the topics from the policy if introspection is for debugging only: {}",
     "sets-clock": "these nodes may set the clock of every node that uses simulated time; only a "

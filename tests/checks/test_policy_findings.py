@@ -145,10 +145,12 @@ NARROW, WIDE = topics("publish", "/x/a"), topics("publish", "/x/*")
     [
         ({"/": [WIDE], "/b": [NARROW]}, "/ has all rights of /b"),
         ({"/": [NARROW, ""]}, "/ has the rights of 2 nodes"),
-        ({"/": [NARROW], "/b": [WIDE]}, ""),
-        ({"/": [NARROW], "/b": [""]}, ""),  # rights that every node needs
+        ({"/": [NARROW], "/b": [WIDE]}, "/ has the rights of the node /n"),
+        ({"/": [""]}, ""),  # rights that every node needs
+        ({"/": [""], "/b": [WIDE]}, ""),
+        ({"/": [NARROW], "/b": [""]}, "/ has the rights of the node /n"),
         ({"/": [WIDE, deny("publish", "/x/a")], "/b": [NARROW]}, "/ has the rights of 2 nodes"),
-        ({"/": [NARROW]}, ""),
+        ({"/": [NARROW]}, "/ has the rights of the node /n"),
         ({"/a": [WIDE], "/b": [NARROW]}, ""),
     ],
 )
@@ -163,6 +165,14 @@ def test_an_enclave_with_everybodys_rights(
     written = policy(*(enclave(profiles(found), path) for path, found in enclaves.items()))
     found = [each for each in findings(tmp_path, written) if each.id == "policy.root-enclave"]
     assert [each.text for each in found] == ([text] if text else [])
+
+
+@pytest.mark.parametrize(("node", "reported"), [("n", True), ("_ros2cli_*", False), ("*", False)])
+def test_tools_and_any_node_may_run_in_the_root_enclave(
+    node: str, reported: bool, tmp_path: Path
+) -> None:
+    text = policy(enclave(NARROW, "/")).replace('node="n"', f'node="{node}"')
+    assert ("policy.root-enclave" in ids(tmp_path, text)) == reported
 
 
 def test_enclave_names(tmp_path: Path) -> None:

@@ -155,7 +155,12 @@ def test_a_node_that_changes_its_name_has_one_profile() -> None:
 
 @pytest.mark.parametrize(
     ("enclaves", "said"),
-    [(("/", "/"), "all of 2 nodes"), (("/", "/x"), "1 of 2 nodes"), (("/",), ""), (("/x",), "")],
+    [
+        (("/", "/"), "2 of 2 nodes"),
+        (("/", "/x"), "1 of 2 nodes"),
+        (("/",), "1 node"),
+        (("/x",), ""),
+    ],
 )
 def test_nodes_whose_enclave_the_graph_does_not_show(enclaves: tuple[str, ...], said: str) -> None:
     """Whether they share it is not known: `sros run` sets it in a way that the graph hides."""
