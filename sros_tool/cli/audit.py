@@ -94,8 +94,8 @@ def audit(
 
     Nothing is denied: DDS has no permissive mode, so sros observes the ROS graph and decides about
     every endpoint as the DDS vendor would. A node is looked up in the enclave that the graph shows,
-    or else in the enclave whose profiles name it. Observes until the graph stops changing; what a
-    node does only later needs --watch. The default is the keystore of $ROS_SECURITY_KEYSTORE.
+    or else in the enclave whose profiles name it. Observes until the graph stops changing; use
+    --watch to see what nodes do only later. The default is the keystore of $ROS_SECURITY_KEYSTORE.
 
     Example:
       $ sros audit robot.xml

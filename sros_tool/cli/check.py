@@ -661,7 +661,7 @@ def _with_enclaves(fleet: Fleet, paths: Sequence[Path]) -> Fleet:
 
 
 def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Finding, str]]:
-    """Merge findings that differ only in the robot; yield each with the other robots.
+    """Merge findings that differ only in the robot; yield each finding with its other robots.
 
     Two findings are merged if they are about the same line of a policy, in enclaves of two robots.
     """

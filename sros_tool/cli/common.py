@@ -868,7 +868,7 @@ def _first_of_pipe(handle: int, path: Path) -> bytes:
     """Wait for a writer of a pipe; return the first byte, or b"" if the writer wrote nothing.
 
     Raises:
-        OSError: nobody opens it for writing.
+        OSError: nobody opens the pipe for writing.
     """
     poll = select.poll()
     poll.register(handle, select.POLLIN)

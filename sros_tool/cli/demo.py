@@ -179,7 +179,7 @@ def demo(
     marked "open" shows an attack that is known to succeed, and counts as expected. OPEN marks an
     attack that succeeds because of your own keystore (--keystore), and would fail with narrow
     permissions and the template production: the exit status is 1 unless --accept-open names the
-    row. With --keystore it is 2 if an attack that has to fail could not be tried.
+    row. With --keystore, the exit status is 2 if an attack that has to fail could not be tried.
     """
     if role is not None:
         _run_by_hand(ctx, role, backend, topic)

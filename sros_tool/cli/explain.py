@@ -254,8 +254,8 @@ def explain(
     keystore, here or on a robot; ENCLAVE can also be an enclave's folder. With --policy and no
     keystore, sros decides by the policy alone, as it would be signed.
 
-    The exit status is 0 if it is allowed (with --who: to any enclave), and 1 if it is denied; with
-    --log, 1 if the log reports a fault.
+    The exit status is 0 if the operation is allowed (with --who: to at least one enclave), and 1 if
+    it is denied; with --log, 1 if the log reports a fault.
 
     Example:
       $ sros explain keystore /talker publish /chatter --policy robot.xml
@@ -424,7 +424,7 @@ def _question(root: Path | None, rest: tuple[str, ...], kind: str | None) -> Que
 
 
 def _echo(lines: Iterator[str]) -> None:
-    """Print lines; a yes or no at the beginning of an answer is coloured."""
+    """Print lines; a yes or no at the beginning of an answer is colored."""
     for number, line in enumerate(lines):
         word, colon, rest = line.partition(":")
         if not number and word in ("yes", "no"):
@@ -735,7 +735,7 @@ def _show_who(
 def _who_lines(everybody: Everybody, fleet: Fleet | None) -> Iterator[str]:
     """Yield the allowed enclaves, the enclaves whose participant does not start now, and counts.
 
-    The enclaves of a fleet are folded by robot.
+    The enclaves of a fleet are grouped by robot.
     """
     from sros_tool.fleet.enclaves import folded
 
@@ -806,7 +806,7 @@ def _show_reach(
 def _followed_lines(followed: FollowedReach) -> Iterator[str]:
     """Yield the enclaves that an enclave influences and learns from, with a shortest path to each.
 
-    The enclaves of a fleet are folded by robot.
+    The enclaves of a fleet are grouped by robot.
     """
     from sros_tool.fleet.enclaves import folded
     from sros_tool.reach import path_text

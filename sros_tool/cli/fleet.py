@@ -159,7 +159,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
 
     FILE is what `sros fleet report` or the Ansible collection made on the robot; - is standard
     input. FILE replaces the last report of the robot. A report is no proof; `sros fleet status`
-    compares it with what the robot should have.
+    compares the report with the files that the robot should have.
 
     Example:
       $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
@@ -406,9 +406,9 @@ def _publish(
 
     PUB has plain files for any web server, bucket or USB stick, and no private key: for each robot
     an archive with the files of its enclaves, sealed by the permissions CA, and metadata of The
-    Update Framework, by which `sros agent` on the robot refuses old, mixed or forged files. Run it
-    after each change, and before the timestamp expires, for example each hour. Archives of
-    unchanged robots stay; archives of robots that were revoked or left the fleet are removed.
+    Update Framework, by which `sros agent` on the robot refuses old, mixed or forged files. Run
+    this verb after each change, and before the timestamp expires, for example each hour. Archives
+    of unchanged robots stay; archives of robots that were revoked or left the fleet are removed.
 
     The keys are in KEYSTORE/private. The root key only signs the list of the other keys: move it
     away from the keystore, and name it with --root-key when you replace a key, and once a year to
@@ -501,8 +501,8 @@ class ComparedFleet(NamedTuple):
 @click.option(
     "--max-age",
     metavar="DURATION",
-    help="Robots not heard of for longer than this are offline. [default: 1d for robots that "
-    "fetch]",
+    help="Robots without a confirmation for longer than this are offline. [default: 1d for robots "
+    "that fetch]",
 )
 @click.option("--prometheus", is_flag=True, help="Print metrics for node_exporter's textfile.")
 @click.option("--html", is_flag=True, help="Print the status as an HTML page.")

@@ -898,7 +898,7 @@ def _issued_lines(update: KeystoreUpdate) -> Iterator[str]:
 
 
 def _replaced_lines(update: KeystoreUpdate) -> Iterator[str]:
-    """Yield until when replaced certificates and permissions still work, and how to end it."""
+    """Yield until when replaced certificates and permissions still work, and how to end this."""
     from sros_tool.validity import iso
 
     if update.works_until:

@@ -411,7 +411,7 @@ _DONE = {
     "--allow-unconfirmed",
     is_flag=True,
     help="Perform the stage even if some robots of the fleet have not confirmed the "
-    "previous stage; they lose communication.",
+    "previous stage; these robots lose communication.",
 )
 @allow_refusal_option
 @json_option

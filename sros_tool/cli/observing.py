@@ -330,7 +330,7 @@ class _Words(Watching):
 @click.option(
     "--accept",
     is_flag=True,
-    help="Write the rights that --from-log proposes; without it, they are only shown.",
+    help="Write the rights that --from-log proposes; without --accept, they are only shown.",
 )
 @click.option(
     "-s", "--use-sim-time", is_flag=True, help="Accepted and ignored: observing needs no clock."
@@ -365,7 +365,7 @@ def generate_policy(
 
     With --from-log, the rights are those that logs report as denied. Any process can print such a
     line, so the rights are shown with the lines that report them, and written only with --accept;
-    without --accept, the exit status is 2. Without FILE, they are printed as a policy, for
+    without --accept, the exit status is 2. Without FILE, the rights are printed as a policy, for
     merge_policy.
 
     Example:
@@ -386,9 +386,9 @@ def generate_policy(
       these lines of logs ask for it; a process can print any line:
         talker.log:7: talker-1: publish rt/nope in /talker_listener/talker
 
-    On a secured robot, observe in a separate enclave. Create it with `sros generate_artifacts -k
-    KEYSTORE -p observer.xml`: policies/observer.xml (see `sros policies`) has the few rights it
-    needs. Observe with --keystore KEYSTORE --enclave /sros_observer.
+    On a secured robot, observe in a separate enclave. Create this enclave with `sros
+    generate_artifacts -k KEYSTORE -p observer.xml`: policies/observer.xml (see `sros policies`) has
+    the few rights it needs. Observe with --keystore KEYSTORE --enclave /sros_observer.
     """
     present = _present_policy(file)
     if logs:

@@ -194,8 +194,8 @@ def diff_policy(
     does not give, with no vendor, in no domain and for no name, and protects nothing less; it is 2
     if that cannot be decided. sros assumes that a policy is signed with access control of
     everything. If A is a policy, a keystore B with less protection than the template production
-    gives more access; if B is a policy, it lowers no protection. The last line says what is assumed
-    and what is left out, such as dates.
+    gives more access; a policy B lowers no protection. The last line says what is assumed and what
+    is left out, such as dates.
 
     Example:
       $ sros diff_policy robot.xml keystore

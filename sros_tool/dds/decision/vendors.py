@@ -180,14 +180,14 @@ class VendorTraits:
     """A decision crashes the process if it reads an expression or default without text."""
     topic_names: TopicNames = TopicNames.ANY
     longest_topic_name: int | None = None
-    """Longest name of a topic that is matched, in bytes; topics with longer names are created."""
+    """Longest topic name that is matched, in bytes; topics with longer names are still created."""
     creates_topics: bool = False
     """A topic is created before its endpoint; a right in either direction is enough.
 
     The first rule with the topic decides, whether it is to publish or to subscribe.
     """
     asks_both_directions: bool = False
-    """Creating a topic needs a right to publish or to subscribe; each has its own first rule."""
+    """Creating a topic needs a right to publish or to subscribe, each decided by its first rule."""
     always_needs_allow_rule: bool = False
     """A participant without allow rules never starts, even without join control."""
     needs_domain_rule: bool = True

@@ -921,7 +921,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             "old permissions put back after revocation",
             Identity(forger.permissions_signed_by_the_ca, "guest"),
             RowStatus.NOT_HEARD,
-            "the listener's crl.pem lists the certificate for which they were signed",
+            "the listener's crl.pem lists the certificate for which the permissions were signed",
             victims=forger.guest_revoked,
         ),
         _injection(
@@ -948,7 +948,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Variant(
                 (Condition.FAST,),
                 RowStatus.NOT_HEARD,
-                mechanism="Fast DDS lets it start; its peers find no rule for the domain",
+                mechanism="Fast DDS starts; the attacker's peers find no rule for the domain",
             ),
             Variant(
                 (Condition.OPEN_JOIN,),
@@ -978,7 +978,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Variant(
                 (Condition.FAST,),
                 RowStatus.NOT_VISIBLE,
-                mechanism="Fast DDS lets it start; its peers find no rule for the domain",
+                mechanism="Fast DDS starts; the attacker's peers find no rule for the domain",
             ),
             Variant(
                 (Condition.UNAUTHENTICATED, Condition.UNAUTHENTICATED_SEE),
@@ -1064,7 +1064,7 @@ def _misspelt(name: str, keystore: KeystoreChoice, variable: str, value: str, wh
     return known_open(
         _misconfigured(name, identity, RowStatus.HEARD, mechanism),
         "rcl ignores every other spelling, and the node does not warn",
-        "start nodes with `sros run`, which sets the variables; `sros doctor` finds wrong ones",
+        "start nodes with `sros run`, which sets the variables; `sros doctor` finds wrong values",
     )
 
 

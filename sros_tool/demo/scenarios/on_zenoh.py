@@ -276,7 +276,7 @@ _SERVICES = _scenario(
 
 
 def _tapped(attack: str, wire: Wire, *, readable: bool) -> tuple[Row, ...]:
-    hidden = "TLS hides it: only the endpoints of a link have its keys"
+    hidden = "TLS encrypts each link: only the endpoints of a link have its keys"
     row = Row(
         f"{attack}, without TLS" if readable else attack,
         RowStatus.READABLE if readable else RowStatus.NOT_READABLE,
@@ -1054,7 +1054,7 @@ _OPEN_ROWS = (
                 reads=reads,
                 part="router",
             ),
-            "TLS ends at the router, and sessions believe what it passes on",
+            "TLS ends at the router, and sessions trust what the router passes on",
             "run the router as a separate user, and let only that user read its key",
         )
         for reads in (False, True)
