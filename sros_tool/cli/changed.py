@@ -93,7 +93,7 @@ def print_follow_up(
     if not result.dry_run:
         _print_closed(result.root, result.changes)
     if rights:  # on stderr, because stdout is that of ros2/sros2
-        _tell(rights_lines(result.rights, dry_run=result.dry_run))
+        _tell(rights_lines(result.root, result.rights, dry_run=result.dry_run))
     _tell(after)
     if restart:
         _print_restart(result.root, result.restart, result.zenoh, exported=exported)
@@ -136,16 +136,23 @@ def _print_closed(root: Path, changes: Sequence[Change]) -> None:
         )
 
 
-def rights_lines(replaced: Sequence[ReplacedRights], *, dry_run: bool) -> Iterable[str]:
-    """Yield a line for every right that an enclave loses or gains."""
+def rights_lines(root: Path, replaced: Sequence[ReplacedRights], *, dry_run: bool) -> Iterator[str]:
+    """Yield a line for every right that an enclave loses or gains; robots of a fleet in one."""
+    from sros_tool.fleet.enclaves import folded
+    from sros_tool.keystore.fleet import load_fleet
+    from sros_tool.keystore.reader import Keystore
+
     together: dict[tuple[str, str], list[str]] = {}
     for rights in replaced:
         for verb, text in (("lose", rights.loses()), ("gain", rights.gains())):
             if text:
                 together.setdefault((verb, text), []).append(rights.enclave)
+    lines = []
     for (verb, text), names in together.items():
         word = f"would {verb}" if dry_run else verb if len(names) > 1 else f"{verb}s"
-        yield f"{shown_names(names)} {word}: {text}"
+        lines.append((names[0], f"{shown_names(names)} {word}: {text}"))
+    fleet = load_fleet(Keystore(root)) if len(lines) > 1 else None
+    yield from folded(fleet, lines)
 
 
 def shown_names(names: Sequence[str]) -> str:
@@ -167,9 +174,9 @@ def _print_restart(
         return
     number = counted(len(names), "enclave")
     text = f"restart the processes of {number} for it to take effect: "
-    text += first_few(names, MAX_NAMES)
+    text += shown_names(names)
     if zenoh and zenoh.files and set(zenoh.restart) != set(names):
-        text += f"; of those on Zenoh: {first_few(zenoh.restart, MAX_NAMES) or 'none'}"
+        text += f"; of those on Zenoh: {shown_names(zenoh.restart) or 'none'}"
     if exported and (published := publish_command(root)):
         text += f"; robots that fetch: {published} first"
     again = "; where they run from an export, export them again first" if exported else ""

@@ -663,19 +663,20 @@ def _with_enclaves(fleet: Fleet, paths: Sequence[Path]) -> Fleet:
 def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Finding, str]]:
     """Merge findings that differ only in the robot; yield each finding with its other robots.
 
-    Two findings are merged if they are about the same line of a policy, in enclaves of two robots.
+    Two findings are merged if they are about the same line of a policy, in enclaves of two robots,
+    or in one enclave about names of two robots.
     """
-    from sros_tool.fleet.enclaves import path_of_robots
+    from sros_tool.fleet.enclaves import name_of_robots, path_of_robots
 
     groups: dict[object, list[tuple[Finding, str]]] = {}
     number: Counter[object] = Counter()
     for finding in findings:
         path, robot = path_of_robots(fleet, finding.subject)
+        if not robot:
+            path, robot = name_of_robots(fleet, f"{path} {finding.text}")
         place = (finding.id, finding.file, finding.line, finding.accepted, finding.remedy)
-        number[finding.subject, place] += 1  # of several that an enclave has there
-        groups.setdefault((place, path, number[finding.subject, place]), []).append(
-            (finding, robot)
-        )
+        number[path, robot, place] += 1  # of several that an enclave has there
+        groups.setdefault((place, path, number[path, robot, place]), []).append((finding, robot))
     for (first, _), *others in groups.values():
         robots = [robot for _, robot in others]
         more = ", ..." if len(robots) > _MOST_ROBOTS else ""

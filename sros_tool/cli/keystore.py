@@ -888,7 +888,7 @@ def _update_lines(update: KeystoreUpdate, undone: Sequence[str]) -> Iterator[str
         yield f"  {'undone':7}  {clause}"
     for change in update.settings:
         yield f"  {change.effect:7}  {change}"
-    yield from rights_lines(update.rights, dry_run=update.dry_run)
+    yield from rights_lines(update.root, update.rights, dry_run=update.dry_run)
 
 
 def _issued_lines(update: KeystoreUpdate) -> Iterator[str]:

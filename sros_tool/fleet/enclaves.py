@@ -270,6 +270,16 @@ def path_of_robots(fleet: Fleet, enclave: str) -> tuple[str, str]:
     return (_with_placeholders(enclave, enclave, robot), robot.name) if robot else (enclave, "")
 
 
+def name_of_robots(fleet: Fleet, text: str) -> tuple[str, str]:
+    """Return a text with a placeholder for the robot that it names first, and the robot's name.
+
+    A text that names no robot stays as it is, and the name is "".
+    """
+    name = next(filter(fleet.robots.__contains__, re.findall(r"\w+", text, re.A)), "")
+    of_robot = "{robot}"
+    return (_whole(name).sub(of_robot, text), name) if name else (text, "")
+
+
 def _with_placeholders(text: str, enclave: str, robot: Robot) -> str:
     of_robot = "{robot}"  # noqa: RUF027 - a placeholder of policies
     own = _whole(robot.name).sub(of_robot, enclave)

@@ -40,6 +40,9 @@ POLICY = """<policy version="0.2.0"><enclaves>
 </enclaves></policy>"""
 
 
+FLEET = ("--fleet", "fleet.toml")
+
+
 def space(robot: str) -> str:
     return f"/hall/{robot}" if robot in CARRIERS else f"/{robot}"
 
@@ -215,7 +218,7 @@ def test_the_rights_of_every_node_are_not_next_to_the_policy(made: Path, tmp_pat
 
 
 def test_findings_that_are_the_same_for_many_robots_are_said_once(made: Path) -> None:
-    fleet = ("--fleet", "fleet.toml")
+    fleet = FLEET
     folded = sros("check", "robot.xml", *fleet, cwd=made).out
     assert "76 nodes lack the common part" in folded
     ended = sros("check", "robot.xml", *fleet, "--exclude", "policy.no-parameter-events", cwd=made)
@@ -231,6 +234,22 @@ def test_findings_that_are_the_same_for_many_robots_are_said_once(made: Path) ->
     assert f"{counted['counts']['error'] - 76} errors" in ended.err
     ids = [each["id"] for each in counted["findings"]]
     assert ids.count("policy.no-rosout") == 76
+
+
+def test_what_differs_in_the_robot_is_said_once(made: Path, tmp_path: Path) -> None:
+    """Findings about the names of robots in one enclave, and the rights that robots gain."""
+    folder = copied(made, tmp_path)
+    policy = folder / "robot.xml"
+    policy.write_text(policy.read_text().replace("/fleet/{robots}/state", "/fleet/{robots}/stat"))
+    ended = sros("check", "robot.xml", "--fleet", "fleet.toml", cwd=folder)
+    _, _, said = ended.out.partition("[policy.name-misspelt]")
+    assert said and "policy.name-misspelt" not in said
+    assert "    the same for 49 more robots: r" in said
+    more = "<topic>odom</topic><topic>grip/force</topic>"
+    policy.write_text(POLICY.replace("<topic>odom</topic>", more))
+    again = sros("generate_artifacts", "-k", "ks", "-p", "robot.xml", *FLEET, cwd=folder).ok()
+    (gains,) = (line for line in again.err.splitlines() if " gains: " in line)
+    assert gains.startswith("/{robot}/base gains: publish topic {namespace}/grip/force"), gains
 
 
 def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
