@@ -486,7 +486,8 @@ def explain_access(
     Args:
         keystore: The keystore, or its path.
         enclave: The name of the enclave, such as "/talker".
-        action: "publish", "subscribe", "call", "serve", "execute" or "join".
+        action: "publish", "subscribe", "call", "serve", "execute" or "join"; "request" and "reply",
+            the words of policies, mean "call" and "serve" for a service.
         name: The absolute ROS name of the topic, service or action; "" for "join".
         kind: The kind of ``name``; without it, "call" and "serve" mean an action if the rights of
             the enclave, the policy or the keystore have an action and no service of that name.

@@ -108,7 +108,11 @@ def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorate
     help="Fleet file whose robots replace the placeholders of the policies.",
 )
 @_paths_option("keystore", "PATH", "A keystore, or its public part.")
-@_paths_option("leave-out", "PATH", "A folder whose policies are not for the robot, such as tests.")
+@_paths_option(
+    "leave-out",
+    "PATH",
+    "A file, or a folder, of policies that are not for the robot, such as tests.",
+)
 @click.option(
     "--new-access",
     type=click.Choice(["fail", "allow"]),

@@ -116,6 +116,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
     domains = [_domains(scenario, options, user, isolation) for scenario in groups]
     started = time.monotonic()
     results: list[ScenarioResult] = []
+    names: dict[str, None] = {}
     with _ended_by_signals(), _folder(options.keep) as folder:
         if zenoh is None:
             progress("looking for a DDS that enforces security")
@@ -138,6 +139,12 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
                 )
             scenario = replace(scenario, rows=rows)
             keystores = create_keystores(scenario_folder, scenario, spec, user)
+            names |= dict.fromkeys(
+                f"{party.role.uses} {keystores.topic(party, topic)}"
+                for row in scenario.rows
+                for party in row.parties
+                if not party.other_topic
+            )
             progress(
                 f"{scenario.name}: running {len(scenario.rows)} rows on {backend.name}"
                 f" ({backend.dds}): {backend.why}"
@@ -170,6 +177,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             why=backend.why,
             template=template.name,
             topic=topic,
+            names=tuple(names),
             own_network=isolation.isolated,
             network_reason=isolation.reason,
             scenarios=tuple(results),

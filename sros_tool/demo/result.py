@@ -570,7 +570,7 @@ class ScenarioResult:
 
 
 @shows(
-    *("backend", "dds", "libraries", "vulnerabilities", "why", "template", "topic"),
+    *("backend", "dds", "libraries", "vulnerabilities", "why", "template", "topic", "names"),
     *("own_network", "network_reason", "as_expected", "left_out", "scenarios", "rows"),
 )
 @dataclass(frozen=True)
@@ -586,7 +586,9 @@ class DemoResult:
     template: str
     """Template of the keystores."""
     topic: str
-    """The ROS topic of the demo."""
+    """The ROS topic of the demo, for parties that name no other topic."""
+    names: tuple[str, ...]
+    """The topics, services and actions that the rows use, such as `topic /chatter`."""
     own_network: bool
     """Whether the demo ran in a network namespace of its own."""
     network_reason: str
@@ -629,6 +631,7 @@ class DemoResult:
 
 
 _MOST_IDS, _ALL_IDS = 3, 10_000
+_MOST_NAMES = 4
 _UNKNOWN = "its version is not known, or no advisory is about it"
 
 
@@ -711,7 +714,7 @@ def demo_table(result: DemoResult) -> str:
         else f"the network of this machine ({result.network_reason})"
     )
     lines = [
-        f"{result.dds}, topic {result.topic}, in {network}",
+        f"{result.dds}, {first_few(result.names, _MOST_NAMES)}, in {network}",
         f"backend {result.backend}: {result.why}",
         result.known_vulnerabilities(_MOST_IDS),
     ]

@@ -72,8 +72,8 @@ class ReviewRequest:
 
     ``head`` is the commit to review, ``base`` the commit to compare with ("": none). With
     ``allow_new_access``, new access is shown but does not make the review fail. The review fails if
-    an enclave expires within ``renew_within``.  ``left_out`` are folders whose policies are not
-    reviewed.
+    an enclave expires within ``renew_within``.  ``left_out`` are files and folders of policies that
+    are not reviewed.
     """
 
     repository: Repository
@@ -625,7 +625,7 @@ class _Review:
         if asked.allow_new_access:
             yield "new access does not fail the review, as asked"
         for path in asked.left_out:
-            yield f"policies below '{path}' are not reviewed, as asked"
+            yield f"policies in '{path}' are not reviewed, as asked"
         if asked.keystores:
             yield "private keys of keystores are not reviewed"
         for side in (self.head, self.base):

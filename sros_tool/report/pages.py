@@ -27,7 +27,7 @@ from sros_tool.report.picture import Bundle, Picture, PicturedEnclave, fold, lac
 from sros_tool.terminal import visible_json, visible_line
 from sros_tool.validity import iso
 from sros_tool.values import as_plain
-from sros_tool.wording import counted
+from sros_tool.wording import counted, first_few
 
 _ASSETS = Path(__file__).with_name("assets")
 _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
@@ -198,6 +198,7 @@ def _table(rows: list[dict[str, Any]]) -> list[list[Any]]:
 
 Json = Mapping[str, Any]
 _SKIPPED = "skipped"
+_MOST_NAMES = 4
 
 
 def render_demo_page(result: Json) -> str:
@@ -238,7 +239,7 @@ def _demo_head(result: Json) -> str:
     )
     facts = [
         f"{escape(result['dds'])}, nodes by {escape(result['backend'])}",
-        f"topic <code>{escape(result['topic'])}</code>",
+        escape(first_few(result["names"], _MOST_NAMES)),
         f"keystore template {escape(result['template'])}",
         where,
     ]

@@ -175,12 +175,13 @@ def test_the_table_shows_reasons_and_a_summary() -> None:
         why="w",
         template="production",
         topic="/t",
+        names=("service /s", "action /a"),
         own_network=False,
         network_reason="no right",
         scenarios=(ScenarioResult("s", "title", rows),),
     )
     text = demo_table(result)
-    assert "no right" in text
+    assert text.startswith("C 1, service /s, action /a, in the network of this machine (no right)")
     assert "FAIL  b" in text
     assert "not permitted" in text
     assert text.endswith("1 of 3 rows as expected, 1 not as expected, 1 skipped.")

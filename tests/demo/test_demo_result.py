@@ -56,6 +56,7 @@ def result(*rows: RowResult) -> DemoResult:
         why="a test",
         template="production",
         topic="/chatter",
+        names=("topic /chatter",),
         own_network=True,
         network_reason="",
         scenarios=(ScenarioResult("attacks", "every way in", named),),

@@ -50,6 +50,7 @@ def result(*rows: dict[str, Any]) -> dict[str, Any]:
         "why": "",
         "template": "production",
         "topic": "/chatter",
+        "names": ["topic /chatter"],
         "own_network": True,
         "network_reason": "",
         "as_expected": all(each["as_expected"] for each in rows),

@@ -35,6 +35,13 @@ class Role(StrEnum):
     ERASER = "eraser"
     """A node that removes the nodes of talkers from the graph of Zenoh."""
 
+    @property
+    def uses(self) -> str:
+        """Whether the role's name is that of a topic, a service or an action."""
+        if self in (Role.SERVER, Role.CLIENT):
+            return "service"
+        return "action" if self in (Role.ACTION_SERVER, Role.ACTION_CLIENT) else "topic"
+
 
 SPEAKING = frozenset({Role.TALKER, Role.RELAY, Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED})
 """Roles whose messages contain a text that identifies the process."""
