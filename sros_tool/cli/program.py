@@ -34,6 +34,10 @@ class VerbEntry(NamedTuple):
 
 
 FAMILIES: dict[str, dict[str, VerbEntry]] = {
+    "Start here": {
+        "demo": VerbEntry("demo", "Show on a real DDS that secured nodes are isolated."),
+        "close": VerbEntry("close", "Close the robot that runs open here, step by step."),
+    },
     "Keystore": {
         "create_keystore": VerbEntry("keystore", "Create a keystore."),
         "create_enclave": VerbEntry("keystore", "Create enclaves in a keystore.", ("create_key",)),
@@ -89,8 +93,6 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "env": VerbEntry("running", "Print the environment of an enclave."),
         "run": VerbEntry("running", "Run a command in an enclave."),
         "units": VerbEntry("running", "Write systemd units for nodes in enclaves, and timers."),
-        "close": VerbEntry("close", "Close the robot that runs open here, step by step."),
-        "demo": VerbEntry("demo", "Show on a real DDS that secured nodes are isolated."),
         "completion": VerbEntry("running", "Print the completion script of a shell."),
     },
 }
