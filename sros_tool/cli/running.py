@@ -424,8 +424,8 @@ class _WithCommandAfterDashes(_WithCommand):
     multiple=True,
     type=click.Choice([job.value for job in Job]),
     help="renew: renew enclaves that expire within 30 days. check: check the keystore "
-    "daily. metrics: write the keystore's metrics every 15 minutes. fleet: write "
-    "these metrics and the metrics of `sros fleet status`. guard: watch all ROS processes of the machine "
+    "daily. metrics: write the keystore's metrics every 15 minutes. fleet: write these metrics "
+    "and the metrics of `sros fleet status`. guard: watch all ROS processes of the machine "
     "(runs as root, without a timer). agent: run `sros agent` for the security folder KEYSTORE of "
     "a robot every 5 minutes.  Can be repeated.",
 )
