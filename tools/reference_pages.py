@@ -117,10 +117,10 @@ def _log_texts() -> str:
 def _template() -> str:
     parts = [
         "A keystore template is a TOML file with these keys; `sros create_keystore keystore "
-        "--template FILE` takes it. The keystore keeps them in its `sros.toml`, and `sros "
-        "update_keystore keystore --set protection.rtps=ENCRYPT` changes one later. A key that is "
-        "not known is refused. [Keystores](../keystores.md#templates) says which of the templates "
-        "that ship with sros is for what.",
+        "--template FILE` uses it. The keystore keeps the keys in its `sros.toml`, and `sros "
+        "update_keystore keystore --set protection.rtps=ENCRYPT` changes a key later. Unknown keys "
+        "are refused. [Keystores](../keystores.md#templates) describes the templates that ship "
+        "with sros.",
         "A *validity* is a duration that counts from the creation (`90d`; also `s`, `m`, `h`, `w` "
         "and `y`, which is 365 days), an expiry (`2027-06-01`), or both ends "
         "(`2026-12-01/2027-06-01`, `2026-12-01/90d`).",

@@ -65,14 +65,14 @@ _PROTECTION: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
         "discovery",
         "true",
         _FLAG,
-        "discovery of it is protected, at the level of `[protection]` "
+        "the topic's discovery is protected, at the level of `[protection]` "
         "(`enable_discovery_protection`)",
     ),
     (
         "liveliness",
         "true",
         _FLAG,
-        "its signs of life are protected, at the level of `[protection]` "
+        "the topic's signs of life are protected, at the level of `[protection]` "
         "(`enable_liveliness_protection`)",
     ),
 )
@@ -85,8 +85,8 @@ KEYS: tuple[Key, ...] = (
         "distributions",
         '["jazzy", "lyrical"]',
         "names of distributions of ROS 2",
-        "the distributions for which the keystore has to hold: `sros check` decides as the DDS of "
-        "each",
+        "the distributions that the keystore is for; `sros check` decides like the DDS of "
+        "each distribution",
         "any of them",
     ),
     Key(
@@ -94,12 +94,12 @@ KEYS: tuple[Key, ...] = (
         "layout",
         '"separate"',
         ("separate", "single"),
-        "two CAs, one for identities and one for permissions; or one for both, as ros2/sros2 has "
-        "it: with Cyclone DDS 0.10.2 and Fast DDS 2.9.1, any enclave can then sign its own "
+        "two CAs, one for identities and one for permissions; or one CA for both, as in "
+        "ros2/sros2: with Cyclone DDS 0.10.2 and Fast DDS 2.9.1, any enclave can then sign its own "
         "permissions",
     ),
-    Key("[authorities]", "name", '"ours"', "1 to 40 characters", "how the names of the CAs begin"),
-    Key("[authorities]", _VALIDITY, '"5y"', _VALIDITY, "of the CAs"),
+    Key("[authorities]", "name", '"ours"', "1 to 40 characters", "the beginning of the CAs' names"),
+    Key("[authorities]", _VALIDITY, '"5y"', _VALIDITY, "validity of the CAs"),
     Key(
         "[authorities]",
         "identity_key",
@@ -117,16 +117,16 @@ KEYS: tuple[Key, ...] = (
         "where the key of the permissions CA is",
         "`private/` of the keystore",
     ),
-    Key("[certificates]", _VALIDITY, '"365d"', _VALIDITY, "of the certificates of enclaves"),
+    Key("[certificates]", _VALIDITY, '"365d"', _VALIDITY, "validity of enclaves' certificates"),
     Key(
         "[certificates]",
         "unique_subject",
         "true",
         _FLAG,
-        "the subject of each certificate has a part of its own, so that permissions of an earlier "
-        "certificate do not fit it",
+        "the subject of each certificate has a unique part, so that permissions of an earlier "
+        "certificate do not fit this certificate",
     ),
-    Key("[permissions]", _VALIDITY, '"180d"', _VALIDITY, "of signed permissions"),
+    Key("[permissions]", _VALIDITY, '"180d"', _VALIDITY, "validity of signed permissions"),
     Key(
         "[permissions]",
         "default",
@@ -135,14 +135,14 @@ KEYS: tuple[Key, ...] = (
         "what an enclave may do as long as it has no policy: everything, or only what every ROS 2 "
         "node needs to start",
     ),
-    Key("[revocation]", _VALIDITY, '"10y"', "a duration", "of the revocation list"),
-    Key("[[enclaves]]", "names", '["/operator/*"]', "names of enclaves", "to whom this applies"),
+    Key("[revocation]", _VALIDITY, '"10y"', "a duration", "validity of the revocation list"),
+    Key("[[enclaves]]", "names", '["/operator/*"]', "names of enclaves", "the enclaves"),
     Key(
         "[[enclaves]]",
         _VALIDITY,
         '"1d"',
         "a duration",
-        "of their certificates and permissions, if it is shorter than the others",
+        "validity of their certificates and permissions, if shorter than the other validities",
     ),
     Key(
         "[protection]",
@@ -156,21 +156,21 @@ KEYS: tuple[Key, ...] = (
         "discovery",
         '"ENCRYPT"',
         tuple(Level),
-        "discovery of topics that ask for it (`discovery_protection_kind`)",
+        "discovery of topics with `discovery = true` (`discovery_protection_kind`)",
     ),
     Key(
         "[protection]",
         "liveliness",
         '"ENCRYPT"',
         tuple(Level),
-        "signs of life of topics that ask for it (`liveliness_protection_kind`)",
+        "signs of life of topics with `liveliness = true` (`liveliness_protection_kind`)",
     ),
     Key(
         "[protection]",
         "allow_unauthenticated_participants",
         "false",
         _FLAG,
-        "processes without security may take part; needs `rtps` to be `NONE`",
+        "processes without security may join; needs `rtps = NONE`",
     ),
     Key(
         "[protection]",
@@ -203,7 +203,7 @@ KEYS: tuple[Key, ...] = (
         "mode",
         '"client"',
         (Mode.CLIENT, Mode.PEER),
-        "sessions connect to the router alone, or (`peer`) also to each other",
+        "sessions connect only to the router, or (`peer`) also to each other",
     ),
     Key(
         "[zenoh]",
@@ -211,7 +211,7 @@ KEYS: tuple[Key, ...] = (
         "[0]",
         "a list of ROS domain ids",
         "the domains of the sessions",
-        "those of the keystore",
+        "the domains of the keystore",
     ),
     Key(
         "[zenoh]",
@@ -219,21 +219,21 @@ KEYS: tuple[Key, ...] = (
         '["/fleet/*"]',
         "a list of names",
         "the topics and services that may pass from one router to another",
-        "all that enclaves at both ends have rights to",
+        "all names for which enclaves at both ends have rights",
     ),
     Key(
         OF_ROUTER,
         "endpoints",
         '["r1.local:7447"]',
         "a list of `HOST:PORT`",
-        "where sessions and other routers connect to it",
+        "where sessions and other routers connect to this router",
     ),
     Key(
         OF_ROUTER,
         "listen",
         '["[::]:7447"]',
         "a list of `HOST:PORT`",
-        "where it listens",
+        "where this router listens",
         "at these ports of all addresses",
     ),
     Key(
@@ -241,26 +241,26 @@ KEYS: tuple[Key, ...] = (
         "enclaves",
         '["/r1/*"]',
         "a list of names of enclaves",
-        "the enclaves whose sessions connect to it",
+        "the enclaves whose sessions connect to this router",
     ),
     Key(
         OF_ROUTER,
         "crossing",
         '["/fleet/*"]',
         "a list of names of topics and services",
-        "the names that may pass between it and other routers",
-        "all that `crossing` of `[zenoh]` lets pass",
+        "the names that may pass between this router and other routers",
+        "all names that `crossing` of `[zenoh]` lets pass",
     ),
 )
 
 ABOUT = {
     "[[enclaves]]": "Enclaves that expire earlier than the others; the table can be repeated.",
-    DEFAULT: "Topics, services and actions that have no table of their own.",
-    "[[protection.topic]]": "Topics with a protection of their own; the table can be repeated. "
+    DEFAULT: "Topics, services and actions without a separate table.",
+    "[[protection.topic]]": "Topics with a separate protection; the table can be repeated. "
     "`[[protection.service]]` and `[[protection.action]]` have the same keys.",
     "[zenoh]": "Only in a keystore with a [network of Zenoh](../zenoh.md); `sros zenoh` adds it.",
-    OF_ROUTER: "A further router, by its enclave, such as that of a robot; the table can be "
-    "repeated. Of two that name the same enclave, the first one has it.",
+    OF_ROUTER: "An additional router, such as a robot's, named by its enclave; the table can be "
+    "repeated. If two routers name the same enclave, the first router serves it.",
 }
 """What is said of a table before its keys."""
 
