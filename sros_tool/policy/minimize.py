@@ -49,6 +49,29 @@ from sros_tool.values import shows
 _Pair = tuple[str, str]
 
 
+def enclaves_of_nodes(
+    observed: Iterable[str], nodes: Mapping[str, Iterable[str]]
+) -> dict[str, str]:
+    """Return the enclaves of nodes that were observed in enclaves named as the nodes.
+
+    ``generate_policy --enclave-per-node`` writes such names.
+
+    Args:
+        observed: the enclaves that were observed.
+        nodes: the full names of the nodes in each enclave of the policy.  A node in several
+            enclaves, and an observed enclave that the policy has, are left out.
+    """
+    homes = defaultdict(list)
+    for enclave, names in nodes.items():
+        for name in names:
+            homes[name].append(enclave)
+    return {
+        path: homes[path][0]
+        for path in observed
+        if path not in nodes and len(homes.get(path, ())) == 1
+    }
+
+
 class WideRule(NamedTuple):
     """A wildcard that matches more names than were used."""
 

@@ -134,6 +134,15 @@ class Policy:
         """Return the enclave with this path, or None."""
         return next((enclave for enclave in self.enclaves if enclave.path == path), None)
 
+    def nodes(self) -> dict[str, tuple[str, ...]]:
+        """Return the full names of the nodes of each enclave, sorted."""
+        return {
+            enclave.path: tuple(
+                sorted({f"{p.ns.rstrip('/')}/{p.node}" for p in enclave.all_profiles()})
+            )
+            for enclave in self.enclaves
+        }
+
     def enclaves_of_node(self, ns: str, node: str) -> tuple[Enclave, ...]:
         """Return the enclaves with a profile for the node ``node`` in the namespace ``ns``."""
         wanted = (ns.strip("/"), node)

@@ -82,6 +82,17 @@ class PictureSource:
     keystore: Keystore | None = None
     unread: tuple[UnreadUnits, ...] = ()
 
+    def in_enclaves(self, homes: Mapping[str, str]) -> PictureSource:
+        """Return a copy whose rights and nodes are in other enclaves, by the present ones."""
+        nodes: dict[str, set[str]] = defaultdict(set)
+        for path, names in self.nodes.items():
+            nodes[homes.get(path, path)].update(names)
+        rights = (
+            right._replace(enclave=homes.get(right.enclave, right.enclave)) for right in self.rights
+        )
+        sorted_nodes = {path: tuple(sorted(names)) for path, names in nodes.items()}
+        return replace(self, rights=frozenset(rights), nodes=sorted_nodes)
+
 
 @dataclass(frozen=True, slots=True)
 class Context:

@@ -45,7 +45,8 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.keys import algorithm
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import Policy, StatedProtection
+from sros_tool.policy.minimize import enclaves_of_nodes
+from sros_tool.policy.model import StatedProtection
 from sros_tool.policy.patterns import Names
 from sros_tool.policy.rights import Right, RightsDifference, policy_rights
 from sros_tool.report.compose import (
@@ -144,7 +145,8 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     places = {enclave: robot.name for enclave, robot in robots.items()}
     context = Context(common_rights(), places | _hosts(drawing.hosts))
     if drawing.observed:
-        read.append(union([read_source(path, now=drawing.now) for path in drawing.observed]))
+        seen = union([read_source(path, now=drawing.now) for path in drawing.observed])
+        read.append(seen.in_enclaves(enclaves_of_nodes(seen.nodes, read[0].nodes)))
     picture = _compared(read, context, use=bool(drawing.observed))
     if drawing.focus:
         routers = max(_routers(source.keystore) for source in read)
@@ -430,7 +432,7 @@ def read_source(
         scope=read.scope,
     )
     if read.policy:
-        nodes, stated = _nodes(read.policy), read.protections or ()
+        nodes, stated = read.policy.nodes(), read.protections or ()
         source = replace(source, nodes=nodes, protections=stated, policy=read.policy)
     elif sample:
         source = _with_keystore(source, sample, now)
@@ -493,15 +495,6 @@ def _template_governance(choice: str, stated: Sequence[StatedProtection] = ()) -
     return governance_for(protection, DomainSet.of((0, 0)))
 
 
-def _nodes(policy: Policy) -> dict[str, tuple[str, ...]]:
-    return {
-        enclave.path: tuple(
-            sorted({f"{each.ns.rstrip('/')}/{each.node}" for each in enclave.all_profiles()})
-        )
-        for enclave in policy.enclaves
-    }
-
-
 def _observation(path: Path) -> PictureSource:
     try:
         observed = from_json(parse_json(read_bytes(path, "file")))
@@ -516,7 +509,7 @@ def _observation(path: Path) -> PictureSource:
     return PictureSource(
         SourceTitle(_base_name(path), "observation"),
         policy_rights(policy),
-        _nodes(policy),
+        policy.nodes(),
         findings=notes,
     )
 

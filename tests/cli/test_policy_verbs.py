@@ -281,6 +281,29 @@ def test_minimize_tells_and_writes(folder: Path) -> None:
     ]
 
 
+def test_a_node_that_was_observed_in_an_enclave_of_its_own(folder: Path) -> None:
+    """`generate_policy --enclave-per-node` names it after the node; a policy has its own names."""
+    profile = '<profile ns="/arm" node="driver"><topics publish="ALLOW"><topic>{}</topic></topics>'
+    whole = '<policy version="0.2.0"><enclaves>{}</enclaves></policy>'
+    enclave = f'<enclave path="{{}}"><profiles>{profile}</profile></profiles></enclave>'
+    (folder / "own.xml").write_text(whole.format(enclave.format("/robot/arm", "/*")))
+    (folder / "seen.xml").write_text(whole.format(enclave.format("/arm/driver", "/pose")))
+    ended = sros("minimize_policy", "own.xml", "--observed", "seen.xml").ok()
+    assert "publish topic /*  covered publish topic /pose" in ended.out
+    assert "/arm/driver was observed, and counts for /robot/arm." in ended.err
+    sros("view", "own.xml", "--observed", "seen.xml", "-o", "use.html").ok()
+    assert "/arm/driver" not in {
+        found["path"]
+        for found in json.loads(
+            sros("view", "own.xml", "--observed", "seen.xml", "--json").ok().out
+        )["enclaves"]
+    }
+    two = enclave.format("/robot/arm", "/*") + enclave.format("/robot/other", "/*")
+    (folder / "own.xml").write_text(whole.format(two))
+    ended = sros("minimize_policy", "own.xml", "--observed", "seen.xml").ok()
+    assert "minimize.enclave-not-in-policy" in ended.err
+
+
 def test_minimize_with_permissions_and_several_observations(keystore: Path) -> None:
     policy = keystore.parent / "p.xml"
     policy.write_text(policy_text({"/a": publish("*"), "/b": publish("old_b", "more"), "/c": DENY}))

@@ -30,6 +30,7 @@ from sros_tool.policy.minimize import (
     EnclaveUse,
     MinimizedPolicy,
     WildcardProposal,
+    enclaves_of_nodes,
     minimize,
     propose_wildcards,
 )
@@ -158,6 +159,15 @@ def minimized_policy(
     if robots:
         observed_rights = with_placeholders(robots, used)
         notes += _robot_notes(unobserved_robots(robots, used))
+    else:
+        homes = enclaves_of_nodes({right.enclave for right in used}, policy.nodes())
+        observed_rights = frozenset(
+            right._replace(enclave=homes.get(right.enclave, right.enclave)) for right in used
+        )
+        notes += [
+            Note("minimize.enclave-of-node", f"{path} was observed, and counts for {home}.")
+            for path, home in sorted(homes.items())
+        ]
     stated = absolute(policy)
     result = minimize(stated, observed_rights, () if strict else _node_basics())
     if robots:
