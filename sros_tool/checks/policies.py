@@ -91,6 +91,12 @@ class _Statement:
         """The absolute ROS name."""
         return self.right.name
 
+    @property
+    def is_private(self) -> bool:
+        """Whether the name begins with the name of its node."""
+        node = self.profile.node
+        return bool(node) and self.name.startswith(expand("~/", self.profile.ns, node))
+
     def found(self, kind: FindingKind, text: str, remedy: str = "") -> Finding:
         """Return a finding of this kind about this line."""
         file, line = self.source.file, self.source.line
@@ -201,11 +207,22 @@ NO_COUNTERPART = FindingKind(
 MISSPELT = FindingKind(
     "policy.name-misspelt",
     WARNING,
-    "a name that differs slightly from a name of the other side",
+    "a name that differs from that of the other side in spelling, namespace or kind",
     "Neither of the two names has a counterpart, so the nodes do not communicate: one of them may "
-    "have a typing error, or be of another kind, such as a service where an action is called.",
+    "have a typing error, lack a namespace, or be of another kind, such as a service where an "
+    "action is called.",
     "sros: the policy as a whole.",
     "Write the same name, of the same kind, on both sides, as the nodes have it after remapping.",
+)
+MISTAKEN_SIDE = FindingKind(
+    "policy.side-mistaken",
+    WARNING,
+    "a service or action with request and reply, or call and execute, mistaken for each other",
+    "A node offers (reply, execute) the services and actions under its own name, and other nodes "
+    "use them (request, call). Nobody has the opposite right, so no call succeeds.",
+    "sros: the policy as a whole.",
+    'Write reply="ALLOW" (action: execute) at the node that offers the service, and '
+    'request="ALLOW" (action: call) at the nodes that use it.',
 )
 
 CONTRADICTING_PROTECTION = FindingKind(
@@ -265,6 +282,7 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
         for statement in checked.statements
         if (other := _ASKING_SIDE.get(statement.right.right)) and is_alone(statement, other)
     ]
+    yield from _offered_by_others(alone)
     offered: dict[str, list[_Statement]] = defaultdict(list)
     for statement in alone:
         if not _is_of_a_node(statement.name):
@@ -274,16 +292,26 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
         other = _OTHER_SIDE.get(statement.right.right)
         if not other or not is_alone(statement, other):
             continue
-        same = [statement.name] if statement.name in offered else []
-        statements = [
+        if statement.right.kind != "topics" and statement.is_private:
+            text = (
+                f"{statement.right.describe()} is under the node's own name, and nobody offers it"
+            )
+            yield statement.found(MISTAKEN_SIDE, text, f'Write {other}="ALLOW" for it.')
+            continue
+        candidates = [
             one
-            for name in (*same, *near.near(statement.name))
+            for name in (statement.name, *near.near(statement.name))
+            for one in offered.get(name, ())
+        ] + [
+            one
+            for name in near.in_other_namespace(statement.name)
             for one in offered[name]
-            if one.profile
-            is not statement.profile  # a node has, say, a topic and a service of one name
+            if one.right.right == other
         ]
-        if statements:
-            yield _misspelt(statement, other, statements)
+        # A node has, say, a topic and a service of one name.
+        candidates = [one for one in candidates if one.profile is not statement.profile]
+        if candidates:
+            yield _misspelt(statement, other, candidates)
         else:
             yield statement.found(NO_COUNTERPART, f"no enclave may {other} {statement.name}")
 
@@ -293,19 +321,51 @@ def _is_of_a_node(name: str) -> bool:
     return name.rpartition("/")[2] in NODE_SERVICES
 
 
-def _misspelt(each: _Statement, other: str, statements: Sequence[_Statement]) -> Finding:
+def _offered_by_others(unused: Iterable[_Statement]) -> Iterator[Finding]:
+    """Yield findings about services that nobody calls, offered by their node and by others."""
+    owners = {
+        (statement.right.right, statement.name): statement
+        for statement in unused
+        if statement.right.kind != "topics" and statement.is_private
+    }
+    for statement in unused:
+        owner = owners.get((statement.right.right, statement.name))
+        if owner and not statement.is_private and statement.right.enclave != owner.right.enclave:
+            asking = _ASKING_SIDE[statement.right.right]
+            place = RelatedPlace(f"{owner.right.enclave} offers it", *_place(owner.source))
+            text = (
+                f"{statement.right.describe()} is under the name of a node in {owner.right.enclave}"
+                f", which offers it, too ({place}), and nobody may {asking} it"
+            )
+            remedy = f'Write {asking}="ALLOW" for it.'
+            yield statement.found(MISTAKEN_SIDE, text, remedy)._replace(related=(place,))
+
+
+def _misspelt(each: _Statement, other: str, candidates: Sequence[_Statement]) -> Finding:
     """Return the finding on a name without counterpart, which suggests similar names."""
-    shown = " or ".join(
-        f"{statement.name} ({statement.right.right})" for statement in statements[:_NAMES_SHOWN]
-    )
-    text = f"no enclave may {other} {each.name}; perhaps you mean {shown}, which nobody uses"
+    shown, remedy = candidates[:_NAMES_SHOWN], ""
+    names = " or ".join(f"{one.name} ({one.right.right})" for one in shown)
+    hint = f"perhaps you mean {names}, which nobody uses"
+    first = shown[0]
+    if first.name == each.name:
+        kind = first.right.kind.removesuffix("s")
+        article = "an" if kind == "action" else "a"
+        hint = f"{first.right.enclave} has it as {article} {kind} ({first.right.right}), unused"
+        if each.right.kind == "actions":
+            place = RelatedPlace("", *_place(first.source))
+            remedy = f"Write it at {place} {_as_action(other, first.written)}"
+        elif kind == "action":
+            remedy = f"Write it {_as_action('call', each.written)}"
+    text = f"no enclave may {other} {each.name}; {hint}"
     places = tuple(
-        RelatedPlace(
-            f"{statement.right.enclave} may {statement.right.describe()}", *_place(statement.source)
-        )
-        for statement in statements[:_NAMES_SHOWN]
+        RelatedPlace(f"{one.right.enclave} may {one.right.describe()}", *_place(one.source))
+        for one in shown
     )
-    return each.found(MISSPELT, text)._replace(related=places)
+    return each.found(MISSPELT, text, remedy=remedy)._replace(related=places)
+
+
+def _as_action(right: str, name: str) -> str:
+    return f'as an action: <actions {right}="ALLOW"><action>{name}</action></actions>.'
 
 
 def _place(source: Source) -> tuple[str, int | None]:
@@ -1050,7 +1110,11 @@ class NearNames:
 
     def __init__(self, names: Iterable[str]) -> None:
         self._by_key: dict[str, list[str]] = defaultdict(list)
-        for name in dict.fromkeys(names):
+        self._by_end: dict[str, list[str]] = defaultdict(list)
+        self._names = dict.fromkeys(names)
+        for name in self._names:
+            for end in _ends(name):
+                self._by_end[end].append(name)
             for key in set(_keys(name)):
                 self._by_key[key].append(name)
 
@@ -1063,6 +1127,22 @@ class NearNames:
         """
         found = {candidate for key in set(_keys(name)) for candidate in self._by_key.get(key, ())}
         return sorted(other for other in found if other != name and _is_near(name, other))
+
+    def in_other_namespace(self, name: str) -> list[str]:
+        """Return the sorted names that are ``name`` with a namespace more, or less, before it.
+
+        Names of one part, such as /scan, are too common to be meant by others.
+        """
+        shorter = (end for end in _ends(name) if end in self._names)
+        longer = self._by_end.get(name, ()) if name.count("/") > 1 else ()
+        return sorted({*shorter, *longer} - {name})
+
+
+def _ends(name: str) -> Iterator[str]:
+    """Yield the ends of a name that consist of at least two parts, without the whole name."""
+    parts = name.split("/")[1:]
+    for at in range(1, len(parts) - 1):
+        yield "/" + "/".join(parts[at:])
 
 
 def _keys(name: str) -> Iterator[str]:

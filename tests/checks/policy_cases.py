@@ -90,6 +90,7 @@ CASES = [
     Case("policy.name-misspelt",
          services("request", "gripper/set") + OTHER + services("reply", "griper/set"),
          services("request", "gripper/set") + OTHER + services("reply", "gripper/set")),
+    Case("policy.side-mistaken", services("request", "~/home"), services("reply", "~/home")),
     Case("policy.several-profiles",
          '</profile></profiles><profiles><profile ns="/" node="m">' + BASICS,
          OTHER, line=None),

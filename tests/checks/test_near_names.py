@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies import NearNames, policy_file_findings
 from sros_tool.files import policies_dir
 from tests.checks.policy_cases import services, topics
@@ -45,25 +46,72 @@ def test_different(one: str, other: str) -> None:
     assert NearNames([other]).near(one) == []
 
 
-def found(path: Path, content: str) -> dict[str, str]:
+@pytest.mark.parametrize(
+    ("one", "other", "near"),
+    [
+        ("/gripper/home", "/left/gripper/home", True),
+        ("/gripper/home", "/cell/left/gripper/home", True),
+        ("/home", "/left/home", False),
+        ("/r1/gripper/home", "/r2/gripper/home", False),
+        ("/gripper/home", "/left_gripper/home", False),
+        ("/gripper/home", "/gripper/home", False),
+    ],
+)
+def test_a_namespace_more_or_less(one: str, other: str, near: bool) -> None:
+    assert NearNames([one, "/x/y"]).in_other_namespace(other) == [one] * near
+    assert NearNames([other, "/x/y"]).in_other_namespace(one) == [other] * near
+
+
+OTHER = '</profile><profile ns="/" node="_b">'
+
+
+def findings(path: Path, content: str) -> dict[str, Finding]:
     path.write_text(
         '<policy version="0.2.0"><enclaves><enclave path="/a"><profiles><profile ns="/" '
         f'node="_a">{content}</profile></profiles></enclave></enclaves></policy>'
     )
-    return {each.id: each.text for each in policy_file_findings(path)}
+    return {each.id: each for each in policy_file_findings(path)}
 
 
-def test_another_kind_is_meant(tmp_path: Path) -> None:
-    other = '</profile><profile ns="/" node="_b">'
-    call = '<actions call="ALLOW"><action>pick</action></actions>'
-    said = found(tmp_path / "p.xml", call + other + services("reply", "pick"))
-    assert "perhaps you mean /pick (reply)" in said["policy.name-misspelt"]
-    said = found(
-        tmp_path / "p.xml", topics("subscribe", "pick") + other + services("reply", "pick")
-    )
-    assert "perhaps you mean /pick (reply)" in said["policy.name-misspelt"]
-    same = found(tmp_path / "p.xml", topics("subscribe", "pick") + services("reply", "pick"))
+def found(path: Path, content: str) -> dict[str, str]:
+    return {identity: each.text for identity, each in findings(path, content).items()}
+
+
+CALL = '<actions call="ALLOW"><action>pick</action></actions>'
+EXECUTE = CALL.replace("call", "execute")
+AN_ACTION = 'as an action: <actions {}="ALLOW"><action>pick</action></actions>.'
+
+
+@pytest.mark.parametrize(
+    ("asking", "offering", "text", "remedy"),
+    [
+        (CALL, services("reply", "pick"), "a service (reply)", "p.xml:1 " + AN_ACTION),
+        (services("request", "pick"), EXECUTE, "an action (execute)", AN_ACTION),
+        (topics("subscribe", "pick"), services("reply", "pick"), "a service (reply)", "same kind"),
+    ],
+)
+def test_another_kind_is_meant(
+    asking: str, offering: str, text: str, remedy: str, tmp_path: Path
+) -> None:
+    said = findings(tmp_path / "p.xml", asking + OTHER + offering)["policy.name-misspelt"]
+    assert f"; /a has it as {text}, unused" in said.text
+    right = "call" if "request" in asking else "execute"
+    assert remedy.format(right) in said.remedy
+    same = found(tmp_path / "p.xml", asking + offering)
     assert "policy.name-misspelt" not in same, "of one node"
+
+
+def test_a_name_in_another_namespace(tmp_path: Path) -> None:
+    file, (one, other) = tmp_path / "p.xml", ("/gripper/home", "/left/gripper/home")
+    said = found(file, services("request", one) + OTHER + services("reply", other))
+    assert said == {
+        "policy.name-misspelt": f"no enclave may reply {one}; perhaps you mean {other} "
+        "(reply), which nobody uses"
+    }
+    said = found(file, services("request", one) + OTHER + topics("publish", other))
+    assert set(said) == {"policy.no-counterpart"}, "of another kind"
+    both = services("reply", other) + services("request", other)
+    assert set(found(file, services("request", one) + OTHER + both)) == {"policy.no-counterpart"}
 
 
 def test_a_name_with_a_counterpart_is_no_typing_error(tmp_path: Path) -> None:
@@ -77,4 +125,33 @@ def test_a_name_with_a_counterpart_is_no_typing_error(tmp_path: Path) -> None:
 def test_the_shipped_policies_have_none() -> None:
     for file in policies_dir().rglob("*.xml"):
         ids = {each.id for each in policy_file_findings(file)}
-        assert "policy.name-misspelt" not in ids, file
+        assert not ids & {"policy.name-misspelt", "policy.side-mistaken"}, file
+
+
+def sides(path: Path, server: str, client: str) -> list[str]:
+    """Return the texts of findings about sides; both nodes are in enclaves of their own."""
+    profiles = (
+        f'<enclave path="/{name}"><profiles>\n<profile ns="/" node="_{name}">{content}</profile>'
+        "</profiles></enclave>"
+        for name, content in (("server", server), ("client", client))
+    )
+    path.write_text(f'<policy version="0.2.0"><enclaves>{"".join(profiles)}</enclaves></policy>')
+    said = [each for each in policy_file_findings(path) if each.id == "policy.side-mistaken"]
+    return [f"{each.line}: {each.text} {each.remedy}" for each in said]
+
+
+def test_sides_that_are_mistaken_for_each_other(tmp_path: Path) -> None:
+    file, use = tmp_path / "p.xml", services("request", "_server/home")
+    right = services("reply", "~/home")
+    assert sides(file, right, use) == []
+    assert sides(file, right, "") == []
+    (own,) = sides(file, services("request", "~/home"), use)
+    assert own.startswith("2: request service /_server/home is under the node's own name")
+    assert own.endswith('Write reply="ALLOW" for it.')
+    (foreign,) = sides(file, right, services("reply", "_server/home"))
+    assert foreign.startswith("3: reply service /_server/home is under the name of a node")
+    assert foreign.endswith('Write request="ALLOW" for it.')
+    assert "p.xml:2" in foreign and "nobody may request it" in foreign
+    both = services("reply", "_server/home") + use
+    assert sides(file, right, both) == [], "a second server"
+    assert sides(file, topics("subscribe", "~/goal"), "") == [], "of topics, this is usual"
