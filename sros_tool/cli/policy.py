@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -66,7 +67,8 @@ def merge_policy(
     """Print POLICY with the rights of every OTHER policy added.
 
     Comments, includes, metadata and layout of POLICY do not change. A right is added only if the
-    enclave does not have it yet; rights from includes and wildcards count. Publish and subscribe
+    enclave does not have it yet; rights from includes and wildcards count. A new profile includes
+    the common parts in POLICY's folder where OTHER has includes. Publish and subscribe
     are separate rights. A DENY always stays and always wins over an ALLOW; contradictions between
     the policies are reported.
 
@@ -86,7 +88,13 @@ def merge_policy(
     target = policy if in_place else output
     if output:
         check_output(output, force=force)
-    merged = merge_all(policy, [read_policy(path) for path in others])
+    additions = [read_policy(path) for path in others]
+    merged = merge_all(policy, additions)
+    if merged.added and (output is None or output.parent.resolve() == policy.parent.resolve()):
+        from sros_tool.graph.learn import with_common_parts
+
+        document = with_common_parts(policy, merged.document, additions)
+        merged = replace(merged, document=document)
     if output:
         _check_includes(policy, output, merged.document)
     saved = ""

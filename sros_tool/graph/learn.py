@@ -45,7 +45,17 @@ from sros_tool.names import (
 )
 from sros_tool.policy.document import IncludedFile, Includer, read_policy
 from sros_tool.policy.merge import Contradiction, EditedText, PlacedElement, merge_into
-from sros_tool.policy.model import ALLOW, RIGHTS, VERSION, Enclave, Group, Policy, Profile, Profiles
+from sros_tool.policy.model import (
+    ALLOW,
+    DENY,
+    RIGHTS,
+    VERSION,
+    Enclave,
+    Group,
+    Policy,
+    Profile,
+    Profiles,
+)
 from sros_tool.policy.rights import Right, Rules, order, policy_rights, profile_rights
 from sros_tool.translate import ros_rights
 from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
@@ -903,6 +913,73 @@ def _with_includes(
     if included and _prefix(text) is None:
         text.put(text.root.inner - len(">"), f' xmlns:xi="{_XINCLUDE}"')
     return text.document(), tuple(sorted(included))
+
+
+def with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> bytes:
+    """Return the policy file ``merged``, whose new profiles include the common parts in its folder.
+
+    A profile is new if the file at ``path`` lacks it.  Without includes in ``others``, which were
+    merged into the file, ``merged`` is returned.  Rights never change, and neither does a profile
+    that denies something or states a protection.
+    """
+    if not any(
+        group.source.file != other.file
+        for other in others
+        for enclave in other.enclaves
+        for profile in enclave.all_profiles()
+        for group in profile.groups
+    ):
+        return merged
+    folder = path.resolve().parent
+    parts = {
+        part: rights
+        for part in PARTS
+        if (folder / part).exists() and (rights := _part_rights(folder, part))
+    }
+    common, policy = CommonParts(parts), read_policy(path, merged)
+    before = read_bytes(path, "policy file")
+    known, profiles = _profiles_of(path, before), []
+    for enclave in policy.enclaves:
+        allowed = frozenset(
+            NodeRight(right.right, right.name)
+            for right in policy_rights(Policy((enclave,)))
+            if right.qualifier is ALLOW
+        )
+        for profile in enclave.all_profiles():
+            ns, node = profile.ns, profile.node
+            own = tuple(profile_rights(enclave.path, profile))
+            if (
+                (enclave.path, ns, node) in known
+                or any(right.qualifier is DENY for right in own)
+                or any(group.protect for group in profile.groups)
+            ):
+                continue
+            rights = frozenset(NodeRight(right.right, right.name) for right in own)
+            # A merge leaves out what another profile of the enclave allows.
+            chosen, _ = common.choose(allowed, ns, node)
+            includes = tuple(part for part in chosen if common.given((part,), ns, node) & rights)
+            groups = _beyond(common.given(includes, ns, node), profile)
+            profiles.append(LearnedProfile(enclave.path, ns, node, rights, includes, groups))
+    document, _ = _with_includes(path, before, merged, profiles)
+    same = policy_rights(read_policy(path, document)) == policy_rights(policy)
+    return document if same else merged
+
+
+def _beyond(given: frozenset[NodeRight], profile: Profile) -> tuple[Group, ...]:
+    """Return the groups of a profile without names all of whose rights are in ``given``."""
+    groups = []
+    for group in profile.groups:
+        names = tuple(
+            name
+            for name in group.names
+            if any(
+                NodeRight(right, expand(name, profile.ns, profile.node)) not in given
+                for right, _ in group.rights
+            )
+        )
+        if names:
+            groups.append(replace(group, names=names))
+    return tuple(groups)
 
 
 def _profiles(text: EditedText) -> dict[tuple[str, str, str], PlacedElement]:

@@ -17,7 +17,7 @@ from benchmarks.inputs import enclaves_policy, topics_policy
 from sros_tool.files import policies_dir, replace_file
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from tests.support.harness import policy_text, publish, snapshot, sros
+from tests.support.harness import policy_text, publish, snapshot, sros, with_includes
 from tests.support.long_form import sometimes
 
 DENY = '<topics publish="DENY"><topic>cmd_vel</topic></topics>'
@@ -52,6 +52,36 @@ def test_merge_to_stdout(folder: Path) -> None:
     assert rights == policy_rights(read_policy(Path("a.xml"))) | {
         right for right in policy_rights(read_policy(Path("b.xml"))) if str(right) in ADDED
     }
+
+
+INCLUDE = '<xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/>'
+WITH_INCLUDE = with_includes(policy_text({"/b": INCLUDE + publish("z", "/x/y")}))
+
+
+def test_merge_keeps_the_include_of_a_common_part(folder: Path) -> None:
+    shutil.copytree(policies_dir() / "common", folder / "other" / "common")
+    other, command = folder / "other" / "b.xml", ("merge_policy", "a.xml", "other/b.xml")
+    other.write_text(WITH_INCLUDE)
+    spelt_out = sros(*command).ok()
+    assert "include" not in spelt_out.out, "the folder has no common part"
+    shutil.copytree(policies_dir() / "common", folder / "common")
+    included = sros(*command).ok()
+    assert included.out.count(INCLUDE) == 1 and "get_parameters" not in included.out
+    assert "<topic>/x/y</topic>" in included.out and "<!-- mine -->" in included.out
+    assert included.err == spelt_out.err
+    result = Path("a.xml")
+    read = [
+        policy_rights(read_policy(result, ended.out.encode())) for ended in (spelt_out, included)
+    ]
+    assert read[0] == read[1]
+    assert "include" not in sros(*command, "-o", "other/c.xml").ok().out
+    assert "include" not in Path("other/c.xml").read_text(), "for another folder"
+    denied = DENY.replace("cmd_vel", "/rosout")
+    other.write_text(WITH_INCLUDE.replace(INCLUDE, denied + INCLUDE))
+    assert "include" not in sros(*command).ok().out, "a denial"
+    (folder / "common/node/time.xml").write_text(f"<profile>{publish('/other')}</profile>")
+    other.write_text(WITH_INCLUDE)
+    assert "common/node.xml" not in sros(*command).ok().out, "another content"
 
 
 def test_merge_in_place_keeps_mode_and_link(folder: Path) -> None:
