@@ -90,6 +90,7 @@ def test_a_good_file(folder: Path) -> None:
     ("old", "new", "line", "told"),
     [
         ('role = "talker"', 'role = "singer"', 6, "'singer' is not a role"),
+        ('role = "talker"', 'role = "router"', 6, "'router' is not a role; use one of talker, l"),
         ('"/arm/viewer"', '"/arm/vewer"', 13, "did you mean /arm/viewer?"),
         ('topic = "/image"', 'topic = "a b"', 8, "not a topic name"),
         ('name = "viewer"', 'name = "camera"', 11, "two parties"),

@@ -115,6 +115,9 @@ _FITTING: Mapping[str, tuple[Role, ...]] = {
 _NAMED = (Role.SERVER, Role.CLIENT, Role.ACTION_SERVER, Role.ACTION_CLIENT)
 """Roles of parties that have to name a service or an action."""
 
+_ZENOH_ROLES = (Role.ROUTER, Role.RELAY, Role.FLOODER, Role.ERASER)
+"""Roles that parties of users' scenarios cannot have: they run only on Zenoh."""
+
 _VARIABLES = (DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY)
 """Environment variables that a party may set; others, such as LD_PRELOAD, could run code."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
@@ -233,7 +236,7 @@ def _party(table: _Table, policy: Policy) -> Party:
         problem = f"{name!r} is not the name of a party"
         remedy = "Use at most 64 letters, digits, blanks, '.', '_' and '-'."
         raise table.error("name", problem, remedy)
-    roles = {role.value: role for role in Role}
+    roles = {role.value: role for role in Role if role not in _ZENOH_ROLES}
     word = table.text("role")
     if word not in roles:
         raise table.error("role", f"{word!r} is not a role; use one of {', '.join(roles)}")
