@@ -240,6 +240,15 @@ class Includer:
         except DocumentError as error:
             remedy = error.remedy or ("" if _is_there(file) else _missing_remedy(file))
             raise PolicyError(f"{where}: {error.what}", error.why, remedy) from error
+        parent = element.getparent()
+        if not pointer and href and parent is not None and parent.tag == target.tag:
+            include = f"{element.prefix}:include" if element.prefix else "include"
+            selected = f'xpointer="xpointer(/{tag_of(target)}/*)"'
+            raise PolicyError(
+                f"{where}: the include of {_short(href)} lacks {selected}",
+                f"Without it, a <{tag_of(target)}> would be in a <{tag_of(target)}>.",
+                f'Write <{include} href="{href}" {selected}/>.',
+            )
         linked = bool(href) and Path(os.path.normpath(place.file.parent / unquote(href))) != file
         inner = IncludedFile(file, (*place.trail, step), linked)
         found = self._expanded([target], inner)
@@ -353,6 +362,13 @@ _EARLIER = "Version 0.1.0, of ROS 2 Crystal to Eloquent, has nodes in place of e
 _EARLIER_BLOCKS = ("profiles", "contexts")
 _EARLIER_ROOTS = ("profiles",)
 """Root elements of earlier formats that are converted without a <policy> around them."""
+_REQUIRED = {
+    "version": '<policy version="0.2.0">',
+    "path": 'path="/NAME", with the name of the enclave',
+    "ns": 'ns="/", or the namespace of the node',
+    "node": 'node="NAME", with the name of the node',
+}
+"""Required attributes, and what to write where one is missing."""
 _QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
 
 
@@ -549,6 +565,10 @@ class _Reader:
             raise PolicyError(
                 f"{self._where(element, place)}: <profile> cannot contain <{kind}>",
                 f"It can contain only {', '.join(f'<{word}>' for word in RIGHTS)}.",
+                f'Write it in <{kind}s {RIGHTS[f"{kind}s"][0]}="ALLOW"> or '
+                f'<{kind}s {RIGHTS[f"{kind}s"][1]}="ALLOW">.'
+                if kind in _ITEMS
+                else "",
             )
         self._attributes(element, place, optional=RIGHTS[kind])
         rights = []
@@ -560,6 +580,7 @@ class _Reader:
                 raise PolicyError(
                     f"{self._where(element, place)}: {right}={_short(value)} is not valid",
                     "A right is ALLOW or DENY.",
+                    f"Write {_allowing(right, value)}.",
                 )
             rights.append((right, _QUALIFIERS[value]))
         if not rights:
@@ -624,9 +645,16 @@ class _Reader:
         if not problem and any(isinstance(child.tag, str) for child in element):
             problem = "It contains other elements."
         if problem:
-            where = self._where(element, place)
+            where, tag = self._where(element, place), tag_of(element)
+            written = name.strip()
+            meant = [written] if written else [str(value) for value in element.attrib.values()]
+            valid = [text for text in meant if text != name and not expression_problem(text)]
             raise PolicyError(
-                f"{where}: {_short(name)} is not a valid {tag_of(element)} name", problem
+                f"{where}: {_short(name)} is not a valid {tag} name",
+                problem,
+                f"Write <{tag}>{valid[0] if valid else 'NAME'}</{tag}>."
+                if valid or not written
+                else "",
             )
         self._attributes(element, place)
         return name
@@ -731,7 +759,7 @@ class _Reader:
                 raise PolicyError(
                     f"{self._where(element, place)}: <{tag_of(element)}> lacks its {name}=",
                     "",
-                    'Write <policy version="0.2.0">.' if name == "version" else "",
+                    f"Write {_REQUIRED[name]}.",
                 )
 
     def _source(self, element: etree._Element, place: IncludedFile) -> Source:
@@ -741,6 +769,13 @@ class _Reader:
 
     def _where(self, element: etree._Element, place: IncludedFile) -> str:
         return str(self._source(element, place))
+
+
+def _allowing(right: str, value: str) -> str:
+    """Return the attribute that is meant where ``value`` is neither ALLOW nor DENY."""
+    meant = value.strip().upper()
+    words = [meant] if meant in _QUALIFIERS else list(_QUALIFIERS)
+    return " or ".join(f'{right}="{word}"' for word in words)
 
 
 def _absolute(profile: Profile) -> tuple[Profile, ...]:

@@ -18,7 +18,7 @@ from sros_tool.policy.model import RIGHTS, Enclave, Group, Policy, Profile, Prof
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import policy_rights
 from sros_tool.xml import tag_of
-from tests.support.harness import policy_text, with_includes
+from tests.support.harness import policy_text, publish, with_includes
 
 names = st.sampled_from(("x", "/x/y", "~/z", "~", "*", "a?", "[!a-c]d", "/a/*/b"))
 
@@ -322,3 +322,45 @@ def test_an_element_in_a_wrong_place_comes_with_its_mend(
     with pytest.raises(PolicyError, match="expected") as error:
         read_policy(tmp_path / "policy.xml")
     assert error.value.remedy.endswith(fix)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "fix"),
+    [
+        (' ns="/"', "", 'Write ns="/", or the namespace of the node.'),
+        (' node="n"', "", 'Write node="NAME", with the name of the node.'),
+        (' path="/a"', "", 'Write path="/NAME", with the name of the enclave.'),
+        ('"ALLOW"', '"allow"', 'Write publish="ALLOW".'),
+        ('"ALLOW"', '"yes"', 'Write publish="ALLOW" or publish="DENY".'),
+        ("<topic>x</topic>", '<topic name="joint_states"/>', "Write <topic>joint_states</topic>."),
+        ("<topic>x</topic>", "<topic> x\n</topic>", "Write <topic>x</topic>."),
+        ("<topic>x</topic>", '<topic name="a b"/>', "Write <topic>NAME</topic>."),
+        ("<topic>x</topic>", "<topic>a b</topic>", ""),
+        ("topics", "topic", 'Write it in <topics publish="ALLOW"> or <topics subscribe="ALLOW">.'),
+    ],
+)
+def test_an_obvious_mistake_comes_with_its_cure(
+    right: str, wrong: str, fix: str, tmp_path: Path
+) -> None:
+    file, text = tmp_path / "p.xml", policy_text({"/a": publish("x")})
+    file.write_text(text)
+    read_policy(file)
+    assert right in text
+    file.write_text(text.replace(right, wrong))
+    with pytest.raises(PolicyError) as error:
+        read_policy(file)
+    assert error.value.remedy == fix
+
+
+def test_an_include_without_its_xpointer_is_named(tmp_path: Path) -> None:
+    file, pointer = tmp_path / "p.xml", ' xpointer="xpointer(/profile/*)"'
+    (tmp_path / "node.xml").write_text(f"<profile>{publish('x')}</profile>")
+    text = with_includes(policy_text({"/a": f'\n<xi:include href="node.xml"{pointer}/>'}))
+    file.write_text(text)
+    read_policy(file)
+    file.write_text(text.replace(pointer, ""))
+    line = text[: text.index("<xi:include")].count("\n") + 1
+    with pytest.raises(PolicyError) as error:
+        read_policy(file)
+    assert error.value.what == f"{file}:{line}: the include of 'node.xml' lacks{pointer}"
+    assert error.value.remedy == f'Write <xi:include href="node.xml"{pointer}/>.'
