@@ -140,11 +140,14 @@ def _replaced_lines(result: Changed) -> Iterator[str]:
         yield "no enclave needs to be renewed"
     if result.works_until:
         end = iso(result.works_until)
-        what = (
-            f"the replaced certificate works until {end}"
-            if len(result.outcomes) == 1
-            else f"the replaced certificates work until {end} at the latest"
-        )
+        what = f"the replaced certificates work until {end} at the latest"
+        if result.may_work_longer:
+            what = (
+                f"the replaced certificates work at least until {end} (the keystore was restored "
+                "from a backup, and its ledger may lack later ones)"
+            )
+        elif len(result.outcomes) == 1:
+            what = f"the replaced certificate works until {end}"
         yield f"{what}, unless revoked: see --revoke-old"
     if result.outcomes and not result.restart:
         published = publish_command(result.root)

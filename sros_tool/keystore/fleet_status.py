@@ -627,8 +627,6 @@ class _Known:
         marks = [entry for entry in entries if entry.what in (RESTORED, "release")]
         if marks and marks[-1].what == RESTORED:
             return "robots have what it signed and does not know"
-        if not self.folder:
-            return ""
         from sros_tool.keystore.delivery.publish import later_in_folder  # few folders are later
 
         return later_in_folder(self._keystore)

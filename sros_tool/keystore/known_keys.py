@@ -21,11 +21,12 @@ from sros_tool.keystore.layout import (
     REQUEST,
     revoked_certificates,
 )
-from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.ledger import RESTORED, SAME_KEY, Entry
 from sros_tool.keystore.reader import Keystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import (
     common_name_of,
+    digest,
     identity_of,
     key_digest,
     load_request,
@@ -33,6 +34,28 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
+
+
+def revoked_serials(keystore: Keystore) -> frozenset[int]:
+    """Return the serial numbers of all revoked certificates, also of those that were replaced."""
+    entries = keystore.ledger_with("what", "revocation").entries
+    recorded = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
+    listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}
+    return frozenset(recorded | listed)
+
+
+def restored_at(keystore: Keystore) -> str:
+    """Return when a keystore was restored with an identity CA that it trusts; "" if never."""
+    file = keystore.identity_file
+    trusted = {digest(ca) for ca in (keystore.certificates_of(file) if file else ())}
+    ledger = keystore.ledger_file.with_values("what", (RESTORED, "ca"))
+    for entry in reversed(ledger.entries):
+        if entry.what == RESTORED and trusted:
+            return entry.time
+        if entry.what == "ca" and entry.reason != SAME_KEY:
+            trusted.discard(entry.sha256)
+    return ""
+
 
 _MOST_NAMES = 200
 """Enclaves whose keys are looked up one by one; for more, the files of all enclaves are read."""
@@ -138,12 +161,12 @@ class KnownKeys:
         """Map the digest of each key to the enclaves that have it."""
 
         def read(names: Sequence[str]) -> list[tuple[str, str]]:
-            return [(digest, name) for name in names for digest in _digests(self._keystore, name)]
+            return [(key, name) for name in names for key in _digests(self._keystore, name)]
 
         enclaves_by_key: dict[str, list[str]] = defaultdict(list)
         for _, part in map_slices(self._keystore.names, read):
-            for digest, name in part:
-                enclaves_by_key[digest].append(name)
+            for key, name in part:
+                enclaves_by_key[key].append(name)
         return enclaves_by_key
 
     def refuse_revoked(
@@ -179,8 +202,8 @@ class KnownKeys:
             shared = {
                 name: others
                 for name in names
-                for digest in _digests(self._keystore, name)
-                if (others := [other for other in self._holders(digest) if other != name])
+                for key in _digests(self._keystore, name)
+                if (others := [other for other in self._holders(key) if other != name])
             }
         else:
             shared = {
@@ -201,19 +224,19 @@ class KnownKeys:
     def _others(self, key: PublicKey, name: str) -> list[str]:
         return [enclave for enclave in self._holders(key_digest(key)) if enclave != name]
 
-    def _holders(self, digest: str) -> Sequence[str]:
-        """Return the enclaves that have the key with this digest.
+    def _holders(self, key: str) -> Sequence[str]:
+        """Return the enclaves that have the key with the digest ``key``.
 
         In a keystore with an index these are the enclaves that the ledger records for the key, and
         that still have it; a key that was put into another enclave by hand is found by `sros
         check`, which reads the files of all.
         """
         if "_enclaves" in self.__dict__ or not self._keystore.ledger_file.is_indexed:
-            return self._enclaves.get(digest, ())
+            return self._enclaves.get(key, ())
         # Certificates of earlier versions of sros are recorded without their keys.
-        entries = self._keystore.ledger_file.with_values("key", (digest, "")).entries
-        recorded = {e.enclave for e in entries if e.what == "certificate" and e.key in ("", digest)}
-        return [name for name in sorted(recorded) if digest in _digests(self._keystore, name)]
+        entries = self._keystore.ledger_file.with_values("key", (key, "")).entries
+        recorded = {e.enclave for e in entries if e.what == "certificate" and e.key in ("", key)}
+        return [name for name in sorted(recorded) if key in _digests(self._keystore, name)]
 
 
 def _described(certificate: x509.Certificate) -> tuple[str, str]:

@@ -608,7 +608,7 @@ def test_home_is_older_than_its_robots(field: Field) -> None:
     field.run("fleet", "publish", "ks", "pub")
     assert in_force() == {True}
     backup = shutil.copytree(field.root, field.folder / "backup", symlinks=True)
-    field.run("renew", "ks", "--all")
+    assert "at the latest, unless revoked" in field.run("renew", "ks", "--all").err
     field.deliver(*ROBOTS)
     field.run("fleet", "publish", "ks", "pub")
     assert field.status()["older"] is None
@@ -625,9 +625,13 @@ def test_home_is_older_than_its_robots(field: Field) -> None:
         command = rf"`sros fleet publish ks {field.folder}/pub --restored`"
         assert re.search(rf"home is older than its robots: {why}.*{command}", rows), rows
         assert not field.status()["complete"] and in_force() == {False}
+        assert "work at least until" in field.run("renew", "ks", "--all", "--dry-run").err
     kept.rename(field.folder / "pub")
     field.run("fleet", "publish", "ks", "pub", "--restored")
     assert field.status()["older"] is None
+    (field.folder / "less.xml").write_text(POLICY.replace("/y", "/z"))
+    less = ("generate_artifacts", "-k", "ks", "-p", "less.xml", "--fleet", "fleet.toml")
+    assert "/dispatcher: its lost rights work at least until" in field.run(*less).err
     timestamp = field.folder / "pub/metadata/timestamp.json"
     for damaged in (b'{"signed": {"version": 9999999999}}', b"[]", b"x", b"{" * 9999):
         timestamp.write_bytes(damaged)

@@ -43,7 +43,7 @@ LEDGERS = {"ledger.jsonl", "ledger.p7s"}
 RENEWED = {"cert.pem", "permissions.p7s", "permissions.xml"}
 
 
-def made(root: Path, *names: str, template: str = "production", **more: timedelta) -> Path:
+def made(root: Path, *names: str, template: str = "production", **more: timedelta | bool) -> Path:
     def make(root: Path) -> None:
         choices = replace(load_template(template), **more)  # type: ignore[arg-type]
         create_keystore(root, template=choices, now=NOW)
@@ -432,6 +432,23 @@ def test_what_is_cut_short_by_its_authority_says_so(day: int, tmp_path: Path) ->
             assert "expire with their CA at 2031-05-31" in text
             assert "sros rotate_ca" in text
     assert not create_enclaves(root, ["/b"], now=late).notes, "nothing was issued"
+
+
+def test_the_last_of_all_earlier_certificates_tells_until_when_they_work(tmp_path: Path) -> None:
+    """As after a restored backup: the ledger has a certificate that expires after the replaced."""
+    root = made(tmp_path / "ks", "/a", unique_subject=False)
+    path = enclave_path(root, "/a") / "cert.pem"
+    first = path.read_bytes()
+    renew(root, ["/a"], now=LATER)
+    last = validity_of(certificate(path)).not_after
+    path.write_bytes(first)
+    ended = renew(root, ["/a"], now=LATER, dry_run=True)
+    assert ended.works_until == last > validity_of(certificate(path)).not_after
+    assert not ended.may_work_longer
+    soon = NOW + timedelta(days=1)
+    assert renew(root, ["/a"], now=soon, revoke_old=True).works_until is None
+    until = renew(root, ["/a"], now=soon).works_until
+    assert until and until < last, "it is revoked"
 
 
 # ── the program ────────────────────────────────────────────────────────────────────────────

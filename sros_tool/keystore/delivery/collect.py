@@ -46,6 +46,7 @@ from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     IDENTITY,
@@ -55,7 +56,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import REPORTED, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
-from sros_tool.keystore.lifecycle.revocation_list import Forgotten, revoked_serials
+from sros_tool.keystore.lifecycle.revocation_list import Forgotten
 from sros_tool.keystore.lifecycle.revoke import (
     REVOKED_AGAIN,
     restore_revocations,

@@ -38,6 +38,7 @@ from sros_tool.keystore.delivery.published import (
     PublishedRelease,
     PublishedRobot,
     damaged_list,
+    may_be_later,
     read_published,
 )
 from sros_tool.keystore.delivery.release import (
@@ -107,7 +108,6 @@ _OURS = re.compile(
 _MOST_SUPERSEDED = 500_000
 """Number of such paths that are remembered: whoever can write to the folder can make many."""
 _BEFORE = "before"
-_SMALL = 64 * 1024
 
 
 class RobotRelease(NamedTuple):
@@ -235,13 +235,9 @@ def later_in_folder(keystore: Keystore) -> str:
     "" if it is not, or this cannot be told here.  Only what keys of the keystore signed counts.
     """
     with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
-        known = read_published(keystore)
-        folder = Path(known.folder)
-        timestamp = read_bytes(folder / _METADATA / "timestamp.json", "timestamp", most=_SMALL)
-        version = parse_json(timestamp)["signed"]["version"]
-        if known.folder and version > known.versions.get("timestamp", 0):
+        if may_be_later(keystore):
             check_tuf()
-            never = datetime.min.replace(tzinfo=UTC)
+            folder, never = Path(read_published(keystore).folder), datetime.min.replace(tzinfo=UTC)
             run = _Run(keystore, folder, never, MetadataExpiry(), dry_run=True)
             try:
                 run.check_restored(restored=False, new_folder=False, keyring=IN_KEYSTORE)

@@ -8,11 +8,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from sros_tool.errors import DocumentError
+from sros_tool.errors import DocumentError, SrosError
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
 from sros_tool.keystore.delivery.release import release_target
 from sros_tool.keystore.layout import PUBLISHED
@@ -23,6 +25,7 @@ from sros_tool.xml import read_bytes
 
 _FORMAT = 1
 _MOST_BYTES = 128 * 1024 * 1024
+_SMALL = 64 * 1024
 MOST_NUMBER = 10**12 - 1
 """Highest number of a release, as a seal can state it, and highest version of metadata."""
 BEGIN_AGAIN = "Begin again as after the theft of all keys: docs/fetching.md says how."
@@ -139,6 +142,21 @@ def read_published(keystore: Keystore) -> Published:
         )
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise damaged_list(keystore) from error
+
+
+def may_be_later(keystore: Keystore) -> bool:
+    """Return whether the publishing folder of a keystore has later metadata than it published.
+
+    Then the keystore was restored from a backup, or somebody else wrote the metadata: they are not
+    verified here.
+    """
+    with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
+        known = read_published(keystore)
+        if known.folder:
+            path = Path(known.folder) / "metadata" / "timestamp.json"
+            version = parse_json(read_bytes(path, "timestamp", most=_SMALL))["signed"]["version"]
+            return bool(version > known.versions.get("timestamp", 0))
+    return False
 
 
 def damaged_list(keystore: Keystore, why: str = "") -> DocumentError:

@@ -60,6 +60,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     earlier_permissions,
     lasting_text,
     replaced_rights,
+    with_ledger,
 )
 from sros_tool.keystore.lifecycle.shown import enclave_results, shown
 from sros_tool.keystore.outcomes import (
@@ -415,7 +416,7 @@ class _Signer:
         )
         issued = self._writer.write(Issuance(name, identity, rights))
         if earlier:
-            change.notes += _lost_rights(root, earlier, issued, change.now)
+            change.notes += _lost_rights(change, earlier, issued)
         change.transaction.write(f"{enclave_folder(name)}/{REQUEST}", request.pem)
         link_shared_files(change.transaction, name, present_files(root, name))
         change.notes += issued.notes()
@@ -566,13 +567,12 @@ def _new_key_note(old: x509.Certificate, request: SigningRequest) -> list[Note]:
     ]
 
 
-def _lost_rights(
-    root: Path, earlier: EarlierPermissions, issued: Issued, now: datetime
-) -> list[Note]:
+def _lost_rights(change: KeystoreChange, earlier: EarlierPermissions, issued: Issued) -> list[Note]:
     """Return a note on the rights that the enclave loses, and how long its old files work."""
     (grant,) = issued.permissions.grants
-    replaced = replaced_rights(issued.issuance.name, earlier, grant, now)
-    text = lasting_text(root, replaced)
+    replaced = replaced_rights(issued.issuance.name, earlier, grant, change.now)
+    (replaced,) = with_ledger(change.keystore, (replaced,), change.now)
+    text = lasting_text(change.root, replaced)
     if not text:
         return []
     lost = f"{replaced.enclave} loses: {replaced.loses()}."

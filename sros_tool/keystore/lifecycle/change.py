@@ -85,9 +85,10 @@ class Changed:
 
     ``outcomes`` maps enclaves to outcomes such as ``created`` or ``renewed``.  ``rights`` has the
     rights that enclaves gain and lose.  ``works_until`` is the latest expiry of replaced files, or
-    None if no replaced file works any more.  ``revoked`` is the number of revoked certificates.
-    ``restart`` are the enclaves whose processes have to be restarted, ``zenoh`` are the Zenoh
-    configurations.  ``remarks`` are notes on open tasks.
+    None if no replaced file works any more; ``may_work_longer`` says that files which the ledger
+    lacks may work longer, because the keystore was restored from a backup.  ``revoked`` is the
+    number of revoked certificates.  ``restart`` are the enclaves whose processes have to be
+    restarted, ``zenoh`` are the Zenoh configurations.  ``remarks`` are notes on open tasks.
     """
 
     root: Path
@@ -96,6 +97,7 @@ class Changed:
     changes: Sequence[Change] = ()
     rights: tuple[ReplacedRights, ...] = ()
     works_until: datetime | None = None
+    may_work_longer: bool = False
     revoked: int = 0
     restart: tuple[str, ...] = ()
     zenoh: KeptZenoh = field(default_factory=KeptZenoh)

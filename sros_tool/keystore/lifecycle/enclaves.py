@@ -40,6 +40,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     Superseded,
     earlier_permissions,
     replaced_rights,
+    with_ledger,
 )
 from sros_tool.keystore.template import NODE_BASICS, Template
 from sros_tool.parallel import Progress
@@ -111,8 +112,11 @@ def write_enclaves(
         writer.signed, replaced=[old.name for old in superseded], stated=wanted, created=created
     )
     change.record()
+    replaced = [made.replaced for made in done.values() if made.replaced]
+    if not revoke_old:
+        replaced = [*with_ledger(change.keystore, replaced, change.now)]
     change.finish(aim="replace the permissions" if superseded else "")
-    return tuple(made.replaced for made in done.values() if made.replaced)
+    return tuple(replaced)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,10 +6,10 @@ that they fit, can use them until they expire (ros2/sros2 issue 275).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from shlex import quote
 
@@ -18,13 +18,15 @@ from cryptography import x509
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
+from sros_tool.keystore.delivery.published import may_be_later
+from sros_tool.keystore.known_keys import restored_at, revoked_serials
 from sros_tool.keystore.ledger import Entry, certificate_entry
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.certificates import key_digest, subject_text, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, compare
 from sros_tool.translate import grant_rights
-from sros_tool.validity import iso
+from sros_tool.validity import iso, parse_iso
 from sros_tool.wording import first_few
 
 
@@ -50,12 +52,15 @@ class ReplacedRights:
     gained: tuple[Right, ...]
     """Rights that were added, and denials that were taken away."""
     works_until: datetime | None
-    """When the replaced permissions expire, in UTC, for whoever kept them with their certificate;
-    null if they no longer work."""
+    """When the last permissions of the enclave that the ledger has expire, in UTC, for whoever kept
+    them with their certificate; null if they no longer work."""
     lost_domains: str = ""
     """ROS domains, such as 0,7, for which the enclave no longer has permissions."""
     gained_domains: str = ""
     """ROS domains for which the enclave has permissions now, and had none before."""
+    may_work_longer: bool = False
+    """Whether the keystore is older than its robots, or was restored from a backup, so that
+    permissions that the ledger lacks may work longer."""
 
     def revoked(self) -> ReplacedRights:
         """Return a copy for an enclave whose earlier certificate is revoked."""
@@ -92,7 +97,10 @@ def earlier_permissions(
 def replaced_rights(
     name: str, earlier: EarlierPermissions, grant: Grant, now: datetime
 ) -> ReplacedRights:
-    """Return the rights gained and lost when ``grant`` replaces ``earlier`` permissions."""
+    """Return the rights gained and lost when ``grant`` replaces ``earlier`` permissions.
+
+    `with_ledger` says whether other permissions of the enclave work longer than ``earlier``.
+    """
     difference = compare(grant_rights(name, earlier.grant), grant_rights(name, grant))
     lost: list[Right] = []
     gained: list[Right] = []
@@ -104,15 +112,67 @@ def replaced_rights(
     with suppress(SrosError):  # an expiry before the beginning
         end = min(end, earlier.grant.validity.not_after)
     before, after = earlier.grant.domains().closed(), grant.domains().closed()
+    lost_domains, gained_domains = (
+        str(DomainSet.of(*((domain, domain) for domain in here if domain not in there)))
+        for here, there in ((before, after), (after, before))
+    )
+    works_until = end if end >= now else None
     return ReplacedRights(
-        name,
-        tuple(lost),
-        tuple(gained),
-        end if end >= now else None,
-        *(
-            str(DomainSet.of(*((domain, domain) for domain in here if domain not in there)))
-            for here, there in ((before, after), (after, before))
-        ),
+        name, tuple(lost), tuple(gained), works_until, lost_domains, gained_domains
+    )
+
+
+class IssuedEarlier:
+    """When the certificates and permissions of enclaves expire that were issued before a change.
+
+    ``lacks_some`` says whether the keystore is older than its robots, or was restored from a
+    backup, so that its ledger may lack some of them.
+    """
+
+    def __init__(self, keystore: Keystore, names: Collection[str]) -> None:
+        self.lacks_some = bool(restored_at(keystore) or may_be_later(keystore))
+        self._expiry: dict[tuple[str, str], str] = {}
+        revoked = revoked_serials(keystore)
+        for entry in keystore.ledger_file.with_values("enclave", names).entries:
+            if not (entry.serial and int(entry.serial, 16) in revoked):
+                kind = entry.enclave, entry.what
+                self._expiry[kind] = max(self._expiry.get(kind, ""), entry.not_after)
+
+    def until(self, name: str, known: datetime, *kinds: str) -> datetime:
+        """Return until when an enclave's files of all ``kinds`` work, at least until ``known``.
+
+        ``kinds`` are "certificate" and "permissions"; revoked certificates do not work.
+        """
+        with suppress(ValueError):  # the ledger has no such file
+            return max(known, parse_iso(min(self._expiry.get((name, kind), "") for kind in kinds)))
+        return known
+
+
+def with_ledger(
+    keystore: Keystore, replaced: Collection[ReplacedRights], now: datetime
+) -> tuple[ReplacedRights, ...]:
+    """Return replaced rights with the latest expiry of what the ledger has of their enclaves.
+
+    It may have permissions that work longer than those that are replaced: a robot has them if the
+    keystore was restored from a backup.
+    """
+    if not replaced:
+        return ()
+    issued = IssuedEarlier(keystore, {rights.enclave for rights in replaced})
+    return tuple(
+        replace(
+            rights,
+            works_until=until if until >= now else None,
+            may_work_longer=issued.lacks_some,
+        )
+        for rights in replaced
+        for until in (
+            issued.until(
+                rights.enclave,
+                rights.works_until or now - timedelta(seconds=1),
+                *("certificate", "permissions"),
+            ),
+        )
     )
 
 
@@ -157,11 +217,16 @@ def _both_text(rights: Sequence[Right], domains: str) -> str:
 
 def lasting_text(root: Path, replaced: ReplacedRights) -> str:
     """Return sentences on lost rights that still work, and how to end that; "" if none work."""
-    if not (replaced.loses() and replaced.works_until):
+    longer = replaced.may_work_longer
+    if not (replaced.loses() and (replaced.works_until or longer)):
         return ""
+    if replaced.works_until:
+        work = f"work {'at least ' if longer else ''}until {iso(replaced.works_until)}"
+    else:
+        work = "may still work"
     command = f"`sros renew {quote(str(root))} {quote(replaced.enclave)} --revoke-old`"
     return (
-        f"{replaced.enclave}: its lost rights work until {iso(replaced.works_until)} for whoever "
+        f"{replaced.enclave}: its lost rights {work} for whoever "
         "kept its earlier permissions and its key, and in its processes until they are restarted. "
         f"To end that, run {command}, and restart all processes, first those of this enclave."
     )

@@ -22,6 +22,7 @@ from cryptography.hazmat.primitives import serialization
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.issuing.authority import Authority, write_bundle
 from sros_tool.keystore.issuing.keyring import Keyring
+from sros_tool.keystore.known_keys import restored_at, revoked_serials
 from sros_tool.keystore.layout import (
     CRL,
     CRL_FILE,
@@ -33,8 +34,6 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import (
     REPORTED,
-    RESTORED,
-    SAME_KEY,
     Entry,
     certificate_entry,
     document_entry,
@@ -69,14 +68,6 @@ from sros_tool.pki.crl import (
     signed_by,
 )
 from sros_tool.validity import BACKDATE, Window, iso
-
-
-def revoked_serials(keystore: Keystore) -> frozenset[int]:
-    """Return the serial numbers of all revoked certificates, also of those that were replaced."""
-    entries = keystore.ledger_with("what", "revocation").entries
-    recorded = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
-    listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}
-    return frozenset(recorded | listed)
 
 
 class Forgotten:
@@ -378,7 +369,7 @@ class RevocationListSigner:
         )
         if unknown := sorted(lacking):
             why.append(f"it does not have the present certificate of {', '.join(unknown)}")
-        if restored := self._restored():
+        if restored := restored_at(self._keystore):
             why.append(f"the keystore was restored from a backup ({restored})")
         if why:
             text = (
@@ -387,18 +378,6 @@ class RevocationListSigner:
                 "`sros rotate_ca`."
             )
             self.remarks.append(Note("ledger.may-lack-certificates", text))
-
-    def _restored(self) -> str:
-        """Return when the keystore was restored with an identity CA that it trusts; "" if never."""
-        file = self._keystore.identity_file
-        trusted = {digest(ca) for ca in (self._keystore.certificates_of(file) if file else ())}
-        ledger = self._keystore.ledger_file.with_values("what", (RESTORED, "ca"))
-        for entry in reversed(ledger.entries):
-            if entry.what == RESTORED and trusted:
-                return entry.time
-            if entry.what == "ca" and entry.reason != SAME_KEY:
-                trusted.discard(entry.sha256)
-        return ""
 
     # ── the lists ──────────────────────────────────────────────────────────────────────────
 

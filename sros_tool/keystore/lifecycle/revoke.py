@@ -13,6 +13,7 @@ from shlex import quote
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     KEY_URI_FILE,
@@ -26,7 +27,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import RESTORED, Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
-from sros_tool.keystore.lifecycle.revocation_list import Forgotten, revoked_serials
+from sros_tool.keystore.lifecycle.revocation_list import Forgotten
 from sros_tool.keystore.selection import no_such_enclave
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import issued_by

@@ -278,8 +278,11 @@ class RenewedEnclaves(NamedTuple):
     ]
     """The renewed enclaves."""
     replaced_work_until: datetime | None
-    """Last expiry of the replaced certificates, in UTC; null if they have expired or were
-    revoked."""
+    """Last expiry of the certificates of these enclaves that the ledger has, in UTC; null if they
+    have expired or were revoked."""
+    may_work_longer: bool
+    """Whether the keystore is older than its robots, or was restored from a backup, so that
+    certificates that the ledger lacks may work longer."""
     revoked: int
     """Number of certificates that were revoked (``--revoke-old``)."""
     restart: TrustRevoked

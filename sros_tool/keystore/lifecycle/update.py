@@ -70,6 +70,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     Superseded,
     replaced_rights,
     rights_text,
+    with_ledger,
 )
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import Keystore
@@ -466,9 +467,11 @@ class _Updater:
             replaced = [old.name for old in superseded] if revoked else ()
             change.keep_zenoh(self._writer.signed, replaced=replaced)
         change.record()
-        rights = tuple(
-            document.rights.revoked() if revoked else document.rights for document in reissued
-        )
+        rights = tuple(document.rights for document in reissued)
+        if revoked:
+            rights = tuple(replaced.revoked() for replaced in rights)
+        else:
+            rights = with_ledger(change.keystore, rights, change.now)
         settings = (
             *compare_governance(self._present.governance, governance),
             *compare_settings(before, after, change.now),
