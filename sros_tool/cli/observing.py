@@ -388,7 +388,8 @@ def generate_policy(
 
     On a secured robot, observe in a separate enclave. Create this enclave with `sros
     generate_artifacts -k KEYSTORE -p observer.xml`: policies/observer.xml (see `sros policies`) has
-    the few rights it needs. Observe with --keystore KEYSTORE --enclave /sros_observer.
+    the few rights that the observer needs. Observe with --keystore KEYSTORE --enclave
+    /sros_observer.
     """
     present = _present_policy(file)
     if logs:

@@ -290,7 +290,7 @@ def report_error(error: BaseException, arguments: Sequence[str], name: str = "sr
     """Print an error with its reason and remedy; return the exit status.
 
     ``arguments`` are the words of the command line: messages begin with the action of its verb.
-    ``name`` is what help calls the program.
+    ``name`` is the program's name in help.
     """
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else 1
