@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -145,9 +146,10 @@ def audit(
     reported: set[str] = set()
 
     def report(observation: Observation) -> None:
-        for line in _denied(judge(observation)):
-            if line not in reported:
-                reported.add(line)
+        # Nodes of the policy may still appear: no line says yet that one of them is meant.
+        for key, line in replace(judge(observation), unseen=()).lines().items():
+            if key not in reported:
+                reported.add(key)
                 echo(f"denied: {line}", err=True)
 
     secured = enclave is not None
@@ -225,17 +227,9 @@ def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:
 # ── output ──────────────────────────────────────────────────────────────────────────────
 
 
-def _denied(audited: Audit) -> list[str]:
-    """Return a line for each enclave that is refused, and for each right that is denied."""
-    refused = [
-        f"{name}: every process: {reason}" for name, reason in sorted(audited.refused.items())
-    ]
-    return [*refused, *map(str, audited.denied)]
-
-
 def _show(audited: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> None:
     """Print denied rights, unseen nodes and a verdict that says what the audit did not cover."""
-    for line in (*_denied(audited), *(f"not seen: {node}" for node in audited.unseen)):
+    for line in (*audited.lines().values(), *(f"not seen: {node}" for node in audited.unseen)):
         echo(line)
     what = [counted(len(audited.denied), "right")] if audited.denied else []
     what += [counted(len(audited.refused), "whole enclave")] if audited.refused else []

@@ -14,6 +14,7 @@ that did not appear, and everything in the graph that belongs to no enclave.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -58,7 +59,7 @@ from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, order
 from sros_tool.translate import governance_for
 from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
-from sros_tool.wording import counted
+from sros_tool.wording import counted, first_few
 
 _DENY_RULE = "deny-rule"
 _USE = "use"
@@ -312,11 +313,41 @@ class Audit:
         """Whether every expected node was seen, and every observed thing was judged."""
         return not (self.unseen or self.unjudged)
 
+    def lines(self) -> dict[str, str]:
+        """Return a line for each refused enclave, denied right and node without an enclave.
+
+        The key of a line stays the same while more rights of a node without an enclave are seen.
+        """
+        lines = {name: f"{name}: every process: {why}" for name, why in self.refused.items()}
+        lines = dict(sorted(lines.items()))
+        lines |= {str(right): str(right) for right in self.denied if not right.new_enclave}
+        homeless: dict[tuple[str, ...], list[DeniedRight]] = {}
+        for right in self.denied:
+            if right.new_enclave:
+                homeless.setdefault(right.nodes, []).append(right)
+        names = Counter(_base_name(node) for nodes in homeless for node in nodes)
+        for nodes, rights in homeless.items():
+            name = _base_name(nodes[0])
+            meant = [unseen for unseen in self.unseen if _base_name(unseen.node) == name]
+            hint = ""
+            if len(nodes) == len(meant) == names[name] == 1:
+                hint = f"; perhaps it is {meant[0]}, which was not seen"
+            shown = ", ".join(nodes)
+            used = first_few([right.right.describe() for right in rights], 3)
+            text = f"{shown}: {rights[0].reason}: {counted(len(rights), 'right')} ({used}){hint}"
+            lines[shown] = text
+        return lines
+
     @cached_property
     def missing(self) -> Learned:
         """The rights to add to the policy; rights that a deny rule denies are not included."""
         learned = learn(_used(self.denied, self.observation))
         return replace(learned, source=RightsFound.AUDIT)
+
+
+def _base_name(node: str) -> str:
+    """Return the name of a node without its namespace."""
+    return node.rpartition("/")[2]
 
 
 def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "") -> Audit:

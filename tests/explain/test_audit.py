@@ -381,3 +381,51 @@ def test_an_enclave_that_dds_refuses_is_reported_as_a_whole(keystore: Path) -> N
     assert said(found) == [] and not found.allowed
     assert set(found.refused) == {"/t"}
     assert "domain 5" in found.refused["/t"]
+
+
+TWO = "2 rights (publish topic /chatter, publish topic /x)"
+
+
+@pytest.mark.parametrize(
+    ("enclaves", "fqns", "lines"),
+    [
+        (
+            {"/left/talker": {"/left/talker": []}},
+            ["/talker"],
+            [f"/talker: {UNNAMED}: {TWO}; perhaps it is node /left/talker of enclave "
+             "/left/talker, which was not seen"],
+        ),
+        ({"/left/talker": {"/left/other": []}}, ["/talker"], [f"/talker: {UNNAMED}: {TWO}"]),
+        (
+            {"/left": {"/left/talker": []}, "/right": {"/right/talker": []}},
+            ["/talker"],
+            [f"/talker: {UNNAMED}: {TWO}"],
+        ),
+        (
+            {"/left/talker": {"/left/talker": []}},
+            ["/a/talker", "/b/talker"],
+            [f"/a/talker: {UNNAMED}: {TWO}", f"/b/talker: {UNNAMED}: {TWO}"],
+        ),
+        (
+            {"/left/talker": {"/left/talker": ["publish /chatter", "publish /x"]}},
+            ["/left/talker"],
+            [],
+        ),
+    ],
+)  # fmt: skip
+def test_one_line_for_a_node_without_an_enclave(
+    enclaves: Enclaves, fqns: list[str], lines: list[str], tmp_path: Path
+) -> None:
+    """The node that the policy has may have been started in another namespace."""
+    nodes = [talks("publish /x", fqn=fqn, pid=fqn) for fqn in fqns]
+    assert list(audited(tmp_path, enclaves, graph(*nodes)).lines().values()) == lines
+
+
+def test_each_right_of_a_known_enclave_has_a_line(tmp_path: Path) -> None:
+    seen = graph(talks("publish /x", "publish /y"), talks(fqn="/new", pid="p2"))
+    denied = audited(tmp_path, TALKER, seen)
+    assert list(denied.lines().values()) == [
+        "/t publish topic /x (/talker): no rule allows publish rt/x",
+        "/t publish topic /y (/talker): no rule allows publish rt/y",
+        f"/new: {UNNAMED}: 1 right (publish topic /chatter)",
+    ]
