@@ -64,7 +64,7 @@ NO_NODE = FindingKind(
 BUFFERS = FindingKind(
     "upgrade.zenoh-buffers",
     WARNING,
-    "Zenoh files without the keys on which the other release sends images",
+    "Zenoh files that lack the keys on which the other release sends images",
     "rmw_zenoh of Lyrical sends messages with arrays of bytes, such as images and point clouds, on "
     "keys below that of the topic. Files of an earlier sros drop them without a word.",
     "ros2/rmw_zenoh, rmw_publisher_data.cpp.",
