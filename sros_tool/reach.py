@@ -4,8 +4,9 @@ An enclave that publishes a topic influences all that may subscribe to it.  A se
 information in both directions: the request to the server, the reply to the client; requests that
 only ask (`QUESTIONS`) can be left out.  An action consists of services and topics.  All of them are
 DDS topics, and are treated as such.  If both sides have wildcards, there is a hop if they share a
-name that neither side is denied.  Every enclave, with any rights, can write or read the topics that
-the governance leaves open.
+name that neither side is denied.  There is no hop between enclaves without a common ROS domain in
+which both have these rights.  Every enclave, with any rights, can write or read the topics that the
+governance leaves open.
 
 This module reads no files.
 """
@@ -14,12 +15,13 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import defaultdict, deque
-from collections.abc import Collection, Container, Iterable, Iterator
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations, product
 from typing import TYPE_CHECKING, NamedTuple
 
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.names import ACTION_SEPARATOR, READING_SERVICES, SERVICE_ENDS, is_expression
 from sros_tool.policy.model import DENY
@@ -30,18 +32,24 @@ from sros_tool.values import shows
 if TYPE_CHECKING:
     from sros_tool.translate_zenoh.rights import RouterLinks
 
+DomainRights = Mapping[DomainSet | None, Collection[Right]]
+"""Maps (closed) sets of ROS domains to the rights there; None stands for every domain."""
+
 
 @dataclass(frozen=True, slots=True)
 class Unguarded:
     """DDS topics that need no right in one direction (publish or subscribe).
 
     ``topic`` is an expression; ``without`` are expressions of earlier rules that protect a part of
-    these topics.
+    these topics.  ``domains`` are the ROS domains where that is so; None stands for every domain.
+    With ``join_needs_right``, only enclaves with a right in a domain can join it.
     """
 
     direction: str
     topic: str
     without: tuple[str, ...]
+    domains: DomainSet | None = None
+    join_needs_right: bool = False
 
 
 def unguarded(governance: Governance) -> Iterator[Unguarded]:
@@ -59,7 +67,13 @@ def unguarded(governance: Governance) -> Iterator[Unguarded]:
                 if on:
                     guarded[direction].append(rule.topic_expression)
                 else:
-                    yield Unguarded(direction, rule.topic_expression, tuple(guarded[direction]))
+                    yield Unguarded(
+                        direction,
+                        rule.topic_expression,
+                        tuple(guarded[direction]),
+                        domain.domains.closed(),
+                        domain.enable_join_access_control,
+                    )
 
 
 OF_EVERY_NODE = ("/parameter_events",)
@@ -129,11 +143,15 @@ class Reach:
 
 @dataclass(frozen=True, slots=True)
 class _Access:
-    """The right of an enclave to DDS topics; ``without`` are denied or ignored expressions."""
+    """The right of an enclave to DDS topics; ``without`` are denied or ignored expressions.
+
+    ``domains`` are the ROS domains of the right; None stands for every domain.
+    """
 
     enclave: str
     topic: str
     without: tuple[str, ...]
+    domains: DomainSet | None = None
 
 
 class _Direction:
@@ -180,21 +198,23 @@ def _starting(ordered: list[str], prefix: str) -> Iterator[str]:
         yield ordered[index]
 
 
-_Used = set[tuple[str, tuple[str, ...], str]]
+_Used = set[tuple[str, tuple[str, ...], str, DomainSet | None]]
 
 
 class Network:
     """All enclaves of a system, connected by the topics that they may write and read.
 
-    ``without`` are topics (ROS names) to ignore, ``questions`` are services (names or wildcards)
-    whose requests are ignored.  All enclaves in ``everybody`` may use the ``unguarded`` topics,
-    independently of their rights.  ``links`` are the links between several Zenoh routers: enclaves
-    at different routers are connected only by what these routers pass on to each other.
+    ``rights`` hold in every ROS domain unless they are mapped from sets of domains.  ``without``
+    are topics (ROS names) to ignore, ``questions`` are services (names or wildcards) whose requests
+    are ignored.  All enclaves in ``everybody`` may use the ``unguarded`` topics, independently of
+    their rights, in the domains that they can join.  ``links`` are the links between several Zenoh
+    routers: enclaves at different routers are connected only by what these routers pass on to each
+    other.
     """
 
     def __init__(
         self,
-        rights: Iterable[Right],
+        rights: Iterable[Right] | DomainRights,
         *,
         without: Collection[str] = (),
         questions: Collection[str] = (),
@@ -204,16 +224,22 @@ class Network:
     ) -> None:
         ignored = ["rt" + name for name in without]
         ignored += [f"rq/{name.lstrip('/')}{SERVICE_ENDS['rq']}" for name in questions]
-        ends = _ends(rights, ignored)
-        for each, enclave in product(dict.fromkeys(unguarded), everybody):
+        by_domains: DomainRights = rights if isinstance(rights, Mapping) else {None: [*rights]}
+        ends = _ends(by_domains, ignored)
+        opened = tuple(dict.fromkeys(unguarded))
+        joined = _joined(by_domains) if opened else {}
+        for each, enclave in product(opened, everybody):
             outside = sorted({*each.without, *ignored})
             met = tuple(other for other in outside if overlap(other, each.topic))
-            if each.topic not in met:
-                ends[each.direction].append(_Access(enclave, each.topic, met))
+            if each.topic in met:
+                continue
+            for domains in joined.get(enclave, (None,)) if each.join_needs_right else (None,):
+                if common := _in_common(each.domains, domains):
+                    ends[each.direction].append(_Access(enclave, each.topic, met, *common))
         self._sides = {direction: _Direction(accesses) for direction, accesses in ends.items()}
         self._router_of = links.router_of if links else {}
         self._passing = {
-            router: _Direction(_ends(given, ignored)["publish"])
+            router: _Direction(_ends({None: given}, ignored)["publish"])
             for router, given in (links.passing.items() if links else ())
         }
 
@@ -270,7 +296,7 @@ class Network:
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
         own, others = (self._sides[direction] for direction in directions)
         for end in own.of.get(enclave, ()):
-            like = (end.topic, end.without, self._router_of.get(enclave, ""))
+            like = (end.topic, end.without, self._router_of.get(enclave, ""), end.domains)
             if like in used:
                 continue
             used.add(like)
@@ -283,6 +309,8 @@ class Network:
 
     def _carrying(self, writer: _Access, reader: _Access) -> str:
         """Return a DDS topic that a writer may write and a reader gets, or ""."""
+        if not _in_common(writer.domains, reader.domains):
+            return ""
         sending, receiving = (self._router_of.get(end.enclave, "") for end in (writer, reader))
         if sending == receiving:
             return _shared(writer, reader)
@@ -291,12 +319,46 @@ class Network:
         return next(filter(None, names), "")
 
 
-def _ends(rights: Iterable[Right], ignored: Collection[str]) -> dict[str, list[_Access]]:
+def _joined(rights: DomainRights) -> dict[str, list[DomainSet | None]]:
+    """Map enclaves to the sets of ROS domains in which they may do something."""
+    joined: dict[str, list[DomainSet | None]] = defaultdict(list)
+    for domains, some in rights.items():
+        for enclave in {right.enclave for right in some if right.qualifier is not DENY}:
+            joined[enclave].append(domains)
+    return joined
+
+
+def _in_common(
+    one: DomainSet | None, other: DomainSet | None
+) -> tuple[DomainSet | None] | tuple[()]:
+    """Return the ROS domains that two sets have in common, in a tuple; () if there are none."""
+    if one is None or other is None or one is other:
+        return (other if one is None else one,)
+    return _both(one, other)
+
+
+@lru_cache(maxsize=4096)
+def _both(one: DomainSet, other: DomainSet) -> tuple[DomainSet] | tuple[()]:
+    common = one & other
+    return (common,) if common.ranges else ()
+
+
+def _ends(rights: DomainRights, ignored: Collection[str]) -> dict[str, list[_Access]]:
     """Return which enclaves may write (publish) and read (subscribe) which topics.
 
     Topics in ``ignored`` are left out.
     """
     ends: dict[str, list[_Access]] = {"publish": [], "subscribe": []}
+    for domains, some in rights.items():
+        for direction, accesses in _accesses(some, domains, ignored):
+            ends[direction] += accesses
+    return ends
+
+
+def _accesses(
+    rights: Iterable[Right], domains: DomainSet | None, ignored: Collection[str]
+) -> Iterator[tuple[str, list[_Access]]]:
+    """Yield each direction with the accesses of an enclave that rights in some domains give."""
     denied: dict[tuple[str, str], set[str]] = defaultdict(set)
     allowed: dict[tuple[str, str], set[str]] = defaultdict(set)
     for right in rights:
@@ -306,11 +368,12 @@ def _ends(rights: Iterable[Right], ignored: Collection[str]) -> dict[str, list[_
                 into[right.enclave, direction].update(topics)
     for (enclave, direction), topics in sorted(allowed.items()):
         outside = sorted(denied[enclave, direction].union(ignored))
+        accesses = []
         for topic in sorted(topics, key=_plain_first):
             met = tuple(name for name in outside if overlap(name, topic))
             if not any(name == topic or covers(name, topic) for name in met):
-                ends[direction].append(_Access(enclave, topic, met))
-    return ends
+                accesses.append(_Access(enclave, topic, met, domains))
+        yield direction, accesses
 
 
 def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:

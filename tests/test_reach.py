@@ -8,10 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sros_tool.dds.domains import DomainSet
 from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, Rules
-from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network, Unguarded, path_text
+from sros_tool.reach import (
+    OF_EVERY_NODE,
+    QUESTIONS,
+    DomainRights,
+    Network,
+    Unguarded,
+    path_text,
+)
 
 
 def rights(*lines: str) -> list[Right]:
@@ -206,3 +214,29 @@ def test_what_the_governance_leaves_open_carries_for_everybody() -> None:
     for left_out, reached in (((), {"/a"}), (OF_EVERY_NODE, set())):
         network = Network(log, without=left_out, unguarded=[open_x], everybody=["/b"])
         assert set(network.reach("/b").influences) == reached
+
+
+NORTH, SOUTH, BOTH = (DomainSet.parse(text) for text in ("10", "20", "10,20"))
+
+
+def test_a_hop_needs_a_common_domain_in_which_both_rights_hold() -> None:
+    found: DomainRights = {
+        NORTH: rights("/n publish /x", "/m subscribe /y", "/d !publish /x"),
+        SOUTH: rights("/s subscribe /x", "/d publish /x"),
+        BOTH: rights("/b subscribe /x", "/b publish /y"),
+    }
+    network = Network(found)
+    assert set(network.reach("/n").influences) == {"/b", "/m"}
+    # Denied in one domain, allowed in the other; through an enclave of both into the first.
+    assert set(network.reach("/d").influences) == {"/s", "/b", "/m"}
+    assert network.reach("/s").learns_from.keys() == {"/d"}
+
+
+@pytest.mark.parametrize(("needs_right", "reached"), [(True, set()), (False, {"/n"})])
+def test_what_is_open_in_a_domain_is_for_those_who_can_join_it(
+    needs_right: bool, reached: set[str]
+) -> None:
+    found: DomainRights = {NORTH: rights("/n subscribe /x"), SOUTH: rights("/s publish /y")}
+    opened = Unguarded("publish", "*", (), BOTH, needs_right)
+    network = Network(found, unguarded=[opened], everybody=["/n", "/s"])
+    assert set(network.reach("/s").influences) == reached

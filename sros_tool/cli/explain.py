@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from shlex import quote
@@ -42,6 +43,7 @@ from sros_tool.wording import counted, first_few
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
+    from sros_tool.dds.domains import DomainSet
     from sros_tool.distributions import Distribution
     from sros_tool.explain.answer import Answer
     from sros_tool.explain.asking import AskedEnclave, AskingContext
@@ -124,7 +126,7 @@ _IGNORED = {
     "--who": ("infrastructure", "policy", "fleet_file", "all_vendors", "all_distros"),
     "--reach": (
         *("patterns", "robots", "kind", "all_vendors", "distro", "all_distros"),
-        *("moment", "domain", "time_zone"),
+        *("moment", "time_zone"),
     ),
     "--log": (
         *("infrastructure", "patterns", "robots", "kind", "policy", "fleet_file"),
@@ -194,7 +196,9 @@ def _refuse_ignored(mode: str) -> None:
     help="Decide as of a date (2027-06-01) or a time from now (90d). [default: now]",
 )
 @click.option(
-    "--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's]"
+    "--domain",
+    metavar="ID",
+    help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's; with --who and --reach all]",
 )
 @click.option(
     "--time-zone",
@@ -291,7 +295,8 @@ def explain(
             raise UsageError("--reach takes no --vendor but zenoh", text, "Leave it out.")
         stated = policy, fleet_file
         zenoh = bool(_why_zenoh(vendor, root))
-        return _show_reach(reach, root, rest, stated, infrastructure, as_json, zenoh=zenoh)
+        only_in = domain_of(domain)
+        return _show_reach(reach, root, rest, stated, infrastructure, only_in, as_json, zenoh=zenoh)
     asking = _circumstances(moment, domain, time_zone, fleet_file)
     if logs:
         return _show_log(logs[0], root, rest, asking, as_json)
@@ -304,6 +309,7 @@ def explain(
 
         print_notes(unknown_distribution(os.environ))
     if who:
+        asking = asking._replace(domain=domain_of(domain))  # all domains, unless asked
         chosen = None if why_zenoh else chosen_vendor(vendor, distro, os.environ)
         only = patterns, robots
         return _show_who(root, rest, kind, chosen, why_zenoh, asking, only, as_json)
@@ -723,7 +729,8 @@ def _show_who(
     if as_json:
         print_json(decider.printed(everybody.question, everybody.outcomes))
     else:
-        _echo(_who_lines(everybody, load_fleet(keystore) if chosen else None))
+        fleet = load_fleet(keystore) if chosen else None
+        _echo(_who_lines(everybody, fleet, asking.domain, keystore.domains))
         echo(f"decided by {decider.title}", err=True)
         if chosen and not kind and not everybody.allowed:
             hint = callable_action(decider, everybody.question)
@@ -732,24 +739,34 @@ def _show_who(
     return 0 if everybody.allowed else 1
 
 
-def _who_lines(everybody: Everybody, fleet: Fleet | None) -> Iterator[str]:
+def _who_lines(
+    everybody: Everybody, fleet: Fleet | None, domain: int | None, domains: DomainSet
+) -> Iterator[str]:
     """Yield the allowed enclaves, the enclaves whose participant does not start now, and counts.
 
-    The enclaves of a fleet are grouped by robot.
+    The enclaves of a fleet are grouped by robot.  ``domain`` is that of --domain, ``domains`` are
+    those of the keystore: where some of them alone allow it, they are named.
     """
     from sros_tool.fleet.enclaves import folded
 
     able = [outcome for outcome in everybody.outcomes if outcome.allowed]
     lines = []
+    by_domains = Counter(outcome.domains for outcome in able)
+    if domain is not None or not by_domains.keys() - {str(domains)}:
+        by_domains.clear()
     for outcome in able:
         wildcard = f"  by the wildcard {outcome.wildcard}" if outcome.wildcard else ""
-        lines.append((outcome.enclave, outcome.enclave + wildcard))
+        where = f"  in domain {outcome.domains}" if by_domains else ""
+        lines.append((outcome.enclave, f"{outcome.enclave}{wildcard}{where}"))
     for outcome in everybody.outcomes:
         if outcome.stopped:
             lines.append((outcome.enclave, f"  not now: {outcome.enclave}  {outcome.stopped}"))
     yield from folded(fleet, lines)
     count = counted(len(everybody.outcomes), "enclave")
-    yield f"{len(able)} of {count} may {everybody.question}"
+    where = "" if domain is None else f" in domain {domain}"
+    if by_domains:
+        where = f": {', '.join(f'{n} in domain {text}' for text, n in by_domains.items())}"
+    yield f"{len(able)} of {count} may {everybody.question}{where}"
 
 
 # ── --reach ────────────────────────────────────────────────────────────────────────────────
@@ -761,6 +778,7 @@ def _show_reach(
     rest: tuple[str, ...],
     stated: tuple[Path | None, Path | None],
     infrastructure: bool,
+    domain: int | None,
     as_json: bool,
     *,
     zenoh: bool,
@@ -789,7 +807,7 @@ def _show_reach(
         fleet = fleet_of(fleet_file, None)
         source = load_rights(root or policy or keystore_from_environment(), fleet)
     with progress("following the rights"):
-        followed = follow_reach(source, enclave, infrastructure=infrastructure)
+        followed = follow_reach(source, enclave, infrastructure=infrastructure, domain=domain)
     if as_json:
         print_json(followed)
     else:
@@ -812,11 +830,12 @@ def _followed_lines(followed: FollowedReach) -> Iterator[str]:
     from sros_tool.reach import path_text
 
     reach = followed.reach
+    where = "" if followed.domain is None else f" in domain {followed.domain}"
     for what, paths in (
         ("can influence", reach.influences),
         ("can learn from", reach.learns_from),
     ):
-        yield f"{reach.enclave} {what} {counted(len(paths), 'enclave')}"
+        yield f"{reach.enclave} {what} {counted(len(paths), 'enclave')}{where}"
         in_order = sorted(paths.items(), key=lambda item: (len(item[1]), item[0]))
         lines = ((name, f"  {path_text(path)}") for name, path in in_order)
         yield from folded(followed.fleet, lines)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 from sros_tool.errors import UsageError
 
@@ -133,6 +134,30 @@ class DomainSet:
             tuple(domain in domain_set for domain_set in sets): domain for domain in reversed(known)
         }
         return tuple(sorted(kinds.values()))
+
+    @classmethod
+    def parts(cls, sets: Iterable[DomainSet]) -> tuple[DomainSet, ...]:
+        """Divide the domains of closed sets into parts: no set has only some domains of a part."""
+        ranges: dict[tuple[bool, ...], list[tuple[int, int]]] = {}
+        known = tuple(dict.fromkeys(sets))
+        if len(known) == 1:
+            return known
+        borders = {part.first or 0 for one in known for part in one.ranges}
+        borders |= {(part.last or 0) + 1 for one in known for part in one.ranges}
+        for first, after in pairwise(sorted(borders)):
+            inside = tuple(first in one for one in known)
+            if any(inside):
+                ranges.setdefault(inside, []).append((first, after - 1))
+        return tuple(cls.of(*pairs) for pairs in ranges.values())
+
+    def __and__(self, other: DomainSet) -> DomainSet:
+        """Return the domains that two closed sets have in common."""
+        common = (
+            (max(one.first or 0, two.first or 0), min(one.last or 0, two.last or 0))
+            for one in self.ranges
+            for two in other.ranges
+        )
+        return DomainSet.of(*(pair for pair in common if pair[0] <= pair[1]))
 
     def preferred(self) -> int:
         """Return 0, the default of ROS, if it is in the set, else the first domain of the set."""

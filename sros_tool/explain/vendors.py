@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from sros_tool.dds.decision.answers import Outcome, OutcomeWord, ReasonWord
 from sros_tool.dds.decision.vendors import PRINCIPAL, Vendor
+from sros_tool.dds.domains import DomainSet
 from sros_tool.distributions import SUPPORTED, Shipped
 from sros_tool.errors import Note, SrosError
 from sros_tool.explain.answer import Answer, Evaluator, Provenance
@@ -295,8 +296,8 @@ def _runs_on_zenoh(keystore: Keystore, name: str) -> bool:
 
 
 @shows(
-    *("enclave", "allowed", "outcome", "reason", "expression", "wildcard"),
-    null_if_empty=("expression", "wildcard"),
+    *("enclave", "allowed", "outcome", "reason", "expression", "wildcard", "domains"),
+    null_if_empty=("expression", "wildcard", "domains"),
 )
 class VendorOutcome(NamedTuple):
     """The decision for one enclave."""
@@ -308,6 +309,8 @@ class VendorOutcome(NamedTuple):
     text: str
     expression: str
     """The expression that decided, or null."""
+    domains: str = ""
+    """The ROS domains in which the enclave may do it, such as ``10`` or ``10,20``, or null."""
 
     @property
     def allowed(self) -> bool:
@@ -326,7 +329,7 @@ class VendorOutcome(NamedTuple):
         return "" if runs else self.text.partition(": ")[2]
 
 
-@shows("question", "vendor", "vendor_why", "documented_only", "enclaves")
+@shows("question", "vendor", "vendor_why", "documented_only", "domain", "enclaves")
 class WhoByVendor(NamedTuple):
     """The decision of a vendor for every enclave of a keystore."""
 
@@ -336,6 +339,8 @@ class WhoByVendor(NamedTuple):
     """The DDS vendor, as `--vendor` takes it."""
     vendor_why: str
     """Why this vendor was chosen."""
+    domain: int | None
+    """The ROS domain of ``--domain``; null for every domain."""
     enclaves: Sequence[VendorOutcome]
     """All enclaves, with the decision for each."""
 
@@ -343,6 +348,22 @@ class WhoByVendor(NamedTuple):
     def documented_only(self) -> bool:
         """Whether the vendor's behavior is known from its documentation alone, not from tests."""
         return self.vendor.documented_only
+
+
+def _parts(enclave: LoadedEnclave, domain: int | None) -> Sequence[DomainSet]:
+    """Divide the ROS domains that an enclave may join by the rules for them.
+
+    With ``domain``, only that domain is returned.
+    """
+    if domain is not None:
+        return (DomainSet.of((domain, domain)),)
+    joined = enclave.joined_domains or DomainSet.of((0, 0))
+    state = enclave.state
+    governed = state.governance.domain_access_rules if state and state.governance else ()
+    granted = state.grant.rules if state and state.grant else ()
+    sets = [rule.domains.closed() for rule in governed]
+    sets += [rule.domains.closed() for rule in granted]
+    return [part for part in DomainSet.parts((joined, *sets)) if (part & joined).ranges]
 
 
 class VendorOfKeystore(NamedTuple):
@@ -362,20 +383,25 @@ class VendorOfKeystore(NamedTuple):
 
     def outcomes(self, question: Question) -> tuple[VendorOutcome, ...]:
         """Return the outcome for each enclave, sorted by name."""
-        from sros_tool.explain.who import of_each  # a question about one enclave needs none
+        from sros_tool.explain.who import in_domains, of_each  # one enclave needs none
 
         def outcome(name: str) -> VendorOutcome:
             enclave = load_enclave_of(self.keystore, name, at=self.asking.at)
-            context = self.asking.context(enclave.joined_domains)
-            answer = Evaluator(self.vendor, enclave, context).answer(question)
-            expression = answer.decision.expression or ""
-            return VendorOutcome(name, answer.outcome, answer.reason, answer.text, expression)
+
+            def decided(domain: int) -> VendorOutcome:
+                context = self.asking._replace(domain=domain).context(None)
+                answer = Evaluator(self.vendor, enclave, context).answer(question)
+                expression = answer.decision.expression or ""
+                return VendorOutcome(name, answer.outcome, answer.reason, answer.text, expression)
+
+            decision, domains = in_domains(_parts(enclave, self.asking.domain), decided)
+            return decision._replace(domains=domains)
 
         return of_each(self.keystore.names if self.names is None else self.names, outcome)
 
     def printed(self, question: Question, outcomes: Sequence[VendorOutcome]) -> WhoByVendor:
         """Return the outcomes in the form that ``--json`` prints."""
-        return WhoByVendor(str(question), self.vendor, self.why, outcomes)
+        return WhoByVendor(str(question), self.vendor, self.why, self.asking.domain, outcomes)
 
     def notes(self, _outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
         """Yield no notes: DDS needs none."""

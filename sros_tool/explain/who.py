@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
+from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note
 from sros_tool.explain.asking import rights_naming, taken_for_action
 from sros_tool.explain.question import Question, about_action, ask
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.rights import RightsSource
+from sros_tool.keystore.rights import RightsSource, rights_by_domains
 from sros_tool.keystore.selection import likely_names, no_such_enclave
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right
-from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, Reach, unguarded
+from sros_tool.reach import (
+    OF_EVERY_NODE,
+    QUESTIONS,
+    HopPath,
+    Network,
+    Reach,
+    Unguarded,
+    unguarded,
+)
 from sros_tool.values import shows
 
 
@@ -38,6 +48,10 @@ class EnclaveOutcome(Protocol):
     @property
     def stopped(self) -> str:
         """Why no process can run in the enclave with its present files, or ""."""
+
+    @property
+    def domains(self) -> str:
+        """The ROS domains in which the enclave may do it, such as 10,20; "" for none."""
 
 
 _Outcome = TypeVar("_Outcome", bound=EnclaveOutcome)
@@ -105,6 +119,20 @@ def callable_action(decider: Decider, question: Question) -> Note | None:
     return None
 
 
+def in_domains(
+    parts: Iterable[DomainSet], decide: Callable[[int], _Outcome]
+) -> tuple[_Outcome, str]:
+    """Return the decision of the first domain that allows it, or else of the first domain.
+
+    Also returns the domains that allow it, as text.  ``decide`` is asked about one domain of each
+    part, because all domains of a part have the same rules.
+    """
+    outcomes = [(part, decide(next(iter(part)))) for part in parts]
+    allowing = [(part, outcome) for part, outcome in outcomes if outcome.allowed]
+    domains = DomainSet.of(*((d, d) for part, _ in allowing for d in part)) if allowing else ""
+    return (allowing or outcomes)[0][1], str(domains)
+
+
 def of_each(names: Sequence[str], decide: Callable[[str], _Outcome]) -> tuple[_Outcome, ...]:
     """Return the decision on each of the enclaves, sorted by name; uses all cores."""
     from sros_tool.parallel import map_slices, tick  # a question about one enclave needs none
@@ -151,7 +179,7 @@ class ReachedEnclave(NamedTuple):
     """A shortest path, step by step."""
 
 
-@shows("path", "left_out", "enclave", "influences", "learns_from")
+@shows("path", "left_out", "domain", "enclave", "influences", "learns_from")
 class FollowedReach(NamedTuple):
     """The enclaves that one enclave can influence and learn from."""
 
@@ -160,6 +188,8 @@ class FollowedReach(NamedTuple):
     left_out: Sequence[str]
     """Topics that do not count, and services (as */NAME) whose requests do not count, because they
     change nothing."""
+    domain: int | None
+    """The ROS domain in which information flows; null for every domain."""
     reach: Reach
     fleet: Fleet | None
     notes: Sequence[Note]
@@ -185,10 +215,14 @@ def _printed(paths: Mapping[str, HopPath]) -> Iterator[ReachedEnclave]:
         yield ReachedEnclave(enclave, [ReachedStep(*hop) for hop in path])
 
 
-def follow_reach(source: RightsSource, enclave: str, *, infrastructure: bool) -> FollowedReach:
+def follow_reach(
+    source: RightsSource, enclave: str, *, infrastructure: bool, domain: int | None = None
+) -> FollowedReach:
     """Return the enclaves that an enclave can influence and learn from, by the rights of a source.
 
     ``infrastructure`` says whether topics of all nodes, and requests that only read, count too.
+    Information goes from enclave to enclave in any ROS domain that both have, or in ``domain``
+    alone.
 
     Raises:
         KeystoreError: the keystore does not have the enclave, or the enclave has no rights.
@@ -196,14 +230,17 @@ def follow_reach(source: RightsSource, enclave: str, *, infrastructure: bool) ->
     of_keystore = source.kind == "keystore"
     names = enclave_names(source.path) if of_keystore or source.kind == "zenoh" else ()
     without, questions = ((), ()) if infrastructure else (OF_EVERY_NODE, QUESTIONS)
-    rights = source.rights
-    if enclave in source.routers:
-        rights |= set(_rights_of_router(source, enclave))
+    rights = {
+        domains: (*some, *_rights_of_router(source, some, enclave))
+        for domains, some in rights_by_domains(source).items()
+        if domain is None or domains is None or domain in domains
+    }
+    opened = tuple(unguarded(Keystore(source.path).governance)) if of_keystore else ()
     network = Network(
         rights,
         without=without,
         questions=questions,
-        unguarded=unguarded(Keystore(source.path).governance) if of_keystore else (),
+        unguarded=opened if domain is None else _in_domain(opened, domain),
         everybody=names if of_keystore else (),
         links=source.links,
     )
@@ -211,22 +248,37 @@ def follow_reach(source: RightsSource, enclave: str, *, infrastructure: bool) ->
         raise no_such_enclave(Keystore(source.path), enclave, names)
     if enclave not in network.enclaves:
         meant = likely_names(enclave, network.enclaves)
+        where = "" if domain is None else f", domain {domain}"
         raise KeystoreError(
-            f"enclave {enclave} has no rights in '{source.path}'",
+            f"enclave {enclave} has no rights in '{source.path}'{where}",
             f"Enclaves with rights: {', '.join(network.enclaves[:5]) or 'none'}.",
             f"Perhaps you mean {' or '.join(meant)}." if meant else "",
         )
     reach = network.reach(enclave)
-    return FollowedReach(source.path, (*without, *questions), reach, source.fleet, source.notes)
+    notes = [note for note in source.notes if note.id != "rights.domains"]  # they are followed
+    return FollowedReach(source.path, (*without, *questions), domain, reach, source.fleet, notes)
 
 
-def _rights_of_router(source: RightsSource, router: str) -> Iterator[Right]:
-    """Yield what a router may send and receive, as rights.
+def _in_domain(opened: Iterable[Unguarded], domain: int) -> Iterator[Unguarded]:
+    """Yield what the governance leaves open in a domain, there alone."""
+    only = DomainSet.of((domain, domain))
+    for topics in opened:
+        if topics.domains is None or domain in topics.domains:
+            yield replace(topics, domains=only)
 
-    It may receive what its enclaves may send, and the reverse; and what other routers allow it.
+
+def _rights_of_router(
+    source: RightsSource, rights: Iterable[Right], router: str
+) -> Iterator[Right]:
+    """Yield what a router may send and receive, as rights; nothing for any other enclave.
+
+    It may receive what its enclaves may send by ``rights``, and the reverse; and what other routers
+    allow it.
     """
+    if router not in source.routers:
+        return
     links = source.links
-    for right in source.rights:
+    for right in rights:
         if right.qualifier is ALLOW and (
             links is None or links.router_of.get(right.enclave) == router
         ):

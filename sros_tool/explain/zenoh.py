@@ -7,6 +7,7 @@ decide.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -17,6 +18,7 @@ from shlex import quote
 from typing import Annotated, Literal, NamedTuple
 
 from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.explain.answer import Answer, Evaluator, PolicyChange, StatedInPolicy
 from sros_tool.explain.asking import Asked, AskedEnclave, AskingContext, ZenohInBrief, meant
@@ -47,10 +49,10 @@ from sros_tool.keystore.zenoh_files import (
 from sros_tool.pki.certificates import common_name_of, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, parts
-from sros_tool.translate_zenoh.graph import example_token
+from sros_tool.translate_zenoh.graph import GRAPH, example_token
 from sros_tool.translate_zenoh.rights import ANY_TYPE, untyped
 from sros_tool.values import shows
-from sros_tool.zenoh.access import Enforcement, Flow, Message, MessageFilter, Remote
+from sros_tool.zenoh.access import AccessControl, Enforcement, Flow, Message, MessageFilter, Remote
 from sros_tool.zenoh.configuration import Mode, RenderedReader, SettingsEdition
 from sros_tool.zenoh.delivery import (
     Check,
@@ -146,7 +148,7 @@ class ZenohAnswer:
     """The decision of Zenoh on a question about an enclave.
 
     ``text`` is the reason, as a clause.  ``checks`` are the decisions on the messages of the right
-    itself.
+    itself.  ``domains`` are the ROS domains that allow it, if several were asked about.
     """
 
     enclave: str
@@ -163,6 +165,7 @@ class ZenohAnswer:
     """When the certificate expires, or null."""
     unsigned: tuple[str, ...] = ()
     """The files that decide and that the permissions CA has not signed."""
+    domains: str = ""
 
     @property
     def in_brief(self) -> ZenohInBrief:
@@ -214,8 +217,8 @@ class ZenohAnswer:
 
 
 @shows(
-    *("enclave", "in_brief", "outcome", "wildcard"),
-    null_if_empty=("wildcard",),
+    *("enclave", "in_brief", "outcome", "wildcard", "domains"),
+    null_if_empty=("wildcard", "domains"),
     spread=("in_brief",),
 )
 class ZenohEnclaveOutcome(NamedTuple):
@@ -227,6 +230,8 @@ class ZenohEnclaveOutcome(NamedTuple):
     outcome: _OutcomeWord
     wildcard: str
     """The key expression that allows the right, if it is a wildcard, or null."""
+    domains: str
+    """The ROS domains in which the enclave may do it, such as ``10`` or ``10,20``, or null."""
 
 
 class WhoOnZenoh(NamedTuple):
@@ -238,8 +243,8 @@ class WhoOnZenoh(NamedTuple):
     """Zenoh."""
     vendor_why: str
     """Why Zenoh was asked."""
-    domain: int
-    """The ROS domain."""
+    domain: int | None
+    """The ROS domain of ``--domain``; null for every domain."""
     enclaves: Sequence[ZenohEnclaveOutcome]
     """All enclaves; the enclave of the router may do whatever passes through the router."""
 
@@ -733,6 +738,37 @@ _ROUTERS_KEY = Note(
 )
 
 
+def _with_equal_rules(evaluator: ZenohEvaluator, domains: DomainSet) -> Iterator[DomainSet]:
+    """Yield parts of ``domains``: the routers have the same rules for all domains of a part."""
+    keys: dict[str, set[object]] = defaultdict(set)
+    for router, file in evaluator.routers.items():
+        for what, expressions in _rules(file.process.access) if file.process else ():
+            for key in expressions:
+                domain, _, rest = key.removeprefix(f"{GRAPH}/").partition("/")
+                keys[domain].add((router, what, rest))
+    parts: dict[frozenset[object], list[int]] = defaultdict(list)
+    for number in domains:
+        parts[frozenset(keys.get(str(number), ()))].append(number)
+    for numbers in parts.values():
+        yield DomainSet.of(*((number, number) for number in numbers))
+
+
+def _rules(access: MessageFilter) -> Iterator[tuple[object, tuple[str, ...]]]:
+    """Yield each rule of access control without its key expressions, and the key expressions."""
+    if isinstance(access, Enforcement):
+        for subject in access.subjects:
+            for rule in access.rules_of(subject.id):
+                what = subject, rule.allows, rule.flows, rule.messages
+                yield what, rule.key_expressions
+    elif isinstance(access, AccessControl):
+        for remote in access.remotes:
+            for stated in remote.rules:
+                yield (
+                    (remote.common_name, stated._replace(key_expressions=())),
+                    (stated.key_expressions),
+                )
+
+
 class ZenohOfKeystore:
     """The decisions of Zenoh for enclaves of a keystore: ``names``, or all with the router."""
 
@@ -745,9 +781,17 @@ class ZenohOfKeystore:
     ) -> None:
         self.keystore = keystore
         self._why = why
-        context = asking.context(keystore.domains)
-        self._evaluator = ZenohEvaluator(keystore, at=context.at, domain=context.domain)
-        self._names = names or self._evaluator.names
+        self._domain = asking.domain
+        first = asking.context(keystore.domains).domain
+        one = ZenohEvaluator(keystore, at=asking.at, domain=first)
+        self._evaluators = {first: one}
+        self._parts: Sequence[DomainSet] = (DomainSet.of((first, first)),)
+        if asking.domain is None:
+            self._parts = tuple(_with_equal_rules(one, keystore.domains))
+            for domain in (next(iter(part)) for part in self._parts):
+                if domain != first:
+                    self._evaluators[domain] = ZenohEvaluator(keystore, at=asking.at, domain=domain)
+        self._names = names or one.names
 
     @property
     def title(self) -> str:
@@ -756,10 +800,14 @@ class ZenohOfKeystore:
 
     def outcomes(self, question: Question) -> tuple[ZenohAnswer, ...]:
         """Return the answer for each enclave, without the enclaves at the other end."""
-        from sros_tool.explain.who import of_each  # a question about one enclave needs none
+        from sros_tool.explain.who import in_domains, of_each  # one enclave needs none
 
         def answer(name: str) -> ZenohAnswer:
-            return self._evaluator.answer(name, question, reach=False, brief=True)
+            def decided(domain: int) -> ZenohAnswer:
+                return self._evaluators[domain].answer(name, question, reach=False, brief=True)
+
+            decision, domains = in_domains(self._parts, decided)
+            return replace(decision, domains=domains)
 
         return of_each(self._names, answer)
 
@@ -767,11 +815,15 @@ class ZenohOfKeystore:
         """Return what ``--json`` prints for these answers."""
         shown = [
             ZenohEnclaveOutcome(
-                outcome.enclave, outcome.in_brief, outcome.outcome, outcome.wildcard
+                outcome.enclave,
+                outcome.in_brief,
+                outcome.outcome,
+                outcome.wildcard,
+                outcome.domains,
             )
             for outcome in outcomes
         ]
-        return WhoOnZenoh(str(question), "zenoh", self._why, self._evaluator.domain, shown)
+        return WhoOnZenoh(str(question), "zenoh", self._why, self._domain, shown)
 
     def notes(self, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
         """Yield a note on the router's key, and a note if the router's file decided for peers."""

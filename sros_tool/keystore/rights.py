@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from cryptography import x509
 
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
+from sros_tool.fleet.enclaves import robot_of
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import load_fleet
@@ -73,7 +75,8 @@ class RightsSource:
     the protection of names; None for anything else.  ``documents`` are the permissions of enclaves,
     ``enforcers`` the access control of each Zenoh process that checks others; ``routers`` are the
     enclaves of a keystore's routers, and ``links`` is what passes between several.
-    ``configurations`` are the Zenoh configurations that were read, also those of clients.
+    ``configurations`` are the Zenoh configurations that were read, also those of clients, and
+    ``key_domains`` maps their rights to the ROS domains in their keys, None for a wildcard.
     ``policy`` is the policy in a policy file.
     """
 
@@ -94,6 +97,7 @@ class RightsSource:
     routers: tuple[str, ...] = ()
     links: RouterLinks | None = None
     configurations: Mapping[Path, ConfigurationDocument] = field(default_factory=dict)
+    key_domains: Mapping[Right, frozenset[int | None]] = field(default_factory=dict)
     policy: Policy | None = None
 
     @property
@@ -149,6 +153,73 @@ def load_rights(
     return _document_rights(path, "permissions", path)
 
 
+def rights_by_domains(source: RightsSource) -> dict[DomainSet | None, set[Right]]:
+    """Map sets of ROS domains to the rights that a source gives there; None: in every domain.
+
+    A policy is for every domain, except for enclaves of robots whose domain the fleet states.
+    """
+    return by_domains(source.rights, source.documents, source.key_domains, source.fleet)
+
+
+def by_domains(
+    rights: Iterable[Right],
+    documents: Mapping[str, Permissions],
+    key_domains: Mapping[Right, frozenset[int | None]],
+    fleet: Fleet | None = None,
+) -> dict[DomainSet | None, set[Right]]:
+    """Map sets of ROS domains to those of the rights that hold there; None: in every domain.
+
+    ``documents`` are the permissions of enclaves, whose rules name domains; ``key_domains`` are as
+    in `RightsSource`.  An enclave without permissions is for the domain that ``fleet`` states for
+    its robot.
+    """
+    by_enclave: dict[str, list[Right]] = {}
+    for right in rights:
+        by_enclave.setdefault(right.enclave, []).append(right)
+    result: dict[DomainSet | None, set[Right]] = {}
+    for enclave, own in by_enclave.items():
+        if key_domains:
+            divided = _by_keys(own, key_domains)
+        elif enclave in documents:
+            divided = _by_rules(own, enclave, documents[enclave])
+        else:
+            robot = robot_of(fleet, enclave) if fleet else None
+            domain = robot.domain if robot else None
+            divided = iter([(None if domain is None else DomainSet.of((domain, domain)), own)])
+        for domains, some in divided:
+            result.setdefault(domains, set()).update(some)
+    return result
+
+
+_Divided = Iterator[tuple[DomainSet | None, Collection[Right]]]
+
+
+def _by_keys(
+    rights: Collection[Right], domains_of: Mapping[Right, frozenset[int | None]]
+) -> _Divided:
+    """Yield the rights of an enclave on Zenoh, divided by the ROS domains of their keys."""
+    domains = {domain for right in rights for domain in domains_of[right]}
+    for domain in domains:
+        some = [right for right in rights if not domains_of[right].isdisjoint((domain, None))]
+        yield None if domain is None else DomainSet.of((domain, domain)), some
+
+
+def _by_rules(rights: Collection[Right], enclave: str, permissions: Permissions) -> _Divided:
+    """Yield the rights of an enclave, divided by the ROS domains of the rules of its grant."""
+    grant = _first_of_each(permissions).get(enclave, permissions.grants[0])
+    listed = [rule.domains.closed() for rule in grant.rules]
+    if len(set(listed)) == 1:
+        yield listed[0], rights
+        return
+    stated: set[Right] = set()
+    for domains in DomainSet.parts(listed):
+        rules = (rule for rule in grant.rules if (rule.domains.closed() & domains).ranges)
+        own = grant_rights(enclave, grant._replace(rules=tuple(rules)))
+        yield domains, own
+        stated |= own
+    yield None, [right for right in rights if right not in stated]
+
+
 def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSource:
     """Return the rights that the Zenoh configurations of a keystore together give its enclaves.
 
@@ -195,6 +266,10 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
     )
     stated = Rules(of_router)
     rights = (right for source in sources for right in source.rights)
+    domains: dict[Right, frozenset[int | None]] = {}
+    for source in sources:
+        for right, of_right in source.key_domains.items():
+            domains[right] = domains.get(right, frozenset()) | of_right
     return RightsSource(
         root,
         "zenoh",
@@ -210,6 +285,7 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
         routers=tuple(routers),
         links=_links({each.path.parent: each for each in sources}, files, routers),
         configurations=configurations,
+        key_domains=domains,
     )
 
 
@@ -289,12 +365,13 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
     return RightsSource(
         path,
         "zenoh",
-        rules.rights,
+        frozenset(rules.domains),
         rules.enclaves,
         True,
         tuple(notes),
         enforcers=(access,),
         configurations={path: document},
+        key_domains=rules.domains,
     )
 
 

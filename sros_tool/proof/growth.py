@@ -32,7 +32,7 @@ from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Grant, Permissions
 from sros_tool.errors import DocumentError, Note
 from sros_tool.keystore.comparison import Effect, SettingChange
-from sros_tool.keystore.rights import SourceKind
+from sros_tool.keystore.rights import SourceKind, by_domains
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.model import ALLOW, Source
 from sros_tool.policy.rights import KIND_OF, Right
@@ -899,17 +899,24 @@ def _edges(side: AccessSource, borrowed: Iterable[tuple[str, str]]) -> _Edges | 
     own denials do not apply.
     """
     rights = side.zenoh if side.kind == "zenoh" and side.zenoh is not None else side.rights
-    by_enclave = _by_enclave(rights)
-    more: list[Right] = []
+    lent: dict[str, list[str]] = defaultdict(list)
     real: dict[str, str] = {}
     for enclave, lender in borrowed:
         name = f"{enclave} by {lender}"
         real[name] = enclave
-        more += (right._replace(enclave=name) for right in by_enclave.get(lender, ()))
-        if len(more) > _MOST_HOPS:
+        lent[lender].append(name)
+    usable = {}
+    left = _MOST_HOPS
+    for domains, some in by_domains(rights, side.permissions, side.key_domains).items():
+        left -= sum(len(lent[right.enclave]) for right in some if right.enclave in lent)
+        if left < 0:
             return None
+        more = (
+            right._replace(enclave=name) for right in some for name in lent.get(right.enclave, ())
+        )
+        usable[domains] = some.union(more)
     network = Network(
-        rights.union(more),
+        usable,
         without=OF_EVERY_NODE,
         questions=QUESTIONS,
         unguarded=unguarded(side.governance) if side.governance else (),

@@ -109,9 +109,11 @@ class AccessSource:
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh"; ``shown`` is its name.
     ``permissions`` are what DDS loads for each enclave, or would load after signing.  ``rights``
     are the rights in ROS terms.  ``zenoh`` are the rights that rules of Zenoh give, None without
-    rules; ``enforcers`` are these rules, ``routers`` the enclaves of routers.  ``passing`` maps
-    each of several routers to the rights that it gives to the others.  ``scope`` are the
-    enclaves that the source is for; None for all.  ``governance`` is None if the source has none.
+    rules; if there are no permissions, ``key_domains`` maps them to the ROS domains in their keys,
+    None for a wildcard.  ``enforcers`` are these rules, ``routers`` the enclaves of routers.
+    ``passing`` maps each of several routers to the rights that it gives to the others.  ``scope``
+    are the enclaves that the source is for; None for all.  ``governance`` is None if the source has
+    none.
     ``authorities`` are the CAs that its enclaves trust, as pairs of role and fingerprint.
     ``trusts`` maps enclaves and `KEYSTORE_ITSELF` to their trust; None if it is not known.
     ``later`` are the settings for enclaves that are created later, or None.  ``certified`` has the
@@ -124,6 +126,7 @@ class AccessSource:
     rights: frozenset[Right]
     permissions: Mapping[str, Permissions]
     zenoh: frozenset[Right] | None = None
+    key_domains: Mapping[Right, frozenset[int | None]] = field(default_factory=dict)
     enforcers: tuple[Enforcement, ...] = ()
     routers: tuple[str, ...] = ()
     passing: Mapping[str, frozenset[Right]] = field(default_factory=dict)
@@ -212,7 +215,12 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         lone = {LONE: _zenoh_file(path, document)}
         # Enclaves that its rules do not name get nothing by it.
         return replace(
-            side, zenoh=source.rights, enforcers=source.enforcers, zenoh_files=lone, scope=None
+            side,
+            zenoh=source.rights,
+            key_domains=source.key_domains,
+            enforcers=source.enforcers,
+            zenoh_files=lone,
+            scope=None,
         )
     if source.kind == "enclave":
         has_one = (path / GOVERNANCE_FILE).exists()

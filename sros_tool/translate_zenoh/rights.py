@@ -451,11 +451,12 @@ _MOST_ANY_CHUNKS = 6
 class RightsInRules:
     """The rights that rules give to processes, by the common name of their certificate.
 
-    ``enclaves`` are the common names in the rules.  ``left_out`` are key expressions that stand for
-    no ROS topic or service, sorted.
+    ``domains`` maps each right to the ROS domains in its keys, None for a wildcard.  ``enclaves``
+    are the common names in the rules.  ``left_out`` are key expressions that stand for no ROS topic
+    or service, sorted.
     """
 
-    rights: frozenset[Right]
+    domains: Mapping[Right, frozenset[int | None]]
     enclaves: frozenset[str]
     left_out: tuple[str, ...]
 
@@ -472,11 +473,11 @@ class RouterLinks(NamedTuple):
 
 
 def rights_in_rules(access: Enforcement) -> RightsInRules:
-    """Return the rights that access control gives to enclaves, in all ROS domains together.
+    """Return the rights that access control gives to enclaves, with their ROS domains.
 
     Subjects without a common name are not enclaves, and are left out.
     """
-    rights: set[Right] = set()
+    domains: dict[Right, set[int | None]] = {}
     left_out: set[str] = set()
     names: set[str] = set()
     for subject in access.subjects:
@@ -485,10 +486,14 @@ def rights_in_rules(access: Enforcement) -> RightsInRules:
             for rule in access.rules_of(subject.id):
                 for right, key in _uses(rule):
                     qualifier = ALLOW if rule.allows else DENY
-                    of_key = ros_names(key)
-                    rights |= {Right(enclave, qualifier, right, name) for name in of_key}
+                    of_key, chunk = ros_names(key), key.partition("/")[0]
+                    domain = int(chunk) if _DOMAIN.fullmatch(chunk) and chunk != "*" else None
+                    for name in of_key:
+                        stated = Right(enclave, qualifier, right, name)
+                        domains.setdefault(stated, set()).add(domain)
                     left_out |= set() if of_key else {key}
-    return RightsInRules(frozenset(rights), frozenset(names), tuple(sorted(left_out)))
+    in_domains = {right: frozenset(of_right) for right, of_right in domains.items()}
+    return RightsInRules(in_domains, frozenset(names), tuple(sorted(left_out)))
 
 
 def _uses(rule: AclRule) -> Iterator[tuple[str, str]]:
