@@ -37,6 +37,9 @@ def time_of_file(seconds: float) -> datetime:
         return datetime.max.replace(tzinfo=UTC) if seconds > 0 else _EPOCH
 
 
+_SOON = timedelta(days=30)
+
+
 @dataclass(frozen=True, slots=True)
 class Window:
     """A validity from ``not_before`` to ``not_after``, both included and both in UTC."""
@@ -58,6 +61,13 @@ class Window:
     def contains(self, moment: datetime) -> bool:
         """Return whether ``moment`` is within the window."""
         return self.not_before <= moment <= self.not_after
+
+    def expires_soon_from(self) -> datetime:
+        """Return from when the window expires soon.
+
+        This is 30 days before it expires, or a third of its length if that is shorter.
+        """
+        return self.not_after - min(_SOON, (self.not_after - self.not_before) / 3)
 
     def life(self, made: datetime | None = None) -> timedelta:
         """Return how long a document with this validity is valid from when it was made.

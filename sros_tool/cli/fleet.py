@@ -538,6 +538,10 @@ def _status(
     with the same state share a line. The last line counts known vulnerabilities of the robots' DDS,
     by the advisories of sros; --robot and --advisories name them.
 
+    The revocation list is in force on a robot that has it and says that no restart is due. Robots
+    do not say which earlier files a process has: after any change, the list counts again once the
+    processes were restarted.
+
     Example:
       $ sros fleet status keystore
       50 robots: 44 current, 1 earlier, 4 never confirmed, 1 another's files
@@ -601,7 +605,7 @@ def _status(
         from sros_tool.values import as_plain
 
         text = render_fleet_page(
-            as_plain(compared), _WORDS, list(_facts(status)), list(_page_rows(compared, robots))
+            as_plain(compared), _WORDS, list(_facts(compared)), list(_page_rows(compared, robots))
         )
     else:
         lines = _lines(compared, robots, findings=advisories is not None)
@@ -640,7 +644,7 @@ def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) ->
     status = compared.status
     counts = ", ".join(f"{number} {_word(state)}" for state, number in status.counts.items())
     yield f"{counted(len(status.robots), 'robot')}: {counts}"
-    yield from _facts(status)
+    yield from _facts(compared)
     rows = list(_rows(compared, robots))
     widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
     for row in rows:
@@ -654,8 +658,9 @@ def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) ->
         yield from _dds_counts(compared)
 
 
-def _facts(status: FleetStatus) -> Iterator[str]:
+def _facts(compared: ComparedFleet) -> Iterator[str]:
     """Yield sentences about the fleet as a whole."""
+    status = compared.status
     command = (
         f"`sros fleet publish {quote(str(status.keystore))} {quote(status.folder or 'PUB')} "
         "--restored`; docs/howto/home_is_lost.md says what else"
@@ -667,13 +672,47 @@ def _facts(status: FleetStatus) -> Iterator[str]:
     if status.stage != "complete":
         behind = sum(robot.stage != status.stage for robot in status.robots if robot.enclaves)
         yield f"CA rotation: {status.stage}; {counted(behind, 'robot')} not there yet"
-    lists = [robot.crl_in_force for robot in status.robots if robot.crl_in_force is not None]
-    if lists:
-        number = f"all {len(lists)}" if all(lists) else f"{sum(lists)} of {len(lists)}"
-        yield f"the revocation list is in force on {number} robots"
+    robots = [robot for robot in status.robots if robot.crl_in_force is not None]
+    if robots and status.is_any_revoked:
+        in_force = sum(bool(robot.crl_in_force) for robot in robots)
+        number = f"{in_force} of " if in_force < len(robots) else "all " if in_force > 1 else ""
+        text = f"the revocation list is in force on {number}{counted(len(robots), 'robot')}"
+        if waiting := sum(robot.has_list and not robot.crl_in_force for robot in robots):
+            text += f"; {waiting} more have it, but may run processes that started before it"
+        yield text
+    yield from _expiry_facts(compared)
     if status.unassigned:
         whom = "it" if status.unassigned == 1 else "them"
         yield f"{counted(status.unassigned, 'enclave')} of no robot: nothing is known of {whom}"
+
+
+def _expiry_facts(compared: ComparedFleet) -> Iterator[str]:
+    """Yield when the first file on a robot expires, if that is soon, and what to do."""
+    from sros_tool.keystore.fleet import publish_command
+
+    soon = [
+        robot
+        for robot in compared.status.robots
+        if robot.enclaves and robot.renew_from and robot.renew_from < compared.at
+    ]
+    if not soon:
+        return
+    end, first, kind = min(
+        (end, robot.robot, kind) for robot in soon for kind, end in robot.expiry.items()
+    )
+    root = compared.status.keystore
+    command = f"`sros renew {quote(str(root))} --all-expiring 30d`, then "
+    if kind == "crl":
+        command = f"`sros crl {quote(str(root))} --refresh`, then "
+    if not any("current" in robot.files.get(kind, ()) for robot in soon):
+        command = ""  # home has renewed them
+    yield (
+        f"first expiry on a robot: {end:%Y-%m-%d} ({first}, {_KINDS.get(kind, kind)}), within 30 "
+        f"days on {counted(len(soon), 'robot')}: {command}{publish_command(root) or 'deliver'}"
+    )
+
+
+_KINDS = {"crl": "revocation list"}
 
 
 class _Group(NamedTuple):

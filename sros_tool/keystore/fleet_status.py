@@ -57,7 +57,7 @@ from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import digest
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.prometheus import Metric, Sample
-from sros_tool.validity import iso, parse_iso
+from sros_tool.validity import Window, iso, parse_iso
 from sros_tool.values import NamedKeystore, Words, shows
 
 
@@ -180,7 +180,8 @@ class RobotStatus:
 
     ``others`` are enclaves of the robot that the fleet does not record.  ``is_published`` says of a
     robot with other files than the keystore that the release which it says it has was published
-    with the present files of the keystore.
+    with the present files of the keystore.  ``has_list`` says whether it has the present revocation
+    list, in force or not, and ``renew_from`` from when a file of it expires soon.
     """
 
     robot: str
@@ -223,9 +224,11 @@ class RobotStatus:
     """The files that the processes of each enclave of the robot have loaded, by its last
     confirmation; null if it does not say it."""
     crl_in_force: bool | None
-    """Whether the robot has the present revocation list, and no process that runs with earlier
-    files, as far as it says it, and is not ``offline``; false if the keystore is older than its
-    robots; null if the keystore has no list, or the robot has no enclave."""
+    """Whether the robot has the present revocation list, says that no process may run with earlier
+    files (``restart`` is empty), and is not ``offline``; false if this is not known, or the
+    keystore is older than its robots; null if the keystore has no list, or the robot has no
+    enclave. Robots do not say which of their earlier files a process has, so a restart for other
+    files counts, too."""
     expiry: Mapping[Annotated[str, Words(_EXPIRING)], datetime]
     """The first expiry of the robot's files, by kind, in UTC, as the ledger has it for the files
     that the robot confirmed."""
@@ -238,6 +241,8 @@ class RobotStatus:
     to_do: str = ""
     """What is to be done with the robot, in few words; empty if nothing is."""
     is_published: bool = False
+    has_list: bool = False
+    renew_from: datetime | None = None
 
     @property
     def unrecorded(self) -> tuple[str, ...]:
@@ -277,7 +282,8 @@ class RobotStatus:
 
     def without_list(self) -> RobotStatus:
         """Return the status if it is not known whether the last revocation list is in force."""
-        return self if self.crl_in_force is None else replace(self, crl_in_force=False)
+        known = None if self.crl_in_force is None else False
+        return replace(self, crl_in_force=known, has_list=False)
 
     def with_to_do(self, now: datetime) -> RobotStatus:
         """Return the status with what is to be done at ``now``."""
@@ -321,6 +327,8 @@ class FleetStatus:
     """Why the keystore is older than its robots, as a clause: it was restored from a backup, or is
     a copy, and has not published since as one that was restored. Null if nothing shows it."""
     folder: str = ""
+    is_any_revoked: bool = False
+    """Whether the revocation list revokes a certificate."""
 
     @property
     def counts(self) -> Mapping[State, int]:
@@ -376,7 +384,15 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
     )
     if older := known.older():  # there may be a later list, which it does not have
         statuses = tuple(status.without_list() for status in statuses)
-    return FleetStatus(root, stages.at_home, statuses, unassigned, older=older, folder=known.folder)
+    return FleetStatus(
+        root,
+        stages.at_home,
+        statuses,
+        unassigned,
+        older=older,
+        folder=known.folder,
+        is_any_revoked=known.is_any_revoked(),
+    )
 
 
 # ── comparing a confirmation with the files at home ────────────────────────────────────────
@@ -637,6 +653,13 @@ class _Known:
         entries = self._keystore.ledger_with("what", "release").entries
         return max((entry.number for entry in entries if entry.what == "release"), default=0)
 
+    def is_any_revoked(self) -> bool:
+        """Return whether the revocation list revokes a certificate, or cannot be read."""
+        try:
+            return any(crl.revoked for crl in self._keystore.revocation_lists)
+        except SrosError:
+            return self.has_list
+
     def revoked(self, robot: Robot) -> tuple[str, ...]:
         """Return the enclaves of a robot that were revoked and are not in the keystore."""
         if not self._revoked:
@@ -645,14 +668,19 @@ class _Known:
         names.update(self._unrecorded[robot.name].below)
         return tuple(sorted(name for name in names if not has_enclave(self._root, name)))
 
-    def expiry(self, compared: _ComparedRobot) -> dict[str, datetime]:
-        """Return the first expiry of a robot's files, by kind, as far as the ledger has them."""
-        first: dict[str, datetime] = {}
+    def validity(self, compared: _ComparedRobot) -> dict[str, Window]:
+        """Return the validity of the robot's file that expires first, by kind, by the ledger."""
+        first: dict[str, Window] = {}
         for kind, digests in compared.expiring.items():
             entries = (self._issued.get(digest) for digest in digests)
-            ends = [entry.not_after for entry in entries if entry and entry.what == kind]
-            if end := min(filter(None, ends), default=""):
-                first[kind] = parse_iso(end)
+            files = [
+                entry
+                for entry in entries
+                if entry and entry.what == kind and "" < entry.not_before < entry.not_after
+            ]
+            if files:
+                entry = min(files, key=lambda file: file.not_after)
+                first[kind] = Window(parse_iso(entry.not_before), parse_iso(entry.not_after))
         return first
 
     def file(self, robot: Robot, difference: _Difference) -> ConfirmedFile:
@@ -738,11 +766,14 @@ def _status(
         state = max(state, State.REFUSED, key=_BADNESS.__getitem__)
         text = f"its last message was refused since {iso(refusal.time)}: {refusal.why}"
         compared = compared._replace(notes=(*compared.notes, text))
-    in_force = (
-        received is not None
-        and not (restart or state in (State.REFUSED, State.LATER))
+    has_list = (
+        known.has_list
+        and bool(compared.enclaves)
+        and received is not None
+        and state not in (State.REFUSED, State.LATER)
         and set(counts.get("crl", ())) <= {State.CURRENT}
     )
+    validity = known.validity(compared)
     return RobotStatus(
         compared.robot.name,
         state,
@@ -759,12 +790,14 @@ def _status(
         different,
         restart,
         compared.running(),
-        in_force if known.has_list and compared.enclaves else None,
-        known.expiry(compared),
+        has_list and restart == () if known.has_list and compared.enclaves else None,
+        {kind: window.not_after for kind, window in validity.items()},
         confirmed.dds if confirmed else None,
         confirmed.problems if confirmed else None,
         compared.notes,
         is_published=bool(different) and known.is_published(compared),
+        has_list=has_list,
+        renew_from=min((window.expires_soon_from() for window in validity.values()), default=None),
     )
 
 
@@ -870,7 +903,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_revocation_list_in_force",
-            "Whether the present revocation list is in force on a robot (1) or not (0).",
+            "Whether the present revocation list is in force on a robot (1), or not, or it is not "
+            "known (0).",
             of_robots(
                 lambda robot: None if robot.crl_in_force is None else int(robot.crl_in_force)
             ),

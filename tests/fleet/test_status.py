@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from sros_tool.cli.fleet import ComparedFleet, _facts
 from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
     RobotDds,
@@ -22,6 +23,7 @@ from sros_tool.keystore.confirmation import (
     Seen,
     parse_confirmation,
 )
+from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.layout import ENCLAVES, REFUSED
 from sros_tool.keystore.reader import Keystore, read_certificate
 from sros_tool.pki.certificates import digest
@@ -56,11 +58,11 @@ class Field:
         assert ended.status == status, ended
         return ended
 
-    def deliver(self, *robots: str) -> None:
+    def deliver(self, *robots: str, **changed: object) -> None:
         """Export the enclaves of robots to them, and confirm what they have then."""
         for robot in robots:
             self.run("distribute_key", "ks", "--robot", robot, robot, "--force")
-            self.confirm(robot)
+            self.confirm(robot, **changed)
 
     def confirm(self, robot: str, **changed: object) -> Ended:
         """Confirm what a robot has, with a sound DDS and with ``changed`` values."""
@@ -396,6 +398,10 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     assert "\nthe revocation list is in force on 0 of 3 robots\n" in said
     field.deliver("r1", "r2")
     field.send("r2", running={"/r2/base": RunningFiles.EARLIER, "/r9/base": RunningFiles.EARLIER})
+    assert in_force() == [False, False, False], "r1 does not say which processes it has"
+    said = field.run("fleet", "status", "ks", status=1).out
+    assert "on 0 of 3 robots; 2 more have it, but may run processes that started" in said
+    field.confirm("r1", restart=[])
     assert in_force() == [True, False, False]
     found = field.status()["robots"]["r2"]
     assert (found["state"], found["restart"]) == ("restart", ["/r2/base"])
@@ -406,10 +412,20 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     assert in_force() == [True, False, False]
     text = field.run("fleet", "status", "ks", "--prometheus", status=1).out
     assert [value for _, value in samples(text, "sros_fleet_revocation_list_in_force")] == [1, 0, 0]
-    field.deliver("r3")
+    field.deliver("r3", restart=[])
     field.send("r2", running={"/r2/base": RunningFiles.CURRENT})
     said = field.run("fleet", "status", "ks").out
     assert "\nthe revocation list is in force on all 3 robots\n" in said
+    said = field.run("fleet", "status", "ks", "--robot", "r3").out
+    assert "\nthe revocation list is in force on 1 robot\n" in said
+
+
+def test_a_list_that_revokes_nobody_is_not_said_to_be_in_force(field: Field) -> None:
+    field.run("crl", "ks", "--refresh")
+    field.deliver(*ROBOTS, restart=[])
+    field.run("renew", "ks", "/r1/base")
+    said = field.run("fleet", "status", "ks", status=1).out
+    assert "revocation list" not in said and "1 earlier" in said
 
 
 def test_expiry_on_robots_is_that_of_the_files_that_they_have(field: Field) -> None:
@@ -433,6 +449,19 @@ def test_expiry_on_robots_is_that_of_the_files_that_they_have(field: Field) -> N
     seconds = dict(samples(text, "sros_fleet_expiry_timestamp_seconds", "robot", "kind"))
     assert seconds["r2", "certificate"] == parse_iso(after["r2"]["certificate"]).timestamp()
     assert len(seconds) == 6
+
+
+def test_robots_with_files_that_expire_soon_are_named(field: Field) -> None:
+    status = fleet_status(Keystore(field.root))
+    kind, end = min(status.robots[0].expiry.items(), key=lambda item: item[1])
+    lines = {
+        days: [*_facts(ComparedFleet(end - timedelta(days=days), status, [], []))]
+        for days in (31, 24)
+    }
+    assert not any("expiry" in line for line in lines[31])
+    (line,) = (line for line in lines[24] if "expiry" in line)
+    assert f"{end:%Y-%m-%d} (r1, {kind}), within 30 days on 3 robots: `sros renew" in line
+    assert line.endswith("--all-expiring 30d`, then deliver")
 
 
 def samples(text: str, metric: str, *labels: str) -> list[tuple[tuple[str, ...], float]]:
@@ -551,7 +580,7 @@ def test_a_robot_that_says_it_has_a_release_that_was_never_published(field: Fiel
     field.deliver(*ROBOTS)
     number = field.status()["robots"]["r2"]["published"]
     for robot, claimed in (("r1", number), ("r2", number + 1), ("r3", number)):
-        field.send(robot, release=claimed)
+        field.send(robot, release=claimed, restart=())
     found = field.status()["robots"]
     assert [found[name]["state"] for name in ROBOTS] == ["current", "later", "current"]
     assert [found[name]["crl_in_force"] for name in ROBOTS] == [True, False, True]
@@ -604,7 +633,7 @@ def test_home_is_older_than_its_robots(field: Field) -> None:
         return {robot["crl_in_force"] for robot in field.status()["robots"].values()}
 
     field.run("crl", "ks", "--refresh")
-    field.deliver(*ROBOTS)
+    field.deliver(*ROBOTS, restart=[])
     field.run("fleet", "publish", "ks", "pub")
     assert in_force() == {True}
     backup = shutil.copytree(field.root, field.folder / "backup", symlinks=True)

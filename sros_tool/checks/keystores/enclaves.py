@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from datetime import datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 from shlex import quote
 
@@ -40,7 +40,7 @@ from sros_tool.keystore.reader import weaknesses
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.pki.token import TokenUri, pin_file_problem, pin_line_break
 from sros_tool.translate import allows_everything
-from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
+from sros_tool.validity import BACKDATE, Span, iso, parse_iso
 
 _SAME_DAY = timedelta(days=1)
 """ros2/sros2 gives a CA and its certificates ten years each, so these expire seconds later."""
@@ -234,7 +234,6 @@ PIN_FILE = FindingKind(
     "Write the PIN alone into the file, with mode 0600, for the user that runs the node.",
 )
 
-_SOON = timedelta(days=30)
 _LONG = timedelta(days=2 * 366)
 
 
@@ -331,7 +330,7 @@ def _expiry(
             file = enclave.file("permissions.p7s")
             yield PERMISSIONS_OUTLIVE.found(enclave.name, text, file)
     for file, what, window in windows:
-        if window.contains(now) and _expires_soon(window, now):
+        if window.expires_soon_from() < now <= window.not_after:
             verb = "expires" if what == "the certificate" else "expire"
             text = f"{what} {verb} at {iso(window.not_after)}"
             accepted = enclave.accepts_expiry
@@ -339,11 +338,6 @@ def _expiry(
 
 
 _EXPIRED = (Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED)
-
-
-def _expires_soon(window: Window, now: datetime) -> bool:
-    """Return whether ``window`` ends within 30 days, or within a third of its length if shorter."""
-    return window.not_after - now < min(_SOON, (window.not_after - window.not_before) / 3)
 
 
 def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:

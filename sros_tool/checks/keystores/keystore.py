@@ -25,6 +25,7 @@ from sros_tool.checks.keystores.documents import (
 from sros_tool.checks.keystores.enclaves import (
     CRL_MISSING,
     EVERYTHING,
+    EXPIRES_SOON,
     LONG_PERMISSIONS,
     NOT_UNIQUE,
     check_enclave,
@@ -56,7 +57,7 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
 from sros_tool.faults import AT_HOME
-from sros_tool.keystore.fleet import stated_distributions
+from sros_tool.keystore.fleet import publish_command, stated_distributions
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     GOVERNANCE_P7S,
@@ -68,7 +69,7 @@ from sros_tool.keystore.reader import Keystore, of_one_state
 from sros_tool.parallel import map_slices, tick
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 
 _NAMES_SHOWN = 3
 _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id, TIME_FORMAT.id})
@@ -182,7 +183,9 @@ def keystore_findings(
     real_root = os.path.realpath(root)
     located = (_at_real_file(finding, root, real_root) for finding in found)
     found = with_causes(joined([_with_names(finding, root) for finding in located]))
-    return _with_cause_of_ros2(found, opened) if keystore.is_home else found
+    if not keystore.is_home:
+        return found
+    return _with_cause_of_expiry(_with_cause_of_ros2(found, opened), root)
 
 
 def _stated(keystore: CheckedKeystore, names: Sequence[str]) -> dict[str, tuple[Distribution, ...]]:
@@ -342,6 +345,26 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list
     )
 
 
+def _with_cause_of_expiry(findings: Sequence[Finding], root: Path) -> list[Finding]:
+    """Return the findings; those on certificates and permissions that expire soon get a cause."""
+    soon = [f for f in findings if f.kind is EXPIRES_SOON and not f.accepted and not f.cause]
+    if not soon:
+        return list(findings)
+    enclaves = len({finding.subject for finding in soon})
+    first = min(soon, key=lambda finding: finding.text.rpartition(" ")[2])
+    published = publish_command(root)
+    return _with(
+        findings,
+        soon,
+        root,
+        EXPIRES_SOON.title.replace("a certificate", "certificates"),
+        f"{counted(len(soon), 'file')} of {counted(enclaves, 'enclave')}, the first of "
+        f"{first.subject}: {first.text}. {EXPIRES_SOON.why}",
+        f"Run `sros renew {quote(str(root))} --all-expiring 30d`, then "
+        f"{published or 'export the enclaves again'}, and restart their processes.",
+    )
+
+
 def _is_plain(findings: Sequence[Finding], name: str) -> bool:
     """Return whether neither certificate nor permissions of an enclave are in the ledger."""
     return sum(finding.kind is UNEXPLAINED and finding.subject == name for finding in findings) > 1
@@ -368,7 +391,7 @@ def _with(
 
 def _kinds(findings: Sequence[Finding]) -> str:
     """Return text with the title of each kind of finding and the number of its findings."""
-    counted = Counter(finding.kind.title for finding in findings if finding.severity >= WARNING)
+    titles = Counter(finding.kind.title for finding in findings if finding.severity >= WARNING)
     return "; ".join(
-        f"{title} ({number} times)" if number > 1 else title for title, number in counted.items()
+        f"{title} ({number} times)" if number > 1 else title for title, number in titles.items()
     )
