@@ -153,9 +153,10 @@ def view(
 
     A SOURCE is a policy file, a keystore (its signed permissions), the folder of an enclave, its
     permissions, a Zenoh configuration (router.json5), or the output of `sros generate_policy
-    --json`. Two policies are compared as before and after, a policy and a keystore for drift, and a
-    Zenoh configuration with what it should allow. --observed compares the rights in SOURCE with
-    those that are used. --focus shows who may use a name, and who can influence those enclaves.
+    --json`. Two policies are compared as before and after, a policy and a keystore are compared for
+    drift, and a Zenoh configuration is compared with the rights that it should allow. --observed
+    compares the rights in SOURCE with those that are used. --focus shows who may use a name, and
+    who can influence those enclaves.
 
     In a keystore with more than 1,000 enclaves, robots that differ only in names are not all read
     in full: for most of them, only the text of the permissions is compared, and the page says so.
