@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.keystore.reader import Keystore
 from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression
@@ -27,6 +28,7 @@ from sros_tool.policy.rights import (
     parts,
     unfolded,
 )
+from sros_tool.reach import DomainRights
 from sros_tool.report.picture import (
     UNKNOWN,
     Edge,
@@ -67,6 +69,7 @@ class PictureSource:
     of the enclaves that the source describes, None for all.  ``protections`` are the protection
     levels that a policy states, and ``policy`` is that policy.  ``keystore`` is the keystore from
     which the source was read; ``unread`` are its units that were only compared with others.
+    ``in_domains`` has the rights by their ROS domains; empty if the source does not say them.
     """
 
     origin: SourceTitle
@@ -81,6 +84,7 @@ class PictureSource:
     policy: Policy | None = None
     keystore: Keystore | None = None
     unread: tuple[UnreadUnits, ...] = ()
+    in_domains: DomainRights = field(default_factory=dict)
 
     def in_enclaves(self, homes: Mapping[str, str]) -> PictureSource:
         """Return a copy whose rights and nodes are in other enclaves, by the present ones."""
@@ -286,15 +290,30 @@ def _enclaves(
     for source in sources:
         for path, names in source.nodes.items():
             nodes[path].update(names)
+    domains = _domains_of(sources)
     return tuple(
         replace(
             described.get(path, PicturedEnclave(path, "")),
             group=group_of(path, context.hosts),
             nodes=tuple(sorted(nodes.get(path, ()))),
+            domains=domains.get(path, ""),
             statements=tuple(statements.get(path, ())),
         )
         for path in sorted({*described, *statements, *nodes})
     )
+
+
+def _domains_of(sources: Sequence[PictureSource]) -> dict[str, str]:
+    """Map enclaves to their ROS domains as text, by the last source that says them."""
+    domains: dict[str, str] = {}
+    for source in sources:
+        of_source: dict[str, list[tuple[int, int]]] = defaultdict(list)
+        for some, rights in source.in_domains.items():
+            ranges = [(part.first or 0, part.last or 0) for part in some.ranges] if some else []
+            for enclave in {right.enclave for right in rights}:
+                of_source[enclave] += ranges
+        domains |= {name: str(DomainSet.of(*of_source[name])) for name in of_source}
+    return domains
 
 
 def group_of(enclave: str, hosts: Mapping[str, str]) -> str:

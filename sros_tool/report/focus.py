@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import NamedTuple
 
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import UsageError
 from sros_tool.keystore.selection import likely_names
@@ -225,18 +226,21 @@ class _System:
     def __init__(self, picture: Picture, sources: Sequence[PictureSource]) -> None:
         self._picture = picture
         enclaves = {enclave.path for enclave in picture.enclaves}
-        self._rights = [
-            right for source in sources for right in source.rights if right.enclave in enclaves
-        ]
+        in_domains: dict[DomainSet | None, list[Right]] = defaultdict(list)
+        for source in sources:
+            for domains, some in (source.in_domains or {None: source.rights}).items():
+                in_domains[domains] += (right for right in some if right.enclave in enclaves)
+        self._rights = [right for some in in_domains.values() for right in some]
+        self._domains = {enclave.path: enclave.domains for enclave in picture.enclaves}
         self._governance: Governance | None = next(
             (source.governance for source in reversed(sources) if source.governance), None
         )
         everybody = sorted(enclaves)
         opened = tuple(unguarded(self._governance)) if self._governance else ()
-        self._by_permissions = Network(self._rights)
-        self._direct = Network(self._rights, unguarded=opened, everybody=everybody)
+        self._by_permissions = Network(in_domains)
+        self._direct = Network(in_domains, unguarded=opened, everybody=everybody)
         self._network = Network(
-            self._rights,
+            in_domains,
             without=OF_EVERY_NODE,
             questions=QUESTIONS,
             unguarded=opened,
@@ -293,6 +297,10 @@ class _System:
         sentence = _sentence(kind, name, senders, receivers, influencing, open_to_all)
         if not is_expression(name) and (kind, name) not in self._known:
             sentence = f"no right states {name} itself, but wildcards match it: {sentence}"
+        domains = {self._domains.get(user, "") for user in senders | receivers}
+        if len(domains) > 1:
+            sentence += "; they are in different ROS domains ("
+            sentence += f"{enumerated(sorted(domains - {''}))}), and reach only those of their own"
         return Focus(
             kind, name, sentence, tuple(sorted(senders)), tuple(sorted(receivers)), influencing
         )

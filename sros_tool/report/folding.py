@@ -115,6 +115,8 @@ class DrawnUnit(NamedTuple):
     """A robot, a namespace or an enclave that can be equal to others of its ``family``.
 
     ``values`` are the words by which names name it: its name, and its namespace if that differs.
+    ``group`` are the groups and the domain of a robot: only robots of the same are expected to be
+    alike.
     """
 
     name: str
@@ -122,6 +124,7 @@ class DrawnUnit(NamedTuple):
     family: int
     enclaves: tuple[str, ...]
     values: tuple[str, ...]
+    group: tuple[object, ...] = ()
 
     @property
     def alone(self) -> bool:
@@ -255,6 +258,7 @@ class _Draft:
         names = UnitNames(self._units, paths)
         self._of, self._text = names.of, names.text
         self._unread = {units.like: units.members for units in picture.unread}
+        self._domains_of = {enclave.path: enclave.domains for enclave in picture.enclaves}
 
     def folding(self) -> Folding:
         """Return the folding; its picture is unchanged if nothing can be folded."""
@@ -303,7 +307,7 @@ class _Draft:
             if enclave.path in self._of:
                 owner, group = owners[enclave.path], self._text(enclave.group)
                 drawn = (
-                    *(owner.form, group.form, enclave.observed),
+                    *(owner.form, group.form, enclave.observed, enclave.domains),
                     *(enclave.path in alarming, roles.get(enclave.path)),
                 )
                 yield self._kind(drawn), (*owner.units, *group.units), enclave.path
@@ -343,7 +347,6 @@ class _Draft:
         for members in sorted(classes.values(), key=lambda members: (-len(members), members)):
             if len(members) > 1:
                 usual.setdefault(self._units[members[0]].family, members[0])
-        self._usual = usual
         sizes = Counter(unit.family for unit in self._units)
         named = self._named_by(usual)
         for unit, *others in classes.values():
@@ -411,15 +414,23 @@ class _Draft:
             edges=edges,
             focus=tuple(map(self._focus, self._picture.focus)),
         )
+        shown_domains = {self._domains(unit) for unit in self._of.values()}
         units = sorted(
             EqualUnits(
                 self._label(members[0]),
                 self._units[members[0]].what,
                 self._members(members),
+                self._domains(members[0]) if len(shown_domains) > 1 else "",
             )
             for members in self._classes.values()
         )
         return Folding(picture, tuple(units), different, self._enclaves, self._names)
+
+    def _domains(self, unit: int) -> str:
+        """Return the ROS domains of a unit's enclaves as text; "" if they differ."""
+        enclaves = self._units[unit].enclaves
+        domains = {self._domains_of[enclave] for enclave in enclaves if enclave in self._domains_of}
+        return domains.pop() if len(domains) == 1 else ""
 
     def _apart(self, unit: int) -> bool:
         """Return whether a unit may not be drawn together with others."""
@@ -572,11 +583,14 @@ class _Draft:
 
         Also returns the drawn enclaves and rights in which they differ.
         """
+        usual_of: dict[object, int] = {}
+        for members in sorted(self._classes.values(), key=lambda members: (-len(members), members)):
+            for n in members:
+                usual_of.setdefault((self._units[n].family, self._units[n].group), members[0])
         near = {
             n: usual
-            for n in set(self._of.values())
-            if (usual := self._usual.get(self._units[n].family)) is not None
-            and usual in self._inside
+            for n in set(self._of.values()) - self._in_focus()
+            if (usual := usual_of.get((self._units[n].family, self._units[n].group))) is not None
             and self._is_drawn(n)
             and self._inside.get(n) != self._inside[usual]
         }
@@ -592,15 +606,21 @@ class _Draft:
                 more = [what for key, what in own.items() if key not in other]
                 fewer = [what for key, what in other.items() if key not in own]
                 differing_parts.update(more)
-                different.append(
-                    DifferentUnit(
-                        self._label(n),
-                        self._label(near[n]),
-                        tuple(self._said(more, n)),
-                        tuple(self._said(fewer, n, near[n])),
+                only = dict.fromkeys(self._said(more, n))
+                missing = dict.fromkeys(self._said(fewer, n, near[n]))
+                # An enclave that both have differs by something else, such as a fault.
+                has = tuple(text for text in only if text not in missing)
+                lacks = tuple(text for text in missing if text not in only)
+                if has or lacks:
+                    different.append(
+                        DifferentUnit(self._label(n), self._label(near[n]), has, lacks)
                     )
-                )
         return tuple(different), differing_parts
+
+    def _in_focus(self) -> set[int]:
+        """Return the units in the focus, which differ from all others by that."""
+        names = (focus.name for focus in self._picture.focus)
+        return {unit for name in names for unit in self._text(name).units}
 
     def _said(
         self, drawn: Sequence[Edge | str], unit: int, instead: int | None = None
@@ -667,7 +687,8 @@ def _robots(paths: Iterable[str], robots: Mapping[str, Robot]) -> Iterator[Drawn
     for name, robot in named.items():
         space = robot.namespace.rpartition("/")[2]
         values = (name, space) if space not in ("", name) else (name,)
-        yield DrawnUnit(name, "robot", 0, tuple(enclaves[name]), values)
+        group = (robot.groups, robot.domain)
+        yield DrawnUnit(name, "robot", 0, tuple(enclaves[name]), values, group)
 
 
 def _guessed(paths: Iterable[str]) -> Iterator[DrawnUnit]:

@@ -217,6 +217,8 @@ class PicturedEnclave:
     """Faults that keep a process from using the enclave."""
     observed: bool = True
     """With ``--observed``: whether the enclave was observed."""
+    domains: str = ""
+    """ROS domains of the enclave's rights, such as ``10`` or ``10,20``; empty for every domain."""
     note: str = ""
 
 
@@ -396,12 +398,15 @@ class EqualUnits(NamedTuple):
     """Kind of the units: robot, namespace or enclave."""
     members: tuple[str, ...]
     """Names of the units."""
+    domains: str = ""
+    """Their ROS domains, if the picture has units of other domains; else empty."""
 
     @property
     def title(self) -> str:
         """The units in words, such as ``r01 … r50: 50 equal robots``."""
         first, last = self.members[0], self.members[-1]
-        return f"{first} … {last}: {len(self.members)} equal {self.what}s"
+        where = f" in domain {self.domains}" if self.domains else ""
+        return f"{first} … {last}: {len(self.members)} equal {self.what}s{where}"
 
 
 class UnreadUnits(NamedTuple):

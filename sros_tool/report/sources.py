@@ -35,7 +35,7 @@ from sros_tool.keystore.reader import (
     OpenedEnclave,
     open_enclave,
 )
-from sros_tool.keystore.rights import RightsSource, is_zenoh, load_rights
+from sros_tool.keystore.rights import RightsSource, is_zenoh, load_rights, rights_by_domains
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import (
     authority_text,
@@ -75,7 +75,7 @@ from sros_tool.report.sampling import SampledKeystore, sample_of
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso
 from sros_tool.values import parse_json
-from sros_tool.wording import first_few
+from sros_tool.wording import enumerated, first_few
 from sros_tool.xml import read_bytes
 
 if TYPE_CHECKING:
@@ -148,6 +148,12 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
         seen = union([read_source(path, now=drawing.now) for path in drawing.observed])
         read.append(seen.in_enclaves(enclaves_of_nodes(seen.nodes, read[0].nodes)))
     picture = _compared(read, context, use=bool(drawing.observed))
+    if len(domains := {enclave.domains for enclave in picture.enclaves}) > 1:
+        several = enumerated(sorted(domains - {""}))
+        text = f"enclaves are for different ROS domains ({several}): a name is drawn once for all, "
+        text += "but information goes only between enclaves with a common domain."
+        finding = PicturedFinding("view.domains", "note", text)
+        picture = replace(picture, findings=(*picture.findings, finding))
     if drawing.focus:
         routers = max(_routers(source.keystore) for source in read)
         picture = focused(picture, read, drawing.focus, routers)
@@ -430,6 +436,7 @@ def read_source(
         read.rights,
         findings=findings,
         scope=read.scope,
+        in_domains=rights_by_domains(read),
     )
     if read.policy:
         nodes, stated = read.policy.nodes(), read.protections or ()

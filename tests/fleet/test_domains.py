@@ -93,3 +93,42 @@ def test_who_may_do_it_in_which_domain(halls: Path) -> None:
     asked = sros("explain", "ks", "--who", "publish", "/plan", "--json", cwd=halls).ok()
     outcomes = {each["enclave"]: each["domains"] for each in json.loads(asked.out)["enclaves"]}
     assert outcomes["/desk"] == "10,20" and outcomes["/p01/eye"] is None
+
+
+ALIKE = (
+    "[groups]\npickers = {}\nforklifts = {}\n[robots]\n"
+    + "".join(
+        f'p{n} = {{ groups = ["pickers"], domain = {10 + n // 4 * 10} }}\n' for n in range(1, 7)
+    )
+    + "".join(f'f{n} = {{ groups = ["forklifts"], domain = 10 }}\n' for n in range(1, 4))
+)
+
+
+def test_robots_of_other_domains_and_groups_are_neither_equal_nor_different(
+    tmp_path: Path,
+) -> None:
+    of_all = {"eye": publish("{namespace}/scan"), "pilot": subscribe("{namespace}/scan")}
+    of_all["pilot"] += publish("{namespace}/cmd")
+    enclaves = {
+        f"/{{robot:{group}}}/{name}": text
+        for group in ("pickers", "forklifts")
+        for name, text in of_all.items()
+    }
+    odd = {"/p2/wheels": subscribe("/p2/cmd"), "/{robot:forklifts}/fork": subscribe("/up")}
+    (tmp_path / "p.xml").write_text(policy_text(enclaves | odd))
+    (tmp_path / "f.toml").write_text(ALIKE)
+
+    def said(*focus: str) -> list[str]:
+        words = ("p.xml", "--fleet", "f.toml", *focus, "-o", f"{len(focus)}.svg")
+        return sros("view", *words, cwd=tmp_path).ok().err.splitlines()
+
+    lines = said()
+    assert "p1 … p3: 2 equal robots in domain 10 are drawn as one" in lines
+    assert "p4 … p6: 3 equal robots in domain 20 are drawn as one" in lines
+    assert "f1 … f3: 3 equal robots in domain 10 are drawn as one" in lines
+    # A robot is compared with those of its group and domain.
+    (different,) = [line for line in lines if "differs" in line]
+    assert different.startswith("p2 differs from p1 … p3: it has enclave /p2/wheels")
+    assert not [line for line in said("--focus", "/p5/cmd") if "differs" in line]
+    focused = said("--focus", "/p5/scan", "--focus", "/up")
+    assert not [line for line in focused if "differs" in line]
