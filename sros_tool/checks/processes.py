@@ -127,6 +127,10 @@ PROCESS_NOT_SEEN = FindingKind(
     "proc(5), ptrace(2) (PTRACE_MODE_READ_FSCREDS).",
     "Run it as root, and not in a container: `sudo sros check runtime`.",
 )
+_ROOT_MAY_NOT = (
+    "Being root is not enough here: the processes are in another container or user namespace, or "
+    "this one lacks the capability CAP_SYS_PTRACE. Look from the host, outside containers."
+)
 
 _NEW_AUTHORITY = Fault.CA_EXPIRED.remedy_in_export("").format(root="KEYSTORE")
 """Remedy for an expired CA, which can no longer renew anything."""
@@ -802,10 +806,11 @@ def _elsewhere(nodes: Sequence[Process], security: Mapping[int, Security]) -> It
 
 def _not_seen(running: RunningProcesses) -> Iterator[Finding]:
     """Yield a finding for each node that could not be examined, and one with their number."""
+    remedy = _ROOT_MAY_NOT if running.by_root else ""
     for process in running.unseen:
         if process.speaks:
             text = f"it speaks ROS 2, and cannot be looked at: {process.why}"
-            yield PROCESS_NOT_SEEN.found(process.label, text)
+            yield PROCESS_NOT_SEEN.found(process.label, text, remedy=remedy)
     others = [process for process in running.unseen if not process.speaks]
     reasons = [running.hidden] if running.hidden else []
     if others:
@@ -816,7 +821,7 @@ def _not_seen(running: RunningProcesses) -> Iterator[Finding]:
         text = f"{len(running.processes)} of them speak ROS 2"
         yield CONTAINER_ALONE.found("processes", text)
     if reasons:
-        yield PROCESS_NOT_SEEN.found("processes", "; ".join(reasons))
+        yield PROCESS_NOT_SEEN.found("processes", "; ".join(reasons), remedy=remedy)
 
 
 # ── metrics ────────────────────────────────────────────────────────────────────────────────

@@ -59,14 +59,18 @@ VERSION_UNKNOWN = FindingKind(
     "restart the processes.",
     prominent=True,
 )
+_UNSEEN_REMEDY = (
+    "Run `sudo sros check runtime` on the robot: it names the processes that root cannot look at, "
+    "and says why."
+)
 ROBOTS_UNKNOWN = FindingKind(
     "runtime.robots-dds-unknown",
     NOTE,
     "robots whose DDS is not known, or not all of it",
     "sros cannot tell which known vulnerabilities they have.",
     "The last confirmations of the robots.",
-    "Confirm again with this version of sros (`sros fleet report` on the robot), as a user who may "
-    "look at all processes, and while the nodes run.",
+    "If nothing was reported or seen, confirm again with this version of sros (`sros fleet report` "
+    f"on the robot), while the nodes run. If processes could not be looked at: {_UNSEEN_REMEDY}",
     prominent=True,
 )
 NOTES_ON_LIBRARIES = (PACKAGE_VULNERABILITIES, VERSION_UNKNOWN, ROBOTS_UNKNOWN)
@@ -106,7 +110,7 @@ def robot_findings(
         if not dds.libraries:
             lacking.setdefault("none seen on", []).append(robot)
         if dds.unseen:
-            lacking.setdefault("processes that could not be looked at on", []).append(robot)
+            lacking.setdefault(_UNSEEN, []).append(robot)
     by = {
         library: [f"{_SEEN[how]} {some_names(where[how])}" for how in Seen if how in where]
         for library, where in seen.items()
@@ -114,9 +118,11 @@ def robot_findings(
     yield from _library_findings(by, advisories)
     if lacking:
         parts = (f"{what} {some_names(names)}" for what, names in lacking.items())
-        yield ROBOTS_UNKNOWN.found("DDS of robots", "; ".join(parts))
+        remedy = _UNSEEN_REMEDY if lacking.keys() == {_UNSEEN} else ""
+        yield ROBOTS_UNKNOWN.found("DDS of robots", "; ".join(parts), remedy=remedy)
 
 
+_UNSEEN = "processes that could not be looked at on"
 _SEEN = {Seen.PROCESS: "loaded by processes of", Seen.INSTALLED: "installed, but not loaded, on"}
 
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import click
@@ -324,11 +325,15 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
         line += _numbers(asked, REQUEST_OUTCOMES, would)
     yield line
     by_outcome = sorted(collected.robots, key=lambda robot: MESSAGE_OUTCOMES.index(robot.outcome))
+    alike: dict[str, dict[str, str]] = {}
     for robot in by_outcome:
-        if robot.why:
-            yield f"{robot.robot}: {robot.outcome}: {robot.why}"
-        for remark in robot.remarks:
-            yield f"{robot.robot}: {remark}"
+        why = (f"{robot.outcome}: {robot.why}",) if robot.why else ()
+        for text in (*why, *robot.remarks):
+            unnamed = _unnamed(text, robot.robot)
+            alike.setdefault(_DURATION.sub("", unnamed), {})[robot.robot] = unnamed
+    names = [robot.robot for robot in collected.robots]
+    for texts in alike.values():
+        yield f"{_runs(texts, names)}: {_joined(texts)}"
     for name, request in sorted(
         requests, key=lambda request: REQUEST_OUTCOMES.index(request[1].outcome)
     ):
@@ -723,6 +728,11 @@ class _Group(NamedTuple):
     to_do: str
     what: str
 
+    @property
+    def names(self) -> list[str]:
+        """Names of the robots."""
+        return [robot.robot for robot in self.robots]
+
     def confirmed(self, at: datetime) -> RobotStatus:
         """Return the robot whose last confirmation is the oldest."""
         return min(self.robots, key=lambda robot: robot.received or at)
@@ -732,35 +742,35 @@ def _groups(compared: ComparedFleet, robots: Sequence[str]) -> list[_Group]:
     """Return the robots in groups, each robot alone if ``robots`` are named; the last group has
     those that are current.
     """
-    status, places = compared.status, _places(compared.status)
+    status, places = compared.status, _places(compared.status.names)
     alike: dict[tuple[str, ...], list[RobotStatus]] = {}
     current: list[RobotStatus] = []
+    whats: dict[str, str] = {}
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
         if robots or robot.state not in ("current", "none") or robot.notes or robot.problems:
             what = _unnamed("; ".join(_summary(robot, status.stage)), robot.robot)
-            row = (robot.state.value, robot.to_do, what)
+            whats[robot.robot] = what
+            row = (robot.state.value, robot.to_do, _DURATION.sub("", what))
             alike.setdefault((*row, robot.robot if robots else ""), []).append(robot)
         elif robot.state == "current":
             current.append(robot)
-    groups = [
-        _Group(
-            group, state, to_do, what.replace(_ROBOT, group[0].robot) if len(group) == 1 else what
-        )
-        for (state, to_do, what, _), group in alike.items()
-    ]
+    groups = []
+    for (state, to_do, *_), group in alike.items():
+        what = _joined({robot.robot: whats[robot.robot] for robot in group})
+        groups.append(_Group(group, state, to_do, what))
     return [*groups, _Group(current, "current", "", "")] if current else groups
 
 
 def _rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Yield the head and the rows of a table, or nothing if no robot needs a row."""
-    groups, places = _groups(compared, robots), _places(compared.status)
+    groups = _groups(compared, robots)
     if not robots and all(group.state == "current" for group in groups):
         groups = [group for group in groups if group.what]
     if not groups:
         return
     yield "robot", "state", "confirmed", "to do", "what"
     for group in groups:
-        names = _runs((robot.robot for robot in group.robots), places)
+        names = _runs(group.names, compared.status.names, compared.status.groups)
         age = _age(group.confirmed(compared.at), compared.at)
         yield names, _word(group.state), age, group.to_do, group.what
 
@@ -771,9 +781,9 @@ def _page_rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple
     """
     from sros_tool.validity import iso
 
-    places = _places(compared.status)
     for group in _groups(compared, robots):
-        names = _runs((robot.robot for robot in group.robots), places, len(group.robots))
+        status, most = compared.status, len(group.robots)
+        names = _runs(group.names, status.names, status.groups, most)
         received = group.confirmed(compared.at).received
         expiry = [moment for robot in group.robots for moment in robot.expiry.values()]
         yield (
@@ -790,6 +800,35 @@ _ROBOT = "{robot}"
 """Stands for the name of each robot that shares a row, as in policies."""
 
 
+_DURATION = re.compile(r"(?<![\w.])\d+ (?:d|h|min|s)(?: \d+ (?:h|min|s))?(?![\w.])")
+"""A duration as `elapsed` writes it."""
+_UNITS = {"d": 86400, "h": 3600, "min": 60, "s": 1}
+
+
+def _joined(texts: Mapping[str, str]) -> str:
+    """Return the texts of robots that differ only in durations, such as "2 min to 5 min behind".
+
+    The text of a single robot has its name in place of `_ROBOT`.
+    """
+    found = [_DURATION.findall(text) for text in texts.values()]
+    ranges = iter([sorted(durations, key=_seconds) for durations in zip(*found, strict=True)])
+    robot, text = next(iter(texts.items()))
+
+    def with_range(_: re.Match[str]) -> str:
+        durations = next(ranges)
+        return " to ".join(dict.fromkeys((durations[0], durations[-1])))
+
+    text = _DURATION.sub(with_range, text)
+    return text.replace(_ROBOT, robot) if len(texts) == 1 else text
+
+
+def _seconds(duration: str) -> int:
+    words = duration.split()
+    return sum(
+        int(number) * _UNITS[unit] for number, unit in zip(words[::2], words[1::2], strict=True)
+    )
+
+
 def _unnamed(text: str, robot: str) -> str:
     """Return a text with `_ROBOT` in place of the robot's name in paths."""
     return re.sub(rf"(?<=/){re.escape(robot)}(?=[/\s,;.:]|$)", _ROBOT, text)
@@ -800,26 +839,41 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part or 0), "") if part.isdigit() else (0, part) for part in _DIGITS.split(name)]
 
 
-def _places(status: FleetStatus) -> dict[str, int]:
+def _places(robots: Iterable[str]) -> dict[str, int]:
     """Map the robots of a fleet to their positions, r2 before r10."""
-    names = sorted((robot.robot for robot in status.robots), key=_natural)
-    return {name: place for place, name in enumerate(names)}
+    return {name: place for place, name in enumerate(sorted(robots, key=_natural))}
 
 
-def _runs(names: Iterable[str], places: Mapping[str, int], most: int = _MOST_GROUPS) -> str:
-    """Return at most ``most`` names of robots; many neighbors in the fleet become "r4 to r50"."""
+def _runs(
+    names: Iterable[str],
+    everybody: Iterable[str],
+    groups: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    most: int = _MOST_GROUPS,
+) -> str:
+    """Return at most ``most`` names of robots, those of a whole group as "pickers (all 40)".
+
+    Many neighbors in the fleet, with names that differ in a number, become "r4 to r50".
+    """
+    places, left, words = _places(everybody), set(names), []
+    number = len(left)
+    for group, members in sorted(groups.items(), key=lambda item: -len(item[1])):
+        if len(members) > _MOST_GROUPS and left.issuperset(members):
+            words.append(f"{group} (all {len(members)})")
+            left.difference_update(members)
     runs: list[list[str]] = []
-    for name in sorted(names, key=places.__getitem__):
-        if runs and places[name] == places[runs[-1][-1]] + 1:
+    for name in sorted(left, key=places.__getitem__):
+        last = runs[-1][-1] if runs else ""
+        is_next = runs and places[name] == places[last] + 1
+        if is_next and _DIGITS.sub("", name) == _DIGITS.sub("", last):
             runs[-1].append(name)
         else:
             runs.append([name])
-    words = []
     for run in runs:
         words += [f"{run[0]} to {run[-1]}"] if len(run) > _MOST_GROUPS else run
-    number = sum(map(len, runs))
     shown = ", ".join(words[:most]) + (", ..." if len(words) > most else "")
-    return f"{shown} ({number} robots)" if number > _MOST_GROUPS else shown
+    if number <= _MOST_GROUPS or (len(words) == 1 and not runs):
+        return shown
+    return f"{shown} ({number} robots)"
 
 
 def _dds_findings(compared: ComparedFleet) -> Iterator[str]:
@@ -836,8 +890,9 @@ def _dds_counts(compared: ComparedFleet) -> Iterator[str]:
     """Yield the robots with an outdated DDS, or the number of findings on the DDS of robots."""
     status, outdated = compared.status, compared.outdated_dds
     if outdated:
+        robots = _runs(outdated, status.names, status.groups)
         yield (
-            f"a DDS to upgrade, for known vulnerabilities: {_runs(outdated, _places(status))}; "
+            f"a DDS to upgrade, for known vulnerabilities: {robots}; "
             f"which: `sros fleet status {quote(str(status.keystore))} --robot {outdated[0]}`"
         )
     elif list(_dds_findings(compared)):
@@ -906,11 +961,18 @@ def _details(robot: RobotStatus) -> Iterator[str]:
         yield f"  {library.product} {version}, {how}: {library.path}"
     if robot.dds and robot.dds.unseen:
         yield f"  {counted(robot.dds.unseen, 'process', 'processes')} could not be looked at"
-    for file in robot.pending[:_MOST_LINES]:
+    pending = robot.pending
+    if robot.revoked and not robot.enclaves:
+        yield (
+            f"  {counted(len(pending), 'file')} of its revoked enclaves: nothing is delivered to "
+            "it, and only whoever has the robot can remove them"
+        )
+        pending = ()
+    for file in pending[:_MOST_LINES]:
         issued = f" of {file.since}" if file.since else ""
         whose = f" of {file.robot or file.enclave}" if file.enclave else ""
         yield f"  {file.action} {file.path}: {file.state}{issued}{whose}"
-    if (more := len(robot.pending) - _MOST_LINES) > 0:
+    if (more := len(pending) - _MOST_LINES) > 0:
         yield f"  and {more} more, see --json"
 
 

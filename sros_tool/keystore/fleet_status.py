@@ -11,7 +11,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from enum import StrEnum
 from functools import cached_property
@@ -329,6 +329,13 @@ class FleetStatus:
     folder: str = ""
     is_any_revoked: bool = False
     """Whether the revocation list revokes a certificate."""
+    groups: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """The groups of the fleet file, with their robots."""
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the robots."""
+        return [robot.robot for robot in self.robots]
 
     @property
     def counts(self) -> Mapping[State, int]:
@@ -392,6 +399,7 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
         older=older,
         folder=known.folder,
         is_any_revoked=known.is_any_revoked(),
+        groups=fleet.groups,
     )
 
 

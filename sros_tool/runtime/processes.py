@@ -185,13 +185,14 @@ class RunningProcesses:
 
     Processes that only wait for another process are left out.  ``hidden`` is a clause on the
     processes that /proc does not show, or "".  ``container`` says whether only the processes of a
-    container can be seen.
+    container can be seen, ``by_root`` whether root looked.
     """
 
     processes: tuple[Process, ...] = ()
     unseen: tuple[UnseenProcess, ...] = ()
     hidden: str = ""
     container: bool = False
+    by_root: bool = False
 
 
 def boot_id(proc: Path = Path("/proc")) -> str:
@@ -280,6 +281,7 @@ class ProcessTable:
             ),
             "" if (self._proc / "1").exists() else "those of other users, which /proc hides",
             _namespace(self._proc / "self/ns/pid") not in ("", _FIRST_PID_NAMESPACE),
+            os.geteuid() == 0,
         )
 
     @contextmanager

@@ -229,6 +229,11 @@ def test_what_could_not_be_looked_at_is_neither_nothing_nor_a_finding(
     ended = sros("check", "runtime")
     assert ended.status == 2
     assert "process 9 (talker): warning: processes that could not be looked at" in ended.out
+    assert "Run it as root" in ended.out
+    by_root = RunningProcesses(unseen=(unseen,), by_root=True)
+    monkeypatch.setattr(ProcessTable, "look", lambda *_: by_root)
+    told = sros("check", "runtime").out
+    assert "Run it as root" not in told and "CAP_SYS_PTRACE" in told
     assert sros("check", "runtime", env={"ROS_SECURITY_ENABLE": "True"}).status == 1
     for accepted in (("--exclude", "runtime.process-not-seen"), ("--fail-on", "error")):
         assert sros("check", "runtime", *accepted).status == 0

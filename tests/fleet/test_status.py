@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from sros_tool.cli.fleet import ComparedFleet, _facts
+from sros_tool.cli.fleet import ComparedFleet, _facts, _joined, _runs
 from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
     RobotDds,
@@ -222,6 +222,10 @@ def test_a_robot_that_was_revoked(field: Field) -> None:
     assert field.pending("r3") == dict.fromkeys(
         ("certificate", "permissions", *SHARED), ("revoked", "remove")
     )
+    lines = field.run("fleet", "status", "ks", "--robot", "r3").out.splitlines()
+    (line,) = (line for line in lines if "only whoever has the robot can remove them" in line)
+    assert line.startswith("  5 files of its revoked enclaves")
+    assert not any("remove enclaves/" in line for line in lines)
     field.deliver("r1", "r2")
     assert field.states() == {"r1": "current", "r2": "current", "r3": "revoked"}
     (field.root / "confirmed/r3.json").unlink()
@@ -540,6 +544,22 @@ def test_fifty_robots_of_which_the_same_is_to_be_said_share_a_line(field: Field)
     ]
     found = field.status()["robots"]
     assert len(found) == 50 and found["r50"]["state"] == "never"
+
+
+def test_robots_are_named_by_group_and_by_neighbors_of_one_name() -> None:
+    pickers = [f"p{number}" for number in range(1, 41)]
+    everybody, groups = ["dispatcher", *pickers], {"pickers": pickers, "none": []}
+    assert _runs(pickers, everybody, groups) == "pickers (all 40)"
+    assert _runs(everybody, everybody, groups) == "pickers (all 40), dispatcher (41 robots)"
+    some = _runs(everybody[:6], everybody, groups)
+    assert some == "dispatcher, p1 to p5 (6 robots)"
+
+
+def test_texts_that_differ_in_durations_are_one() -> None:
+    texts = {"p1": "it is 3 min 28 s late at {robot}", "p2": "it is 59 s late at {robot}"}
+    assert _joined(texts) == "it is 59 s to 3 min 28 s late at {robot}"
+    assert _joined({"p1": texts["p1"]}) == "it is 3 min 28 s late at p1"
+    assert _joined(dict.fromkeys(texts, texts["p2"])) == "it is 59 s late at {robot}"
 
 
 def test_robots_that_differ_in_their_names_share_a_line(field: Field) -> None:

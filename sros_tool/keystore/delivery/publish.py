@@ -603,9 +603,14 @@ class _Run:
         if any(entry.what == "release" and entry.number == latest for entry in entries):
             return False
         if not restored:
-            robots = [robot for robot, there in self._there.items() if there.number == latest]
+            known = self.list.robots
+            robots = [
+                robot
+                for robot, there in self._there.items()
+                if robot not in known or there.number > known[robot].release.number
+            ]
             raise self._restored(
-                f"has later releases: {first_few(robots, 3)} with the number {latest}",
+                f"has later releases: {first_few(robots, 3)}, up to the number {latest}",
                 "repeat the later changes, and then add --restored, which revokes again the "
                 "enclaves that these releases revoke",
             )
