@@ -14,7 +14,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 
 from sros_tool.automata import NameSet, SearchLimit
@@ -188,9 +188,13 @@ def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
     may = not isinstance(requirement, Must)
     if not may and any(use.enclave in world.idle for use in witness.uses):
         return
-    confirm = world.confirm if may else world.confirm_own
+    worlds = (world, *(world.elsewhere if isinstance(requirement, Apart) else ()))
     for use in witness.uses:
-        if confirm(use.enclave, use.writes, use.topic) is not may:
+        confirm = any(
+            (each.confirm if may else each.confirm_own)(use.enclave, use.writes, use.topic)
+            for each in worlds
+        )
+        if confirm is not may:
             raise AssertionError(f"{world.title} decides otherwise on {use}, for {requirement}")
 
 
@@ -302,12 +306,24 @@ def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | 
                 topic = (topics.valid() - own).example(limit, longest=world.longest)
                 if topic:
                     lacking.append(_use(enclave, right, part, topics, topic))
-    if lacking:
-        return Witness((min(lacking, key=_better),))
-    for writes, topic in world.needed:
-        if topic not in _own(world, enclave, writes):
-            return Witness((Use(enclave, "", topic, topic, writes),))
-    return None
+    lacking += [
+        Use(enclave, "", topic, topic, writes)
+        for writes, topic in world.needed
+        if not lacking and topic not in _own(world, enclave, writes)
+    ]
+    if not lacking or _is_elsewhere(world, enclave, limit):
+        return None
+    return Witness((min(lacking, key=_better),))
+
+
+def _is_elsewhere(world: World, enclave: str, limit: SearchLimit) -> bool:
+    """Return whether an enclave has rights in other ROS domains, and none in that of ``world``."""
+
+    def has_rights(some: World) -> bool:
+        sides = (_own(some, enclave, writes) for writes in (True, False))
+        return any(names.example(limit, longest=some.longest) for names in sides)
+
+    return bool(world.elsewhere) and not has_rights(world) and any(map(has_rights, world.elsewhere))
 
 
 def _kept_from_others(requirement: Must, world: World, limit: SearchLimit) -> KeptUse | None:
@@ -652,15 +668,16 @@ def _shortest_chain(
 ) -> _Chain:
     """Return a shortest chain of hops from a source to one of ``targets``, or ().
 
-    It does not pass through the enclaves ``without``.
+    It does not pass through the enclaves ``without``.  An enclave with rights in several ROS
+    domains passes on what it learns in one of them to the others.
     """
     starts = list(sources)
     # A target can be a source, too, and must be reached from another one: so two are kept.
     most = 2 if any(start in targets for start in starts) else 1
     origins: dict[str, set[str]] = {start: {start} for start in starts}
-    used: dict[tuple[str, str], set[str]] = {}
+    used: dict[tuple[int, str, str], set[str]] = {}
     queue: deque[tuple[str, str, _Chain]] = deque((start, start, ()) for start in starts)
-    flow = _Flow(world, limit)
+    flows = [_Flow(each, limit) for each in (world, *world.elsewhere)]
     while queue:
         here, origin, chain = queue.popleft()
 
@@ -669,19 +686,20 @@ def _shortest_chain(
             return enclave not in without and origin not in there and len(there) < most
 
         def is_unused(
-            topic: str, origin: str = origin, router: str = world.router_of(here)
+            number: int, topic: str, origin: str = origin, router: str = world.router_of(here)
         ) -> bool:
-            by = used.setdefault((topic, router), set())
+            by = used.setdefault((number, topic, router), set())
             fresh = origin not in by and len(by) < most
             by.add(origin)
             return fresh
 
-        for topic, target in flow.hops(here, is_unused, is_new):
-            longer = (*chain, TopicHop(here, target, topic))
-            if target in targets:
-                return longer
-            origins.setdefault(target, set()).add(origin)
-            queue.append((target, origin, longer))
+        for number, flow in enumerate(flows):
+            for topic, target in flow.hops(here, partial(is_unused, number), is_new):
+                longer = (*chain, TopicHop(here, target, topic))
+                if target in targets:
+                    return longer
+                origins.setdefault(target, set()).add(origin)
+                queue.append((target, origin, longer))
     return ()
 
 

@@ -425,14 +425,24 @@ def _keystore_system(
             access[name] = tuple(each for each in accesses if each is not None)
         lenders = also_fitting(vendor.traits, subjects, granting)
         worlds.append(_dds_world(vendor, access, stated, title=title, idle=idle, lenders=lenders))
+    for first in range(0, len(worlds), len(domains)):
+        _link_domains(worlds[first : first + len(domains)])  # those of one vendor
     if _ZENOH in only or (not only and has_zenoh_files(root, hidden=True)):
-        worlds += _zenoh_worlds(keystore, domain, stated)
+        on_zenoh = list(_zenoh_worlds(keystore, domain, stated))
+        _link_domains(on_zenoh)
+        worlds += on_zenoh
     files = {name: str(enclave_path(root, name) / PERMISSIONS_FILE) for name in names}
     places = {
         name: [Place(right, Source(files[name], 0)) for right in rights if right.enclave == name]
         for name in names
     }
     return System(str(root), tuple(worlds), Places(places), rights)
+
+
+def _link_domains(worlds: Sequence[World]) -> None:
+    """Tell the worlds of a vendor, or of Zenoh, which worlds are of other ROS domains."""
+    for world in worlds:
+        world.elsewhere = tuple(other for other in worlds if other is not world)
 
 
 def _possible(enclave: LoadedEnclave, grants: Sequence[Grant], governance: bytes) -> LoadedEnclave:

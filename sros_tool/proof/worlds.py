@@ -310,6 +310,8 @@ class World:
         self.needed = tuple(needed)
         self.idle = frozenset(idle)
         self.crossing = crossing
+        self.elsewhere: tuple[World, ...] = ()
+        """The worlds of the same vendor, or of Zenoh, in other ROS domains."""
         self._weak = weak
         self.demanded = demanded
         self._readers_of: dict[str, list[str]] = {}
@@ -344,6 +346,7 @@ class World:
             and (self._weak, self.demanded) == (other._weak, other.demanded)
             and self.own == other.own
             and self.lenders == other.lenders
+            and [world.own for world in self.elsewhere] == [world.own for world in other.elsewhere]
             and self.crossing is other.crossing is None
         )
 

@@ -95,6 +95,50 @@ def test_who_may_do_it_in_which_domain(halls: Path) -> None:
     assert outcomes["/desk"] == "10,20" and outcomes["/p01/eye"] is None
 
 
+REQUIREMENTS = """
+[[apart]]
+from = ["/f02/*"]
+to = ["/p01/*"]
+[[apart]]
+from = ["/p02/*"]
+to = ["/f01/*"]
+[[must]]
+enclave = "/p01/wheels"
+subscribe = ["/hall/estop"]
+[[must]]
+enclave = "/p02/wheels"
+subscribe = ["/nothing"]
+"""
+
+
+def test_requirements_hold_in_the_domains_of_each_enclave(halls: Path) -> None:
+    (halls / "r.toml").write_text(REQUIREMENTS)
+
+    def broken(*source: str) -> list[str]:
+        words = ("--requirements", "r.toml", "--include", "requirement.*", "--json")
+        checked = json.loads(sros("check", *source, *words, cwd=halls).out)
+        return sorted(each["text"].partition(", but")[0] for each in checked["findings"])
+
+    chain = "/p02/eye -publish /hall/seen-> /desk -publish /plan-> /f01/guard"
+    for vendor in ("fastdds", "zenoh"):
+        assert broken("ks", "--vendor", vendor) == [
+            f"influences /f01/guard: {chain}",
+            "may not subscribe /nothing",
+        ]
+    # A policy says no domains, and counts as being for a single one.
+    across = "influences /p01/wheels: /f02/guard -publish /hall/estop-> /p01/wheels"
+    assert across in broken("p.xml", "--fleet", "f.toml")
+
+
+def test_new_reach_stays_in_a_domain(halls: Path) -> None:
+    (halls / "base.xml").write_text(POLICY.replace("/hall/estop", "/hall/stop", 1))
+    words = ("base.xml", "p.xml", "--fleet", "f.toml", "--json")
+    compared = json.loads(sros("diff_policy", "--no-new-access", *words, cwd=halls).out)
+    reach = {(each["source"], each["target"]) for each in compared["reach"]}
+    guards = {pair for pair in reach if pair[0].endswith("/guard")}
+    assert guards == {("/f01/guard", "/p01/wheels"), ("/f02/guard", "/p02/wheels")}
+
+
 ALIKE = (
     "[groups]\npickers = {}\nforklifts = {}\n[robots]\n"
     + "".join(
