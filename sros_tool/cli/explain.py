@@ -847,7 +847,7 @@ def _followed_lines(followed: FollowedReach) -> Iterator[str]:
 def _show_log(
     log: str, root: Path | None, rest: tuple[str, ...], asking: AskingContext, as_json: bool
 ) -> int:
-    """Print explanations of a DDS log, or of standard input for "-"; return 1 for any, else 0."""
+    """Print explanations of a DDS log, or of standard input for "-"; return 1 if there are any."""
     from sros_tool.explain.log import explain_log_of
 
     if len(rest) > 1:

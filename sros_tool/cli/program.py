@@ -228,8 +228,8 @@ Example:
   $ sros run keystore /talker -- ros2 run demo_nodes_cpp talker
 
 Where a verb takes a keystore, $ROS_SECURITY_KEYSTORE is the default.
-Exit status: 0 yes or done; 1 no, denied, different or findings; 2 could not be
-asked or done."""
+Exit status: 0 yes or done; 1 no, denied, different or findings; 2 sros could
+not answer or do it."""
 
 
 @click.group(
