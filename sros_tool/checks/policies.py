@@ -199,8 +199,9 @@ NO_COUNTERPART = FindingKind(
     "policy.no-counterpart",
     NOTE,
     "a name for which no enclave has the counterpart right",
-    "No enclave of the policy may publish this subscribed topic, or serve this called service or "
-    "action. The name may have a typing error, or the other side is in another policy.",
+    "No enclave of the policy, in any ROS domain, may publish this subscribed topic, or serve this "
+    "called service or action. The name may have a typing error, or the other side is in another "
+    "policy.",
     "sros: the policy as a whole.",
     "Compare the names on both sides, after remapping.",
 )

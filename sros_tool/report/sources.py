@@ -150,8 +150,9 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     picture = _compared(read, context, use=bool(drawing.observed))
     if len(domains := {enclave.domains for enclave in picture.enclaves}) > 1:
         several = enumerated(sorted(domains - {""}))
-        text = f"enclaves are for different ROS domains ({several}): a name is drawn once for all, "
-        text += "but information goes only between enclaves with a common domain."
+        text = f"enclaves are for different ROS domains ({several}), and a name is drawn once for "
+        text += "all of them. Information goes only between enclaves with a common domain; what a "
+        text += "click on a page shows as reach ignores domains (--focus respects them)."
         finding = PicturedFinding("view.domains", "note", text)
         picture = replace(picture, findings=(*picture.findings, finding))
     if drawing.focus:

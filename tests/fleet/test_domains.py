@@ -166,6 +166,9 @@ def test_robots_of_other_domains_and_groups_are_neither_equal_nor_different(
         words = ("p.xml", "--fleet", "f.toml", *focus, "-o", f"{len(focus)}.svg")
         return sros("view", *words, cwd=tmp_path).ok().err.splitlines()
 
+    shown = json.loads(sros("view", "p.xml", "--fleet", "f.toml", "--json", cwd=tmp_path).ok().out)
+    (note,) = [each for each in shown["findings"] if each["id"] == "view.domains"]
+    assert "different ROS domains (10 and 20)" in note["text"]
     lines = said()
     assert "p1 … p3: 2 equal robots in domain 10 are drawn as one" in lines
     assert "p4 … p6: 3 equal robots in domain 20 are drawn as one" in lines
