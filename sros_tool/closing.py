@@ -45,8 +45,9 @@ from sros_tool.graph.observation import (
     from_json,
     make_observation,
 )
-from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.layout import CLOSED_POLICY, CLOSED_PROCESSES, enclave_path, list_enclaves
 from sros_tool.keystore.participant import JoinContext
+from sros_tool.keystore.reader import FilesReadOnce, open_enclave
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import RIGHTS, Policy
@@ -276,6 +277,10 @@ class Closing(NamedTuple):
     secured: Mapping[str, bool]
     """The enclaves in which a process of the robot runs now, and whether with the present files;
     otherwise it has to be restarted."""
+    new: Sequence[str]
+    """The enclaves of the policy of which no process was observed, and none runs."""
+    valid_until: datetime | None
+    """When the first enclave of the export expires, in UTC; null without an export."""
     denied: Sequence[str]
     """What the observed nodes do and the keystore denies them, as sentences."""
     problems: Sequence[str]
@@ -288,7 +293,8 @@ class Closing(NamedTuple):
     @property
     def left(self) -> Sequence[str]:
         """The enclaves of which no process runs with the present files, and one should."""
-        names = {process.enclave for process in self.observed.processes} | self.secured.keys()
+        names = {process.enclave for process in self.observed.processes} | {*self.new}
+        names |= self.secured.keys()
         return sorted(name for name in names if not self.secured.get(name))
 
     @property
@@ -490,6 +496,8 @@ class _Step(NamedTuple):
     words: Sequence[str]
     made: Path | None = None
     into: Path | None = None
+    guards: bool = False
+    """Whether no later step is done if this one finds something."""
 
     @property
     def command(self) -> str:
@@ -507,11 +515,11 @@ class OpenRobot:
 
     def __init__(self, folder: Path, domain: int | None, shell: Shell) -> None:
         self.folder, self._shell = folder, shell
-        self.policy, self.observer = folder / "policy.xml", folder / "observer.xml"
+        self.policy, self.observer = folder / CLOSED_POLICY, folder / "observer.xml"
         self.requirements = folder / "requirements.toml"
         self.keystore, self.export = folder / "keystore", folder / "export"
         self.start, self.page = folder / "start", folder / "rights.html"
-        self.seen, self.processes = folder / "observed.json", folder / "processes.json"
+        self.seen, self.processes = folder / "observed.json", folder / CLOSED_PROCESSES
         self._check_own()
         self.observed = read_processes(self.processes) if self.processes.exists() else None
         named = domain_of(shell.environment) if domain is None else domain
@@ -556,12 +564,12 @@ class OpenRobot:
         return [
             _Step((*learn, "--json"), None if duration else self.processes, self.seen),
             _Step(("check", policy, "--suggest"), self.requirements, self.requirements),
+            _Step(("check", policy, "--requirements", needed, *created, *only_errors), guards=True),
             _Step(("create_keystore", keystore, *created, *domain), self.keystore),
             _Step(("generate_artifacts", "-k", keystore, *both)),
             *([_Step(("zenoh", keystore))] if on_zenoh else ()),
             _Step(("distribute_key", keystore, "--all", str(self.export), "--force")),
             _Step(("check", policy, keystore, "--policy", policy, *only_errors)),
-            _Step(("check", keystore, "--requirements", needed, *only_errors)),
             _Step(("view", policy, *created, "-o", str(self.page), "--force")),
         ]
 
@@ -577,18 +585,19 @@ class OpenRobot:
                 "A new keystore would have other CAs.",
                 "Bring it back to change the robot; --proof and --undo need only the export.",
             )
-        steps, problems = [], []
+        steps, problems, is_stopped = [], [], False
         for step in self.steps(duration):
             state = "kept" if step.made and step.made.exists() else "open"
             if dry_run:
                 self._shell.say(f"{'kept' if state == 'kept' else 'would run'}: {step.command}")
-            elif state == "open":
+            elif state == "open" and not is_stopped:
                 state, problem = self._do(step)
                 problems += [problem] if problem else []
+                is_stopped = step.guards and state == "findings"
             steps.append(CloseStep(step.command, state))
         closing = self._closing()._replace(steps=steps, dry_run=dry_run)
-        if dry_run:
-            return closing
+        if dry_run or is_stopped:
+            return closing._replace(problems=problems)
         changes = self._write_starts(closing.observed)
         denied = [str(right) for right in self._denied()]
         problems += self._problems(closing.observed, partial=partial)
@@ -597,15 +606,32 @@ class OpenRobot:
     def _closing(self) -> Closing:
         """Return the processes of the enclaves that the policy has, as they run now."""
         running = ProcessTable().look(self._shell.now())
-        observed = ObservedProcesses(self.domain)
-        if self.observed:
-            observed = self.observed.as_they_run(running)
-        if self.policy.exists():
-            observed = observed.within(read_policy(self.policy))
+        observed, new = ObservedProcesses(self.domain), set[str]()
         present = self._in_their_enclaves(running)
         names = {enclave.name for _, enclave in self._secured(running)} - {_OBSERVER}
         secured = {name: name in present for name in sorted(names)}
-        return Closing(self.folder, observed, (), secured, (), (), (), False, ())
+        if self.observed:
+            observed = self.observed.as_they_run(running)
+        if self.policy.exists():
+            policy = read_policy(self.policy)
+            observed = observed.within(policy)
+            known = {process.enclave for process in observed.processes} | names
+            new = {enclave.path for enclave in policy.enclaves} - known - {*observed.elsewhere}
+        new -= {_OBSERVER} if self.observed else new
+        until = self._valid_until()
+        started = observed, (), secured, sorted(new), until
+        return Closing(self.folder, *started, (), (), (), False, ())
+
+    def _valid_until(self) -> datetime | None:
+        """Return when the first enclave of the export expires; None if one cannot be read."""
+        if not self.export.exists():
+            return None
+        now, files = self._shell.now(), FilesReadOnce()
+        moments = [
+            open_enclave(enclave_path(self.export, name), now=now, files=files).valid_until()
+            for name in list_enclaves(self.export)
+        ]
+        return min(filter(None, moments), default=None) if all(moments) else None
 
     def _do(self, step: _Step) -> tuple[str, str]:
         """Do a step; return its state, and why the robot is not closed yet, or "".
@@ -627,10 +653,10 @@ class OpenRobot:
         if status:
             for line in () if step.into else f"{output}{messages}".splitlines():
                 self._shell.say(line)
-            mend = ""
+            mend = "; nothing was signed" if step.guards else ""
             if VIOLATED.id in output:
                 needed = shlex.quote(str(self.requirements))
-                mend = f"; if you want the change, edit {needed}, or remove it for a new suggestion"
+                mend += f"; if you want the change, edit {needed}, or remove it for new ones"
             return "findings", f"findings of `{step.command}`{mend}"
         if step.into:
             replace_file(step.into, output.encode())
@@ -744,8 +770,8 @@ class OpenRobot:
             service = render_container(Container(process.enclave, name, of_enclave, where), COMPOSE)
             services += ["services:", *service.splitlines()[1:]][len(services) > 1 :]
         lines = [
-            "# No script: stop all of these processes (secured and open ones do not hear each",
-            "# other), and start each by its command, where it is started now: a start script, ...",
+            "# Stop all of these processes: secured and open ones do not hear each other. Then",
+            "# start each of them by its command, in the place that starts it today.",
         ]
         for command, processes in observed.by_hand(folder).items():
             lines += ["", f"# {', '.join(process.enclave for process in processes)}", command]
@@ -779,6 +805,9 @@ class OpenRobot:
             if name not in (_OBSERVER, _ROUTER) and not policy.enclave(name):
                 revoke = f"sros revoke {shlex.quote(str(self.keystore))} {name}"
                 yield f"the policy does not have {name}, and the keystore does: {revoke}"
+        for name in sorted({*list_enclaves(self.export)} - {*list_enclaves(self.keystore)}):
+            remove = f"rm -r {shlex.quote(str(enclave_path(self.export, name)))}"
+            yield f"the export has {name}, and the keystore does not: {remove}"
         owner, export = self.export.stat().st_uid, self.export.absolute()
         users = sorted({process.user for process in observed.processes})
         for user in users:
@@ -884,7 +913,10 @@ class OpenRobot:
         return closing if dry_run else closing._replace(problems=[*self._not_open(observed)])
 
     def _not_open(self, observed: ObservedProcesses) -> Iterator[str]:
-        """Yield how each process is started open that does not run open."""
+        """Yield how each process is started open that runs in an enclave, or does not run.
+
+        Processes of enclaves that were taken out of the policy are left out.
+        """
         running = ProcessTable().look(self._shell.now())
         are_open = {
             process.command
@@ -892,13 +924,19 @@ class OpenRobot:
             if not process.asks_for_security
         }
         secured = {enclave.name: process for process, enclave in self._secured(running)}
-        commands = dict.fromkeys(
-            process.open_command
-            for process in chain.from_iterable(observed.by_hand(self.folder).values())
-            if process.enclave in secured or tuple(process.command) not in are_open
-        )
-        for command in commands:
+        if self.policy.exists():
+            observed = observed.within(read_policy(self.policy))
+        by_hand = [*chain.from_iterable(observed.by_hand(self.folder).values())]
+        closed = [process for process in by_hand if process.enclave in secured]
+        for command in dict.fromkeys(process.open_command for process in closed):
             yield f"restart it open: {command}"
+        ended = [
+            process
+            for process in by_hand
+            if process.enclave not in secured and tuple(process.command) not in are_open
+        ]
+        for command in dict.fromkeys(process.open_command for process in ended):
+            self._shell.say(f"it does not run; start it open: {command}")
         for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
             yield f"{name} started later; restart it open: {_described(secured[name])}"
 
@@ -934,10 +972,29 @@ class OpenRobot:
         nodes = self._observation().nodes
         before = make_observation(node for node in nodes if node.enclaves[0] not in missing)
         proof = self._proof_of_processes(len(expected) - len(missing), running)
-        if missing and proof.holds:
-            without = f"{proof.reason}, but no process of {first_few(missing, 5)}"
+        if missing and not proof.fails:
+            without = f"{proof.reason}; no process runs of {', '.join(missing)}"
             proof = proof._replace(holds=None, reason=without)
-        return [proof, self._proof_of_talk(before, missing), self._proof_of_silence(before)]
+        return [
+            proof,
+            *self._proof_of_requirements(),
+            self._proof_of_talk(before, missing),
+            self._proof_of_silence(before),
+        ]
+
+    def _proof_of_requirements(self) -> Iterator[Proof]:
+        """Decide the requirements for the enclaves that the processes use."""
+        if not self.requirements.exists():
+            return
+        needed = ("--requirements", str(self.requirements), "--include", "requirement.*")
+        step = _Step(("check", str(self.export), *needed, "--fail-on", "error"))
+        self._shell.say(f"$ {step.command}")
+        status, output, messages = self._shell.run(step.words, False)
+        if status:
+            self._shell.say(f"{output}{messages}".rstrip())
+        reasons = {0: "as the file says", 1: "one is violated", 2: "they could not be decided"}
+        holds = {0: True, 1: False}.get(status)
+        yield Proof("the requirements hold", holds, f"{reasons[status]}: {self.requirements}")
 
     def _why_missing(self, missing: Sequence[str], running: RunningProcesses) -> str:
         """Return which enclaves have no process, and which have one with earlier files."""
@@ -945,10 +1002,11 @@ class OpenRobot:
         absent = [name for name in missing if name not in earlier]
         old = [f"{name} (process {earlier[name]})" for name in missing if name in earlier]
         reasons = [
-            f"no secured process of {first_few(absent, 5)}; start it as {self.start} says"
+            f"no secured process of {', '.join(absent)}; start it as {self.start / COMMANDS} says; "
+            f"if it ended: sros explain {shlex.quote(str(self.export))} --log ITS_LOG"
         ] * bool(absent)
         if old:
-            reasons.append(f"earlier files in the processes of {first_few(old, 5)}; restart them")
+            reasons.append(f"earlier files in the processes of {', '.join(old)}; restart them")
         return "; ".join(reasons)
 
     def _in_their_enclaves(self, running: RunningProcesses) -> set[str]:
@@ -1018,7 +1076,8 @@ class OpenRobot:
                 number = counted(len(before.nodes), "node")
                 but = f", but for {counted(len(denied), 'right')} that the policy denies now"
                 seen = f"{number} with {before.endpoint_count} endpoints as before"
-                return Proof(claim, True, f"{seen}{but if denied else ''}")
+                left = f", without {', '.join(missing)}" if missing else ""
+                return Proof(claim, True, f"{seen}{left}{but if denied else ''}")
         return Proof(claim, False, reason)
 
     def _proof_of_silence(self, before: Observation) -> Proof:

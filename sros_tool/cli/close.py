@@ -25,7 +25,8 @@ from sros_tool.cli.common import (
 )
 from sros_tool.errors import UsageError
 from sros_tool.terminal import echo
-from sros_tool.wording import enumerated, first_few
+from sros_tool.validity import iso
+from sros_tool.wording import enumerated
 
 if TYPE_CHECKING:
     from sros_tool.closing import ClosedProcess, Closing, OpenRobot
@@ -161,8 +162,13 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
             how = f"closed {_EARLIER}: {how}"
         pid = f"process {process.pid}, known by its {process.known_by}"
         echo(f"  {process.enclave}: {pid if process.pid else 'not running as observed'}: {how}")
+    export = shlex.quote(str(robot.export.absolute()))
+    for name in closed.new:
+        echo(f"  {name}: new, start it by: sros run {export} {name} -- COMMAND")
     for right in closed.denied:
-        echo(f"looks wrong: seen, and denied from now on: {right}")
+        echo(f"used when sros watched, and denied from now on: {right}")
+    if closed.denied:
+        echo("  if this is not meant, change the policy; if it is, the node may end when it starts")
 
 
 def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) -> None:
@@ -180,11 +186,13 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
     elif holds:
         asked = all(proof.holds for proof in closed.proofs)
         but = "" if asked else ", except for what was not asked"
-        keys = f"bring {folder}/keystore to another machine: it has the CA keys"
-        echo(f"the robot is closed{but}; next: {keys}", err=True)
+        following = f"; next: bring {folder}/keystore to another machine: it has the CA keys"
+        following = following if robot.keystore.exists() else ""
+        echo(f"the robot is closed{but}{_until(closed)}{following}", err=True)
     elif closed.proofs:
-        again = f"next: ask again with sros close {folder} --proof, or go back with --undo"
-        echo(f"the robot is not proved closed; {again}", err=True)
+        accept = "" if any(proof.fails for proof in closed.proofs) else _ACCEPT
+        again = f"ask again with sros close {folder} --proof, or go back with --undo"
+        echo(f"the robot is not proved closed; next: {accept}{again}", err=True)
     elif applies:
         for command, processes in closed.left_by_hand.items():
             stop = _together(processes)
@@ -195,14 +203,14 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
         ask = f"sros close {folder} --proof"
         steps = f"stop the robot, start each process by the commands in {robot.start / COMMANDS}"
         if closed.secured:
-            steps = f"restart these by the commands in {robot.start / COMMANDS}"
+            steps = f"restart them by the commands in {robot.start / COMMANDS}"
         if not closed.left:
             following = ask
         elif any(name in observed.units for name in closed.left):
             following = f"sros close {folder} --apply"
         else:
-            following = f"{steps}, and ask\n{ask}"
-        echo(f"{_state(closed, applies=applies)}; next: {following}", err=True)
+            following = f"{steps}, and ask {ask}"
+        echo(f"{_state(closed, applies=applies)}{_until(closed)}; next: {following}", err=True)
 
 
 def _show_undone(robot: OpenRobot, closed: Closing) -> None:
@@ -220,8 +228,24 @@ def _state(closed: Closing, *, applies: bool) -> str:
     """Return how far the processes run closed."""
     if not closed.secured:
         return "nothing was closed" if applies else "nothing is closed yet"
-    but = [f"{name} ({_EARLIER if name in closed.secured else 'open'})" for name in closed.left]
-    return f"the robot runs closed{', except for ' if but else ''}{first_few(but, 3)}"
+    stopped = {process.enclave for process in closed.observed.processes if not process.pid}
+    words = {
+        name: _EARLIER
+        if name in closed.secured
+        else "not running"
+        if name in {*closed.new, *stopped}
+        else "open"
+        for name in closed.left
+    }
+    but = ", ".join(f"{name} ({word})" for name, word in words.items())
+    return f"the robot runs closed{', except for ' if but else ''}{but}"
+
+
+def _until(closed: Closing) -> str:
+    """Return until when the files of closed processes are valid."""
+    if not (closed.secured and closed.valid_until):
+        return ""
+    return f", its files are valid until {iso(closed.valid_until)}"
 
 
 def _together(processes: Sequence[ClosedProcess]) -> str:
@@ -239,3 +263,4 @@ def _together(processes: Sequence[ClosedProcess]) -> str:
 
 _ANSWERS = {True: "yes", False: "no", None: "not asked"}
 _EARLIER = "with earlier files"
+_ACCEPT = "accept with --partial what could not be asked, "

@@ -24,7 +24,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import DomainRule, ProtectionKind, TopicRule
 from sros_tool.dds.permissions import Grant
 from sros_tool.explain.question import OWN_PARTS, Part, Question
-from sros_tool.keystore.layout import FLEET
+from sros_tool.keystore.layout import CLOSED_POLICY, FLEET, closed_robot, has_authorities
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, VendorParticipant
 from sros_tool.keystore.reader import Keystore, Problem
 from sros_tool.names import is_expression
@@ -313,17 +313,19 @@ class Answer(NamedTuple):
         """The commands that apply the change of the policy."""
         if not self.change and not self.sign:
             return []
-        file = str(self.enclave.policy_file or "POLICY")
-        root = str(self.enclave.root or "KEYSTORE")
+        keystore = self.enclave.root
+        robot = closed_robot(keystore) if keystore else None
+        file = str(self.enclave.policy_file or (robot / CLOSED_POLICY if robot else "POLICY"))
+        root = str(keystore if keystore and has_authorities(keystore) else "KEYSTORE")
         if self.enclave.has_placeholders:
-            recorded = self.enclave.root and (self.enclave.root / FLEET).exists()
+            recorded = keystore and (keystore / FLEET).exists()
             robots = f"{root}/{FLEET}" if recorded else "FLEET_FILE"
             return [f"sros generate_artifacts -k {root} -p {file} --fleet {robots}"]
         commands = []
         if self.change and self.change.document:
             commands.append(f"sros merge_policy {file} {ADDITION} --in-place")
-        commands.append(f"sros create_permission {root} {self.enclave.name} {file}")
-        return commands
+        sign = f"sros create_permission {root} {self.enclave.name} {file}"
+        return [*commands, f"sros close {robot}" if robot else sign]
 
 
 _CREATED = {

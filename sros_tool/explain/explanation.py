@@ -41,9 +41,9 @@ from sros_tool.keystore.layout import (
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
-    PRIVATE,
     ca_certificate,
     enclave_path,
+    has_authorities,
 )
 from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
 from sros_tool.names import NODE_SERVICES, is_expression, nodes_served
@@ -182,7 +182,7 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
         file = file or (GOVERNANCE_FILE if fault in _OF_GOVERNANCE else "")
         text = fault.remedy_in(file)
     keystore = Path(root) if root and Path(root).is_dir() else None
-    if keystore and not _has_authorities(keystore):
+    if keystore and not has_authorities(keystore):
         if "`" not in text or fault is Fault.GOVERNANCE_DOMAIN:
             return _filled(text, root, enclave, file)
         if fault:
@@ -236,11 +236,6 @@ def _is_latest(keystore: Path, enclave: str) -> bool:
     last = (entry for entry in entries if (entry.what, entry.enclave) == ("permissions", enclave))
     digest = next((entry.sha256 for entry in last), "")
     return not digest or digest == hashlib.sha256(signed).hexdigest()
-
-
-def _has_authorities(keystore: Path) -> bool:
-    """Return whether a folder is an original keystore, not an export or an enclave's folder."""
-    return (keystore / PRIVATE).is_dir() or (keystore / LEDGER).is_file()
 
 
 # ── the smallest change of a policy ────────────────────────────────────────────────────────

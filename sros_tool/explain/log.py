@@ -587,7 +587,10 @@ class _Examiner:
         answer = self._answer(enclave, denial.vendor, _question(denial))
         if answer.allowed:
             facts = ["the present permissions allow it"]
-            remedy = "Restart the process: it loaded earlier permissions."
+            remedy = (
+                "Restart the process: it loaded earlier permissions. If it runs from an export, "
+            )
+            remedy += "export the enclave again first."
         else:
             other, better = self._other_node(denial, answer)
             if not other:

@@ -18,6 +18,8 @@ from typing import NamedTuple, TypeAlias
 from sros_tool.errors import DocumentError, KeystoreError
 
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
+CLOSED_PROCESSES, CLOSED_POLICY = "processes.json", "policy.xml"
+"""Files that `sros close` writes next to its keystore."""
 SETTINGS = "sros.toml"
 """The settings of the keystore; keystores of ros2/sros2 do not have this file."""
 FLEET = "fleet.toml"
@@ -199,6 +201,18 @@ def is_keystore(root: Path) -> bool:
         )
     except PermissionError as error:
         raise _unreadable(root, [UnreadPath.of(error)], "Its enclaves cannot be listed.") from error
+
+
+def has_authorities(root: Path) -> bool:
+    """Return whether a folder is an original keystore, not an export or an enclave's folder."""
+    return (root / PRIVATE).is_dir() or (root / LEDGER).is_file()
+
+
+def closed_robot(root: Path) -> Path | None:
+    """Return the folder of `sros close` that has this keystore or export, or None."""
+    folder = root.parent
+    made = all((folder / file).is_file() for file in (CLOSED_PROCESSES, CLOSED_POLICY))
+    return folder if made else None
 
 
 def is_enclave(folder: Path) -> bool:

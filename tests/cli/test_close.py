@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -239,6 +240,15 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     assert robot.restarts == []
     sros(*revoke.split()[1:], cwd=robot.folder).ok()
     robot.remaining = (TALKER,)
+    left = robot.folder / "robot/export/enclaves/listener"
+    said = robot.close("--apply", status=1).out
+    assert (
+        f"the export has /listener, and the keystore does not: rm -r {left}\n".replace(
+            f"{robot.folder}/", ""
+        )
+        in said
+    )
+    shutil.rmtree(left)
     ended = robot.close("--apply", status=1)
     assert robot.restarts == ["daemon-reload", "restart talker.service"]
     assert "no: every process runs in its enclave: process 4712 (run): in domain 0" in ended.out
@@ -270,8 +280,9 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     robot.close()
     closed = robot.close("--apply")
     assert robot.restarts == ["daemon-reload", "restart listener.service talker.service"]
-    assert closed.out.splitlines()[-3:] == [
+    assert closed.out.splitlines()[-4:] == [
         "yes: every process runs in its enclave: 2 enclaves, and no open process",
+        "yes: the requirements hold: as the file says: robot/requirements.toml",
         "yes: everything that talked still talks: 2 nodes with 36 endpoints as before",
         "yes: an open listener finds nothing: the observer that saw 2 nodes before sees none",
     ]
@@ -301,19 +312,31 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
         "no: every process runs in its enclave: no secured process of /listener, /talker; "
         in robot.close("--proof", status=1).out
     )
+    for root in ("robot/keystore", "robot/export"):
+        denied = sros("explain", root, "/talker", "publish", "/x", cwd=robot.folder).out
+        assert "merge_policy robot/policy.xml allow.xml --in-place\n" in denied
+        assert denied.endswith("sros close robot\n")
     robot.by_hand = {"/talker"}
     ended = robot.close()
     assert "/talker: process 4711, known by its process id: closed\n" in ended.out
-    assert "the robot runs closed, except for /listener (open); next: restart these" in ended.err
+    assert "the robot runs closed, except for /listener (open), its files are valid" in ended.err
+    assert "; next: restart them by the commands in robot/start/commands.txt, and ask" in ended.err
     assert "start it by" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
     robot.by_hand = {"/talker", "/listener"}
-    assert robot.close().err.endswith("the robot runs closed; next: sros close robot --proof\n")
+    said = robot.close().err.splitlines()[-1]
+    assert re.fullmatch(
+        "the robot runs closed, its files are valid until 20.*Z; next: sros close robot --proof",
+        said,
+    )
     for words in ("--apply", "--proof"):
-        assert "the robot is closed; next: " in robot.close(words).err
-    robot.by_hand = {"/talker"}
+        assert "; next: bring robot/keystore to another machine" in robot.close(words).err
+    robot.by_hand, robot.absent = {"/talker"}, {"/listener"}
     undone = robot.close("--undo", status=1)
     assert undone.out == "restart it open: cd /opt && /opt/run talker\n"
+    assert "it does not run; start it open: cd /opt && /opt/run listener\n" in undone.err
+    robot.absent = set()
+    undone = robot.close("--undo", status=1)
     assert undone.err == (
         "the robot is not open yet; next: restart these, and ask again with sros close robot "
         "--undo\n"
@@ -342,17 +365,25 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
             flags=re.DOTALL,
         )
     )
-    said = robot.close(status=1).out
-    assert "; if you want the change, edit robot/requirements.toml, or remove it for " in said
+    ended = robot.close(status=1)
+    assert "; nothing was signed; if you want the change, edit robot/requirements.toml" in ended.out
+    assert "$ sros generate_artifacts" not in ended.err
+    assert list_enclaves(robot.folder / "robot/export") == (
+        "/listener",
+        "/sros_observer",
+        "/talker",
+    )
     (robot.folder / "robot/requirements.toml").unlink()
-    robot.close()
+    ended = robot.close()
+    assert "  /late: new, start it by: sros run " in ended.out
+    assert "closed, except for /late (not running), its files" in ended.err
     export = robot.folder / "robot/export"
     environment = secured_environment(export, "/late", 0)
     late = robot.with_its_files(replace(late, environment=environment))
     robot.more = (replace(late, started=datetime.now(UTC) - timedelta(days=1)),)
-    assert "closed, except for /late (with earlier files); next: restart" in robot.close().err
+    assert "closed, except for /late (with earlier files), its files" in robot.close().err
     robot.more = (replace(late, started=datetime.now(UTC) + timedelta(days=1)),)
-    assert "the robot runs closed; next: sros close robot --proof" in robot.close().err
+    assert "the robot runs closed, its files are valid until" in robot.close().err
     watching = robot.close("--for", "1s", status=2).err
     assert "the robot runs closed: process 4711 (run), process 4712 (run), process 7" in watching
     assert "/late started later; restart it open: process 7 (late): /opt/late" in (
@@ -367,10 +398,10 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert "no: every process runs in its enclave: no secured process of /listener; st" in ended.out
     ended = robot.close("--proof", "--partial")
     assert (
-        "not asked: every process runs in its enclave: 1 enclave, and no open process, but no "
-        "process of /listener\n"
+        "not asked: every process runs in its enclave: 1 enclave, and no open process; no process "
+        "runs of /listener\n"
     ) in ended.out
-    assert "yes: everything that talked still talks: 1 node with 18 endpoints as bef" in ended.out
+    assert "talks: 1 node with 18 endpoints as before, without /listener\n" in ended.out
     assert "the robot is closed, except for what was not asked" in ended.err
     robot.absent = set()
     assert "process 4712 (run): in domain 0" in robot.close("--proof", "--partial", status=1).out
@@ -409,6 +440,15 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
         "no: an open listener finds nothing: it sees /spy\n" in robot.close("--proof", status=1).out
     )
     robot.nodes = (TALKER, LISTENER)
+    needed = robot.folder / "robot/requirements.toml"
+    kept = needed.read_text()
+    needed.write_text("[[only]]\n")
+    assert "[[only]] names no right" in robot.close("--proof", status=2).err
+    needed.write_text('[[only]]\npublish = ["/chatter"]\nenclaves = ["/listener"]\n')
+    ended = robot.close("--proof", status=1)
+    assert "no: the requirements hold: one is violated: robot/requirements.toml\n" in ended.out
+    assert "/talker: may publish /chatter" in ended.err
+    needed.write_text(kept)
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
     assert "not asked: every process runs in its enclave" in robot.close("--proof", status=1).out
     assert "closed, except for what was not asked" in robot.close("--proof", "--partial").err
