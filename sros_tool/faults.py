@@ -74,8 +74,8 @@ class Fault(Enum):
     LINK_DANGLING = (
         "link-dangling",
         "a file of an enclave is a broken link",
-        "It counts as missing. It happens when an enclave is copied without the files that it "
-        "links to; `sros distribute_key` exports files in place of links.",
+        "DDS treats it as missing. This happens when an enclave is copied without the files that "
+        "it links to; `sros distribute_key` exports files in place of links.",
         _RCL,
         _COMPLETE,
         {"permissions.p7s": _SIGN},
@@ -171,7 +171,8 @@ class Fault(Enum):
     KEY_MISMATCH = (
         "key-mismatch",
         "a private key that does not belong to the certificate",
-        "Fast DDS refuses it; Cyclone DDS starts, and every peer aborts the handshake.",
+        "With Fast DDS the node does not start; with Cyclone DDS it starts, and every peer aborts "
+        "the handshake.",
         'Fast DDS 2.14.5 ("Error verifying private key"), Cyclone DDS 0.10.2; measured.',
         _NEW_KEY,
     )
@@ -208,12 +209,12 @@ class Fault(Enum):
     CRL_USAGE = (
         "crl-usage",
         "a revocation list of a CA that may not sign lists",
-        "The keyUsage of the CA lacks cRLSign, so every vendor refuses the list, and with it every "
+        "The keyUsage of the CA lacks cRLSign, so every vendor refuses the list, and every "
         "participant.",
         "RFC 5280, 4.2.1.3; OpenSSL 3 (x509_vfy.c); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; "
         "measured.",
-        "Replace the CA with one whose keyUsage has cRLSign. Until then, nodes start without the "
-        "list, and trust again what was revoked: `rm {path}`.",
+        "Replace the CA with one whose keyUsage has cRLSign. Until then, nodes start if you remove "
+        "the list (`rm {path}`), but trust revoked enclaves again.",
     )
     CRL_PARTIAL = (
         "crl-partial",
@@ -242,7 +243,7 @@ class Fault(Enum):
     REVOKED = (
         "revoked",
         "an enclave whose certificate is revoked",
-        "Every participant with this crl.pem refuses it; Fast DDS does not report it.",
+        "Every participant with this crl.pem refuses the enclave; Fast DDS does not report it.",
         "RFC 5280, 5; Fast DDS 2.6 to 3.6; measured.",
         "This is intended after a revocation. If not, give the enclave a new key and certificate: "
         "`sros renew {root} {enclave} --new-key`.",
@@ -298,7 +299,7 @@ class Fault(Enum):
         'DDS) or "Could not find domain in governance" (Cyclone DDS, code 141).',
         "DDS-Security 1.1, 9.4.1.2; measured.",
         "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env {root} {enclave} --domain ID` "
-        "prints the variables. To add a domain, name all of them in `sros update_keystore {root} "
+        "prints the variables. To add a domain, name all domains in `sros update_keystore {root} "
         "--domain IDS --allow-looser`.",
     )
     PERMISSIONS_EXPIRED = (
@@ -319,7 +320,7 @@ class Fault(Enum):
     PERMISSIONS_SUBJECT = (
         "permissions-subject",
         "permissions for another subject",
-        "No grant fits the certificate. It happens when permissions of an earlier certificate, "
+        "No grant fits the certificate. This happens when permissions of an earlier certificate, "
         "or of another enclave, were put in place.",
         'DDS-Security 1.1, 9.4.1.3; Fast DDS ("Not found the identity subject name"), Cyclone '
         "DDS code 146.",
@@ -336,24 +337,24 @@ class Fault(Enum):
     CERTIFICATE_FILE = (
         "certificate-file",
         "a file of certificates that a vendor cannot read",
-        "Fast DDS reads a CA file to its end, and refuses it for any part that is damaged; Cyclone "
-        "DDS reads its first certificate, and no 'TRUSTED CERTIFICATE'.",
+        "Fast DDS reads the whole CA file, and refuses it if any part is damaged; Cyclone DDS "
+        "reads only the first certificate, and does not read 'TRUSTED CERTIFICATE'.",
         "OpenSSL 3.0 (pem_info.c); Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
         "Keep only the certificates in the file, as '-----BEGIN CERTIFICATE-----'.",
     )
     CA_CRASH = (
         "ca-crash",
         "a CA file that crashes a vendor",
-        "Fast DDS, but not 2.9.1, frees the first certificate of a CA file, if it is not signed "
-        "with SHA-256, and then verifies it.",
+        "If the first certificate of a CA file is not signed with SHA-256, Fast DDS (except 2.9.1) "
+        "frees its memory and then uses it.",
         "Fast DDS 2.6 to 3.6 (FileProvider.cpp); measured.",
         "Put a CA that is signed with SHA-256 first in the file.",
     )
     CERTIFICATE_CRASH = (
         "certificate-crash",
         "a certificate that crashes a vendor",
-        "Fast DDS crashes on a certificate with an empty subject: its own, or that of a peer "
-        "before it is verified.",
+        "Fast DDS crashes on a certificate with an empty subject: its own, or a peer's that is not "
+        "verified yet.",
         "Fast DDS 2.6 to 3.6 (PKIDH.cpp); measured.",
         "Issue a certificate with the common name of the enclave.",
     )
@@ -361,15 +362,14 @@ class Fault(Enum):
         "certificate-lasts",
         "a certificate that expires more than 292 years from now",
         "Fast DDS 2.6 and 3.2 set a timer for its expiry, whose nanoseconds overflow: the node is "
-        "refused as if it had expired, or crashes.",
+        "refused as if the certificate had expired, or crashes.",
         "Fast DDS 2.6.12 and 3.2.5 (PKIDH.cpp, arm_identity_expiry); measured.",
         "Issue a certificate for a shorter time: `sros renew {root} {enclave}`.",
     )
     CA_CHAIN = (
         "ca-chain",
         "a CA certificate that a vendor refuses",
-        "Fast DDS, but not 2.9.1, also verifies the CA certificate, by the strict rules of "
-        "OpenSSL.",
+        "Fast DDS (except 2.9.1) also verifies the CA certificate, by the strict rules of OpenSSL.",
         "RFC 5280, 6.1; Fast DDS 2.6 to 3.6 (FileProvider.cpp); measured.",
         "Use a self-signed CA with keyCertSign, first in its file.",
     )

@@ -78,7 +78,7 @@ MISSPELT = FindingKind(
     "runtime.variable-misspelt",
     ERROR,
     "a misspelt or obsolete variable, which ROS 2 ignores",
-    "The name looks like a typo, or an old name, of a variable that rcl reads. rcl ignores it "
+    "The name looks like a misspelled or old name of a variable that rcl reads. rcl ignores it "
     "without a message.",
     _RCL,
     "Correct the name.",
@@ -131,8 +131,8 @@ OTHER_DISTRIBUTION = FindingKind(
     "runtime.other-distribution",
     WARNING,
     "ROS_DISTRO is none of the distributions that the keystore is for",
-    "`sros check` decided by the DDS of those distributions. Another distribution can allow or "
-    "deny other accesses, without any message.",
+    "`sros check` decided by the rules of the DDS that those distributions ship. Another "
+    "distribution can allow or deny other accesses, without any message.",
     "sros: `distributions` in the settings of a keystore, `distribution` in its fleet file.",
     "Source one of these distributions. Or check the other one, with `--upgrade-to` of `sros "
     "check KEYSTORE`, and add it: `sros update_keystore KEYSTORE --set distributions=NAME,...`, "
@@ -357,8 +357,8 @@ UNREAD = FindingKind(
     "runtime.zenoh-unread",
     WARNING,
     "a configuration of Zenoh that sros cannot read",
-    "Zenoh reads more than sros: YAML, TOML, lists in place of objects, pipes, more than 16 MiB. "
-    "Whether the configuration enforces anything is not known.",
+    "Zenoh reads forms that sros does not: YAML, TOML, lists in place of objects, pipes, more than "
+    "16 MiB. So sros does not know whether the configuration enforces anything.",
     _SOURCE,
     f"Write it as JSON5 objects into a file. {OWN_CONFIGURATION}",
 )
@@ -375,7 +375,7 @@ OVERRIDDEN = FindingKind(
     "runtime.zenoh-overridden",
     WARNING,
     "ZENOH_CONFIG_OVERRIDE changes what a configuration of Zenoh protects",
-    "It is applied after the file, for nodes and the router alike, and can switch off access "
+    "Zenoh applies it after the file, in nodes and in the router, so it can switch off access "
     "control, TLS and everything else that the file states.",
     _SOURCE,
     f"Leave only the paths of certificates and keys in it. {OWN_CONFIGURATION}",
@@ -383,17 +383,17 @@ OVERRIDDEN = FindingKind(
 NO_CERTIFICATE = FindingKind(
     "runtime.zenoh-no-certificate",
     ERROR,
-    "a configuration of Zenoh with TLS, and without the paths of certificates and keys",
+    "a configuration of Zenoh with TLS, but without the paths of certificates and keys",
     "No session opens with it, and no router starts.",
     "Zenoh 1.10.2, measured.",
-    f"Name them in ZENOH_CONFIG_OVERRIDE. {OWN_CONFIGURATION}",
+    f"Name the paths in ZENOH_CONFIG_OVERRIDE. {OWN_CONFIGURATION}",
 )
 PROCESS_OPEN = FindingKind(
     "runtime.zenoh-process-open",
     ERROR,
-    "a process of rmw_zenoh that asks for security and enforces nothing",
+    "a process of rmw_zenoh that runs open although security is enabled",
     "It runs without a session file, or with one that has no access control: whoever connects to "
-    "it, or impersonates its router, reads everything from it and sends it anything.",
+    "it, or impersonates its router, can read everything from it and send it anything.",
     _SOURCE,
     f"Stop it, and start it again. {OWN_CONFIGURATION}",
 )
@@ -429,7 +429,7 @@ def zenoh_environment_findings(environment: Mapping[str, str]) -> Iterator[Findi
     overrides = tuple(override_pairs(environment.get(OVERRIDE, "")))
     for name, path in _named_files(environment):
         if path.suffix not in ENDINGS:
-            text = f"'{path}': the ending of its name is none of {', '.join(ENDINGS)}"
+            text = f"the name of '{path}' ends with none of {', '.join(ENDINGS)}"
             yield FILE_NOT_FOUND.found(name, text, str(path))
             continue
         try:

@@ -610,8 +610,8 @@ DOCUMENT_SIZE = FindingKind(
     "portable.document-size",
     WARNING,
     "signed permissions of 60 KB or more",
-    "Participants send them in the handshake, with their certificate. If both do not fit into one "
-    "message of 64 KB, Fast DDS 2.6 and 2.9 never finish the handshake, or abort; later "
+    "Participants send their permissions and certificate together in the handshake. If these "
+    "exceed one message of 64 KB, Fast DDS 2.6 and 2.9 never finish the handshake, or abort; later "
     "releases and Cyclone DDS accept them.",
     "ros2/sros2 issue 228; Fast DDS 2.6.12, 2.9.1 (SecurityManager.cpp), 2.14.5, 3.2.5 and "
     "3.6.2, Cyclone DDS 0.10.2; measured.",
@@ -633,8 +633,8 @@ DENY_BLOCKS = FindingKind(
     "portable.deny-blocks-topic",
     WARNING,
     "a topic that is denied in one direction and allowed in the other",
-    "Cyclone DDS 0.10 checks whether the topic may be created at all, and a denial of either "
-    "direction forbids it; Fast DDS and Cyclone DDS 11 allow it.",
+    "Cyclone DDS 0.10 does not create a topic of which one direction is denied; Fast DDS and "
+    "Cyclone DDS 11 create it.",
     "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c), Fast DDS 2.6 to 3.6; measured.",
     "Remove the denial: everything that no rule allows is denied anyway.",
     vendors=(Vendor.CYCLONE,),
@@ -663,8 +663,8 @@ SEVERAL_PROFILES = FindingKind(
     "policy.several-profiles",
     NOTE,
     "an enclave with several <profiles>",
-    "sros joins all blocks. ros2/sros2 makes one grant from each, and DDS uses only the first "
-    "grant.",
+    "sros joins all <profiles>. ros2/sros2 makes one grant from each of them, and DDS uses only "
+    "the first grant.",
     "ros2/sros2 0.13; DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2.",
     "Put all <profile> of an enclave into one <profiles>.",
 )
@@ -682,8 +682,8 @@ ROOT_ENCLAVE = FindingKind(
     "Every process that is started without an enclave runs in /, and gets all of its rights; "
     "without an enclave / in the keystore, it does not start.",
     "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",
-    "Remove the enclave / from the policy once each process has its own: `sros generate_policy "
-    "POLICY --enclave-per-node` writes such a policy.",
+    "Remove the enclave / from the policy once each process has its own enclave: `sros "
+    "generate_policy POLICY --enclave-per-node` writes such a policy.",
 )
 
 
@@ -983,7 +983,10 @@ def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
         while above := above.rpartition("/")[0]:  # a robot in / is meant to be above the others
             if met := _on_one_domain(inside, robots.get(above, [])):
                 outer, inner = (robot.name for robot in met)
-                yield f"the namespace of {inner}, {namespace}, is in {above}, that of {outer}"
+                yield (
+                    f"the namespace of {inner}, {namespace}, is inside {above}, the namespace of "
+                    f"{outer}"
+                )
 
 
 def _on_one_domain(

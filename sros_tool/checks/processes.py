@@ -95,7 +95,7 @@ PROCESS_EXPIRED = FindingKind(
     "runtime.process-expired",
     ERROR,
     "a process whose certificate, permissions or CA has expired",
-    "Processes that start, or find it, from now on refuse it.",
+    "Processes that start, or discover this process, from now on refuse it.",
     "DDS-Security 1.1, 8.3.2.8 and 9.4.1.3.2.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2 (read at the "
     "start).",
     "Renew the enclave (`sros renew KEYSTORE ENCLAVE`), bring it here, and restart the process.",
@@ -114,8 +114,8 @@ PROCESS_REPLACEABLE = FindingKind(
     "runtime.process-files-replaceable",
     WARNING,
     "a process whose enclave other users can replace",
-    "Whoever can write to a folder of the keystore decides with which files the process starts "
-    "the next time.",
+    "Anyone who can write to a folder of the keystore decides which files the process loads at its "
+    "next start.",
     "POSIX.1-2017, rename() and unlink(): they need only the right to write to the folder.",
     "Remove the write permission of other users: `chmod go-w FOLDER`.",
 )
@@ -416,9 +416,10 @@ PROCESS_UNSECURED = FindingKind(
 PROCESS_RUNS_UNSECURED = FindingKind(
     "runtime.process-runs-unsecured",
     ERROR,
-    "a node that asks for security and runs without it",
-    "Its ROS_SECURITY_STRATEGY is not exactly `Enforce`, so rcl starts it unsecured where its "
-    "enclave or a file of it is missing: everybody on the network hears it and can send to it.",
+    "a node that runs open although security is enabled",
+    "Its ROS_SECURITY_STRATEGY is not exactly `Enforce`, so rcl starts it unsecured if its "
+    "enclave, or a file of the enclave, is missing: everybody on the network hears it and can send "
+    "to it.",
     "rcl 9 (rcl/src/rcl/security.c), rmw_dds_common (security.cpp); ran with ROS 2 Jazzy.",
     "Stop it, and start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
@@ -436,8 +437,8 @@ PROCESS_PERMISSIVE = FindingKind(
     "runtime.process-permissive",
     WARNING,
     "a process that is secured now, and would start without security",
-    "Its ROS_SECURITY_STRATEGY is not exactly `Enforce`: when its enclave or a file of it is "
-    "missing, it starts unsecured.",
+    "Its ROS_SECURITY_STRATEGY is not exactly `Enforce`: if its enclave, or a file of the enclave, "
+    "is missing, the process starts unsecured.",
     "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy.",
     "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
@@ -453,11 +454,11 @@ ZENOH_UNREAD = FindingKind(
     "runtime.zenoh-process-unread",
     WARNING,
     "a process of Zenoh whose configuration sros cannot read",
-    "Zenoh reads more forms than sros, such as YAML, and a process without an RMW chooses its "
-    "configuration itself. It may enforce nothing: whether it does is not known.",
+    "Zenoh reads forms that sros does not, such as YAML, and a process without an RMW chooses its "
+    "configuration itself. sros does not know whether the process enforces anything.",
     "Zenoh 1.10.2, measured.",
-    "Write the configuration as JSON5 objects, or start the process with the one of its enclave. "
-    f"{OWN_CONFIGURATION}",
+    "Write the configuration as JSON5 objects, or start the process with the configuration of its "
+    f"enclave. {OWN_CONFIGURATION}",
 )
 PROCESS_ELSEWHERE = FindingKind(
     "runtime.process-elsewhere",
@@ -816,7 +817,7 @@ def _not_seen(running: RunningProcesses) -> Iterator[Finding]:
     if others:
         why = ", ".join(sorted({process.why for process in others})[:3])
         count = f"{len(others)} processes" if len(others) > 1 else others[0].label
-        reasons.append(f"{count}, of which it is not known whether they are nodes ({why})")
+        reasons.append(f"{count} that may or may not be nodes ({why})")
     if running.container:
         text = f"{len(running.processes)} of them speak ROS 2"
         yield CONTAINER_ALONE.found("processes", text)

@@ -45,9 +45,9 @@ ASSUMED = FindingKind(
 NOT_CROSSING = FindingKind(
     "requirement.not-crossing",
     NOTE,
-    "a demanded right whose data does not pass between routers of Zenoh",
-    "The enclave has the right, and so has an enclave at another router, but the routers do not "
-    "pass the name on to each other.",
+    "a required right whose data does not pass between routers of Zenoh",
+    "The enclave and an enclave at another router have the right, but the routers do not forward "
+    "the name to each other.",
     "The requirements file, and the router.json5 of both routers.",
     "Add the name to `crossing` in the settings, or ignore this if the name is used on one robot "
     "only.",

@@ -39,7 +39,8 @@ REFUSED = FindingKind(
     "The DDS of the other distribution does not accept a file of the enclave, or its peers do not "
     "accept the enclave.",
     _ENGINE,
-    "Replace what is refused, before the update. `sros check KEYSTORE --all-distros` names it.",
+    "Before the update, replace the refused files, which `sros check KEYSTORE --all-distros` "
+    "names.",
 )
 ACCEPTED = FindingKind(
     "upgrade.accepted",
@@ -66,7 +67,8 @@ BUFFERS = FindingKind(
     WARNING,
     "Zenoh files that lack the keys on which the other release sends images",
     "rmw_zenoh of Lyrical sends messages with arrays of bytes, such as images and point clouds, on "
-    "keys below that of the topic. Files of an earlier sros drop them without a word.",
+    "keys below the key of the topic. With files of an earlier sros, Zenoh drops them without a "
+    "log line.",
     "ros2/rmw_zenoh, rmw_publisher_data.cpp.",
     "Write the files again with `sros zenoh KEYSTORE`, and deliver them before the update.",
 )
@@ -74,7 +76,7 @@ ZENOH = FindingKind(
     "upgrade.zenoh-release",
     NOTE,
     "another release of rmw_zenoh",
-    "Files that sros writes are for all supported releases, from the version that is named.",
+    "The files that sros writes work with all supported releases, from the named version on.",
     "ros2/rmw_zenoh, its changelogs.",
     "Install at least that version on every robot.",
 )
@@ -85,16 +87,16 @@ VULNERABILITIES = FindingKind(
     "The latest releases that both distributions ship are compared; `sros check runtime` looks at "
     "the libraries that processes have loaded.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
-    "Take new ones into account before the update. Those that no release fixes stay: keep others "
-    "out of the network.",
+    "Take new ones into account before the update. Against those that no release fixes, keep "
+    "strangers out of the network.",
     prominent=True,
 )
 NOT_MEASURED = FindingKind(
     "distribution.not-measured",
     NOTE,
     "a DDS that was not measured",
-    "sros decides by the rules of another release of this product, so that a difference between "
-    "the two is not seen.",
+    "sros decides by the rules of another release of this product, so it does not see differences "
+    "between the two releases.",
     _ENGINE,
     "Try the update on one robot, and look at its logs with `sros explain KEYSTORE --log FILE`.",
     prominent=True,

@@ -26,7 +26,7 @@ KNOWN_VULNERABILITIES = FindingKind(
     "secured robot. The version is the one of the library that the process has loaded.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
     "Upgrade the package of the library to a release with the fixes, and restart the processes. "
-    "Vulnerabilities that no release fixes stay: keep others out of the network.",
+    "Against vulnerabilities that no release fixes, keep strangers out of the network.",
 )
 PACKAGE_VULNERABILITIES = FindingKind(
     "runtime.package-vulnerabilities",
@@ -66,7 +66,7 @@ _UNSEEN_REMEDY = (
 ROBOTS_UNKNOWN = FindingKind(
     "runtime.robots-dds-unknown",
     NOTE,
-    "robots whose DDS is not known, or not all of it",
+    "robots whose DDS libraries are not known, or only some of them",
     "sros cannot tell which known vulnerabilities they have.",
     "The last confirmations of the robots.",
     "If nothing was reported or seen, confirm again with this version of sros (`sros fleet report` "
@@ -198,7 +198,7 @@ def vulnerability_metrics(
         Metric(
             "sros_dds_unknown_versions",
             "Number of DDS libraries that processes have loaded and whose known vulnerabilities "
-            "cannot be told: their version is unknown, or no advisory is about the product.",
+            "cannot be determined: their version is unknown, or no advisory is about the product.",
             tuple(Sample(number, {"product": name}) for name, number in sorted(unknown.items())),
         ),
     )
@@ -251,5 +251,5 @@ def _remedy(kind: FindingKind, library: MappedLibrary) -> str:
         package = "fastrtps" if distribution in _FASTRTPS else "fastdds"
     return (
         f"Upgrade the package ros-{distribution}-{package}, and restart the processes. "
-        "Vulnerabilities that no release fixes stay: keep others out of the network."
+        "Against vulnerabilities that no release fixes, keep strangers out of the network."
     )

@@ -40,7 +40,7 @@ UNREAD = FindingKind(
     WARNING,
     "a configuration that Zenoh may accept, and sros does not read",
     "Zenoh also reads YAML, TOML, and lists in place of objects, whose meaning depends on its "
-    "version. Whether the configuration enforces anything is not known.",
+    "version. So sros does not know whether the configuration enforces anything.",
     "Zenoh 1.10.2 (commons/zenoh-config), measured.",
     "Write it as JSON5 objects into a file whose name ends with .json5.",
 )
@@ -94,9 +94,9 @@ EVERYBODY = FindingKind(
     "zenoh.subject-of-everybody",
     ERROR,
     "a subject without a name",
-    "A subject matches every process by properties that it does not state; interfaces and "
-    "protocols are not identities, and a process chooses its own zid. So the rules hold for "
-    "everyone who gets a connection.",
+    "A subject matches any value of a property that it does not state. Interfaces and protocols "
+    "are not identities, and a process chooses its own zid. So the rules apply to everyone who "
+    "gets a connection.",
     "Zenoh 1.9 (authorization.rs); 1.10.2 measured.",
     'Name each enclave by "cert_common_names".',
 )
@@ -104,8 +104,8 @@ SELF_LIMITING = FindingKind(
     "zenoh.self-limiting",
     ERROR,
     "a session whose rules bind only itself",
-    "No rule names another process: the rules say what this process may do, and bind it only "
-    "while it obeys. Any other process with a certificate of the CA publishes to it, and reads "
+    "No rule names another process: the rules say what this process may do, and only this process "
+    "itself obeys them. Any other process with a certificate of the CA publishes to it, and reads "
     "from it.",
     "zenoh_security_tools writes such files; Zenoh 1.10.2, measured.",
     _BY_SROS,
@@ -124,7 +124,7 @@ DENY_OVERRULED = FindingKind(
     "zenoh.deny-overruled",
     ERROR,
     "a denial without effect, because another subject of the access control allows the name",
-    "Where a process matches two subjects, it is enough that one of them allows a message.",
+    "If a process matches two subjects, one of them is enough to allow a message.",
     "Zenoh 1.6.2 and 1.10.2, measured.",
     "Use one subject for each name, and rules that allow.",
 )
@@ -132,7 +132,8 @@ OVERLAPPING = FindingKind(
     "zenoh.overlapping-subjects",
     WARNING,
     "subjects that match the same process",
-    "Such a process has the rights of both subjects; up to Zenoh 1.5.1, of either one, by chance.",
+    "Such a process has the rights of both subjects; up to Zenoh 1.5.1, the rights of one of them, "
+    "by chance.",
     "Zenoh 1.5.1 (issue 2137 of zenoh) and 1.10.2, measured.",
     "Use one subject for each name.",
 )
@@ -148,7 +149,7 @@ PLAIN_ENDPOINT = FindingKind(
     "zenoh.plain-endpoint",
     ERROR,
     "an endpoint without TLS",
-    "What passes there is neither encrypted nor authenticated: everybody on the network reads it, "
+    "Messages there are neither encrypted nor authenticated: everybody on the network reads it, "
     "and gets a connection without a certificate.",
     _MEASURED,
     "Write tls/HOST:PORT.",
@@ -157,7 +158,7 @@ ENDPOINT_REFUSED = FindingKind(
     "zenoh.endpoint-refused",
     ERROR,
     "an endpoint of a protocol that the configuration excludes",
-    "Zenoh does not start when it should listen there, and never connects.",
+    "Zenoh does not start if it has to listen at the endpoint, and never connects to it.",
     _MEASURED,
     "Change the endpoint, or transport/link/protocols.",
 )
@@ -165,8 +166,8 @@ PROTOCOLS_OPEN = FindingKind(
     "zenoh.protocols-open",
     WARNING,
     "protocols without encryption are not excluded",
-    "An endpoint tcp/... that is added (for instance by ZENOH_CONFIG_OVERRIDE) or that another "
-    "process names is used in addition to tls/... .",
+    "Zenoh also uses an endpoint tcp/... that is added (for instance by ZENOH_CONFIG_OVERRIDE) or "
+    "that another process names.",
     _MEASURED,
     'Write "protocols": ["tls"] in transport/link.',
 )
@@ -174,7 +175,7 @@ NO_MUTUAL_TLS = FindingKind(
     "zenoh.no-mutual-tls",
     ERROR,
     "a listener that asks for no certificate",
-    "Everybody gets a connection; nobody has a name that a rule could ask for.",
+    "Everybody gets a connection, without a name that a rule could require.",
     _MEASURED,
     'Write "enable_mtls": true in transport/link/tls.',
 )
@@ -201,8 +202,8 @@ SHARED_MEMORY = FindingKind(
     "zenoh.shared-memory",
     WARNING,
     "shared memory between the processes of a host",
-    "Messages of more than 3 KB lie there unencrypted, whatever TLS does, and stay there after "
-    "both processes have ended.",
+    "Messages of more than 3 KB lie there unencrypted, even with TLS, and stay there after both "
+    "processes have ended.",
     _MEASURED,
     'Write "enabled": false in transport/shared_memory; Zenoh\'s default is true.',
 )
@@ -453,7 +454,9 @@ def _wildcard_past(
                 ]
             for wide, by in passing:
                 if not any(includes(other, wide) for other in denied):
-                    return f"{flow} {message} of {key} is denied, and {by} allows that of {wide}"
+                    return (
+                        f"{flow} {message} of {key} is denied, but {by} allows {message} of {wide}"
+                    )
     return ""
 
 
@@ -509,7 +512,7 @@ class AllowedName(NamedTuple):
     domain: str
     """The ROS domain, perhaps with wildcards."""
     lacks: Sequence[str]
-    """Kinds of messages without which the right is of no use, and which are not allowed."""
+    """Kinds of messages that the right needs, but that are not allowed."""
 
 
 class KeyRight(NamedTuple):
@@ -534,7 +537,7 @@ class SubjectRights(NamedTuple):
     unsaid: Sequence[KeyRight]
     """Rights to keys that no ROS name states exactly."""
     denied: Sequence[KeyRight]
-    """Denied keys; a wildcard may pass a denial."""
+    """Denied keys; a wildcard may get past a denial."""
 
 
 class ReadConfiguration(NamedTuple):

@@ -256,8 +256,8 @@ def _action_meant(
 def taken_for_action(question: Question, action: Question) -> Note:
     """Return a note that a question about a service is answered for an action."""
     text = (
-        f"{action.name} is an action in these rights, not a service: {question.word} is taken "
-        f"for '{action}'; --type service asks about a service."
+        f"{action.name} is an action in these rights, not a service: the answer is for '{action}'. "
+        "To ask about a service, add --type service."
     )
     return Note("explain.an-action", text)
 

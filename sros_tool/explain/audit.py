@@ -263,8 +263,9 @@ class AuditResult(NamedTuple):
     domain: int
     """The ROS domain."""
     allowed: bool
-    """Whether the exit status is 0: nothing would be denied, and nothing was left out that
-    ``--partial`` does not accept."""
+    """Whether the exit status is 0: nothing would be denied, and ``--partial`` accepts everything
+    that was left out.
+    """
     denied: Sequence[DeniedRight]
     """The rights that would be denied."""
     refused: Sequence[RefusedEnclave]
@@ -419,18 +420,19 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
 
 
 _DIVIDED = (
-    "no enclave has all nodes of these processes, and a process has one enclave; the enclave with "
-    "the fewest denials was judged"
+    "no single enclave has all nodes of these processes, but a process runs in one enclave; sros "
+    "judged the enclave with the fewest denials"
 )
 _UNCLEAR = (
-    "several enclaves are for these nodes, and the graph does not show in which they run; all of "
-    "them were judged; start each process with `--ros-args --enclave /its/name` to distinguish them"
+    "several enclaves are for these nodes, and the graph does not show in which of them they run; "
+    "sros judged all of them; start each process with `--ros-args --enclave /its/name` to "
+    "distinguish them"
 )
 _TOOLS = (
-    "left out, because these nodes are tools that observe the robot; on the secured robot they need"
-    " an enclave as policies/operator.xml has it"
+    "left out, because these nodes are tools that observe the robot; on the secured robot they "
+    "need an enclave such as the one in policies/operator.xml"
 )
-_SILENT = "not judged, because these nodes were announced and had no endpoint"
+_SILENT = "not judged, because these nodes were announced but had no endpoint"
 _STRAYS = "not judged, because the writers or readers of these topics belong to no ROS node"
 
 

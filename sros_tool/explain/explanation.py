@@ -132,9 +132,12 @@ _ROTATION = (
 )
 _RIGHTS = (
     "Sign the intended permissions: `sros create_permission {root} {enclave} POLICY`; `sros renew` "
-    "refuses these, because they are not the last ones in the ledger."
+    "refuses these, because the ledger has later permissions."
 )
-_VENDOR = "Write it as every vendor reads it: `sros create_permission {root} {enclave} POLICY`."
+_VENDOR = (
+    "Write it in the form that all vendors read alike: `sros create_permission {root} {enclave} "
+    "POLICY`."
+)
 
 _BY_REASON: dict[str, str | Fault] = {
     "expired": Fault.PERMISSIONS_EXPIRED,

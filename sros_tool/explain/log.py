@@ -218,7 +218,8 @@ def explain_log_of(
 _NOTES = (
     Note(
         "log.only-text",
-        "a process can print any line: only the lines after 'found' were checked in the enclave",
+        "a process can print any line, true or false: sros checked in the enclave only the lines "
+        "after 'found'",
     ),
 )
 

@@ -164,7 +164,7 @@ def _checked(name: str, word: str, kind: str) -> str:
     problem = expression_problem(name)
     remedy = ""
     if not problem and is_expression(name):
-        problem = "It has a wildcard, and a node uses one name."
+        problem = "It has a wildcard, but a node uses one exact name."
         remedy = "Write one name, as the running robot shows it."
     elif not problem and not name.startswith("/"):
         problem = "It is relative to a node, and an enclave may have nodes of many namespaces."

@@ -217,11 +217,11 @@ def _provenance_notes(answer: Answer) -> Iterator[Note]:
     match answer.provenance:
         case Provenance.CHANGED:
             text = (
-                f"the permissions were not made from '{policy}' in its current form: it states "
-                "other rights than they have. The lines are from the current file."
+                f"the permissions were not made from the current '{policy}', which states other "
+                "rights. The lines shown are from the current file."
             )
         case Provenance.UNKNOWN:
-            text = f"whether the permissions were made from '{policy}' is not recorded."
+            text = f"the ledger does not say whether the permissions were made from '{policy}'."
         case _:
             return
     yield Note(f"explain.policy-{answer.provenance}", text)
@@ -245,7 +245,7 @@ def _no_topic(answer: Answer, asked: AskedEnclave) -> Iterator[Note]:
     kinds = {right.kind for right in asked.other_rights(name) if right.name == name}
     if kinds & {"services", "actions"} and "topics" not in kinds:
         what, word = ("an action", "execute") if "actions" in kinds else ("a service", "serve")
-        text = f"{name} is {what} in the rights here, and no topic: ask about call or {word}."
+        text = f"{name} is {what} in the rights here, not a topic: ask about call or {word}."
         yield Note("explain.no-topic", text)
 
 

@@ -290,8 +290,8 @@ class ZenohEvaluator:
         if has_zenoh_files(self.root):
             raise KeystoreError(
                 f"keystore '{self.root}' has no {ROUTER_FILE}",
-                "Without the router's file it is not known what the router enforces.",
-                "Ask in the keystore from which it was exported, or write the files again: "
+                "sros cannot know what the router enforces without the router's file.",
+                "Ask about the keystore that this one was exported from, or write the files again: "
                 f"`sros zenoh {quote(str(self.root))}`.",
             )
         raise KeystoreError(
@@ -732,9 +732,8 @@ def _closed(enclave: str, file: str, problem: str) -> ZenohFile:
 _ROUTERS_KEY = Note(
     "explain.zenoh-router",
     "anyone with the router's key may send and receive everything that passes through the router, "
-    "whatever its permissions say, because forwarding needs that. In peer mode, every session "
-    "also trusts a second process with that key, next to the router. Keep the key from all other "
-    "processes.",
+    "whatever its permissions say, because forwarding needs this. In peer mode, every session also "
+    "trusts a second process with that key, next to the router. Give the key to no other process.",
 )
 
 
@@ -962,16 +961,20 @@ def _notes(answer: ZenohAnswer, stated: Answer, outdated: Sequence[str] | None) 
             yield _ROUTERS_KEY
     elif answer.allowed is not stated.allowed and not stated.problems:
         does, other = ("allow", "Zenoh drops") if stated.allowed else ("deny", "Zenoh lets through")
-        text = f"the signed permissions {does} it and {other} it: the two are not in step."
+        text = f"the signed permissions {does} it, but {other} it: the two differ."
         yield Note("explain.zenoh-differs", text)
     if outdated:
-        text = f"out of date: {', '.join(outdated)}. The answer is by these files as they are."
+        text = f"out of date: {', '.join(outdated)}. The answer follows these files as they are."
         yield Note("explain.zenoh-out-of-date", text)
     if outdated is None:
-        text = "it was not compared with what the permissions ask for, which takes the keystore's "
-        text += "settings and all its enclaves: the answer is by the files as they are."
+        text = (
+            "the files were not compared with the permissions, because this needs the keystore's "
+        )
+        text += "settings and all its enclaves: the answer follows the files as they are."
         yield Note("explain.zenoh-not-compared", text)
     if answer.unsigned:
-        text = f"the permissions CA has not signed {', '.join(answer.unsigned)}: whoever can write "
-        text += "it gives rights, since Zenoh verifies no signature."
+        text = (
+            f"the permissions CA has not signed {', '.join(answer.unsigned)}: anyone who can write "
+        )
+        text += "to it can give rights, because Zenoh verifies no signature."
         yield Note("explain.zenoh-unsigned", text)

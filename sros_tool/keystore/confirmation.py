@@ -482,7 +482,8 @@ def refusals(root: Path) -> dict[str, RefusedMessage]:
     except (SrosError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise DocumentError(
             f"'{path}' is damaged",
-            "It has the robots whose last message was refused: what these have is not known.",
+            "It lists the robots whose last message was refused, so it is not known what these "
+            "robots have.",
             "Remove it, and run `sros fleet collect`, which writes it again.",
         ) from error
 
@@ -502,7 +503,7 @@ def last_confirmation(root: Path, robot: str) -> Received | None:
     except ValueError as error:
         raise _refused(what, "it is not JSON") from error
     if not isinstance(value, dict) or value.keys() - {"message"} != {"received", "confirmation"}:
-        raise _refused(what, "its keys are not received and confirmation")
+        raise _refused(what, 'its keys are not "received" and "confirmation"')
     confirmation = _confirmation_from(value["confirmation"], what)
     if confirmation.robot != robot:
         raise _refused(what, f"it is the confirmation of {confirmation.robot}")
@@ -517,7 +518,7 @@ def _message_from(value: Any, what: str) -> LastMessage:
         DocumentError: it is not of that form.
     """
     if not isinstance(value, dict) or value.keys() != set(LastMessage._fields):
-        raise _refused(what, "its message has not the keys sequence, sha256 and enclave")
+        raise _refused(what, 'the keys of its message are not "sequence", "sha256" and "enclave"')
     if not _is_digest(value["sha256"]):
         raise _refused(what, "the digest of its message is not a SHA-256 digest")
     sequence = _sequence_from(value["sequence"], what)
@@ -606,7 +607,7 @@ def _expiry_from(value: Any, what: str) -> dict[str, EnclaveExpiry]:
     expiry = {}
     for name, times in value.items():
         if not isinstance(times, dict) or times.keys() != set(EnclaveExpiry._fields):
-            raise _refused(what, "an expiry has not the keys certificate and permissions")
+            raise _refused(what, 'the keys of an expiry are not "certificate" and "permissions"')
         moments = (
             None if times[file] is None else _moment(times[file], what)
             for file in EnclaveExpiry._fields
@@ -620,7 +621,7 @@ def _running_from(value: Any, what: str) -> dict[str, RunningFiles]:
         raise _refused(what, "its running is not an object")
     for state in value.values():
         if state not in tuple(RunningFiles):
-            raise _refused(what, f"{_short(state)} does not say what processes have loaded")
+            raise _refused(what, f"{_short(state)} is not a state of running processes")
     return {_enclave_from(name, what): RunningFiles(state) for name, state in value.items()}
 
 
@@ -632,7 +633,7 @@ def _clock_from(value: Any, what: str) -> RobotClock:
 
 def _problems_from(value: Any, what: str) -> tuple[str, ...]:
     if not isinstance(value, list) or len(value) > MOST_PROBLEMS:
-        raise _refused(what, f"its problems are no list of at most {MOST_PROBLEMS}")
+        raise _refused(what, f"its problems are not a list of at most {MOST_PROBLEMS}")
     for text in value:
         if not (isinstance(text, str) and text.isprintable() and 0 < len(text) <= LONGEST_PROBLEM):
             raise _refused(
@@ -643,10 +644,10 @@ def _problems_from(value: Any, what: str) -> tuple[str, ...]:
 
 def _requests_from(value: Any, what: str) -> tuple[str, ...]:
     if not isinstance(value, list) or len(value) > MOST_REQUESTS:
-        raise _refused(what, f"its requests are no list of at most {MOST_REQUESTS}")
+        raise _refused(what, f"its requests are not a list of at most {MOST_REQUESTS}")
     for text in value:
         if not (isinstance(text, str) and len(text) <= _LONGEST_REQUEST and _REQUEST.match(text)):
-            raise _refused(what, "a request of it is not one signing request in PEM")
+            raise _refused(what, "one of its requests is not exactly one signing request in PEM")
     return tuple(value)
 
 
@@ -675,16 +676,18 @@ def _dds_from(value: Any, what: str) -> RobotDds:
         DocumentError: it is not of that form.
     """
     if not isinstance(value, dict) or value.keys() != set(RobotDds._fields):
-        raise _refused(what, "its dds has not the keys libraries and unseen")
+        raise _refused(what, 'the keys of its dds are not "libraries" and "unseen"')
     listed, unseen = value["libraries"], value["unseen"]
     if type(unseen) is not int or not 0 <= unseen <= _MOST_UNSEEN:
         raise _refused(what, "its number of unseen processes is not a number")
     if not isinstance(listed, list) or len(listed) > _MOST_LIBRARIES:
-        raise _refused(what, f"its libraries of DDS are no list of at most {_MOST_LIBRARIES}")
+        raise _refused(what, f"its libraries of DDS are not a list of at most {_MOST_LIBRARIES}")
     libraries = []
     for library in listed:
         if not isinstance(library, dict) or library.keys() != set(RobotLibrary._fields):
-            raise _refused(what, "a library of its DDS has not the keys product, version, ...")
+            raise _refused(
+                what, ('the keys of a library of its DDS are not "product", "version", ...')
+            )
         product, version, path, seen = (library[key] for key in RobotLibrary._fields)
         if product not in PRODUCTS:
             raise _refused(what, f"{_short(product)} is not a DDS that confirmations name")
@@ -741,7 +744,7 @@ def _moment(text: object, what: str) -> datetime:
             return parse_iso(text)
         except ValueError:
             pass
-    raise _refused(what, f"its time {_short(text)} has not the form 2027-05-21T12:50:48Z")
+    raise _refused(what, f"its time {_short(text)} does not have the form 2027-05-21T12:50:48Z")
 
 
 _AGAIN = "Make the confirmation again on the robot."

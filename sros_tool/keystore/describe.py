@@ -516,7 +516,7 @@ def _one_below(folder: Path) -> str:
         root, name = locate_enclave(folder)
         if enclaves := enclaves_below(root, name):
             command = quote(str(root / enclave_folder(enclaves[0])))
-            return f"It holds {first_few(enclaves, 3)}; name one: `sros inspect {command}`."
+            return f"It contains {first_few(enclaves, 3)}; name one: `sros inspect {command}`."
     return ""
 
 

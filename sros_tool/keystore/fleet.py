@@ -109,7 +109,7 @@ def _edited(ledger: Ledger, data: bytes | None) -> str:
     # What somebody else adds to the ledger is not among the entries that are certain.
     last = next((entry for entry in reversed(ledger.certain) if entry.what == "fleet"), None)
     if last is None and any(entry.what == "fleet" for entry in ledger.entries):
-        state = "is missing" if data is None else "may not be the file that sros wrote"
+        state = "is missing" if data is None else "is perhaps not the file that sros wrote"
         return f"{state}: the ledger was changed by another program"
     if last is None:
         return "" if data is None else "was not written by sros"
@@ -167,7 +167,7 @@ def deliver_first(root: Path) -> str:
     """Return a sentence on how new files get to robots, before processes restart with them."""
     published = publish_command(root)
     before = f"Publish them first, for robots that fetch: {published}. " if published else ""
-    return f"{before}Where they run from an export, export the enclaves again first."
+    return f"{before}If processes run from an export, export the enclaves again first."
 
 
 class EnclaveDomains(NamedTuple):
@@ -191,7 +191,7 @@ class EnclaveDomains(NamedTuple):
             return self.keystore
         if robot.domain not in self.keystore:
             raise KeystoreError(
-                f"the robot {robot.name} is in domain {robot.domain}, and the keystore is for "
+                f"the robot {robot.name} is in domain {robot.domain}, but the keystore is for "
                 f"domain {self.keystore}",
                 "An enclave can communicate only in the domains that the governance names.",
                 f"Add it with `sros update_keystore KEYSTORE --domain "
@@ -310,7 +310,7 @@ def refuse_stale_domains(
             continue
         if before.of(name) != (domains := after.of(name)):
             raise KeystoreError(
-                f"enclave {name} belongs to domain {domains} by the fleet, but would keep its "
+                f"by the fleet, enclave {name} belongs to domain {domains}, but it would keep its "
                 f"permissions for domain {before.of(name)}",
                 "No policy of this command states its rights, so it gets no new permissions.",
                 "Name the policies of all enclaves whose robots change their domain.",

@@ -78,13 +78,13 @@ class State(StrEnum):
     """A Zenoh file that is not the present one; the ledger does not record earlier Zenoh files."""
     MISSING = "missing"
     OFFLINE = "offline"
-    """Nothing was heard of the robot for too long, whatever it had then."""
+    """The robot has sent nothing for too long, whatever files it had then."""
     BROKEN = "broken"
     """The file in the keystore is missing or cannot be read, so no export can be made."""
     NEVER = "never"
     """The robot has sent no confirmation."""
     REFUSED = "refused"
-    """The last message of the robot was refused, so that what it has now is not known."""
+    """The last message of the robot was refused, so its present files are not known."""
     LATER = "later"
     """The robot says that it has installed a later release than was ever published for it."""
     UNKNOWN = "unknown"
@@ -190,9 +190,10 @@ class RobotStatus:
     """The worst state of the robot's files; ``revoked`` also if all its enclaves were revoked
     (``enclaves`` is 0); ``restart``: they are current, but processes still run with earlier ones;
     ``offline``: its last confirmation is too old (`overdue`); ``later``: it says that it has a
-    later release than was ever published for it, so that nothing it says can be relied on;
+    later release than was ever published for it, so that nothing in its message is reliable;
     ``refused``: its last message was refused; ``never``: it sent no confirmation; ``none``: it has
-    no enclave in the keystore."""
+    no enclave in the keystore.
+    """
     enclaves: int
     """Number of the robot's enclaves in the keystore."""
     revoked: tuple[str, ...]
@@ -230,8 +231,7 @@ class RobotStatus:
     enclave. Robots do not say which of their earlier files a process has, so a restart for other
     files counts, too."""
     expiry: Mapping[Annotated[str, Words(_EXPIRING)], datetime]
-    """The first expiry of the robot's files, by kind, in UTC, as the ledger has it for the files
-    that the robot confirmed."""
+    """The first expiry of the files that the robot confirmed, by kind, in UTC, from the ledger."""
     dds: RobotDds | None
     """The DDS of the robot by its last confirmation; null if it does not say it."""
     problems: tuple[str, ...] | None
@@ -301,7 +301,7 @@ class RobotStatus:
         if (self.published or 0) == (self.release or 0):
             return "find out why" if self.is_published else "publish"
         is_silent = self.received is None or now - self.received > _SILENCE
-        return "see whether it is on" if is_silent else "wait: it fetches"
+        return "check whether it is on" if is_silent else "wait: it fetches"
 
 
 @shows(
@@ -325,7 +325,8 @@ class FleetStatus:
     option, the robots that fetch and were not heard of for more than a day."""
     older: str = ""
     """Why the keystore is older than its robots, as a clause: it was restored from a backup, or is
-    a copy, and has not published since as one that was restored. Null if nothing shows it."""
+    a copy, and has not published with ``--restored`` since. Null if nothing shows that it is older.
+    """
     folder: str = ""
     is_any_revoked: bool = False
     """Whether the revocation list revokes a certificate."""
@@ -895,8 +896,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_expiry_timestamp_seconds",
-            "The first expiry of the files on a robot by kind, in seconds since 1970, as the "
-            "ledger has it for the files that the robot confirmed.",
+            "The first expiry of the files that a robot confirmed, by kind, in seconds since 1970, "
+            "from the ledger.",
             tuple(
                 Sample(int(end.timestamp()), {**labels, "kind": kind})
                 for labels, robot in robots
@@ -984,8 +985,8 @@ def _dds_metrics(
     )
     yield Metric(
         "sros_fleet_dds_unknown",
-        "Number of DDS libraries of a robot whose known vulnerabilities cannot be told; 1 if it "
-        "reported no library.",
+        "Number of DDS libraries of a robot whose known vulnerabilities cannot be determined; 1 if "
+        "it reported no library.",
         tuple(unknown),
     )
     yield Metric(

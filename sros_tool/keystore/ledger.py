@@ -115,8 +115,9 @@ class Entry(NamedTuple):
     settings: str = ""
     """The settings of the keystore, as TOML."""
     nodes: str = ""
-    """Namespaces and names of nodes that the policy of permissions names and the permissions
-    lack."""
+    """Nodes (namespaces and names) that the policy of the permissions names, but the permissions
+    lack.
+    """
     previous: str = ""
     """SHA-256 of the line before."""
 
@@ -542,7 +543,7 @@ class LedgerFile:
                 _verify(signed, authorities)
             stated = _HEAD.fullmatch(signed.text)
         except SrosError as error:
-            return _Head(fault=f"{LEDGER_HEAD} does not sign its end: {error.what}")
+            return _Head(fault=f"{LEDGER_HEAD} does not sign the end of the ledger: {error.what}")
         if not stated:
             return _Head(fault=f"{LEDGER_HEAD} is not the signed end of a ledger")
         return _Head(int(stated[1]), stated[2].decode(), index_root=(stated[3] or b"").decode())
@@ -677,7 +678,7 @@ def _sealed_before(file: BinaryIO) -> Entry | None:
 
 def _not_as_sealed(root: Path, sealed: Entry) -> KeystoreError:
     return KeystoreError(
-        f"{ledger_part(sealed.number)} is not the part that was sealed of the ledger of '{root}'",
+        f"{ledger_part(sealed.number)} is not the sealed part of the ledger of '{root}'",
         "It was changed, cut off or exchanged.",
         "Copy the sealed part back from your archive.",
     )
@@ -896,7 +897,8 @@ def _too_large(path: Path) -> KeystoreError:
         f"If it belongs to this keystore, move {LEDGER}, its parts and {LEDGER_HEAD} to an "
         f"archive, state all rights again with `sros generate_artifacts -k {quote(str(root))} -p "
         f"POLICY_FILE`, and replace the CAs with `sros rotate_ca {quote(str(root))} --next`, so "
-        "that nothing that the new ledger lacks is valid. Otherwise restore it from a backup.",
+        "that files that the new ledger lacks are no longer valid. Otherwise restore it from a "
+        "backup.",
     )
 
 

@@ -243,7 +243,7 @@ class LedgerIndex:
         """Return what was read of a bucket, if its digest is the one with this number."""
         digest = self._digests[number * _DIGEST : (number + 1) * _DIGEST]
         if type(data) is not bytes or hashlib.sha256(data).digest() != digest:
-            raise IndexDamagedError(f"'{self._path}' is not as the ledger's head states")
+            raise IndexDamagedError(f"'{self._path}' does not match the head of the ledger")
         return data
 
     def _read_only(self) -> sqlite3.Connection:

@@ -363,7 +363,7 @@ def _signer_fault(
         if not signature.is_intact(signed.content, signer):
             return "its signature does not match its content"
         if is_for_pss(signer):
-            return "the key of its signer is for RSA-PSS alone, which signed documents cannot have"
+            return "the key of its signer is for RSA-PSS only, which signed documents cannot use"
         if listed:
             continue
         fault = chain_fault(signer, trusted, signed.certificates, at=at, checks=Checks.DOCUMENTS)

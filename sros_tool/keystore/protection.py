@@ -160,8 +160,8 @@ class _Raising:
     def _parted(self, topic: str, stated: StatedProtection) -> PolicyError:
         other = self._named[self._owner[topic]]
         return PolicyError(
-            f'{stated.source}: {stated} has protect="{stated.word}", and the settings of the '
-            f"keystore protect {other} in their own way",
+            f'{stated.source}: {stated} has protect="{stated.word}", but the settings of the '
+            f"keystore have their own protection for {other}",
             "Some names match both wildcards, and it is unclear which of the two decides.",
             "In the policy, protect names that only one of the wildcards matches, or change the "
             "settings: `sros update_keystore --help` describes --rule and --drop-rule.",

@@ -991,7 +991,7 @@ class _EnclaveFiles:
             self._add(CRL_FILE, error.clause, Fault.CRL_MALFORMED)
             return data
         if ca and not signer:
-            text = "it is not of the identity CA, so DDS refuses every participant"
+            text = "the identity CA did not sign it, so DDS refuses every participant"
             self._add(CRL_FILE, text, Fault.CRL_ISSUER)
         if signer and not may_sign_lists(signer):
             text = (
@@ -1040,7 +1040,7 @@ class _EnclaveFiles:
             return read(document, name)
         except SrosError as error:
             kind = kind_of(document)
-            what = f"what is signed in it is {kind}, and not XML in UTF-8"
+            what = f"its signed content is {kind}, not XML in UTF-8"
             text = error.clause if kind in ("", XML) else what
             self._add(name, text, malformed)
             return None

@@ -351,7 +351,10 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
         text = "it has rules for processes without a name, which are no enclaves: they are left out"
         notes.append(Note("rights.zenoh-nameless", f"{path}: {text}; `sros check` shows them."))
     if unclear := document.open_link():
-        text = f"{path}: {unclear}: whoever connects there has no name that a rule could ask for."
+        text = (
+            f"{path}: {unclear}: a process that connects there has no name that a rule could "
+            "require."
+        )
         notes.append(Note("rights.zenoh-strangers", text))
     if unclear := access.unclear():
         notes.append(Note("rights.zenoh-conditions", f"{path}: {unclear}."))
@@ -726,22 +729,25 @@ class RecordedRights:
         last, trust = recorded.last.get(name), ""
         if last and last.sha256 != digest:
             why = (
-                f"The ledger has others, signed at {last.time}. Perhaps older permissions were "
-                "put back, with rights that were removed since."
+                f"The ledger has other permissions, signed at {last.time}. Perhaps older "
+                "permissions were put back, with rights that were removed since."
             )
         elif recorded.gaps and name not in recorded.certain:
-            why = f"The ledger has gaps ({'; '.join(recorded.gaps)}), so later ones may be missing."
+            why = (
+                f"The ledger has gaps ({'; '.join(recorded.gaps)}), so later permissions may be "
+                "missing."
+            )
         elif recorded.unchained and name not in recorded.chained:
             why = (
-                f"Nothing shows whether a line was removed from the first {recorded.unchained} of "
-                "the ledger, so later ones may be missing."
+                f"Nothing shows whether one of the first {recorded.unchained} lines of the ledger "
+                "was removed, so later permissions may be missing."
             )
             trust = (
                 " If you know that nobody else could change the ledger since version 0.1 of sros "
                 f"wrote it, run `sros update_keystore {quote(str(self._root))} --trust-records`."
             )
         elif not last and recorded.complete:
-            why = "The ledger has none for this enclave."
+            why = "The ledger has no permissions for this enclave."
         else:
             return last.policy if last else ""
         raise KeystoreError(

@@ -142,15 +142,15 @@ def _unrecorded_notes(root: Path, below: list[str], left: list[str]) -> Iterator
     if below:
         yield Note(
             "fleet.revoked-unrecorded",
-            f"The fleet does not record {_some(below)}: revoked, too, as in the folder of a robot "
-            "that you revoke.",
+            f"Also revoked: {_some(below)}, in the folder of a robot that you revoke. The fleet "
+            "does not record this.",
         )
     if left:
         yield Note(
             "fleet.unrecorded-enclaves",
-            f"The fleet does not record whose {_some(left)} is: still valid, with the name of a "
-            "robot that you revoke in the path. If the key was on that robot, run `sros revoke "
-            f"{quote(str(root))} {words_for(root, left)}`.",
+            f"Still valid: {_some(left)}, with the name of a robot that you revoke in the path. "
+            "The fleet does not record whose enclave it is. If the key was on that robot, run "
+            f"`sros revoke {quote(str(root))} {words_for(root, left)}`.",
         )
 
 

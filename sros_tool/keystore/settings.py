@@ -118,7 +118,8 @@ class PresentSettings(NamedTuple):
             raise KeystoreError(
                 "the governance of the keystore has rules that settings cannot express",
                 "It has several domain rules, no rule for * at its end, or a rule for a DDS topic "
-                "that is not a topic, service or action of ROS. A single change would replace it.",
+                "that is not a topic, service or action of ROS. Changing one setting would replace "
+                "these rules.",
                 "Replace all settings with --template; --dry-run shows the changes.",
             )
         return self.settings
@@ -173,7 +174,7 @@ def edit_notes(keystore: Keystore, governance: Governance) -> tuple[Note, ...]:
     if not edits:
         return ()
     clauses = first_few(edits.clauses(), _SHOWN, "; ", "; and ")
-    text = f"{clauses}. Only what is issued from now on may follow it, "
+    text = f"{clauses}. Only files issued from now on may follow the edit, "
     text += f"and the signed governance does not: {edit_remedy(keystore.root)}"
     return (Note("keystore.edited", text),)
 
@@ -222,7 +223,7 @@ def _unsigned(
 ) -> Iterator[str]:
     """Yield a clause if the signed governance is not what sros.toml states."""
     if not settings or (recorded and recorded.protection == present.protection):
-        yield f"the signed governance is not what [protection] in {SETTINGS} states"
+        yield f"the signed governance differs from [protection] in {SETTINGS}"
 
 
 def _differences(old: Template, new: Template, origin: str) -> Iterator[str]:

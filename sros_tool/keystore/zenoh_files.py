@@ -199,7 +199,9 @@ def _read(folder: Path, file: str, state: OpenedEnclave) -> Configuration | Zeno
     try:
         signed = state.read_once.signed(message)
         if state.permissions_ca is None:
-            text = "the permissions CA of the enclave, which has to have signed it, is not there"
+            text = (
+                "the permissions CA of the enclave is missing, so its signature cannot be verified"
+            )
             return ZenohProblem(signed_file, text, ZenohFault.SIGNATURE)
         signed.verify(state.permissions_ca)
     except SrosError as error:
@@ -224,7 +226,9 @@ def _before_revocation(configuration: Configuration, state: OpenedEnclave) -> st
         return ""  # a problem of the enclave that is reported elsewhere
     if configuration.revoked >= _last_revocation(lists=(crl,)):
         return ""
-    return f"it is from before the last revocation in {CRL_FILE}, and may give the revoked rights"
+    return (
+        f"it is older than the last revocation in {CRL_FILE}, and may still give the revoked rights"
+    )
 
 
 def _out_of_date(configuration: Configuration, file: str, name: str, state: OpenedEnclave) -> str:
@@ -255,8 +259,8 @@ def _out_of_date(configuration: Configuration, file: str, name: str, state: Open
         ):
             # Refused all the same: the earlier rules may let others do more.
             return (
-                f"it has the topics and services of {PERMISSIONS_FILE}, and not the rules that "
-                "this version of sros writes for them: an earlier version wrote it"
+                f"it has the topics and services of {PERMISSIONS_FILE}, but an earlier version of "
+                "sros wrote it, with other rules than this version"
             )
         return f"it does not state the rights of {PERMISSIONS_FILE}"
     return ""

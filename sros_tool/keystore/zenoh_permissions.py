@@ -64,10 +64,10 @@ def grant_for_all(document: bytes, name: str, subject: str) -> Grant | None:
             read[reader] = read_permissions_as(vendor, document)
         chosen = _grant_for(vendor, read[reader], subject, at)
         if isinstance(chosen, Refusal):
-            raise DocumentError(f"{name} give no rights with every vendor of DDS: {chosen.text}")
+            raise DocumentError(f"{name} are not accepted by every vendor of DDS: {chosen.text}")
         if (chosen.rules, chosen.default_allow) != (grant.rules, grant.default_allow):
             raise DocumentError(
-                f"{name} are not the same for every vendor of DDS: {vendor.title} takes other rules"
+                f"{name} are not the same for every vendor of DDS: {vendor.title} uses other rules"
             )
     return grant
 

@@ -323,7 +323,7 @@ def test_a_disk_that_is_full_after_the_keystore_changed(
     publisher.run("renew", "ks", "/r1/base")
     with monkeypatch.context() as patched:
         patched.setattr(publishing, "_put", full)
-        with pytest.raises(KeystoreError, match=r"No space left on device\. Robots find what"):
+        with pytest.raises(KeystoreError, match=r"No space left on device\. Robots find either"):
             publisher.publish()
     assert robot.gets() == before
     publisher.publish()

@@ -49,14 +49,14 @@ def _(bench: Bench) -> None:
     path.write_bytes(b"\n" + path.read_bytes())
 
 
-@cause("enclave.permissions-malformed", "what is signed in it is an S/MIME signed message")
+@cause("enclave.permissions-malformed", "its signed content is an S/MIME signed message")
 def _(bench: Bench) -> None:
     path = bench.path(PERMISSIONS)
     signer = bench.authority("permissions"), bench.key("permissions")
     path.write_bytes(smime.sign(path.read_bytes(), *signer))
 
 
-@cause("enclave.permissions-malformed", "what is signed in it is a text in UTF-16")
+@cause("enclave.permissions-malformed", "its signed content is a text in UTF-16")
 def _(bench: Bench) -> None:
     """Opaque, as OpenSSL signs it: the signed part of other messages has no zero byte."""
     folder = bench.root.parent

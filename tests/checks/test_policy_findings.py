@@ -260,10 +260,16 @@ def test_nothing_in_the_policies_of_sros(path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
-        (("/hall", None), "the namespace of a, /hall/r1, is in /hall, that of b"),
+        (("/hall", None), "the namespace of a, /hall/r1, is inside /hall, the namespace of b"),
         (("/hall/r1", None), "a and b have the namespace /hall/r1"),
-        (("/hall/r1/arm", None), "the namespace of b, /hall/r1/arm, is in /hall/r1, that of a"),
-        (("/hall/r1/arm", 7), "the namespace of b, /hall/r1/arm, is in /hall/r1, that of a"),
+        (
+            ("/hall/r1/arm", None),
+            "the namespace of b, /hall/r1/arm, is inside /hall/r1, the namespace of a",
+        ),
+        (
+            ("/hall/r1/arm", 7),
+            "the namespace of b, /hall/r1/arm, is inside /hall/r1, the namespace of a",
+        ),
         (("/hall/r1/arm", 8), ""),
         (("/hall/r10", 7), ""),
         (("/", 7), ""),

@@ -49,7 +49,7 @@ def test_what_still_works_after_taking_a_right_away(verb: str, root: Path) -> No
     before = certificate(folder / "cert.pem")
     ended = sros(*TAKES_AWAY[verb].split(), cwd=root.parent).ok()
     assert "/robot loses: publish topic /secret" in ended.err
-    (line,) = [each for each in ended.err.splitlines() if "lost rights work until" in each]
+    (line,) = [each for each in ended.err.splitlines() if "it lost still work until" in each]
     assert f"{validity_of(before).not_after:%Y-%m-%d}" in line
     assert "until they are restarted" in line
     # What it names as the remedy runs, and ends it.
@@ -97,7 +97,10 @@ def test_a_request_that_is_answered_with_less(root: Path) -> None:
     assert "rights-lost" not in sros(*words, "more.xml", "-o", "two.tar.gz", cwd=work).ok().err
     ended = sros(*words, "less.xml", "-o", "three.tar.gz", cwd=work).ok()
     (line,) = [each for each in ended.err.splitlines() if "rights-lost" in each]
-    assert "/remote loses: publish topic /secret. /remote: its lost rights work until" in line
+    assert (
+        "/remote loses: publish topic /secret. /remote: the rights that it lost still work until"
+        in line
+    )
     sros(*commands(line)[0], cwd=work).ok()
 
 

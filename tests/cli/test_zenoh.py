@@ -247,9 +247,9 @@ def test_a_file_of_before_a_revocation_is_refused_where_the_list_is_newer(folder
         shutil.copy(folder / "before/enclaves/a" / name, folder / "robot/enclaves/a" / name)
     checked = sros("verify", "robot", cwd=folder)
     assert (checked.status, "zenoh.out-of-date" in checked.out) == (1, True)
-    assert "it is from before the last revocation in crl.pem" in checked.out
+    assert "it is older than the last revocation in crl.pem" in checked.out
     refused = sros("env", "robot", "/a", "--rmw", "rmw_zenoh_cpp", cwd=folder)
-    assert (refused.status, "before the last revocation" in refused.err) == (2, True)
+    assert (refused.status, "older than the last revocation" in refused.err) == (2, True)
 
 
 def test_files_are_in_step_after_a_revocation(folder: Path) -> None:
@@ -275,7 +275,7 @@ def test_a_revocation_that_is_in_the_list_alone_counts(folder: Path) -> None:
         sign_crl(authority, key, more, number=9, this_update=now, next_update=now + timedelta(9))
     )
     env = ("env", "ks", "/a", "--rmw", "rmw_zenoh_cpp")
-    assert "before the last revocation" in sros(*env, cwd=folder).err
+    assert "older than the last revocation" in sros(*env, cwd=folder).err
     sros("zenoh", "ks", cwd=folder).ok()
     sros(*env, cwd=folder).ok()
 
@@ -301,9 +301,9 @@ def test_a_file_of_an_earlier_version_is_refused_with_what_to_do(
         sros("verify", "robot", cwd=folder).ok()
     checked = sros("verify", "robot", cwd=folder)
     assert (checked.status, "zenoh.out-of-date" in checked.out) == (1, True)
-    assert "an earlier version wrote it" in checked.out
+    assert "an earlier version of sros wrote it" in checked.out
     refused = sros("env", "robot", "/a", "--rmw", "rmw_zenoh_cpp", cwd=folder)
-    assert (refused.status, "an earlier version wrote it" in refused.err) == (2, True)
+    assert (refused.status, "an earlier version of sros wrote it" in refused.err) == (2, True)
     assert "`sros zenoh KEYSTORE` where the CA keys are, and export the enclave" in refused.err
     # Other permissions are told as that.
     (folder / "wider.xml").write_text(policy_text({"/a": publish("/x", "/y")}))

@@ -224,7 +224,7 @@ def test_the_verb_says_what_it_did(home: Home) -> None:
     assert lines[0] == "3 robots: 2 kept, 1 refused; 1 request: 1 not due"
     assert lines[1] == "r3: refused: it is signed by /r1/base, an enclave of r1"
     assert lines[2].startswith("/r2/base: not due: it can be renewed from ")
-    assert "1 name in 'inbox' is that of no robot" in ended.err and "\x1b" not in ended.err
+    assert "1 name in 'inbox' is not in the fleet" in ended.err and "\x1b" not in ended.err
     home.send("r3", now)
     home.send("r2", now)
     shutil.rmtree(home.inbox / "r9\x1b")
@@ -290,7 +290,7 @@ def test_a_certificate_that_proves_nothing(home: Home) -> None:
     foreign = home.folder / "other/enclaves/r1/base"
     foreign_key = key_of(home.folder / "other", "/r1/base")
     home.put("r1", smime.sign(document, read_certificate(foreign / "cert.pem"), foreign_key))
-    assert home.of("r1").why.startswith("its certificate is of no identity CA of the keystore")
+    assert home.of("r1").why.startswith("no identity CA of the keystore issued its certificate")
     home.put("r1", smime.sign(document, own, key))
     assert home.of("r1").outcome == "kept"
     home.send("r1")
@@ -329,7 +329,7 @@ def test_a_certificate_of_the_ca_that_a_rotation_replaces(home: Home) -> None:
     assert home.of("r1").outcome == "kept", "the old CA is still trusted"
     home.run("rotate_ca", "ks", "--next", "--allow-unconfirmed")
     home.send("r1")
-    assert "of no identity CA" in home.of("r1").why
+    assert "no identity CA of the keystore" in home.of("r1").why
 
 
 @pytest.mark.parametrize(

@@ -585,10 +585,10 @@ def test_a_robot_that_does_not_fetch_what_is_published_may_be_off(field: Field) 
     field.run("fleet", "publish", "ks", "pub")
     field.age("r3", timedelta(minutes=31))
     rows = field.run("fleet", "status", "ks", status=1).out
-    assert rows.count("wait: it fetches") == 1 and rows.count("see whether it is on") == 1, rows
+    assert rows.count("wait: it fetches") == 1 and rows.count("check whether it is on") == 1, rows
     page = field.run("fleet", "status", "ks", "--html", status=1).out
     assert page.count(">wait: it fetches</td>") == 1
-    assert page.count(">see whether it is on</td>") == 1
+    assert page.count(">check whether it is on</td>") == 1
 
 
 def test_a_robot_that_says_it_has_a_release_that_was_never_published(field: Field) -> None:
@@ -670,7 +670,7 @@ def test_home_is_older_than_its_robots(field: Field) -> None:
             assert "home is older" not in sros("fleet", "status", "ks", cwd=field.folder).out
             assert field.send("r1").status == 1
         rows = field.run("fleet", "status", "ks", status=1).out
-        why = "robots have what it signed" if away else "'.*/pub' has later releases"
+        why = "robots have files that it signed" if away else "'.*/pub' has later releases"
         command = rf"`sros fleet publish ks {field.folder}/pub --restored`"
         assert re.search(rf"home is older than its robots: {why}.*{command}", rows), rows
         assert not field.status()["complete"] and in_force() == {False}

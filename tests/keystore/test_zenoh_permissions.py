@@ -258,21 +258,21 @@ def test_the_grant_that_every_vendor_takes(document: bytes) -> None:
         # Cyclone DDS takes a grant whose subject has all attributes of the certificate's.
         (
             permissions(grant(OTHERS, subject="CN=/t,O=x"), grant(OWN, subject="CN=/t")),
-            "are not the same for every vendor of DDS: Cyclone DDS 0.10 takes other rules",
+            "are not the same for every vendor of DDS: Cyclone DDS 0.10 uses other rules",
         ),
         (
             permissions(grant(OTHERS, subject=" CN=/t"), grant(OWN, subject="CN=/t")),
-            "are not the same for every vendor of DDS: Fast DDS 2.14 takes other rules",
+            "are not the same for every vendor of DDS: Fast DDS 2.14 uses other rules",
         ),
         (
             permissions(grant(OWN, OTHERS, subject="CN=/t")).replace(
                 b"rt/secret", b"rt/<!-- -->secret"
             ),
-            "are not the same for every vendor of DDS: Fast DDS 2.14 takes other rules",
+            "are not the same for every vendor of DDS: Fast DDS 2.14 uses other rules",
         ),
         (
             permissions(grant(OWN, subject="CN=/t", end="2300-01-01T00:00:00Z")),
-            "give no rights with every vendor of DDS: Cyclone DDS 0.10: grant 'g' expired",
+            "are not accepted by every vendor of DDS: Cyclone DDS 0.10: grant 'g' expired",
         ),
     ],
 )

@@ -616,7 +616,7 @@ def test_a_fleet_in_another_domain_is_said_when_it_is_signed(fleet: Path) -> Non
     ended = sros(*words, cwd=fleet).ok()
     assert "same rights" not in ended.out
     assert "/r1/base loses: domain 0" in ended.err
-    assert "/r1/base: its lost rights work until" in ended.err
+    assert "/r1/base: the rights that it lost still work until" in ended.err
     rights = json.loads(sros(*words[:-1], "any.toml", "--dry-run", "--json", cwd=fleet).out)
     assert [each["gained_domains"] for each in rights["rights"]] == ["0"]
 

@@ -59,7 +59,7 @@ class VerifiedFolder(NamedTuple):
     kind: Annotated[str, Words(("keystore", "enclave"))]
     """Whether DIR is a keystore or an enclave."""
     ok: bool
-    """Whether there is no finding, so that the exit status is 0."""
+    """Whether there are no findings; the exit status is then 0."""
     enclaves: Sequence[ArrivedEnclave]
     """The enclaves."""
     findings: Sequence[ArrivalFinding]
@@ -85,9 +85,9 @@ class ArrivedEnclave:
     name: str
     """The enclave."""
     loadable: bool
-    """Whether a process can run in it."""
+    """Whether a process can run in the enclave."""
     domains: str
-    """The ROS domains that it can join, or null."""
+    """The ROS domains that the process can join, or null."""
     valid_until: datetime | None
     """The earliest expiry of the enclave's certificates and permissions, in UTC, or null."""
     key_on_robot: bool = False
@@ -220,10 +220,10 @@ TOKEN_KEY = FindingKind(
     "enclave.token-key",
     ERROR,
     "a token that does not have the key of an enclave",
-    "Without its token, with another key, or with a PIN that is refused, no node starts.",
+    "No node starts if its token is missing, has another key, or refuses the PIN.",
     "Fast DDS 2.9.1 (Pkcs11Provider.cpp); measured.",
-    "Check that the token is there, and its module and PIN. If its key is lost, make another one, "
-    "with `sros create_request` in another folder.",
+    "Check that the token is there, and check its module and PIN. If its key is lost, make another "
+    "key, with `sros create_request` in another folder.",
 )
 
 
@@ -238,7 +238,7 @@ def _token_findings(
     try:
         key = open_enclave_key(state.token, secrets)
         if state.certificate and not key.signs_for(state.certificate.public_key()):
-            text = f"the key {state.token.object!r} on it is not the key of cert.pem"
+            text = f"the key {state.token.object!r} on the token is not the key of cert.pem"
             yield TOKEN_KEY.found(name, text, file)
     except SrosError as error:
         yield TOKEN_KEY.found(name, str(error), file)

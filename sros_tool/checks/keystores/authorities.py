@@ -71,19 +71,20 @@ INTERMEDIATE = FindingKind(
     WARNING,
     "a CA that is not self-signed",
     "Cyclone DDS accepts only a self-signed CA, as the first certificate of its file. Fast DDS "
-    "verifies a chain of identity CAs; 2.14 requires keyUsage and key identifiers in each of "
-    "them. For an intermediate permissions CA, Fast DDS 2.14 requires keyUsage, 2.9 a purpose "
+    "verifies a chain of identity CAs; 2.14 requires keyUsage and key identifiers in each CA. For "
+    "an intermediate permissions CA, Fast DDS 2.14 requires keyUsage, and 2.9 requires a purpose "
     "that allows signing documents.",
     "Fast DDS 2.6 to 3.6 (FileProvider.cpp), Cyclone DDS 0.10 and 11.0; measured.",
-    "Use a separate root CA for robots, unless all of them run a Fast DDS that accepts it.",
+    "Use a separate root CA for robots, unless all of them run a Fast DDS that accepts this CA.",
 )
 CA_PURPOSE = FindingKind(
     "portable.ca-purpose",
     WARNING,
     "a permissions CA whose certificate does not allow signing documents",
     "Fast DDS 2.9 and Cyclone DDS 0.10 verify the S/MIME purpose, and refuse every document "
-    '("unsuitable certificate purpose"): keyUsage must have digitalSignature, extendedKeyUsage '
-    "emailProtection, if present. Fast DDS 2.14 and Cyclone DDS 11 check neither.",
+    '("unsuitable certificate purpose"): keyUsage, if present, must have digitalSignature, and '
+    "extendedKeyUsage, if present, emailProtection. Fast DDS 2.14 and Cyclone DDS 11 check "
+    "neither.",
     "RFC 8550, 4.4.2; Fast DDS 2.9.1 and 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2 and 11.0.1; "
     "measured.",
     "Replace it with `sros rotate_ca KEYSTORE`, or issue its certificate again with "
@@ -112,8 +113,8 @@ WEAK = FindingKind(
     "keystore.weak-cryptography",
     ERROR,
     "a weak key, or a signature with a weak hash",
-    "Whoever computes the key, or a second document for the signature, can issue any identity or "
-    "any permissions. DDS accepts both.",
+    "An attacker who computes the key, or finds another document with the same signature, can "
+    "issue any identity or any permissions. DDS accepts weak keys and weak hashes.",
     "NIST SP 800-57 part 1, 5.6, and SP 800-131A: RSA under 2048 bits, EC under 256 bits, SHA-1.",
     "Replace a CA with `sros rotate_ca KEYSTORE`; renew an enclave with `sros renew KEYSTORE "
     "ENCLAVE`.",
@@ -244,8 +245,8 @@ SETTINGS_EDITED = FindingKind(
     "keystore.settings-edited",
     WARNING,
     "settings that were edited by hand and not applied",
-    "Files that are issued later may follow the edit, earlier files do not; and nobody was shown "
-    "which protection it weakens.",
+    "Files issued later may follow the edit, earlier files do not. Nobody was shown which "
+    "protection the edit weakens.",
     "sros: the ledger has the settings as sros wrote them.",
     edit_remedy("KEYSTORE"),
 )
@@ -253,8 +254,8 @@ FLEET_EDITED = FindingKind(
     "keystore.fleet-edited",
     WARNING,
     "robots of the fleet that were edited by hand",
-    "The file decides which enclaves belong to a robot, and which domains they may join, so verbs "
-    "that issue, revoke or export by it refuse it.",
+    "The file decides which enclaves belong to a robot, and which domains they may join. Verbs "
+    "that use the file to issue, revoke or export refuse it after such an edit.",
     "sros: the ledger has the SHA-256 of the file as sros wrote it.",
     FLEET_REMEDY,
 )
@@ -262,11 +263,11 @@ LEFT_ENCLAVES = FindingKind(
     "keystore.left-enclaves",
     NOTE,
     "enclaves of robots that are no longer in the fleet, or in its group",
-    "Whoever has their files has their rights until they expire, and `--robot` does not choose "
-    "them any more.",
-    "sros: their paths are those of a robot's enclaves, and they belong to no robot.",
-    "Revoke them by `sros revoke KEYSTORE ENCLAVE...` if the robots are gone. Keep an enclave that "
-    "never belonged to a robot.",
+    "Anyone who has the files of such an enclave has its rights until the files expire, and "
+    "`--robot` no longer chooses the enclave.",
+    "sros: the paths have the form of a robot's enclaves, and no robot has these enclaves.",
+    "Revoke them with `sros revoke KEYSTORE ENCLAVE...` if the robots are gone. Keep an enclave "
+    "that never belonged to a robot.",
 )
 NOT_AS_SETTINGS = FindingKind(
     "governance.not-as-settings",
@@ -280,7 +281,8 @@ LEDGER_MISSING = FindingKind(
     "keystore.ledger-missing",
     WARNING,
     "a keystore made by sros without its ledger",
-    "Without it, replaced permissions and certificates from another source cannot be detected.",
+    "Without the ledger, sros cannot detect replaced permissions, or certificates from another "
+    "source.",
     "sros: ledger.jsonl lists everything that was issued.",
     "Restore ledger.jsonl from a backup.",
 )
@@ -288,21 +290,21 @@ LEDGER_DAMAGED = FindingKind(
     "keystore.ledger-damaged",
     ERROR,
     "a ledger with lines that are missing or were changed",
-    "It may lack certificates that `sros revoke` should revoke, and permissions that replaced the "
+    "It may lack certificates that `sros revoke` should revoke, and permissions newer than the "
     "present ones.",
-    "sros: each line of ledger.jsonl has the digest of the line before, ledger.p7s that of the "
-    "last.",
+    "sros: each line of ledger.jsonl has the digest of the line before it; ledger.p7s has the "
+    "digest of the last line.",
     "Restore ledger.jsonl and ledger.p7s from the same backup. Without one, state all rights again "
     "with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`, and replace the CAs with `sros "
-    "rotate_ca KEYSTORE --next`, so that nothing that the ledger lacks is valid.",
+    "rotate_ca KEYSTORE --next`, so that files that the ledger lacks are no longer valid.",
 )
 LEDGER_UNCHAINED = FindingKind(
     "keystore.ledger-unchained",
     NOTE,
     "a ledger with lines that another version wrote, without a chain",
     "If one of these lines was removed, nothing shows it.",
-    "sros: each line of ledger.jsonl has the digest of the line before, ledger.p7s that of the "
-    "last.",
+    "sros: each line of ledger.jsonl has the digest of the line before it; ledger.p7s has the "
+    "digest of the last line.",
     "New lines are chained. Once the CAs are replaced (`sros rotate_ca KEYSTORE --next`), the "
     "earlier lines no longer matter.",
 )
@@ -310,11 +312,11 @@ LEDGER_UNPROVEN = FindingKind(
     "keystore.ledger-unproven",
     WARNING,
     "enclaves whose rights are recorded only in ledger lines without a chain",
-    "Version 0.1 of sros wrote such lines. Whoever removes one of them can put earlier permissions "
-    "back, so `sros renew`, `sros zenoh` and `sros rotate_ca` leave these enclaves out or refuse "
-    "them.",
-    "sros: each line of ledger.jsonl has the digest of the line before, ledger.p7s that of the "
-    "last.",
+    "Version 0.1 of sros wrote such lines. Anyone who can remove such a line can put earlier "
+    "permissions back, so `sros renew`, `sros zenoh` and `sros rotate_ca` leave these enclaves out "
+    "or refuse them.",
+    "sros: each line of ledger.jsonl has the digest of the line before it; ledger.p7s has the "
+    "digest of the last line.",
     "If you know that nobody else could change the keystore, run `sros update_keystore KEYSTORE "
     "--trust-records`. Otherwise state the rights again, with `sros generate_artifacts -k KEYSTORE "
     "-p POLICY_FILE` or `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`.",

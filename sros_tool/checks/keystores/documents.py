@@ -45,8 +45,9 @@ SEVERAL_GRANTS = FindingKind(
     "portable.several-grants",
     WARNING,
     "several grants in one document",
-    "Fast DDS uses the first grant of the subject that is valid now; Cyclone DDS uses the first "
-    "one, valid or not, and also takes a grant whose subject merely contains the certificate's.",
+    "Fast DDS uses the subject's first grant that is valid now. Cyclone DDS uses the subject's "
+    "first grant, valid or not, and also accepts a grant whose subject only contains the subject "
+    "of the certificate.",
     "Fast DDS 2.6 to 3.6 (Permissions.cpp), Cyclone DDS 0.10 and 11.0; measured.",
     "Write one document with one grant for each enclave.",
 )
@@ -62,8 +63,8 @@ ALLOW_RULES = FindingKind(
     "portable.several-allow-rules",
     NOTE,
     "several allow rules in one grant",
-    "Fast DDS decides by the first rule whose topic matches, and denies if its partitions do not; "
-    "Cyclone DDS goes on to a rule in which both match.",
+    "Fast DDS decides by the first rule whose topic matches, and denies if the partitions of this "
+    "rule do not match; Cyclone DDS goes on to a rule in which topic and partitions match.",
     "Fast DDS 2.6 to 3.6 (Permissions.cpp), Cyclone DDS 0.10 and 11.0; measured.",
     "Put all topics into one allow rule.",
     vendors=FAST_DDS,
@@ -72,7 +73,7 @@ PARTITIONS = FindingKind(
     "portable.partitions",
     WARNING,
     "partitions in a rule",
-    "Fast DDS ignores partitions in deny rules, and denies if an allow rule matches the topic and "
+    "Fast DDS ignores partitions in deny rules, and denies if an allow rule matches the topic but "
     "not the partition; Cyclone DDS goes on to the next rule. ROS 2 uses only the default "
     "partition.",
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
@@ -120,12 +121,13 @@ TIME_FORMAT = FindingKind(
     "portable.time-format",
     WARNING,
     "a date that vendors read differently",
-    "Fast DDS ignores the offset and reads local time; Cyclone DDS refuses dates without a time, "
-    "and years from 2263 on.",
+    "Fast DDS ignores the UTC offset and reads local time; Cyclone DDS refuses dates without a "
+    "time, and years from 2263 on.",
     "DDS-Security 1.1, 9.4.1.3.2.2; Fast DDS 2.6 to 3.6 (mktime), Cyclone DDS 0.10 and 11.0; "
     "measured.",
     "Sign the permissions again: all with renew --all, or those of one enclave with `sros "
-    "create_permission KEYSTORE ENCLAVE POLICY_FILE`. Others write CCYY-MM-DDThh:mm:ssZ.",
+    "create_permission KEYSTORE ENCLAVE POLICY_FILE`. In documents that sros does not sign, write "
+    "CCYY-MM-DDThh:mm:ssZ.",
 )
 TIME_WINDOW = FindingKind(
     "portable.validity-window",
@@ -207,7 +209,7 @@ FEWER_DOMAINS = FindingKind(
     "In the other domains no node of the enclave can communicate. This is intended if a fleet file "
     "gives the robot a domain.",
     "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; measured.",
-    "None is needed if the robot is in this domain.",
+    "Nothing to do if the robot is in this domain.",
 )
 
 _MOMENT = re.compile(r"(\d{4})-\d\d-\d\dT\d\d:\d\d:\d\dZ\Z")
@@ -248,7 +250,7 @@ def _domain_problems(domains: DomainSet) -> Iterator[str]:
         if part.first is None and part.last is None:
             continue  # the rule has no <domains>, which is an error of its own
         if part.first is None or part.last is None:
-            yield f"{part} has only one end"
+            yield f"{part} has only a minimum or only a maximum"
         elif part.last > MAX_DOMAIN:
             yield f"{part} goes beyond {MAX_DOMAIN}"
 
@@ -322,7 +324,9 @@ def _times(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding
     if begin is None or end is None:
         return  # TIME_FORMAT reports it
     if not begin <= int(now.timestamp()) <= end:
-        here = f"in {enclave.keystore.zone} Fast DDS reads that as {_utc(begin)} to {_utc(end)}"
+        here = (
+            f"in {enclave.keystore.zone} Fast DDS reads these dates as {_utc(begin)} to {_utc(end)}"
+        )
         accepted = enclave.accepts_expiry if now.timestamp() > end else ""
         yield LOCAL_TIME.found(enclave.name, f"{text}, and {here}", file, accepted=accepted)
     elif now - _WEST < window.not_before or now + _EAST > window.not_after:
@@ -354,7 +358,8 @@ def _order(grant: Grant, name: str, file: str) -> Iterator[Finding]:
                     late.setdefault(met, []).append(topic)
             for met, topics in late.items():
                 text = (
-                    f"rule {index + 1} denies to {direction} {some_names(topics)} after one that "
+                    f"rule {index + 1} denies to {direction} {some_names(topics)} after a rule "
+                    "that "
                 )
                 yield NO_EFFECT.found(name, f"{text}allows {met}", file)
 
@@ -372,7 +377,7 @@ def _hidden(
             else:
                 left += 1
     if hidden and not left:
-        text = f"rule {index + 1} allows nothing, as an earlier one denies {some_names([*hidden])}"
+        text = f"rule {index + 1} allows nothing, as an earlier rule denies {some_names([*hidden])}"
         yield UNREACHABLE.found(name, text, file)
         return
     for by, topics in hidden.items():
@@ -432,7 +437,7 @@ def _domains(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Findi
         wanted = EnclaveDomains(governed, enclave.keystore.fleet).of(enclave.name)
     if allowed == wanted:
         return
-    text = f"the permissions are for domain {str(allowed) or 'none'}, "
+    text = f"the permissions are for domain {str(allowed) or 'none'}, but "
     if wanted != governed:
         yield DOMAINS.found(enclave.name, f"{text}its robot is in domain {wanted}", file)
         return
@@ -453,9 +458,9 @@ UNAUTHENTICATED = FindingKind(
     "governance.unauthenticated",
     ERROR,
     "participants without an identity may join",
-    "On Fast DDS they can read and write every topic without access control and protection, "
-    "on Cyclone DDS every topic without protection, whatever its access control. With RTPS "
-    "protection too, Fast DDS refuses the document; only 2.9 ignores the attribute.",
+    "On Fast DDS they can read and write every topic without access control and protection; on "
+    "Cyclone DDS, every topic without protection, even with access control. If RTPS messages are "
+    "protected too, Fast DDS refuses the document; only Fast DDS 2.9 ignores the attribute.",
     f"{_GOVERNANCE} (allow_unauthenticated_participants); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS "
     "0.10 and 11.0; measured.",
     "Run `sros update_keystore KEYSTORE --set "
@@ -465,8 +470,8 @@ UNAUTHENTICATED_KEPT_OUT = FindingKind(
     "governance.unauthenticated-kept-out",
     NOTE,
     "participants without an identity are allowed, but the vendor keeps them out",
-    "Fast DDS 2.9 ignores the attribute, and on Cyclone DDS messages that are protected as a whole "
-    "keep them out. Another vendor may open topics to them, or refuse the document.",
+    "Fast DDS 2.9 ignores the attribute, and Cyclone DDS refuses them if RTPS messages are "
+    "protected. Another vendor may open topics to them, or refuse the document.",
     UNAUTHENTICATED.source,
     UNAUTHENTICATED.remedy,
 )
@@ -475,7 +480,7 @@ NO_JOIN_CONTROL = FindingKind(
     WARNING,
     "any authenticated participant may join, whatever its permissions",
     "The permissions of a participant are not checked when it joins; vendors then decide "
-    "differently on a participant without permissions.",
+    "differently about a participant without permissions.",
     f"{_GOVERNANCE} (enable_join_access_control); Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
     "Run `sros update_keystore KEYSTORE --set protection.join_access_control=true`.",
 )
@@ -541,10 +546,10 @@ NO_TOPIC_RULE = FindingKind(
 NO_OTHER_TOPIC_RULE = FindingKind(
     "governance.only-ros-topics",
     NOTE,
-    "topic rules for the names of ROS alone",
+    "topic rules for names of ROS only",
     "A program that uses DDS without ROS can create no endpoint.",
     f"{_GOVERNANCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
-    "None is needed if all programs are nodes of ROS 2. Otherwise add a rule for * at the end.",
+    "Nothing to do if all programs are nodes of ROS 2. Otherwise add a rule for * at the end.",
 )
 UNREACHABLE_TOPIC_RULE = FindingKind(
     "governance.unreachable-rule",
@@ -567,7 +572,7 @@ GOVERNANCE_OPEN_RANGE = FindingKind(
     WARNING,
     "a range of domains without an end, which counts as one domain",
     "Fast DDS and Cyclone DDS read a range without <max> as the domain <min> alone; by the "
-    "standard it has no end.",
+    "standard, the range has no end.",
     "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Write <id>, or <min> and <max> up to 230.",
 )
@@ -709,7 +714,7 @@ def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:
         and topic_rule.data_protection_kind is ProtectionKind.NONE
     ]
     if not opened:
-        return "they reach no topic, because all are controlled or protected"
+        return "they reach no topic, because all topics are controlled or protected"
     return f"anybody can read and write {some_names(opened)}"
 
 
@@ -747,7 +752,7 @@ def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
         if hiding is not None:
             yield (
                 UNREACHABLE_TOPIC_RULE,
-                f"the rule for {hiding} stands before the rule for {topic.topic_expression}",
+                f"the rule for {hiding} comes before the rule for {topic.topic_expression}",
             )
 
 

@@ -117,17 +117,17 @@ OUTLIVES_CA = FindingKind(
     "a certificate that is valid for longer than its CA",
     "Once the CA expires, DDS refuses the certificate, whatever its own dates are.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
-    "Plan with the expiry of the CA, or renew the enclave after `sros rotate_ca`.",
+    "Take the CA's expiry as the certificate's, or renew the enclave after `sros rotate_ca`.",
 )
 PERMISSIONS_OUTLIVE = FindingKind(
     "enclave.permissions-outlive",
     WARNING,
     "permissions that are valid for longer than the certificate",
-    "They can be used with a later certificate of the same subject, even if its rights have "
-    "changed since.",
+    "They can be used with a later certificate of the same subject, even if the enclave's rights "
+    "have changed since.",
     "ros2/sros2 issue 275; DDS-Security 1.1, 9.4.1.3.",
-    "Run `sros renew KEYSTORE ENCLAVE`, which signs permissions that expire with the certificate "
-    "at the latest.",
+    "Run `sros renew KEYSTORE ENCLAVE`, which signs permissions that expire no later than the "
+    "certificate.",
 )
 NAME_MISMATCH = FindingKind(
     "enclave.name-mismatch",
@@ -220,7 +220,7 @@ TOKEN_ON_ZENOH = FindingKind(
     "zenoh.key-on-token",
     WARNING,
     "a Zenoh configuration of an enclave whose key is on a token",
-    "Zenoh reads its key from key.pem alone, so a process of rmw_zenoh_cpp does not start.",
+    "Zenoh reads the key only from key.pem, so a process of rmw_zenoh_cpp does not start.",
     "Zenoh 1.x (io/zenoh-links/zenoh-link-tls); rmw_zenoh_cpp.",
     "Use a key in a file, or Fast DDS.",
 )
@@ -228,8 +228,8 @@ PIN_FILE = FindingKind(
     "enclave.pin-file",
     WARNING,
     "a PIN file that other users can read, or that Fast DDS cannot read",
-    "Whoever can read it can use the key while the token is there; a node that cannot read it does "
-    "not start.",
+    "Anyone who can read the file can use the key while the token is there; a node that cannot "
+    "read the file does not start.",
     "RFC 7512, 2.4 and 4; libp11 0.4.12 (eng_parse.c), measured.",
     "Write the PIN alone into the file, with mode 0600, for the user that runs the node.",
 )

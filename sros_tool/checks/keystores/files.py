@@ -140,7 +140,7 @@ FOREIGN_STAGE = FindingKind(
     ERROR,
     "an interrupted write that sros cannot have left",
     "Somebody else may have forged it, in the keystore or in the archive that the keystore came "
-    "from, so that sros moves files in your name. Every verb that writes refuses to go on.",
+    "from, to make sros move files with your rights. Verbs that write refuse to continue.",
     "sros: keystore/transaction/stage.py; CWE-59.",
     "Find out who can write to the keystore, look at what is in the folder, and remove it.",
 )
@@ -156,7 +156,8 @@ ARCHIVE = FindingKind(
     "keystore.archive",
     WARNING,
     "an archive or a container of keys where none belongs",
-    "It may hold private keys; a backup of the keystore has its CA keys. sros does not open it.",
+    "It may contain private keys: a backup of the keystore, for instance, contains its CA keys. "
+    "sros does not open it.",
     "ROS 2 keystore layout: private/ alone is for keys of CAs.",
     "Look at what is in it, and move it to a safe place. If others had access to a CA key in it, "
     "replace the CA (`sros rotate_ca`).",
@@ -167,7 +168,7 @@ CA_KEY_ON_ROBOT = FindingKind(
     "a CA key in an export for a robot",
     "An attacker on the robot can create any enclave, with any rights.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "Make sure that the keystore that the export is from has the key, and remove it here. If "
+    "Make sure that the keystore that made the export has the key, and remove the key here. If "
     "others had access, replace the CA in that keystore (`sros rotate_ca`).",
 )
 HOME_OR_ROBOT = FindingKind(
@@ -488,7 +489,7 @@ def _other(
         return
     name = Path(path).name
     if _ARCHIVES.search(name) and place not in (PRIVATE, REVOKED, RETIRED):
-        yield ARCHIVE.found(path, "an archive or a container of keys is not part of it", path)
+        yield ARCHIVE.found(path, "a keystore contains no archive and no container of keys", path)
         return
     known = (
         (inside == "." and (name in _TOP or SEALED_LEDGER.fullmatch(name)))

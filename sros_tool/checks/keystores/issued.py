@@ -63,7 +63,7 @@ OLD_PERMISSIONS = FindingKind(
     "enclave.old-permissions",
     ERROR,
     "replaced permissions are in use again",
-    "Their signature is valid, and if the subject stays the same DDS accepts them until they "
+    "Their signature is valid, and if the subject stays the same, DDS accepts them until they "
     "expire. Perhaps a backup was restored, or someone tries to get back a removed right.",
     "ros2/sros2 issue 275; sros: ledger.jsonl.",
     "Sign the intended permissions with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`. "
@@ -137,8 +137,8 @@ ROOT_ENCLAVE = FindingKind(
     "keystore.root-enclave",
     WARNING,
     "an enclave / with all rights of other enclaves",
-    "Every process that is started without an enclave runs in /, and gets all of its rights; "
-    "without an enclave / in the keystore, it does not start.",
+    "A process that names no enclave runs in /, and gets all rights of /; if the keystore has no "
+    "enclave /, the process does not start.",
     "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",
     "Start each process in its enclave, run `sros revoke KEYSTORE /`, and remove the enclave / "
     "from the policy.",
@@ -333,7 +333,7 @@ def _lists(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> It
         crl = load_crl(keystore.opened.read(path, "revocation list"), f"'{path}'")
         for summary in older:
             folder = str(enclave_path(keystore.root, summary.name))
-            of = f"the one of {newest.name} has number {newest.list_number}"
+            of = f"the list of {newest.name} has number {newest.list_number}"
             if crl.revokes(summary.serial):
                 yield REVOKED_BY_NEWER_LIST.found(summary.name, f"{of}, and revokes it", folder)
             elif (

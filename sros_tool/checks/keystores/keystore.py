@@ -337,9 +337,9 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list
         f"{len(names)} enclaves that the keystore never issued"
         if len(names) > 1
         else "an enclave that the keystore never issued",
-        f"{some_names(names)}: neither certificate nor permissions are in the ledger, as "
-        f"`ros2 security create_enclave` leaves them. Found: {_kinds(chosen)}.",
-        f"If you made it, state its rights by `{command}`, which also issues the certificate "
+        f"{some_names(names)}: the ledger has neither the certificate nor the permissions; `ros2 "
+        f"security create_enclave` leaves enclaves in this state. Found: {_kinds(chosen)}.",
+        f"If you made it, state its rights with `{command}`, which also issues the certificate "
         "again. If nobody did, somebody else has the CA key: revoke the enclave, and replace the "
         "CA (`sros rotate_ca`).",
     )

@@ -19,8 +19,8 @@ NO_ROS_NAME = FindingKind(
     "permissions.no-ros-name",
     WARNING,
     "names that no ROS topic, service or action has",
-    "The DDS name of a ROS topic begins with rt/, those of a service with rq/ and rr/. A rule for "
-    "another name decides on nothing that a node does, so what it should allow is denied, and what "
+    "DDS names of ROS topics begin with rt/, those of services with rq/ and rr/. A rule with "
+    "another name matches nothing that a node does: what the rule should allow is denied, and what "
     "it should deny may be allowed.",
     _MAPPING,
     "Write the DDS name, such as rt/chatter, rq/addRequest and rr/addReply, or let sros write it: "
@@ -31,10 +31,10 @@ NOT_FOR_ROS = FindingKind(
     "permissions.not-for-ros",
     NOTE,
     "permissions without any name of ROS 2",
-    "No node of ROS 2 can run in this enclave: it needs ros_discovery_info, and the DDS name of a "
-    "ROS topic begins with rt/, those of a service with rq/ and rr/.",
+    "No node of ROS 2 can run in this enclave: a node needs ros_discovery_info, and the DDS names "
+    "of ROS topics begin with rt/, those of services with rq/ and rr/.",
     _MAPPING,
-    "None is needed if a program uses DDS without ROS. Otherwise give the enclave a policy: `sros "
+    "Nothing to do if a program uses DDS without ROS. Otherwise give the enclave a policy: `sros "
     "create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
     prominent=True,
 )

@@ -71,7 +71,7 @@ DIFFER = FindingKind(
     "vendors that decide differently on the same permissions",
     "An access that works with one RMW is denied, or open to everybody, with another.",
     _ENGINE,
-    "Stay inside the portable profile; `sros explain --all-vendors` shows the decision of each "
+    "Use only the portable profile; `sros explain --all-vendors` shows the decision of each "
     "vendor.",
 )
 

@@ -35,7 +35,7 @@ UNSIGNED = FindingKind(
     "zenoh.unsigned",
     ERROR,
     "a Zenoh configuration that the permissions CA has not signed",
-    "Whoever could write the file chose its rules: the process may enforce nothing.",
+    "Anyone who could write the file may have changed its rules: the process may enforce nothing.",
     _SOURCE,
     _AGAIN,
 )
@@ -43,9 +43,9 @@ OTHER_DOCUMENT = FindingKind(
     "zenoh.other-document",
     ERROR,
     "a Zenoh configuration that is not the signed one next to it",
-    "Somebody changed it after it was signed, and Zenoh reads it as it is now.",
+    "Somebody changed it after it was signed, and Zenoh reads the changed file.",
     _SOURCE,
-    f"Find out who did. {_AGAIN}",
+    f"Find out who changed it. {_AGAIN}",
 )
 OUT_OF_DATE = FindingKind(
     "zenoh.out-of-date",
@@ -59,9 +59,10 @@ LEFT_OVER = FindingKind(
     "zenoh.left-over",
     WARNING,
     "a signed Zenoh configuration that its enclave should not have",
-    "A process that uses it enforces rules that the keystore no longer keeps in step.",
+    "A process that uses it enforces rules that sros no longer updates.",
     _SOURCE,
-    "Run `sros zenoh KEYSTORE`, or remove all with `sros zenoh KEYSTORE --off`.",
+    "Run `sros zenoh KEYSTORE`, or remove all Zenoh configurations with `sros zenoh KEYSTORE "
+    "--off`.",
 )
 LEFT_OUT = FindingKind(
     "zenoh.left-out",
@@ -76,12 +77,12 @@ SHARED_NODE = FindingKind(
     "zenoh.shared-node",
     WARNING,
     "a node that several enclaves may announce in the graph",
-    "rmw_zenoh removes a node from the graph without checking its enclave: a process of one of "
-    "these enclaves can remove or imitate the node of another one, whose topics and services are "
-    "then not found, although its data pass.",
+    "rmw_zenoh does not check which enclave removes a node from the graph: a process of one of "
+    "these enclaves can remove or imitate the node of another enclave. The topics and services of "
+    "that node are then not found, although its data pass.",
     "rmw_zenoh (graph_cache.cpp); sros (docs/zenoh.md).",
-    "Name each node in the policy of one enclave. Where a wildcard gives an enclave the services "
-    "of all nodes, deny those of the others' nodes, such as `/camera/*`.",
+    "Name each node in the policy of one enclave. If a wildcard gives an enclave the services of "
+    "all nodes, deny the services of other enclaves' nodes, such as `/camera/*`.",
 )
 _RENEW = "Renew it with `sros renew KEYSTORE ENCLAVE`, or revoke it if nobody needs it."
 _EXPIRED = {Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED}
@@ -90,7 +91,7 @@ CANNOT_BE_MADE = FindingKind(
     ERROR,
     "a Zenoh network whose configurations cannot be made",
     "The keystore's settings define the network, but its permissions or its enclaves do not fit "
-    "it, so the files are not kept up to date.",
+    "the network, so sros does not update the files.",
     _SOURCE,
     "Run `sros zenoh KEYSTORE --dry-run` and do what it says.",
 )
@@ -184,5 +185,5 @@ def _of_drift(keystore: CheckedKeystore, drift: Drifted) -> Iterator[Finding]:
     state = keystore.enclave(drift.enclave)
     enclave = CheckedEnclave(keystore, drift.enclave, state)
     found = list(_of_opened(enclave, open_zenoh(enclave.folder, drift.enclave, state)))
-    text = "it is not what the settings and the permissions of the keystore give"
+    text = "the settings and the permissions of the keystore give another configuration"
     yield from found or [OUT_OF_DATE.found(drift.enclave, text, file)]

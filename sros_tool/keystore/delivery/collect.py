@@ -406,8 +406,8 @@ def _unknown_names(inbox: Path, fleet: Fleet) -> Iterator[Note]:
         verb = "is" if len(unknown) == 1 else "are"
         yield Note(
             "fleet.unknown-in-inbox",
-            f"{counted(len(unknown), 'name')} in '{inbox}' {verb} that of no robot of the fleet, "
-            f"and {verb} not read: {first_few(unknown, _SHOWN)}.",
+            f"{counted(len(unknown), 'name')} in '{inbox}' {verb} not in the fleet, and {verb} not "
+            f"read: {first_few(unknown, _SHOWN)}.",
         )
 
 
@@ -475,7 +475,7 @@ class _Verifier:
             signed = smime.parse_new(data)
             signer = signed.signer()
             if signer is None or len(signed.signatures) != 1:
-                raise _RefusedError("it is not signed by exactly one certificate in it")
+                raise _RefusedError("it is not signed by exactly one certificate that it contains")
             signed.verify(signer)
             if weakness := signed.weakness():
                 raise _RefusedError(weakness)
@@ -489,7 +489,7 @@ class _Verifier:
         if confirmation.robot != robot.name:
             raise _RefusedError(f"it is the confirmation of {confirmation.robot}")
         if confirmation.sequence is None:
-            raise _RefusedError("it has no sequence number, as `sros agent` gives it")
+            raise _RefusedError("it has no sequence number, although `sros agent` writes one")
         return _Verified(confirmation, enclave, signer)
 
     def was_revoked(self, robot: Robot) -> bool:
@@ -519,7 +519,7 @@ class _Verifier:
         validity = validity_of(signer)
         moment = min(max(self._now, validity.not_before), validity.not_after)
         if fault := chain_fault(signer, self._authorities, at=moment):
-            raise _RefusedError(f"its certificate is of no identity CA of the keystore: {fault}")
+            raise _RefusedError(f"no identity CA of the keystore issued its certificate: {fault}")
         if signer.serial_number in self._revoked:
             raise _RefusedError(f"its certificate, {signer.serial_number:x}, was revoked")
         issued = self._issued(digest(signer))
@@ -530,7 +530,7 @@ class _Verifier:
             )
         owner = robot_of(self._fleet, issued.enclave)
         if owner != robot:
-            whose = f"an enclave of {owner.name}" if owner else "which is of no robot"
+            whose = f"an enclave of {owner.name}" if owner else "which belongs to no robot"
             raise _RefusedError(f"it is signed by {issued.enclave}, {whose}")
         return issued.enclave
 
@@ -660,13 +660,13 @@ class _Renewals:
             )
         if not same_key and message.enclave != name:
             raise _RefusedError(
-                f"it has a new key, which only {name} itself can vouch for, and {message.enclave} "
-                "signed the message"
+                f"it has a new key, so {name} itself has to sign the message, but "
+                f"{message.enclave} signed it"
             )
         if not same_key and message.certificate.public_key() != present.public_key():
             raise _RefusedError(
-                f"it has a new key, which only the present key of {name} can vouch for, but an "
-                "earlier key signed the message"
+                f"it has a new key, so the present key of {name} has to sign the message, but an "
+                "earlier key signed it"
             )
         for certificate in (message.certificate, present):
             self._check_grace(robot, validity_of(certificate))

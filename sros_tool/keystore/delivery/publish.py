@@ -223,8 +223,8 @@ def publish(
             except OSError as error:  # such as of a full disk
                 raise KeystoreError(
                     f"not all files could be written in '{folder}'",
-                    f"{error.strerror}. Robots find what was there before, or all that is new.",
-                    "Publish again once that is mended.",
+                    f"{error.strerror}. Robots find either all earlier files or all new files.",
+                    "Repair the cause, and publish again.",
                 ) from error
         return run.result(keys)
 
@@ -315,8 +315,8 @@ class _Keys:
         first = not self.roots.versions
         if first and (there := [role for role in _ROLES if self._path(role).exists()]):
             raise KeystoreError(
-                f"'{self._root}' has the {there[0]} key of what it publishes, but no {FLEET_ROOT}",
-                "It says which keys robots trust.",
+                f"'{self._root}' has the {there[0]} key for publishing, but no {FLEET_ROOT}",
+                "This file says which keys robots trust.",
                 f"Restore {FLEET_ROOT} from a backup.",
             )
         self.rotated = () if first else tuple(role for role in _ROLES if role in rotate)
@@ -328,7 +328,7 @@ class _Keys:
         if left < expiry.root / 3 and not self.has_new_root:
             text = (
                 f"the root metadata expires at {iso(self.roots.last.expires)}, and robots then "
-                "refuse everything: publish with --root-key FILE before"
+                "refuse everything: before then, publish with --root-key FILE"
             )
             self.notes.append(Note("fleet.root-expires", text))
 
@@ -370,7 +370,7 @@ class _Keys:
             if must or self._elsewhere:
                 raise KeystoreError(
                     f"the root key '{path}' does not exist",
-                    "It has to sign which keys robots trust.",
+                    "This key signs the list of the keys that robots trust.",
                     "Name its file with --root-key.",
                 )
             return
@@ -585,15 +585,15 @@ class _Run:
             f"'{self._folder}' has nothing that the keystore '{self.keystore.root}' published",
             "The keystore has published before. If it was restored from a backup and the folder "
             "was lost, too, robots that were revoked since would get releases again.",
-            "Name the folder in which it publishes. If that is lost, or this is a further one, add "
-            "--new-folder; if the keystore was restored, first revoke again what was revoked, and "
-            "add --restored as well.",
+            "Name the folder in which the keystore publishes. If that folder is lost, or this is "
+            "an additional folder, add --new-folder; if the keystore was restored, first repeat "
+            "its later revocations, and add --restored as well.",
         )
 
     def _has_later_releases(self, restored: bool) -> bool:
         """Return whether the folder has later releases; refuse that unless ``restored``."""
         if self.list.number >= (unused := self.keystore.ledger_file.next_number()):
-            why = f"It has release {self.list.number}, and the ledger none after {unused - 1}."
+            why = f"It has release {self.list.number}, but the ledger has none after {unused - 1}."
             raise damaged_list(self.keystore, why)
         latest = self._latest
         if latest <= self.list.number:
@@ -658,10 +658,12 @@ class _Run:
         for robot, there in last:
             try:
                 if not (data := self._read(robot, there)):
-                    raise DocumentError(f"'{self._folder / there.path(robot)}' is not there, whole")
+                    raise DocumentError(
+                        f"'{self._folder / there.path(robot)}' is missing or incomplete"
+                    )
                 release = read_release(data)
                 if release.number != there.number:
-                    raise DocumentError(f"the release of {robot} has another number than was said")
+                    raise DocumentError(f"the release of {robot} does not have the recorded number")
             except SrosError as error:
                 problem = problem or f"{error.what[:1].upper()}{error.what[1:]}."
                 continue
@@ -672,9 +674,9 @@ class _Run:
         else:
             raise KeystoreError(
                 f"no last release in '{self._folder}' can be read",
-                f"{problem} So it cannot be told which revocations the keystore lacks.",
-                "Put it there from a copy of the folder, or from the robot, whose agent has it as "
-                "FOLDER/.agent/release.tar.gz.",
+                f"{problem} So it is not known which revocations the keystore lacks.",
+                "Copy a release there from a copy of the folder, or from the robot, whose agent "
+                "keeps it as FOLDER/.agent/release.tar.gz.",
             )
         return forgotten
 

@@ -28,7 +28,7 @@ _MOST_BYTES = 128 * 1024 * 1024
 _SMALL = 64 * 1024
 MOST_NUMBER = 10**12 - 1
 """Highest number of a release, as a seal can state it, and highest version of metadata."""
-BEGIN_AGAIN = "Begin again as after the theft of all keys: docs/fetching.md says how."
+BEGIN_AGAIN = "Start again as after a theft of all keys: docs/fetching.md says how."
 """Remedy for numbers that somebody has counted up as far as they go."""
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 
@@ -60,7 +60,7 @@ class PublishedRelease(NamedTuple):
 def check_count(value: object, most: int = MOST_NUMBER) -> int:
     """Return a number of a release or a version; raise `ValueError` if it is none."""
     if type(value) is not int or not 1 <= value <= most:
-        raise ValueError("a number or version is none, or too high")
+        raise ValueError("a number or version is not a number, or is too high")
     return value
 
 

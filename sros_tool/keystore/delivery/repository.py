@@ -86,7 +86,7 @@ def replaced_key(role: str) -> str:
 
 
 _NAME_ROOT = (
-    "Name the right file with --root-key. After a rotation of this key that was killed, it is "
+    "Name the right file with --root-key. If a rotation of this key was killed, the right file is "
     "FILE.new, next to the earlier one."
 )
 

@@ -359,12 +359,12 @@ class _Signer:
             refuse_stale_domains(root, before, fleet, stated)
         for name, of_enclave in stated.items():
             if of_enclave.path and not (fleet and robot_of(fleet, name)):
-                lacks = "its fleet does not have the robot" if fleet else "it has no fleet for that"
+                lacks = "its fleet does not have the robot" if fleet else "it has no fleet"
                 change.notes.append(
                     Note(
                         "fleet.unrecorded-enclaves",
-                        f"The keystore does not record whose enclave {name} is: {lacks} of enclave "
-                        f"{name}. `--robot` chooses it, and revokes it, after `sros "
+                        f"The keystore does not record which robot enclave {name} belongs to: "
+                        f"{lacks}. `--robot` can choose and revoke the enclave only after `sros "
                         f"generate_artifacts -k {quote(str(root))} -p POLICY_FILE --fleet "
                         "FLEET_FILE`.",
                     )

@@ -143,7 +143,7 @@ def refuse_stopping(
         Note(
             "vendor.refuses",
             f"{vendor.title} refuses {_some(refusals.enclaves)} from now on: "
-            f"{'; '.join(refusals.reasons)}. Running nodes go on until they are started again.",
+            f"{'; '.join(refusals.reasons)}. Running nodes continue until they are restarted.",
         )
         for vendor, refusals in stopped.items()
     ]
@@ -271,8 +271,8 @@ def _would_be_shut_out(
     options = " ".join(f"--allow-refusal {word}" for word in words_of(vendors))
     return KeystoreError(
         f"processes that still have certificates of {name} would be refused in '{root}'",
-        f"With any revocation list, {demand} a list of each CA, and the keyUsage of "
-        f"{name} lacks cRLSign. Nothing was changed.",
+        f"Once there is a revocation list, {demand} a list of each CA, but the keyUsage of {name} "
+        "lacks cRLSign. Nothing was changed.",
         f"{remedy} If no process runs with such a certificate, add {options}.",
     )
 

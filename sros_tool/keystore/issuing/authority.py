@@ -75,7 +75,7 @@ class Authority:
         """
         if self.own_key is None:
             raise KeystoreError(
-                f"only its CA service signs as {authority_text(self.certificate)}",
+                f"only the CA service can sign for {authority_text(self.certificate)}",
                 "The key is not here.",
             )
         return self.own_key
@@ -175,8 +175,8 @@ def create_authorities(
                 raise UsageError(
                     f"the certificate of the CA service '{service.place}' is missing",
                     "",
-                    "Run `sros create_keystore` with --identity-ca FILE, which has it and the "
-                    "certificates above it.",
+                    "Run `sros create_keystore` with --identity-ca FILE, a file with this "
+                    "certificate and the certificates of its issuers.",
                 )
             existing = check_imported(role, imported[role], None, now)
             transaction.write(f"{PUBLIC}/{file}.cert.pem", existing.bundle)

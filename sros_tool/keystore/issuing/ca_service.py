@@ -227,19 +227,19 @@ def _fault(
     if len(names) > 1 or not subject.issuperset((part.oid, part.value) for part in asked.subject):
         has, wanted = subject_text(certificate.subject), subject_text(asked.subject)
         return (
-            f"its subject is {has}, and should be {wanted}, to which parts may be added. Let the "
-            "service take it from $SROS_SUBJECT. For a service that takes it from the request of a "
-            "robot, set certificates.unique_subject to false"
+            f"its subject is {has}; it should be {wanted}, perhaps with more parts. Let the "
+            "service take the subject from $SROS_SUBJECT. If the service takes it from the request "
+            "of a robot, set certificates.unique_subject to false"
         )
     constraints = extension(certificate, x509.BasicConstraints)
     if (constraints and constraints.ca) or not denies_issuing(certificate):
-        return "it is the certificate of a CA, or does not say that it is none"
+        return "it is a CA certificate, or does not state that it is not one"
     if not (validity.contains(now) or validity.contains(now + _AHEAD)):
         return f"it is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, not now"
     if validity.not_after > asked.validity.not_after:
         return (
-            f"it expires at {iso(validity.not_after)}, later than {iso(asked.validity.not_after)}, "
-            "which was asked for"
+            f"it expires at {iso(validity.not_after)}, later than the requested "
+            f"{iso(asked.validity.not_after)}"
         )
     if not 0 < certificate.serial_number.bit_length() <= _MOST_SERIAL_BITS:
         return "no revocation list can have its serial number"

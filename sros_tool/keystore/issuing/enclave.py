@@ -338,7 +338,7 @@ class EnclaveWriter:
                 return known.pem
         raise KeystoreError(
             f"the key of enclave {name} is not in this keystore, nor a request that it signed",
-            "A CA service wants the proof that somebody has the key.",
+            "A CA service requires proof that the requester has the key.",
             "Create a request on the robot with `sros create_request`, and sign it here with "
             "`sros sign_request --renew`.",
         )

@@ -254,7 +254,7 @@ def absolute_place(place: str) -> str:
 def _refuse_ca_service(role: str, place: str) -> None:
     if is_ca_service(place):
         raise KeystoreError(
-            f"the key of the {role} CA is that of a CA service, '{place}'",
+            f"the key of the {role} CA belongs to the CA service '{place}'",
             "The service issues certificates, and sros has no key to sign anything else, or to "
             "replace the CA.",
         )

@@ -156,6 +156,6 @@ def _revoked_names(
         yield Note(
             "zenoh.revoked-name",
             f"a revoked certificate of {', '.join(again)} has not expired: Zenoh has no revocation "
-            "list, and gives whoever has it the rights of that enclave. Give the enclave another "
-            "name, or replace the identity CA with `sros rotate_ca`.",
+            "list, so anyone who has the certificate gets the rights of that enclave. Give the "
+            "enclave another name, or replace the identity CA with `sros rotate_ca`.",
         )

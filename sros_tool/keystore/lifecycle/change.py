@@ -342,9 +342,9 @@ class KeystoreChange:
         if revoke_old and self.identity.service:
             raise KeystoreError(
                 "a CA service does not revoke earlier certificates in the same step",
-                "It signs its revocation list only once the new certificates are there.",
-                "Leave --revoke-old out, revoke the earlier ones there, and give its list: `sros "
-                f"crl {quote(str(self.root))} --refresh --crl FILE`.",
+                "It signs its revocation list only once the keystore has the new certificates.",
+                "Leave --revoke-old out, revoke the earlier certificates at the service, and give "
+                f"its list: `sros crl {quote(str(self.root))} --refresh --crl FILE`.",
             )
         return EnclaveWriter(
             self.transaction,
@@ -547,8 +547,8 @@ class KeystoreChange:
 
 def _no_network(root: Path) -> Note:
     text = (
-        "the fleet names routers of robots, which begin with the Zenoh network of the keystore: "
-        f"`sros zenoh {quote(str(root))}`."
+        "the fleet names Zenoh routers of robots, but the keystore has no Zenoh network yet; "
+        f"create it with `sros zenoh {quote(str(root))}`."
     )
     return Note("fleet.no-zenoh-network", text)
 

@@ -98,8 +98,8 @@ def raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection])
         exports_note(root, change.names),
         Note(
             "keystore.earlier-governance",
-            "The signature of the former governance stays valid: whoever changes the files of a "
-            "robot can put it back there, until the CA that signed it is replaced (`sros "
+            "The signature of the former governance stays valid: anyone who can change the files "
+            "of a robot can put it back there, until the CA that signed it is replaced (`sros "
             "rotate_ca --help`).",
         ),
         *_zenoh_notes(template),
@@ -143,15 +143,14 @@ def restart_note(disturbed: Mismatch, *, revoked: bool = False) -> Note:
 def _restart_text(disturbed: Mismatch, *, revoked: bool) -> str:
     if revoked and not disturbed.everything:
         return (
-            "All vendors: restart all processes together; processes after the restart refuse the "
-            "revoked certificates of processes before it. Until then, running processes "
-            "communicate as before."
+            "All vendors: restart all processes together; restarted processes refuse the revoked "
+            "certificates of other processes. Until then, running processes communicate as before."
         )
     if disturbed:
         which, what = "all processes", "do not communicate"
         if not disturbed.everything:
             which = "the processes that use these names"
-            what += f" on {', '.join(disturbed.names)}, and do on everything else"
+            what += f" on {', '.join(disturbed.names)}, but do on everything else"
         return (
             f"Cyclone DDS and Fast DDS: restart {which} together; processes before and after the "
             f"restart {what}. Until then, running processes communicate as before."
@@ -166,8 +165,8 @@ def exports_note(root: Path, names: Sequence[str]) -> Note:
     """Return a note that robots need new files, with the commands that deliver them."""
     if published := publish_command(root):
         text = (
-            f"Robots have the former files: publish the new ones ({published}); where nodes run "
-            "from an export, export them again."
+            f"Robots have the former files: publish the new ones ({published}); if nodes run from "
+            "an export, export them again."
         )
         return Note("keystore.export-again", text)
     shown = quote(str(root))

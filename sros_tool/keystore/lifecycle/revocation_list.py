@@ -237,7 +237,7 @@ class RevocationListSigner:
         if given and not authority.service:
             raise UsageError(
                 "the keystore signs its revocation list itself",
-                "Only where a CA service is the identity CA is a list given.",
+                "--crl is only for a keystore whose identity CA is a CA service.",
                 "Leave --crl out.",
             )
         self._given = given
@@ -361,7 +361,7 @@ class RevocationListSigner:
         why = list(ledger.gaps)
         if ledger.unchained:
             why.append(
-                f"nothing shows whether a line was removed from its first {ledger.unchained}"
+                f"nothing shows whether one of its first {ledger.unchained} lines was removed"
             )
         recorded = {int(entry.serial, 16) for entry in ledger.entries if entry.serial}
         lacking = (
@@ -476,7 +476,10 @@ class RevocationListSigner:
                 the present list, is not valid now, or does not revoke all ``serials``.
         """
         numbers = ", ".join(sorted(f"{serial:x}" for serial in serials)) or "nothing"
-        remedy = f"Revoke the certificates there ({numbers}), and give its list with --crl FILE."
+        remedy = (
+            f"Revoke the certificates at the service ({numbers}), and give its list with --crl "
+            "FILE."
+        )
         if not self._given:
             raise KeystoreError(
                 f"the identity CA of keystore '{self._root}' is a CA service, and it alone signs "
@@ -673,7 +676,7 @@ def another_ca(keystore: Keystore, aim: str) -> str:
     if read_rotation(keystore).stage is not RotationStage.NONE:
         return (
             f"First retire the old CA: `{' '.join(words)} --finish`, restart all processes, and "
-            f"{aim} then."
+            f"then {aim}."
         )
     if len(keystore.authority_files) > 1:
         words.append("--identity")
@@ -681,5 +684,5 @@ def another_ca(keystore: Keystore, aim: str) -> str:
         words.append("--identity-key URI")
     return (
         f"Replace the identity CA by a CA that may sign revocation lists: `{' '.join(words)} "
-        f"--finish`, restart all processes, and {aim} then."
+        f"--finish`, restart all processes, and then {aim}."
     )

@@ -180,8 +180,8 @@ def restore_revocations(
         if replaced:
             names = " ".join(sorted(replaced))
             raise KeystoreError(
-                "certificates were replaced after the backup, and are revoked: give their enclaves "
-                f"others first, with `sros renew {quote(str(root))} {names}`"
+                "certificates were revoked because they were replaced after the backup: first give "
+                f"their enclaves new certificates, with `sros renew {quote(str(root))} {names}`"
             )
         _check_names(change, tuple(again))
         revocations = []
@@ -257,8 +257,8 @@ def restored_note(restored: Changed, whence: str) -> Note:
     """Return a note on lists that `restore_revocations` took from ``whence``."""
     again = "would be revoked again" if restored.dry_run else "is revoked again"
     text = (
-        f"{whence} a revocation list that the keystore signed and does not know: it was restored "
-        f"from a backup, or is a copy. What the list revokes {again}"
+        f"{whence} a revocation list that the keystore signed but does not know: the keystore was "
+        f"restored from a backup, or is a copy. Everything on the list {again}"
     )
     if restored.outcomes:
         text += f", with {first_few(tuple(restored.outcomes), _SHOWN)}"

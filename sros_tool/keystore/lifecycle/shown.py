@@ -219,7 +219,7 @@ class EnclaveWithoutZenoh(NamedTuple):
     enclave: str
     """The enclave."""
     why: str
-    """Why it has none, as a clause."""
+    """Why the enclave has no file, as a clause."""
 
 
 class KeystoreZenoh(NamedTuple):

@@ -207,7 +207,7 @@ def _checked_target(root: Path, present: PresentSettings, target: Template) -> T
         wanted, place = getattr(target, name), getattr(present.settings, name)
         if wanted and wanted != place:
             raise UsageError(
-                f"the settings name '{wanted}' as the place of a CA key, and it is at "
+                f"the settings name '{wanted}' as the place of a CA key, but it is at "
                 f"'{place or PRIVATE}'",
                 "An update moves no CA key.",
                 f"Leave authorities.{name} out; `sros rotate_ca --{name.replace('_', '-')}` makes "
@@ -218,7 +218,8 @@ def _checked_target(root: Path, present: PresentSettings, target: Template) -> T
             "a keystore with separate CAs cannot change back to one CA for both",
             "With one CA, every enclave can sign its own permissions (Cyclone DDS 0.10.2, Fast DDS "
             "2.9.1).",
-            "Add --set authorities.layout=separate to keep them, or create another keystore.",
+            "Add --set authorities.layout=separate to keep separate CAs, or create another "
+            "keystore.",
         )
     known = hidden_protections(present.settings.protection)
     for hidden, by in hidden_protections(target.protection):
@@ -226,7 +227,7 @@ def _checked_target(root: Path, present: PresentSettings, target: Template) -> T
             raise UsageError(
                 f"the settings would protect {hidden} twice, and the second rule would never apply",
                 f"The rule for {by} decides on the same names.",
-                "State one rule for them.",
+                "State one rule for these names.",
             )
     return with_places(with_values(target), present.settings)
 
@@ -664,8 +665,8 @@ class _Updater:
         shared = same_key(identity, self._change.permissions.key)
         if self._goal.settings.separate_authorities and shared:
             text = (
-                "Identity CA and permissions CA have files of their own now, and still the same "
-                "key, so an enclave can sign its own permissions, until the permissions CA is "
+                "Identity CA and permissions CA now have files of their own, but still the same "
+                "key, so an enclave can sign its own permissions until the permissions CA is "
                 f"replaced: {self._rotation(f' --{PERMISSIONS}')}."
             )
             return [Note("keystore.one-authority", text)]
@@ -742,7 +743,7 @@ def trust_records(
         change.record()
         change.transaction.commit()
     text = (
-        f"taken on trust: the rights of {counted(len(names), 'enclave')}, as the ledger "
+        f"accepted without proof: the rights of {counted(len(names), 'enclave')}, as the ledger "
         "has them in lines without a chain. If somebody removed one of these lines, older "
         "permissions may be in force again: compare them with your policy (`sros diff_policy`)."
     )

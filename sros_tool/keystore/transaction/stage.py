@@ -322,6 +322,6 @@ def _unknown(folder: Folder, why: str) -> KeystoreError:
 def _foreign(folder: Folder, why: str) -> KeystoreError:
     return KeystoreError(
         f"'{folder.path / STAGE}' is not an interrupted change of yours",
-        f"{why} Somebody else may have put it there, so that files are moved in your name.",
+        f"{why} Somebody else may have put it there, to make sros move files with your rights.",
         "Find out who can write to the keystore, look at its content, and remove it.",
     )
