@@ -272,7 +272,7 @@ def _check_token_used(place: TokenUri, name: str, rmw: str) -> None:
     if rmw and not (vendor and vendor.traits.reads_tokens):
         raise KeystoreError(
             f"a process of {rmw} cannot run in enclave {name}",
-            f"Its key is on the token {place.token!r}, and {rmw} reads a key from key.pem alone.",
+            f"Its key is on the token {place.token!r}, but {rmw} reads a key only from key.pem.",
             "Use rmw_fastrtps_cpp of ROS 2 Jazzy or later, or an enclave with a key in a file.",
         )
 
@@ -303,7 +303,7 @@ def _uses_zenoh(named: str | None, rmw: str) -> bool:
 
     if named is not None and named not in RMWS:
         raise UsageError(
-            f"--rmw {named!r} is not an RMW that sros knows to enforce security",
+            f"--rmw {named!r} is not an RMW that is known to enforce security",
             "",
             f"Choose one of {', '.join(RMWS)}.",
         )
@@ -311,7 +311,7 @@ def _uses_zenoh(named: str | None, rmw: str) -> bool:
         return True
     if (middleware := middleware_of(rmw)) and middleware.name == "Zenoh":
         raise UsageError(
-            f"{RMW} is {rmw!r}, which is not an RMW that sros knows to enforce security",
+            f"{RMW} is {rmw!r}, which is not an RMW that is known to enforce security",
             f"The only RMW on Zenoh that sros knows is {RMW_ZENOH}.",
             f"Set {RMW} to another RMW, or name an RMW with --rmw.",
         )
@@ -391,7 +391,7 @@ def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
     if drifted(now) and drifted(None):
         where = quote(str(keystore.root))
         raise KeystoreError(
-            f"the Zenoh configuration of enclave {name} is not in step with the keystore",
+            f"the Zenoh configuration of enclave {name} does not match the keystore",
             "It contains rights of other enclaves that differ from their permissions.",
             f"Write it again: `sros zenoh {where}`, and restart the processes that it names.",
         )

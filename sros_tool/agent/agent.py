@@ -98,8 +98,9 @@ class Round(NamedTuple):
     restart: Sequence[str]
     """Enclaves whose processes were not yet seen with the installed files."""
     unseen: Sequence[str]
-    """Those of ``restart`` of which no process was seen, while not all processes here can be seen:
-    with ``--restarted``, these restarts are done."""
+    """Enclaves of ``restart`` of which no process was seen, although not all processes here can be
+    seen. ``--restarted`` says that these restarts are done.
+    """
     requests: int
     """Number of signing requests in the message."""
     sent: bool
@@ -225,7 +226,7 @@ class _Round:
                 else "its certificates are not valid before"
             )
             self._problems.append(
-                f"The clock shows {iso(now)}, but {what} {iso(proven)}: it is at least "
+                f"The clock shows {iso(now)}, but {what} {iso(proven)}: the clock is at least "
                 f"{elapsed(proven - now)} behind. Nothing is restarted; set the clock."
             )
             return RobotClock.BEHIND
@@ -295,9 +296,10 @@ class _Round:
         settings, state = self._settings, self._state
         if release.number == state.accepted and self._differs_from_accepted(release):
             self._problems.append(
-                f"Another release with the number {release.number}, which is installed here, is "
-                "published: the keystore at home comes from a backup, or somebody else publishes. "
-                "Nothing was changed. At home: `sros fleet publish KEYSTORE PUB --restored`."
+                f"The published release has the number {release.number} of the installed release, "
+                "but other files: the keystore at home comes from a backup, or somebody else "
+                "publishes. Nothing was changed. At home: `sros fleet publish KEYSTORE PUB "
+                "--restored`."
             )
             return Installation()
         names = tuple({*release.enclaves(), *search_enclaves(self._folder)[0]})

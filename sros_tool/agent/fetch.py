@@ -108,14 +108,14 @@ def pin_root(state: Path, data: bytes, *, now: datetime) -> str:
             FetchProblem.NOT_SIGNED,
             "the file is not the root metadata of a publishing folder",
             f"{_sentence(error)}",
-            "Take root.json from PUB/metadata as `sros fleet publish` wrote it at home.",
+            "Use the root.json that `sros fleet publish` wrote into PUB/metadata at home.",
         ) from error
     if root.signed.is_expired(now):
         raise FetchError(
             FetchProblem.EXPIRED,
             f"the root metadata expired at {iso(root.signed.expires)}",
             "",
-            "Take the present root.json of the publishing folder; or set the clock of this robot.",
+            "Use the present root.json of the publishing folder; or set the clock of this robot.",
         )
     with Folder(state) as folder:
         if folder.is_folder(_METADATA):
@@ -215,8 +215,8 @@ def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datet
         raise FetchError(
             FetchProblem.NOT_SIGNED,
             f"'{state}' has no {_PINNED_ROOT}",
-            "Without it, no key for the published files is known.",
-            "Name it to `sros agent init` with --root.",
+            "Without it, the agent knows no key for the published files.",
+            "Give it to `sros agent init` with --root.",
         )
     with Folder(state) as folder:
         if not folder.is_folder(_METADATA):
@@ -279,7 +279,7 @@ def _read(path: Path, robot: str, number: int) -> Release:
     if release.robot != robot:
         raise FetchError(
             FetchProblem.NOT_FOR_ROBOT,
-            f"what is published for {robot} is the release of {release.robot}",
+            f"the release that is published for {robot} belongs to {release.robot}",
             "Somebody with the keys of the metadata put it there, or a robot was renamed.",
             "Nothing was changed. Look into it at home.",
         )
@@ -303,7 +303,8 @@ def _explained(error: Exception, source: str, now: datetime) -> FetchError:
         return FetchError(
             FetchProblem.EXPIRED,
             f"the metadata in {source} has expired",
-            f"{why} It is {iso(now)} here. Home publishes no more, or somebody withholds it.",
+            f"{why} The clock here shows {iso(now)}. Home no longer publishes, or somebody "
+            "withholds the new files.",
             f"Run `sros fleet publish` at home; {_CLOCK}.",
         )
     if isinstance(error, exceptions.BadVersionNumberError):

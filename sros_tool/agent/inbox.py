@@ -56,7 +56,9 @@ def send(
             if connection.is_cut_off:  # what came may be a part of the answer
                 raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
     except (OSError, http.client.HTTPException, ValueError) as error:
-        raise UnavailableError(what, f"{error}.", "It is tried again at the next run.") from error
+        raise UnavailableError(
+            what, f"{error}.", ("The agent tries again at its next run.")
+        ) from error
     if not 200 <= reply.status < 300:
         raise UnavailableError(
             what, f"It answers {reply.status} to PUT {where}.", "See the log of the server."
@@ -74,5 +76,5 @@ def _write(inbox: Path, robot: str, message: bytes) -> None:
         raise UnavailableError(
             f"the message cannot be written into '{inbox}'",
             f"{error.strerror or error}.",
-            "It is tried again at the next run.",
+            "The agent tries again at its next run.",
         ) from error

@@ -76,8 +76,9 @@ class Installation(NamedTuple):
     kept: Mapping[str, str] = {}
     """Enclaves that kept their files, except perhaps the revocation list, and why, as a clause."""
     latest: datetime | None = None
-    """When the newest certificate or revocation list was made, as it says, of the enclaves that did
-    not keep their files."""
+    """The newest date of the certificates and revocation lists of the enclaves that did not keep
+    their files.
+    """
 
 
 @dataclass(slots=True)
@@ -186,14 +187,14 @@ def _check_release(
         raise KeystoreError(
             f"the release is of robot {release.robot}, not of {robot}",
             "Nothing was changed.",
-            "See whether this robot has the right name (`sros agent init --robot`).",
+            "Check whether this robot has the right name (`sros agent init --robot`).",
         )
     trusted = [*_trusted(folder, present), *_pinned(release, pinned)]
     if not trusted:
         raise KeystoreError(
             f"'{folder}' trusts no permissions CA yet",
-            "Nothing here can tell whether the release is of your keystore.",
-            "Bring the first enclave by `sros import` or a play, or name the permissions CA with "
+            "Nothing here shows whether the release comes from your keystore.",
+            "Bring the first enclave with `sros import` or a play, or name the permissions CA with "
             "`sros agent init --ca`.",
         )
     if problem := seal_problem(release, trusted):
@@ -201,7 +202,7 @@ def _check_release(
             f"release {release.number} comes from another keystore",
             f"No permissions CA that '{folder}' trusts has sealed it: {problem.rstrip('.')}.",
             "Nothing was changed. If this robot missed a stage of a CA rotation, bring its files "
-            f"by `sros distribute_key KEYSTORE --robot {robot} FOLDER --force`; if not, find out "
+            f"with `sros distribute_key KEYSTORE --robot {robot} FOLDER --force`; if not, find out "
             "who can write to the publishing folder.",
         )
     with Folder(folder) as opened:
@@ -212,7 +213,7 @@ def _check_release(
             f"'{folder}' has {enumerated(usable)}, the release has "
             f"{enumerated(sorted(release.enclaves()))}. Installing it would remove the keys of "
             "these enclaves. Nothing was changed.",
-            "See whether this robot has the right name (`sros agent init --robot`).",
+            "Check whether this robot has the right name (`sros agent init --robot`).",
         )
     if release.number < installed:
         raise KeystoreError(
@@ -354,7 +355,7 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
         return
     same_authority = present.files.get(PERMISSIONS_CA_FILE) == sent.files.get(PERMISSIONS_CA_FILE)
     newer = [
-        f"its {what} is valid from {iso(here)}, that of the release from {iso(there)}"
+        f"its {what} is valid from {iso(here)}, the one in the release from {iso(there)}"
         for what, here, there in (
             (
                 "certificate",
@@ -368,7 +369,7 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
     if same_authority and newer:
         raise KeystoreError(
             "it has newer files than the release",
-            f"{newer[0]}; if home comes from a backup, `sros renew KEYSTORE --all` and publish "
+            f"{newer[0]}; if home comes from a backup, run `sros renew KEYSTORE --all` and publish "
             "there",
         )
 

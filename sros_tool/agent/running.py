@@ -254,7 +254,7 @@ def restart_units(
             )
         except (OSError, subprocess.SubprocessError) as error:
             why = plain(str(error), 120)
-            return Restarts((), (f"Whether units may restart could not be asked: {why}.",))
+            return Restarts((), (f"The agent could not ask whether units may restart: {why}.",))
         if allowed.returncode:
             return Restarts()
     try:

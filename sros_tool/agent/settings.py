@@ -76,7 +76,7 @@ def check_owner(folder: Path) -> None:
     if state.st_uid != user:
         raise KeystoreError(
             f"'{folder}' belongs to {user_name(state.st_uid)}",
-            "The agent runs as the owner of the security folder, which needs no right of root.",
+            "The agent runs as the owner of the security folder, and needs no root rights.",
             "Run it as that user.",
         )
     own = agent_folder(folder)
@@ -92,7 +92,7 @@ def check_owner(folder: Path) -> None:
             raise KeystoreError(
                 f"others can change '{path}'",
                 f"{why[:1].upper()}{why[1:]}. They could choose what the agent trusts and runs.",
-                f"Take the right from them: `chmod go-w {path}`.",
+                f"Remove their right to write: `chmod go-w {path}`.",
             )
 
 
@@ -194,7 +194,7 @@ def settings_from(value: Mapping[str, Any], what: str) -> AgentSettings:
         elif key == "unit" and isinstance(entry, list):
             fields["units"] = tuple(_unit(unit, what) for unit in entry)
         else:
-            raise _wrong(what, f"{key} is not a key of it, or not of the right form")
+            raise _wrong(what, f"{key} is not a known key, or its value has the wrong form")
     if missing := [key for key in ("robot", "from", "inbox") if _TEXTS[key] not in fields]:
         raise _wrong(what, f"it lacks {', '.join(missing)}")
     settings = AgentSettings(**fields)
@@ -217,7 +217,7 @@ def _unit(value: Any, what: str) -> Unit:
     if not isinstance(name, str) or not _UNIT.match(name):
         raise _wrong(what, f"{name!r} is not the name of a service or target of systemd")
     if not _is_texts(enclaves):
-        raise _wrong(what, f"the enclaves of {name} are no list of names")
+        raise _wrong(what, f"the enclaves of {name} are not a list of names")
     try:
         return Unit(name, tuple(map(check_enclave_name, enclaves)))
     except InvalidNameError as error:

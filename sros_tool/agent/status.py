@@ -40,7 +40,9 @@ class AgentStatus(NamedTuple):
     release: int
     """Number of the release that is installed with all its enclaves; 0 for none."""
     accepted: int
-    """Highest number of a release that was verified; if higher, some enclaves wait for it."""
+    """Highest number of a release that was verified; if it is higher than ``release``, some
+    enclaves wait for it.
+    """
     fetched: datetime | None
     """When the source was last reached, by the clock of the robot, in UTC; null for never."""
     sent: datetime | None
@@ -48,12 +50,13 @@ class AgentStatus(NamedTuple):
     restart: Sequence[str]
     """Enclaves whose processes were not yet seen with the installed files."""
     unseen: Sequence[str]
-    """Those of ``restart`` of which no process was seen, while not all processes here can be seen:
-    `sros agent run FOLDER --once --restarted` says that they are done."""
+    """Enclaves of ``restart`` of which no process was seen, although not all processes here can be
+    seen. `sros agent run FOLDER --once --restarted` says that these restarts are done.
+    """
     problems: Sequence[str]
     """What the last round could not do, and what is wrong, as sentences."""
     well: bool
-    """Whether nothing is wrong or due, and source and inbox were reached of late."""
+    """Whether nothing is wrong or due, and source and inbox were reached recently."""
 
 
 def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStatus:

@@ -160,8 +160,9 @@ def read_advisories(path: Path) -> tuple[Advisory, ...]:
         *products, last = _REPOSITORIES.values()
         raise DocumentError(
             f"'{path}' has no advisory about {', '.join(products)} or {last}",
-            "sros knows them by their repositories.",
-            f"Name the package as in {next(iter(_REPOSITORIES))}, or the repository of a range.",
+            "sros recognizes these products by their repositories.",
+            f"Write the package as {next(iter(_REPOSITORIES))}, or write the repository of a "
+            "range.",
         )
     replaced = {(advisory.id, advisory.product) for advisory in newer}
     kept = (old for old in shipped_advisories() if (old.id, old.product) not in replaced)

@@ -185,7 +185,7 @@ class _Reader:
         usual = {"namespace": f"/{name}", "address": name, "user": "", "domain": None}
         robot = Robot(name, groups=member, **(usual | given))
         if robot.crossing and not robot.router:
-            text = "Nothing passes through a router that the robot does not have."
+            text = "Names can pass only through a router, and the robot has none."
             raise self._refused(f"{at}.crossing", list(robot.crossing), text)
         return robot
 
@@ -335,7 +335,9 @@ _SHOWN = {"robots": "hosts", **_VARIABLES}
 _OF_ALL = ("all", "ungrouped", "_meta")
 _MOST_DEPTH = 64
 _MOST_STEPS = 200_000  # a host counts in each group, a group in each other one
-_WRITE_OUT = "Write it out with `ansible-inventory -i FILE --list > hosts.json`, and name that."
+_WRITE_OUT = (
+    "Write it out with `ansible-inventory -i FILE --list > hosts.json`, and name hosts.json."
+)
 
 
 def _fleet_table(data: bytes, what: str, *, is_json: bool) -> dict[str, Any]:

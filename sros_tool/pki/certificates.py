@@ -808,7 +808,7 @@ def load_request(data: bytes, what: str) -> SigningRequest:
     if problem := key_problem(public):
         raise PkiError(
             f"the key of the request {what} is weak",
-            f"Its certificate would be no proof: {problem}.",
+            f"A certificate for this key would prove nothing: {problem}.",
             "Create another key with `sros create_request`, in another folder or on another token.",
         )
     if not isinstance(digest, _DIGESTS) or not _has_valid_signature(request):

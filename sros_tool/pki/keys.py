@@ -259,7 +259,7 @@ def _check_derivation(pem: bytes, name: str) -> None:
         if not allowed or min(numbers, default=0) < 0:
             raise PkiError(
                 f"the private key {name} takes too long to decrypt",
-                f"Its file asks for {max(numbers)} rounds to try a passphrase.",
+                f"Its file requires {max(numbers)} rounds to try a passphrase.",
                 "Encrypt it again with `openssl pkcs8 -topk8 -scrypt -in KEY -out KEY.new`.",
             )
 
@@ -288,16 +288,16 @@ def few_rounds(pem: bytes) -> str:
     (one round of MD5).
     """
     if _TRADITIONAL in pem:
-        return "one round of MD5 tries a passphrase"
+        return "trying a passphrase takes one round of MD5"
     for block in _ENCRYPTED.findall(pem):
         try:
             scrypt, numbers = _derivation(block)
         except (ValueError, PkiError):
             continue  # `load_key` reports it
         if scrypt and math.prod(numbers[:3]) < _LEAST_SCRYPT_WORK:
-            return f"scrypt with {', '.join(map(str, numbers[:3]))} tries a passphrase"
+            return f"trying a passphrase takes scrypt with {', '.join(map(str, numbers[:3]))}"
         if not scrypt and numbers and numbers[0] < _FEWEST_ROUNDS:
-            return f"{numbers[0]} rounds try a passphrase"
+            return f"trying a passphrase takes {numbers[0]} rounds"
     return ""
 
 

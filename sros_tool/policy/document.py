@@ -167,7 +167,7 @@ class Includer:
         if place.linked and href:
             raise PolicyError(
                 f"{where}: the include of {_short(href)} is in a file that is included by a link",
-                "It is unclear whether it starts at the link or at the file.",
+                "It is unclear whether the path starts at the link or at the file.",
                 f"Include '{place.file}' itself instead of the link.",
             )
         names = path.split("/")
@@ -400,7 +400,7 @@ def refuse_fallbacks(policy: Policy) -> None:
     for source, file in policy.fallbacks:
         raise PolicyError(
             f"{source}: the fallback of the include is used, because '{file}' is absent",
-            "Decisions on this policy would hold only on machines that lack the file, too.",
+            "Decisions on this policy would be right only on machines that lack the file, too.",
             "Add the file, or put the rights of the fallback in the place of the include.",
         )
 
@@ -447,7 +447,7 @@ class _Reader:
         if len(blocks) == 1 and blocks[0][0].tag in _EARLIER_BLOCKS:
             raise PolicyError(
                 f"{where}: the policy has <{blocks[0][0].tag}> in place of <enclaves>",
-                f"That is an earlier format than the version {version} that it names.",
+                f"That is an earlier format than the version {version} that the policy names.",
                 self._how_to_convert(),
             )
         blocks = [self._expect(child, at, "enclaves") for child, at in blocks]
@@ -702,8 +702,8 @@ class _Reader:
         raise PolicyError(
             f"{where}: {_short(text)} has a placeholder for the robots of a fleet",
             "Without a fleet it has no value.",
-            "Name the fleet's file with --fleet FILE, or the robot in place of the placeholder "
-            "where the verb has no --fleet.",
+            "Name the fleet's file with --fleet FILE. If the verb has no --fleet, write the "
+            "robot's name in place of the placeholder.",
         )
 
     def _children(
@@ -1014,8 +1014,8 @@ class _EarlierReader(_Reader):
             names = ", ".join(dict.fromkeys(self._private[:3]))
             yield Note(
                 "convert.private-name",
-                f"{names}: a private name has a slash since ROS 2 Eloquent, and got one. "
-                "ros2/sros2 of Eloquent joined it to the name of the node without one.",
+                f"{names}: since ROS 2 Eloquent a private name has a slash, which was added here. "
+                "ros2/sros2 of Eloquent joined the name to the name of the node without a slash.",
             )
         for enclave in policy.enclaves:
             if not any(profile.groups for profile in enclave.all_profiles()):
@@ -1145,7 +1145,7 @@ def is_policy(name: str, content: bytes, shown: str) -> bool:
     if begin.lstrip(b"\xef\xbb\xbf\xff\xfe \t\r\n").startswith(b"<") and b"<policy" in begin:
         raise DocumentError(
             f"{shown} looks like a policy, but its name does not end with .xml",
-            "A policy in a folder that is not read would not count.",
+            "In a folder, sros reads only policies whose names end with .xml.",
             "Name it .xml, or move it out of the folder.",
         )
     return False

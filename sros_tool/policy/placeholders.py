@@ -127,12 +127,14 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
     for placeholder in placeholders_of(name):
         if placeholder.plural:
             if not several:
-                raise ValueError(f"{placeholder} is several names, and only one can be here.")
+                raise ValueError(
+                    f"{placeholder} stands for several names, but only one can be here."
+                )
         elif not of_path:
             instead = f" For a name for each robot write {placeholder._replace(plural=True)}."
             raise ValueError(
-                f"{placeholder} is one robot, and the enclave's path does not say which one."
-                f"{instead if several else ''}"
+                f"{placeholder} stands for one robot, but the enclave's path does not say which "
+                f"one.{instead if several else ''}"
             )
         elif placeholder.group not in ("", of_path[0].group):
             raise ValueError(f"{placeholder} is not the robot of the enclave: leave out the group.")

@@ -150,8 +150,8 @@ def _assumed(base: AccessSource, head: AccessSource) -> Iterator[str]:
             yield "both are signed with the same governance, which controls all access"
         elif base.governance is None:
             yield (
-                "BASE means access control of everything, and encryption unless it demands another "
-                "protection"
+                "BASE is signed with access control of everything, and with encryption unless it "
+                "demands another protection"
             )
         elif head.governance is None:
             yield (
@@ -163,9 +163,9 @@ def _assumed(base: AccessSource, head: AccessSource) -> Iterator[str]:
             continue
         if domains_of_robots(side, against).keys() < side.permissions.keys():
             whose = "its enclaves without a robot" if side.fleet else "it"
-            yield f"{name} does not say the domains, and {whose} is for those of {other}"
+            yield f"{name} names no domains: for {whose}, the domains of {other} count"
         if against.zenoh is not None:
-            yield f"{name} counts as having the settings of Zenoh that sros writes"
+            yield f"{name} has the settings of Zenoh that sros writes"
 
 
 def left_out(base: AccessSource, head: AccessSource) -> tuple[str, ...]:

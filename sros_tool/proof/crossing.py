@@ -84,7 +84,7 @@ def _moved(
                     f"router of {enclave}",
                     f"{one}, where {crossing} crosses",
                     other,
-                    f"{name} may pass between it and enclaves that were at {there}",
+                    f"{name} may pass between this enclave and enclaves that were at {there}",
                 )
                 break
 
@@ -99,7 +99,7 @@ def more_passed_on(
     """
     if new.routers and not (states_routers(old) and states_routers(new)):
         for router in sorted({*old.passing} - {*new.routers}):
-            meaning = "its enclaves and others may be at one router"
+            meaning = "its enclaves may now be at the same router as others"
             yield SettingChange(
                 Effect.LOOSER, f"router {router} of Zenoh", "present", "missing", meaning
             )

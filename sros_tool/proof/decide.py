@@ -615,7 +615,7 @@ def _always(requirement: Requirement, world: World) -> str:
             sources = {name for name in left if _match(requirement.sources, name)}
             targets = {name for name in left if _match(requirement.targets, name)}
             if not any(sources - {target} for target in targets):
-                return "no two enclaves are left that it keeps apart"
+                return "no two enclaves are left to keep apart"
     return ""
 
 

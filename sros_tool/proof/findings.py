@@ -301,7 +301,7 @@ def _assumed(requirement: Requirement, name: str) -> Finding:
 def _not_crossing(requirement: Requirement, kept: KeptUse) -> Finding:
     own, use, others = requirement.source, kept.use, _listed(kept.others)
     ends = f"from {use.enclave} to {others}" if use.writes else f"from {others} to {use.enclave}"
-    text = f"{use.name} does not pass {ends}, at other routers: {demand(requirement)}"
+    text = f"{use.name} does not pass between routers {ends}: {demand(requirement)}"
     return NOT_CROSSING.found(own.file, text, own.file, own.line)
 
 
@@ -425,10 +425,9 @@ def _gates(world: World) -> Iterator[Apart]:
 
 # ── writing ────────────────────────────────────────────────────────────────────────────────
 
-_HEAD = """\
-# Requirements that hold for {of} today, for all names that could ever be used.
-# Keep those that have to hold tomorrow, say why, and strike the others.
-"""
+_HEAD = r"""\ # Requirements that hold for {of} today, for all names that could ever be used. # Keep
+        those that have to hold tomorrow, say why, and delete the others.
+        """
 
 
 def render_requirements(requirements: Iterable[Requirement], of: str) -> str:

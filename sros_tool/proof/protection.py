@@ -123,9 +123,9 @@ def less_protection(
                 f"{role} CA {fingerprint[:16]}...",
                 "unknown",
                 "trusted",
-                "whoever has its key can become any enclave"
+                "anyone who has its key can become any enclave"
                 if role == "identity"
-                else "whoever has its key can give any right",
+                else "anyone who has its key can give any right",
             )
     yield from _trusted_again(old, new)
     yield from _certified_otherwise(old, new)
@@ -170,7 +170,7 @@ def _looser_later(
                     f"later enclaves: domain of robot {name}",
                     str(known.domain),
                     domain,
-                    "what is signed for it later is valid there",
+                    "permissions that are signed for it later are valid there",
                 )
 
 
@@ -183,7 +183,7 @@ def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[Setti
         if new_one.name not in (before, old_one.name if old_one else enclave):
             what, text = (
                 f"certificate of {enclave}",
-                "whoever has its key is that enclave to all others",
+                "anyone who has its key can act as that enclave",
             )
             yield SettingChange(Effect.LOOSER, what, before, new_one.name, text)
 
@@ -208,10 +208,10 @@ def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChan
     for serial in sorted(again)[:_MOST_SERIALS]:
         names = [each for each in again[serial] if each != KEYSTORE_ITSELF] or [KEYSTORE_ITSELF]
         who = f"{names[0]} trusts" if len(names) == 1 else f"{len(names)} enclaves trust"
-        text = f"{who} whoever has its key again"
+        text = f"{who} anyone who has its key again"
         yield SettingChange(Effect.LOOSER, f"certificate {serial:x}", "revoked", "trusted", text)
     if (more := len(again) - _MOST_SERIALS) > 0:
-        text = "enclaves trust whoever has their keys again"
+        text = "enclaves again trust anyone who has their keys"
         yield SettingChange(Effect.LOOSER, f"{more} certificates more", "revoked", "trusted", text)
 
 

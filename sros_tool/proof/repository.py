@@ -540,11 +540,11 @@ def _of_kind(
             raise DocumentError(
                 f"git cannot read it: the object {object_id} is not in the repository",
                 "",
-                "Fetch all of the commit: no partial clone (`git fetch --refetch`).",
+                "Fetch the whole commit, not a partial clone: `git fetch --refetch`.",
             )
         if objects[object_id][0] != kind:
             raise DocumentError(
-                f"the object {object_id} is no {kind}, but a {objects[object_id][0]}"
+                f"the object {object_id} is not a {kind}, but a {objects[object_id][0]}"
             )
     return {object_id: objects[object_id][1] for object_id in ids}
 

@@ -342,7 +342,7 @@ class _Table:
         if not isinstance(value, str) or not value or len(value) > _LONGEST_TEXT:
             raise self.error(
                 key,
-                f"{key} has {_short(value)}, and not a text",
+                f"{key} has {_short(value)}, which is not a text",
                 f"It has 1 to {_LONGEST_TEXT} characters.",
             )
         return value
@@ -437,7 +437,7 @@ def _at_most(table: _Table) -> AtMost:
     if type(most) is not int or not 0 < most < 2**31:
         raise table.error(
             "enclaves",
-            f"enclaves has {_short(most)}, and not a number",
+            f"enclaves has {_short(most)}, which is not a number",
             "Write how many enclaves may use one name, from 1; for none there is [[nobody]].",
         )
     return AtMost(**own, rights=table.rights(), most=most)
@@ -461,7 +461,7 @@ def _not_both(table: _Table) -> NotBoth:
         if not isinstance(value, dict) or not value or set(value) - set(KIND_OF):
             raise table.error(
                 key,
-                f"{key} has {_short(value)}, and not rights",
+                f"{key} has {_short(value)}, which does not state rights",
                 'Write for example first = { publish = ["/cmd_vel"] }.',
             )
         line = table.lines.get(key, table.source.line)

@@ -444,7 +444,7 @@ class _Review:
             for where in sorted({*before, *after}, key=_decisive_first):
                 if before.get(where) != (value := after.get(where)):
                     said = "is gone, which" if value is None else f"is {value}, which"
-                    lines.append((f"{said} can change how Ansible delivers keys, and whose", where))
+                    lines.append((f"{said} can change which keys Ansible delivers, and how", where))
         return (self._new_access, Facts(tuple(lines))) if lines else None
 
     def _others(self, reviewed: Sequence[Path], fleet: Fleet | None) -> tuple[int, Content] | None:

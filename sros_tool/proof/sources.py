@@ -371,7 +371,7 @@ def _trusts(
         for data in dict.fromkeys(([] if own is None else [own]) + embedded_lists(pem)):
             found = load_crl(data, CRL_FILE)
             key = next((key for certificate, key in keys if signed_by(found.list, certificate)), "")
-            if refusal := refusal_of(found.list) or ("" if key else "it is of another CA"):
+            if refusal := refusal_of(found.list) or ("" if key else "another CA signed it"):
                 raise DocumentError(
                     f"its revocation list makes DDS refuse every enclave: {refusal}"
                 )

@@ -260,8 +260,8 @@ def _present(
         what = first_few(unknown, _SHOWN) if by_distribution else f"'{files.file}'"
         raise UsageError(
             f"it is not known from which distribution {what} is updated to {later.title}",
-            "Neither --distro nor $ROS_DISTRO names another one, nor does the keystore.",
-            "Name the present one, for example with --distro jazzy.",
+            "Neither --distro, nor $ROS_DISTRO, nor the keystore names another distribution.",
+            "Name the present distribution, for example with --distro jazzy.",
         )
     return by_distribution
 
@@ -539,7 +539,7 @@ def _on_zenoh(files: DecidedFiles, before: Distribution, after: Distribution) ->
         return
     text = (
         f"ROS 2 {before.title} has rmw_zenoh {version_text(old.begin)} or later, {after.title} "
-        f"{version_text(new.begin)} or later, of which the files need {version_text(new.least)}"
+        f"{version_text(new.begin)} or later; the files need at least {version_text(new.least)}"
     )
     yield ZENOH.found(files.file, text)
     more = [key for key in new.below_topics if key not in (*old.below_topics, _OF_EACH)]

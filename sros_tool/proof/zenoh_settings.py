@@ -169,7 +169,10 @@ def _changes(
         if value(after) is open_value is not value(before):
             one, other = (str(value(each)).lower() for each in (before, after))
             yield path, one, other, meaning
-    for key, what in (("listen", "it listens there"), ("connect", "it connects to what is there")):
+    for key, what in (
+        ("listen", "it listens there"),
+        ("connect", ("it connects to the process there")),
+    ):
         own = [before] if known else [each.document for each in old.values()]
         there = {each.text for one in own for each in getattr(one, key)}
         for endpoint in getattr(after, key):

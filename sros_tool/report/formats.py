@@ -156,7 +156,7 @@ def render_svg(picture: Picture, scene: Scene) -> str:
 def _summary(picture: Picture, scene: Scene) -> str:
     """Return how many enclaves and names a scene shows, and how many names it leaves out."""
     text = f"{counted(len(picture.enclaves), 'enclave')}, {counted(scene.shown, 'name')}"
-    return text + (f", {scene.hidden} left out that every node needs" if scene.hidden else "")
+    return text + (f", {scene.hidden} that every node needs are left out" if scene.hidden else "")
 
 
 def _lines(text: str, width: int) -> list[str]:
@@ -185,7 +185,7 @@ def _link_text(link: Link, overlay: Overlay | None) -> str:
     if link.violates:
         text += ": breaks a requirement"
     if link.differs:
-        text += ": not so of the equal ones"
+        text += ": not for the equal ones"
     if overlay and link.mark is not OverlaySide.BOTH:
         text += f": {overlay.first if link.mark is OverlaySide.FIRST else overlay.second}"
     return f"{text}, {LEVEL_NAMES[link.level]}"
@@ -268,7 +268,7 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
     if any(link.violates for link in scene.links):
         rows.append(('<path class="link violates" d="M0 -4h40"/>', "breaks a requirement"))
     if any(link.differs for link in scene.links):
-        rows.append(('<path class="link differs" d="M0 -4h40"/>', "not so of the equal ones"))
+        rows.append(('<path class="link differs" d="M0 -4h40"/>', "not for the equal ones"))
     if picture.overlay:
         rows.append(('<path class="link first" d="M0 -4h40"/>', picture.overlay.first))
         rows.append(('<path class="link second" d="M0 -4h40"/>', picture.overlay.second))
@@ -299,7 +299,7 @@ def _card_legend(picture: Picture, scene: Scene) -> Iterable[str]:
         of_each = f"each of {len(units.members)} {units.what}s, which are equal but for their names"
         yield _row([("", f"{units.label}: {of_each}")])
     if any(word in line for word in OTHERS for card in scene.cards for line in card.lines):
-        yield _row([("", f"{{1 {OTHERS[0]} …}}: such a name of another one of them")])
+        yield _row([("", f"{{1 {OTHERS[0]} …}}: the same name of another one of them")])
 
 
 _BOX = '<g class="card {}"><rect y="-11" width="34" height="14" rx="4"/></g>'
@@ -455,7 +455,7 @@ def _link_label(picture: Picture, link: Link) -> str:
     if link.violates:
         text += ": breaks a requirement"
     if link.differs:
-        text += ": not so of the equal ones"
+        text += ": not for the equal ones"
     if picture.overlay and link.mark is not OverlaySide.BOTH:
         said = picture.overlay.first if link.mark is OverlaySide.FIRST else picture.overlay.second
         text += f": {said}"

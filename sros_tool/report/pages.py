@@ -254,7 +254,7 @@ def _demo_head(result: Json) -> str:
         ("error", str(here), "open in this keystore"),
         ("", str(skipped), "skipped"),
         ("", str(result.get("left_out", 0)), "left out"),
-        ("error", str(not_tried), "not tried, and needed for a proof"),
+        ("error", str(not_tried), "not tried, but needed for a proof"),
     ]
     shown = "".join(
         f'<li class="tile {kind}"><b>{number}</b> {text}</li>'

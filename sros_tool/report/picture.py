@@ -145,7 +145,9 @@ class Name:
     wildcard: bool = False
     """Whether it is a wildcard that matches no known name."""
     lacks: Lack = Lack.NOTHING
-    """The side that no enclave may take; the server of a service is its receiver."""
+    """The side that is missing because no enclave has the right; the server of a service is its
+    receiver.
+    """
 
 
 _LACKING = {
@@ -377,7 +379,7 @@ class Requirements(NamedTuple):
         """Return the results as sentences without a full stop."""
         holds = f"{counted(self.hold, 'requirement')} hold{'s' if self.hold == 1 else ''}"
         if self.assumed:
-            holds += f", {len(self.assumed)} of them by an assumption: {self.assumed[0]}"
+            holds += f", {len(self.assumed)} of them under an assumption: {self.assumed[0]}"
         if not self.violations:
             return (holds,)
         number = len(self.violations)
@@ -506,10 +508,10 @@ class Picture:
         likes = first_few([units.like for units in self.unread], _SHOWN)
         yield (
             f"{counted(number, self.unread[0].what)} with {counted(enclaves, 'enclave')} "
-            f"({first_few(members, _SAID)}) were only compared: the text of their permissions is "
-            f"that of {likes} but for their names. Their signatures, certificates, expiry and "
-            "findings, and rights of others to their names, are not here: --robot NAME reads one, "
-            "`sros check` checks all"
+            f"({first_few(members, _SAID)}) were only compared: their permissions have the same "
+            f"text as those of {likes}, except for names. Their signatures, certificates, expiry "
+            "and findings, and rights of others to their names, are not in this picture: --robot "
+            "NAME reads one, `sros check` checks all"
         )
 
 

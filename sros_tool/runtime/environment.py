@@ -334,7 +334,7 @@ def _text(path: Path) -> str:
     if set(text) & set(";?") or any("\ud800" <= letter <= "\udfff" for letter in text):
         raise KeystoreError(
             f"the path {text!r} cannot be given to Zenoh",
-            "Zenoh reads paths as UTF-8 text, in which neither ';' nor '?' can be.",
+            "Zenoh reads a path as UTF-8 text, and does not accept ';' and '?' in it.",
             "Move the keystore to another path.",
         )
     return json.dumps(text, ensure_ascii=False).translate(_LINE_ENDS)
@@ -482,7 +482,8 @@ def render_secret(enclave: str, files: Mapping[str, bytes]) -> str:
     size = sum(map(len, files.values()))
     if size > MAX_SECRET:
         raise KeystoreError(
-            f"the files of enclave {enclave} have {size} bytes, and a Secret holds {MAX_SECRET}",
+            f"the files of enclave {enclave} have {size} bytes, but a Secret has room for "
+            f"{MAX_SECRET}",
             "Kubernetes refuses a larger Secret.",
             "Give the enclave fewer rights, or bring its files to the node of the cluster: `sros "
             "distribute_key`.",

@@ -319,7 +319,7 @@ class ProcessTable:
                 process = None
             if _stat(folder).identity == stat.identity:
                 return _Looked(stat, process, unseen)
-        why = "it starts one program after the other"
+        why = "it keeps starting other programs"
         return _Looked(stat, None, UnseenProcess(pid, command, why, _may_speak(command)))
 
     def _with_files(self, process: Process, folder: int) -> Process:

@@ -72,7 +72,9 @@ ROS_ADVICE = (
     "The ROS 2 packages of Ubuntu (such as ros-jazzy-ros-base or ros-kilted-ros-base) have DDS "
     "Security built in; the wheels on PyPI do not."
 )
-_ZENOH_ADVICE = "It enforces the files that `sros zenoh KEYSTORE` writes, and none of DDS Security."
+_ZENOH_ADVICE = (
+    "It enforces the files that `sros zenoh KEYSTORE` writes, not those of DDS Security."
+)
 _EXIT_SECONDS = 5.0
 
 
@@ -317,7 +319,9 @@ def judge(run: ProbeRun, allowed: str, denied: str) -> ProbeVerdict:
     refusals = [_refusal(answers[question], run, denied) for question in asked]
     if not all(refusals):
         reason = _reason(answers[asked[0]], run)
-        return _untried(f"endpoints on {denied} failed, but not by a security refusal. {reason}")
+        return _untried(
+            f"endpoints on {denied} failed, but not because security refused them. {reason}"
+        )
     return ProbeVerdict(
         True,
         f"with an enclave made by sros, it created the allowed writer on {allowed} and refused the"

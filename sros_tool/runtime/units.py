@@ -436,7 +436,7 @@ def unit_changes(folder: Path, files: Mapping[str, str], *, force: bool) -> dict
     different = [path for path, action in changes.items() if action == "replace"]
     if different and not force:
         raise UsageError(
-            f"'{folder}' already holds other versions of {', '.join(different[:3])}",
+            f"'{folder}' already has other versions of {', '.join(different[:3])}",
             "Nothing was changed.",
             "Add --force to replace these files, or choose another folder.",
         )

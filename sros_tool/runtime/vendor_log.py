@@ -142,8 +142,8 @@ _RENEW_PEER = (
 )
 _OTHER_SIGNER = (
     "its permissions are not signed by a permissions CA that this process has loaded. This process "
-    "was not restarted since stage 1 of a rotation (`sros rotate_ca`), or the peer not since stage "
-    "2; or both have enclaves of two keystores, or a file was changed"
+    "was not restarted since stage 1 of a rotation (`sros rotate_ca`), or the peer was not "
+    "restarted since stage 2; or they have enclaves of different keystores, or a file was changed"
 )
 _PEERS = "Give both sides enclaves of the same keystore; `sros inspect` shows the CA of each."
 _FAST, _CYCLONE = Vendor.FAST, Vendor.CYCLONE
@@ -244,7 +244,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "peer-signature", _CYCLONE,
         rf"{_PEER_OF_CYCLONE} permissions from plugin: .*(?:PKCS7|SMIME)",
         f"a PEER was refused: {_OTHER_SIGNER}",
-        "Restart all processes together after stage 2 of `sros rotate_ca`. If it goes on: "
+        "Restart all processes together after stage 2 of `sros rotate_ca`. If this continues: "
         f"{_PEERS}",
     ),
     _text(
@@ -398,7 +398,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "peer-signature", _FAST, rf"{_REFUSED_PEER}Cannot read as PKCS7 the permissions file",
         f"a PEER was refused: {_OTHER_SIGNER}",
-        f"Restart this process, and then the peer. If it goes on: {_PEERS}",
+        f"Restart this process, and then the peer. If this continues: {_PEERS}",
     ),
     _text(
         "peer-malformed", _FAST,
@@ -426,7 +426,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         r"(?:serialize|cipher)",
         "a message of a peer could not be decrypted or verified: one side restarted, or has "
         "another governance, or a packet was damaged or forged",
-        f"If it goes on, restart both sides. {_PEERS}",
+        f"If this continues, restart both sides. {_PEERS}",
     ),
     # ── Fast DDS, starting ─────────────────────────────────────────────────────────────────
     _text(
@@ -524,7 +524,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "endpoint-gone", _FAST, r"Cannot find (?:local|remote) (?:reader|writer|participant)\b",
         "a message could not be protected, because its writer, its reader or the peer is not known "
         "yet or has just gone: seen when a process starts or ends",
-        "Do nothing if it stops. If it goes on, restart the process and its peers.", weak=1,
+        "Do nothing if it stops. If this continues, restart the process and its peers.", weak=1,
     ),
     # ── messages that follow others ────────────────────────────────────────────────────────
     _text(
@@ -664,8 +664,8 @@ NO_ENCLAVE = _text(
 RUNS_OPEN = _text(
     "runs-open", _ROS, "",
     "no enclave is named for this process: unless the keystore has an enclave /, it RUNS UNSECURED "
-    "where ROS_SECURITY_STRATEGY is not exactly Enforce, without any further message; with Enforce "
-    "it does not start",
+    "if ROS_SECURITY_STRATEGY is not exactly Enforce, without any further message; with Enforce it "
+    "does not start",
     f"If it runs, stop it. Then {_NAMED}", weak=4,
 )  # fmt: skip
 """The meaning of rcl's line about the enclave /, in a log without an error after it."""
@@ -887,7 +887,7 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
         "alert", r"zenoh_link\S*: received fatal alert: (?P<alert>\w{1,40})",
         "a PEER closed the connection: it does not accept the certificate of this process "
         "({alert}); most often it compares the name of the endpoint with it "
-        "(verify_name_on_connect), and certificates of enclaves name no host",
+        "(verify_name_on_connect), but certificates of enclaves name no host",
         f"Look at the configuration of the peer. {_WRITTEN}",
     ),
     _zenoh_text(
@@ -919,8 +919,8 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
     ),
     _zenoh_text(
         "name", r"invalid peer certificate: certificate not valid for name (?P<name>\"[^\"]*\")",
-        "this process compares {name} with the certificate there (verify_name_on_connect), and "
-        "certificates of enclaves name no host",
+        "this process compares {name} with the certificate of the other side "
+        "(verify_name_on_connect), but certificates of enclaves name no host",
         _WRITTEN,
     ),
     _zenoh_text(

@@ -577,10 +577,10 @@ class Enforcement:
             not rule.allows and set(rule.messages) != {Message.LIVELINESS_TOKEN}
             for rule in self.rules
         ):
-            return "it has denials, which do not hold for messages with wildcards"
+            return "it has denials, which do not apply to messages with wildcards"
         for subject in self.subjects:
             if key := self._only_history(subject.id):
-                return f"its subject {subject.id[:80]!r} gets the history of {key[:80]!r} alone"
+                return f"its subject {subject.id[:80]!r} gets only the history of {key[:80]!r}"
         return ""
 
     def _only_history(self, subject: str) -> str:

@@ -36,9 +36,9 @@ class Mode(StrEnum):
 
     ROUTER = "router"
     PEER = "peer"
-    """Connects to the router, and directly to the processes that the router tells it of."""
+    """Connects to the router, and directly to the processes that the router names."""
     CLIENT = "client"
-    """Connects to the router alone, which passes on all data."""
+    """Connects only to the router, which forwards all data."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,8 @@ class ZenohNetwork:
             else:
                 raise UsageError(
                     f"the routers {first.name} and {second.name} cannot connect to each other",
-                    "The endpoints of each router name its own host, or it listens only there.",
+                    "The endpoints of each router name its own host, or the router listens only on "
+                    "its own host.",
                     "Name an endpoint by which another host reaches one of them.",
                 )
         return connections
@@ -490,7 +491,7 @@ def check_network(network: ZenohNetwork) -> None:
     far = sorted(hosts - {_LOOPBACK})
     if network.mode is Mode.PEER and far:
         raise UsageError(
-            f"sessions in peer mode cannot reach a router at {far[0]} and each other",
+            f"sessions in peer mode cannot reach both a router at {far[0]} and each other",
             "They listen only on their own host, and the router forwards no data between peers: "
             "peers on different hosts would receive nothing.",
             "Use client mode for several hosts: `--mode client`. For one host, leave the endpoint "

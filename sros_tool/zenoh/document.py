@@ -228,7 +228,7 @@ def _root(data: bytes, name: str, *, lines: bool) -> _Section:
     except UnicodeDecodeError as error:
         raise _not_json5(name)(
             f"the Zenoh configuration '{name}' is not UTF-8",
-            f"The byte at {error.start} is none of a text.",
+            f"The byte at {error.start} does not belong to UTF-8 text.",
         ) from error
     except Json5Error as error:
         raise _not_json5(name)(
@@ -238,7 +238,7 @@ def _root(data: bytes, name: str, *, lines: bool) -> _Section:
     if isinstance(value, list):
         raise UnreadConfigurationError(
             f"the Zenoh configuration '{name}' is a list, which sros does not read",
-            "What it means to Zenoh depends on the version.",
+            "Its meaning depends on the version of Zenoh.",
             "Write it as an object with settings.",
         )
     if not isinstance(value, Json5Object):

@@ -461,7 +461,7 @@ def expression_problem(text: str) -> str:
     if "" in chunks:
         return "it begins or ends with '/', or has two of them"
     if "#" in text or "?" in text:
-        return "'#' and '?' are no characters of a key"
+        return "'#' and '?' are not allowed in a key"
     for chunk in chunks:
         if chunk in (ANY_CHUNK, ANY_CHUNKS):
             continue

@@ -55,8 +55,8 @@ def too_old_because(version: Version) -> str:
     if version >= release.least:
         return ""
     return (
-        f"Files that sros writes need Zenoh {_LEAST_ZENOH} and ZENOH_CONFIG_OVERRIDE, which it has "
-        f"since {version_text(release.least)} (ROS 2 {release.distribution})."
+        f"Files that sros writes need Zenoh {_LEAST_ZENOH} and ZENOH_CONFIG_OVERRIDE, which "
+        f"rmw_zenoh_cpp has since {version_text(release.least)} (ROS 2 {release.distribution})."
     )
 
 

@@ -326,7 +326,7 @@ def test_nothing_is_decided_that_depends_on_a_file_that_is_absent(tmp_path: Path
         assert ended.status == 2
         line = policy.read_text().split("<xi:include")[0].count("\n") + 1
         assert f"{policy}:{line}: the fallback of the include is used, because" in ended.err
-        assert "would hold only on machines that lack the file" in ended.err
+        assert "would be right only on machines that lack the file" in ended.err
     assert sros("diff_policy", "--no-new-access", policy, before).status == 2
     (tmp_path / "site.xml").write_text(f"<profile ns='/' node='n'>{publish('/cmd_vel')}</profile>")
     assert [sros(*asked).status for asked in (compared, decided)] == [1, 1]

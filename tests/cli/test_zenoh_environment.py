@@ -239,7 +239,7 @@ def test_nothing_starts_with_a_signed_file_from_before_another_enclave_changed(
     for path, content in earlier.items():
         path.write_bytes(content)
     ended = sros("env", keystore, name, *ZENOH)
-    assert ended.status == 2 and "is not in step with the keystore" in ended.err
+    assert ended.status == 2 and "does not match the keystore" in ended.err
     sros("env", keystore, "/a", *ZENOH).ok()
 
 

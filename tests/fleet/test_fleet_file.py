@@ -110,7 +110,7 @@ def test_names(name: str) -> None:
         ('router = "r.local:7447"\ncrossing = ["fleet"]', "start with '/'"),
         ('router = "r.local:7447"\ncrossing = ["/a b"]', "crossing has '/a b'"),
         ('router = "r.local:7447"\ncrossing = "/fleet"', "list of names"),
-        ('crossing = ["/fleet"]', "router that the robot does not have"),
+        ('crossing = ["/fleet"]', "only through a router, and the robot has none"),
         ('renewal = "yes"', "neither allowed nor refused"),
         ("renewal = true", "not a text"),
         ('renewal_grace = "30"', "and one of s, m, h, d, w, y"),

@@ -124,7 +124,7 @@ def test_requirements_and_pictures_know_of_routers(routed: Path, tmp_path: Path)
     shutil.copytree(routed / "narrow", tmp_path / "none", symlinks=True)
     sros("zenoh", "none", "--cross", "/nothing", cwd=tmp_path).ok()
     scan, state = (f"/r1/base -publish {name}-> /office" for name in ("/r1/scan", "/fleet/state"))
-    kept = "/r1/scan does not pass from /r1/base to /office, at other routers"
+    kept = "/r1/scan does not pass between routers from /r1/base to /office"
     for keystore, said, not_said in (
         (routed / "wide", (scan,), (kept,)),
         (routed / "narrow", (state, kept), (scan,)),

@@ -109,10 +109,10 @@ CANNOT_FAIL = {
     '[[widest]]\nenclaves = ["*"]\npublish = ["/*"]\nsubscribe = ["/*"]':
         "wildcards may match every name",
     '[[apart]]\nfrom = ["/r/a"]\nto = ["/r/c"]\nthrough = ["*"]':
-        "no two enclaves are left that it keeps apart",
-    '[[apart]]\nfrom = ["/r/a"]\nto = ["/r/a"]': "no two enclaves are left that it keeps apart",
+        "no two enclaves are left to keep apart",
+    '[[apart]]\nfrom = ["/r/a"]\nto = ["/r/a"]': "no two enclaves are left to keep apart",
     '[[apart]]\nfrom = ["/r/a"]\nto = ["*"]\nthrough = ["/r/[bc]"]':
-        "no two enclaves are left that it keeps apart",
+        "no two enclaves are left to keep apart",
 }  # fmt: skip
 CAN_FAIL = (
     '[[only]]\npublish = ["/x"]\nenclaves = ["/r/a", "/r/b", "/r/c"]',
@@ -242,7 +242,7 @@ EXPRESSIBLE = {
     ),
     '[[only]]\npublish = ["/image"]\nenclaves = ["*", "!/base"]\n': "",
     '[[apart]]\nfrom = ["*", "!/camera"]\nto = ["/base"]\n': (
-        "r.toml: no two enclaves are left that it keeps apart: * (but not /camera) must not "
+        "r.toml: no two enclaves are left to keep apart: * (but not /camera) must not "
         "influence /base"
     ),
 }

@@ -337,7 +337,7 @@ def test_a_policy_alone_means_a_strict_governance(made: Path, kind: str) -> None
     strict = sros(*words, "robot.xml", "ks", cwd=made)
     assert strict.status == 0
     assert "nothing is protected less" in strict.err
-    assert "; assumed: BASE means access control of everything" in strict.err
+    assert "; assumed: BASE is signed with access control of everything" in strict.err
 
 
 def test_what_a_policy_demands_of_a_name_is_asked_of_a_keystore(made: Path) -> None:

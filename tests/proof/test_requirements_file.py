@@ -162,7 +162,7 @@ WRONG = {
     '[[protected]]\ntopics = ["/x"]\nlevel = []': "r.toml:3: level has []",
     '[[only]]\npublish = ["/x"]\nenclaves = ["!/x"]': "r.toml:3: enclaves only excepts enclaves",
     '[[only]]\npublish = ["/x"]\nenclaves = ["!x"]': "r.toml:3: '!x' is not an enclave",
-    "[[not_both]]\nfirst = 1": "r.toml:2: first has 1, and not rights",
+    "[[not_both]]\nfirst = 1": "r.toml:2: first has 1, which does not state rights",
     '[[not_both]]\nfirst = { publish = ["/x"] }': "r.toml:1: second has None",
     '[[not_both]]\nfirst = { fly = ["/x"] }': "r.toml:2: first has {'fly': ['/x']}",
     "[[not_both]]\nfirst = { publish = [] }": "r.toml:2: publish is not a list of names",

@@ -68,7 +68,7 @@ def test_what_was_not_tried_is_said_and_nothing_of_it_is_green() -> None:
     page = html.fromstring(render_demo_page(shown))
     tiles = {each.text_content(): each.get("class", "") for each in page.cssselect("li.tile")}
     assert "good" not in tiles["1 of 2 rows as expected"]
-    assert {"1 skipped", "3 left out", "2 not tried, and needed for a proof"} <= set(tiles)
+    assert {"1 skipped", "3 left out", "2 not tried, but needed for a proof"} <= set(tiles)
     text = page.text_content()
     assert f"Not tried, and needed for a proof: a; {HOSTILE[0]}." in text
     assert f"guest /a (why {HOSTILE[0]})" in text

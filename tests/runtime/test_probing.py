@@ -77,7 +77,7 @@ CASES = {
     "endpoints fail for another reason": (
         run(JOINED, ALLOWED, WRITER, READER, DONE, output="out of memory\n"),
         None,
-        "not by a security refusal",
+        "not because security refused them",
     ),
     "even the allowed endpoint fails": (
         run(

@@ -137,7 +137,7 @@ def test_a_process_that_always_starts_another_program_is_named(
     programs = (_Stat(1, 1, (str(number),), "1", is_idle=False) for number in range(9))
     monkeypatch.setattr(processes, "_stat", lambda _: next(programs))
     (unseen,) = proc.look().unseen
-    assert unseen.why == "it starts one program after the other"
+    assert unseen.why == "it keeps starting other programs"
 
 
 def test_what_proc_hides_is_said(proc: Proc) -> None:

@@ -90,7 +90,7 @@ def test_an_isolation_that_is_not_to_be_had_says_why(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize(
     ("version", "advice"),
-    [("0.10.5", "It enforces the files"), ("0.2.2", "which it has since 0.2.3")],
+    [("0.10.5", "It enforces the files"), ("0.2.2", "which rmw_zenoh_cpp has since 0.2.3")],
 )
 def test_the_release_of_rmw_zenoh_is_said(
     version: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

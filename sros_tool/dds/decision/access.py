@@ -61,7 +61,7 @@ def choose_grant(
             if state:  # not compared
                 continue
             text = (
-                f"{traits.title} ends with an error where it compares the grant for {granted!r} "
+                f"{traits.title} ends with an error when it compares the grant for {granted!r} "
                 f"with the subject {subject!r}."
             )
             return Refusal("blank-subject", text, Outcome.CRASHES)
