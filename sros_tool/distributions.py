@@ -46,8 +46,10 @@ class Shipped(NamedTuple):
         return _minor(self.vendor.release) == _minor(self.latest)
 
     def __str__(self) -> str:
-        """Return text such as ``Fast DDS 3.6, taken to decide as Fast DDS 2.14``."""
-        return self.release + ("" if self.measured else f", taken to decide as {self.vendor.title}")
+        """Return text such as ``Fast DDS 3.6, assumed to decide as Fast DDS 2.14``."""
+        return self.release + (
+            "" if self.measured else f", assumed to decide as {self.vendor.title}"
+        )
 
 
 class Distribution(NamedTuple):
@@ -98,7 +100,7 @@ class Distribution(NamedTuple):
         if not self.stands_for:
             return ""
         why = "has no releases" if self.stands_for == _ROLLING else "is not supported any more"
-        return f"ROS 2 {self.title} {why}: taken to decide as {self.name.capitalize()}."
+        return f"ROS 2 {self.title} {why}: assumed to decide as {self.name.capitalize()}."
 
     def why(self, vendor: Vendor) -> str:
         """Return why a vendor decides: ``as in ROS 2 Jazzy``, with what is assumed."""

@@ -313,9 +313,9 @@ def _due_lines(folder: Path, due: Sequence[str], unseen: Sequence[str]) -> Itera
         yield f"restart due: {first_few(due, _MOST_SHOWN)}"
     if unseen:
         yield (
-            f"not all processes here can be seen; once those of {first_few(unseen, _MOST_SHOWN)} "
-            "were restarted, or none runs, say so: `sros agent run "
-            f"{quote(str(folder))} --once --restarted`"
+            "sros cannot see all processes here; once the processes of "
+            f"{first_few(unseen, _MOST_SHOWN)} were restarted, or none of them runs, say so: `sros "
+            f"agent run {quote(str(folder))} --once --restarted`"
         )
 
 
@@ -356,7 +356,7 @@ def _status(folder: Path, max_age: str, as_json: bool) -> int:
 
 def _status_lines(status: AgentStatus, moment: datetime) -> Iterator[str]:
     release = f"release {status.release}" if status.release else "no release"
-    newer = f", not yet whole: {status.accepted}" if status.accepted > status.release else ""
+    newer = f", not yet complete: {status.accepted}" if status.accepted > status.release else ""
     yield f"robot {status.robot}: {release}{newer}"
     yield f"fetched {_ago(status.fetched, moment)} from {status.source}"
     yield f"confirmed {_ago(status.sent, moment)} to {status.inbox}"

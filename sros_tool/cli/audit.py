@@ -207,7 +207,7 @@ def audit(
 
 _NOT_ALL = (
     "the exit status is 1, because something was not seen or could not be decided: --watch finds "
-    "nodes that start later, and --partial accepts it"
+    "nodes that start later, and --partial accepts this"
 )
 _NO_PATCH = "no patch was written: no added right would allow what is denied"
 

@@ -187,7 +187,7 @@ def _refuse_terminal() -> None:
     if sys.stdout is not None and sys.stdout.isatty():
         raise UsageError(
             "an archive would be written to this terminal",
-            "It is binary, and it may hold private keys.",
+            "It is binary, and it may contain private keys.",
             "Use a pipe, such as `| ssh robot tar -xz -C /etc/robot`, or name a file.",
         )
 

@@ -292,7 +292,7 @@ def explain(
     if reach:
         if vendor not in (None, _ZENOH):
             text = "It follows the rights, which are the same for all vendors of DDS."
-            raise UsageError("--reach takes no --vendor but zenoh", text, "Leave it out.")
+            raise UsageError("--reach takes only --vendor zenoh", text, "Leave it out.")
         stated = policy, fleet_file
         zenoh = bool(_why_zenoh(vendor, root))
         only_in = domain_of(domain)
@@ -586,7 +586,7 @@ def _table_lines(compared: Comparison) -> Iterator[str]:
         for answer in compared.vendors or ()
     ]
     for each in compared.distributions or ():
-        remark = "" if each.measured else f" (taken to decide as {each.decided_as.title})"
+        remark = "" if each.measured else f" (assumed to decide as {each.decided_as.title})"
         rows.append((each.shipped.distribution.title, f"  {each.release}", each.answer, remark))
     widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
     for name, release, answer, remark in rows:

@@ -478,7 +478,9 @@ def _published_lines(published: PublishedFleet) -> Iterator[str]:
             keeps = "keeps its earlier release" if robot.number else "has no release"
             yield f"refused: {robot.robot} {keeps}: {robot.why}"
     if published.rotated:
-        yield f"new keys: {', '.join(published.rotated)}; robots follow by {published.root.name}"
+        yield (
+            f"new keys: {', '.join(published.rotated)}; robots accept them by {published.root.name}"
+        )
     if published.versions.get("timestamp") == 1:
         yield f"robots pin {published.root}, SHA-256 {published.root_sha256}"
     if published.expires:

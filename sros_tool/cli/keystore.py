@@ -246,7 +246,11 @@ def generate_artifacts(
             "neither an enclave nor a policy is named", "", "Give -e ENCLAVE... or -p FILE... ."
         )
     if fleet_file and not policy_files:
-        raise UsageError("--fleet fills in policies, and none is named", "", "Give -p FILE... .")
+        raise UsageError(
+            ("--fleet fills in placeholders of policies, but no policy is named"),
+            "",
+            "Give -p FILE... .",
+        )
     if fleet_file:
         policies: list[Policy | FleetPolicy] = [*fleet_policies(policy_files, fleet_file)]
     else:

@@ -212,7 +212,7 @@ def revoke(
     Example:
       $ sros revoke keystore /talker --reason key_compromise
       revoked enclave /talker
-      restart the processes of 2 enclaves for it to take effect: /listener, ...
+      restart the processes of 2 enclaves for the change to take effect: /listener, ...
     """
     from sros_tool.keystore.lifecycle.revoke import revoke as work
     from sros_tool.keystore.reader import Keystore
@@ -529,7 +529,7 @@ def rotate_ca(
     verb = "would be" if dry_run else "are"
     cut_off = (
         f"cut off: {', '.join(step.cut_off)} {verb} unable to talk to robots with the files of "
-        "this stage until they get them, too"
+        "this stage until they get these files, too"
     )
     print_changed(step, shown, after=[cut_off] if step.cut_off else (), restart=False)
 
@@ -548,7 +548,7 @@ def _print_step(
         echo(f"nothing is left to do: {done}", err=True)
         return
     if same_key:
-        echo("renewed the identity CA with the same key; certificates it issued stay valid")
+        echo("renewed the identity CA with the same key; certificates that it issued stay valid")
         echo(
             "Restart the processes at any time; processes before and after the restart "
             "communicate. Certificates keep their expiry: `sros renew "

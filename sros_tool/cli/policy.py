@@ -433,7 +433,7 @@ def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
             yield f"    {wide.rule.describe()}  becomes  {instead}"
         else:
             yield f"    {wide.rule.describe()}  covered {used}"
-            yield f"      {f'becomes {instead}' if instead else 'not needed: other rules have it'}"
+            yield f"      {f'becomes {instead}' if instead else 'not needed: other rules give it'}"
     if use.kept_for_every_node:
         number = len(use.kept_for_every_node)
         yield f"  never observed, but kept because every node needs it: {number}"

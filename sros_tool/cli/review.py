@@ -353,7 +353,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             return "the rights that are written differ"
         case DroppedRequirements(count=count, chosen=chosen):
             dropped = counted(count, "requirement")
-            return f"{dropped} dropped or changed, decided as before: {chosen.summary()}"
+            return f"{dropped} dropped or changed, decided as they were before: {chosen.summary()}"
         case ExpiryCheck(due=due, unreadable=unreadable, count=count):
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""
             return f"{len(due)} of {count} enclaves need to be renewed{unread}"

@@ -429,7 +429,7 @@ def _left_out(subjects: Sequence[RightsBehindRules]) -> Iterator[Note]:
     if domains:
         yield Note(
             "zenoh.domains",
-            f"a policy names no domains: the rights of domains {', '.join(domains)} hold in every "
+            f"a policy names no domains: the rights of domains {', '.join(domains)} apply in every "
             "domain of a keystore that is made from it. Write one policy for each domain if their "
             "rights differ.",
         )

@@ -465,7 +465,7 @@ def _widest(
             continue
         widest = max(free, key=width.__getitem__)
         if any(width[widest][:2]):
-            why = f"may {right} {name if width[widest][0] else 'what nobody named'} by a wildcard"
+            why = f"may {right} {name if width[widest][0] else 'any other name'} by a wildcard"
         else:
             why = f"has the most rights among enclaves that may not {right} {name}"
         yield part, (widest, why)

@@ -353,8 +353,8 @@ def _judge_replay(case: _Case) -> _Finding:
     again = sum(event.time >= injected.time for event in case.heard())
     return case.result(
         again > 0,
-        f"{claim.subject} heard {again} messages in {injected.packets} packets of the"
-        f" {claim.talker} that were sent again, twice, after it had left",
+        f"{claim.subject} heard {again} messages in {injected.packets} packets of the "
+        f"{claim.talker} that were sent again, twice, after the talker had left",
     )
 
 
@@ -648,7 +648,7 @@ class UsedLibrary(NamedTuple):
     vulnerabilities: Sequence[str] | None
     """Ids of the known vulnerabilities of this version; null if they are not known."""
     unclear: Sequence[str]
-    """Ids of vulnerabilities of which it is not known whether this version has them."""
+    """Ids of vulnerabilities that this version may or may not have."""
 
     def sentence(self, most: int) -> str:
         """Return what is known of the library, with at most ``most`` ids."""
@@ -656,7 +656,7 @@ class UsedLibrary(NamedTuple):
         name = f"{self.product} {version}, which the processes loaded,"
         if self.vulnerabilities is None:
             return f"{name} may have vulnerabilities: {_UNKNOWN}."
-        unclear = f"; of {len(self.unclear)} more it is not known" if self.unclear else ""
+        unclear = f"; {len(self.unclear)} more are unclear" if self.unclear else ""
         if not self.vulnerabilities:
             return f"{name} has no known vulnerability{unclear}."
         number = counted(len(self.vulnerabilities), "known vulnerability", "known vulnerabilities")

@@ -464,7 +464,7 @@ def test_access_control_that_is_off_is_told(tmp_path: Path) -> None:
         (["/a", "publish", "/x", "--at", "9999-12-31"], "is not a date"),
         (["/a", "publish", "/x", "--at", "0001-01-01"], "is not a date"),
         (["--who", "publish", "/x", "--reach", "/a"], "exclude each other"),
-        (["--reach", "/a", "--vendor", "fastdds"], "--reach takes no --vendor but zenoh"),
+        (["--reach", "/a", "--vendor", "fastdds"], "--reach takes only --vendor zenoh"),
         (["--reach", "/a", "--at", "90d"], "--reach takes no --at"),
         (["--who", "publish", "/x", "--all-vendors"], "--who takes no --all-vendors"),
         (["--who", "publish", "/x", "--policy", "p.xml"], "--who takes no --policy"),

@@ -65,7 +65,7 @@ def test_an_existing_keystore_gets_a_governance_that_keeps_to_it(folder: Path) -
     assert f"would replace {ks}/enclaves/governance.p7s" in planned.out
     done = sros("generate_artifacts", "-k", ks, "-p", policy, cwd=folder).ok()
     for ended in (planned, done):
-        assert "restart the processes of 1 enclave for it to take effect: /old" in ended.err
+        assert "restart the processes of 1 enclave for the change to take effect: /old" in ended.err
         assert f"topic /cmd_vel encrypt ({policy}:6)" in ended.err
         assert "export them again" in ended.err
     check_whole(ks)

@@ -406,7 +406,7 @@ def test_the_program(tmp_path: Path) -> None:
     assert "enclaves/a/key.pem" in plan.out
     done = sros("revoke", root, "/a", "--reason", "key-compromise").ok()
     assert done.out == "revoked enclave /a\n"
-    assert "restart the processes of 2 enclaves for it to take effect: /b, /c" in done.err
+    assert "restart the processes of 2 enclaves for the change to take effect: /b, /c" in done.err
     listed = sros("crl", root).ok().out
     assert listed.startswith("revocation list 1, until ")
     assert "keyCompromise" in listed
@@ -417,7 +417,7 @@ def test_the_program(tmp_path: Path) -> None:
     assert sros("revoke", root, "/a").status == 2
     assert sros("revoke", root).status == 2
     done = sros("revoke", root, "/b").ok()
-    assert "restart the processes of 1 enclave for it to take effect: /c" in done.err
+    assert "restart the processes of 1 enclave for the change to take effect: /c" in done.err
     assert "\n  1 enclave\n" in sros("inspect", root).ok().out
 
 

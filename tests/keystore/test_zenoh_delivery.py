@@ -134,7 +134,7 @@ def test_an_answer_brings_new_rights_and_names_what_to_restart(mode: str, folder
     assert imported(folder, "--dry-run")["restart_zenoh"] == ["/far"]
     assert (folder / "robot/enclaves/far" / SESSION).read_bytes() == before
     ended = sros("import", "far.tgz", "robot", cwd=folder).ok()
-    assert "restart the processes of 1 enclave for it to take effect: /far" in ended.err
+    assert "restart the processes of 1 enclave for the change to take effect: /far" in ended.err
     assert (folder / "robot/enclaves/far" / SESSION).read_bytes() != before
     sros("verify", "robot", cwd=folder).ok()
     assert runs(folder, "robot", "/far").ok().out == first  # the same paths

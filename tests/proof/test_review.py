@@ -453,7 +453,7 @@ _HOSTS = """{"_meta": {"hostvars": {"r1": {"ansible_host": "10.0.0.1"}}},
                 "hosts.json",
                 _HOSTS,
                 _HOSTS.replace('"red"', '"red", "ansible_ssh_common_args": "-o ProxyCommand=evil"'),
-                "'all.vars.ansible_ssh_common_args' is -o ProxyCommand=evil, which can change which",
+                "'all.vars.ansible_ssh_common_args' is -o ProxyCommand=evil, which can change",
             ),
             (
                 "hosts.json",

@@ -302,7 +302,7 @@ def test_what_an_update_cannot_show_is_said(bench: Bench) -> None:
     found = check_upgrade(bench.root, unknown, Circumstances(bench.now), present=BEFORE).findings
     ids = [each.id for each in found if each.id != VULNERABLE]
     assert ids == ["distribution.not-measured", "upgrade.zenoh-release"]
-    assert "Fast DDS 99.1, taken to decide as Fast DDS" in found[0].text
+    assert "Fast DDS 99.1, assumed to decide as Fast DDS" in found[0].text
 
 
 def test_nodes_of_a_later_distribution_need_more(bench: Bench) -> None:

@@ -677,7 +677,7 @@ _IDENTITY_ROWS: tuple[Row, ...] = (
             _DATES_CHECKED,
         ),
         _succeeds(
-            "the same identity in date",
+            "the same identity before it expires",
             Identity(Undefended(forger.identity_in_date), "talker"),
             "the wrong dates",
         ),
@@ -824,7 +824,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Variant(
                 (Condition.EXACT_SIGNER, Condition.CYCLONE),
                 RowStatus.NOT_LET_IN,
-                mechanism="Cyclone DDS 11 reads the first CA of the file alone",
+                mechanism="Cyclone DDS 11 reads only the first CA of the file",
             ),
             Variant(
                 (Condition.EXACT_SIGNER,),
@@ -872,7 +872,8 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             "permissions borrowed, subjects not unique",
             Identity(Undefended(forger.borrowed_permissions, forger.shared_subjects), "guest"),
             RowStatus.HEARD,
-            "Cyclone DDS compares parts of subject names: /guest may use what is for /guest/admin",
+            "Cyclone DDS compares parts of subject names: /guest may use the permissions of "
+            "/guest/admin",
             Variant((Condition.FAST,), RowStatus.HEARD, instead=_SAME_SUBJECT),
             removed=_UNIQUE_SUBJECTS,
         ),

@@ -357,7 +357,7 @@ def _let_in(name: str, keystore: KeystoreChoice, removed: str) -> Row:
     return _attempt(
         name,
         RowStatus.HEARD,
-        "it gets a connection, and rules that are not for a name let it through",
+        "it gets a connection, and rules without a name let it through",
         hears("listener", party.name),
         (wide, listener, party),
         removed=removed,
@@ -436,7 +436,7 @@ _CONNECTION_ROWS = (
             "TLS checks the dates of the certificate",
             "certificate not valid yet",
         ),
-        _in_date("the same identity in date", "the wrong dates"),
+        _in_date("the same identity before it expires", "the wrong dates"),
     ),
     *tries(
         "the key of another enclave",
@@ -632,7 +632,7 @@ def _rogue(
     return _attempt(
         name,
         RowStatus.HEARD if succeeds else RowStatus.NOT_HEARD,
-        "sessions believe this router"
+        "sessions trust this router"
         if succeeds
         else "a session accepts data from the router only if the certificate has the router's name",
         hears(rogue.name, "talker") if reads else hears("listener", rogue.name),
@@ -690,14 +690,14 @@ _ROUTERS = _scenario(
     _attempt(
         "talker to listener at another router",
         RowStatus.HEARD,
-        "both routers allow what both enclaves may, if its name may cross",
+        "both routers allow a name to which both enclaves have rights, if the name may cross",
         hears("listener", "talker"),
         _far_pair(zenoh_forger.far_router),
     ),
     _attempt(
         "talker to listener at the same router, the topic may not cross",
         RowStatus.HEARD,
-        "what may cross concerns only other routers",
+        "the limit on crossing concerns only other routers",
         hears("listener", _NEAR.name),
         _NOT_CROSSING,
         world="not crossing",
@@ -722,9 +722,9 @@ def _rogue_far_router(name: str, keystore: KeystoreChoice, removed: str = "") ->
     return _attempt(
         name,
         RowStatus.HEARD if removed else RowStatus.NOT_HEARD,
-        "the router believes this router"
+        "the router trusts this router"
         if removed
-        else "a router believes another router only by the name in its certificate",
+        else "a router trusts another router only by the name in its certificate",
         hears(rogue.name, "talker"),
         (rogue, replace(wide, turn=1), replace(talker, turn=2), replace(observer, turn=2)),
         (Claim(Relation.SEES, "observer", "talker"),),
@@ -792,7 +792,7 @@ _WILDCARD_ROWS = (
                 f"{attack}, denied inside a wildcard",
                 party,
                 done,
-                "a denial of the name holds only for the name, not for a wider expression",
+                "a denial of the name applies only to the name, not to a wider expression",
                 zenoh_forger.denial_in_a_wildcard,
                 "denial in a wildcard",
                 "exact permission",
@@ -861,7 +861,7 @@ def _announcing(
     return _attempt(
         f"{token.attack}{how}",
         RowStatus.VISIBLE if removed else RowStatus.NOT_VISIBLE,
-        "nobody compares what a token names with a policy" if removed else token.mechanism,
+        "nobody compares the names in a token with a policy" if removed else token.mechanism,
         Claim(Relation.SEES, "observer", impostor.name),
         (wide, talker, observer, impostor),
         (Claim(Relation.SEES, "observer", "talker"),),
@@ -902,7 +902,7 @@ def _erasing(how: str, keystore: KeystoreChoice, world: str, removed: str = "") 
     return _attempt(
         f"{_ERASING}{how}",
         RowStatus.ERASED if removed else RowStatus.NOT_ERASED,
-        "the graph looks at session and name of a token that ends, and at no enclave"
+        "when a token ends, the graph compares its session and name, but not the enclave"
         if removed
         else "a token passes only for nodes that the policy of its sender names",
         Claim(Relation.LOSES, "observer", "eraser"),
@@ -950,7 +950,7 @@ def _earlier(name: str, keystore: KeystoreChoice, expected: RowStatus, removed: 
     return _attempt(
         name,
         expected,
-        "the file decides what its own process may do, and nobody else does"
+        "only this file decides what its own process may do"
         if removed
         else "a session file limits only the others, which decide what this enclave may do",
         hears("listener", guest.name),
@@ -1026,7 +1026,7 @@ _OPEN_ROWS = (
             "revoked identity whose name is used again",
             zenoh_forger.revoked_name_in_use_again,
             RowStatus.HEARD,
-            "the rules know the name alone, and the old certificate has it, too",
+            "the rules know only the name, which the old certificate has, too",
         ),
         "Zenoh has no revocation list (zenoh#2749)",
         "give the enclave another name, or `sros rotate_ca`; short validity",
