@@ -95,7 +95,9 @@ _USABLE = ~Letters(_NO_LETTERS)
 # ── automata ───────────────────────────────────────────────────────────────────────────────
 
 _Moves = Mapping[int, int]
-"""Maps a distance to the positions (a bit mask) that a letter moves by it; 0: they stay."""
+"""Maps a distance to a bit mask of the positions that a letter moves by this distance; 0: they
+stay.
+"""
 
 
 _MOST_KNOWN = 20_000

@@ -106,7 +106,7 @@ class Distribution(NamedTuple):
         """Return why a vendor decides: ``as in ROS 2 Jazzy``, with what is assumed."""
         parts = [f"as in ROS 2 {self.title}"]
         if self.stands_for:
-            parts.append(f"which is taken to be like {self.name.capitalize()}")
+            parts.append(f"which is assumed to be like {self.name.capitalize()}")
         parts += (
             f"whose {shipped.release} was not measured"
             for shipped in self.shipped
@@ -203,7 +203,9 @@ def unknown_distribution(environment: Mapping[str, str]) -> list[Note]:
     name = environment.get(ROS_DISTRO, "")
     if not name or not distribution_problem(name):
         return []
-    text = f"{ROS_DISTRO} is {name!r}, which sros does not know: decided as if it were not set. "
+    text = (
+        f"{ROS_DISTRO} is {name!r}, which sros does not know; sros decides as if it were not set. "
+    )
     return [Note("distribution.unknown", f"{text}Name the one that is sourced, such as jazzy.")]
 
 

@@ -135,8 +135,8 @@ def _enclave_problem(name: str) -> str:
         return "It does not start with '/'."
     if len(name) > MAX_COMMON_NAME:
         return (
-            f"It has {len(name)} characters, and the common name of an X.509 certificate holds "
-            f"at most {MAX_COMMON_NAME}."
+            f"It has {len(name)} characters, but the common name of an X.509 certificate has at "
+            f"most {MAX_COMMON_NAME}."
         )
     if name == "/":
         return ""

@@ -170,7 +170,10 @@ def require_child(root: etree._Element, tag: str, name: str, what: str) -> etree
     if space and root.prefix:
         why = f"Its elements have the prefix {root.prefix}: (as <{root.prefix}:dds>); DDS has none."
     elif space:
-        why = f"Its elements are in the namespace {space} (xmlns), and those of DDS are in none."
+        why = (
+            f"Its elements are in the namespace {space} (xmlns), but elements of DDS have no "
+            "namespace."
+        )
     elif root.tag != "dds":
         why = f"It begins with <{tag_of(root)}>, and not with <dds><{tag}>."
     raise DocumentError(f"{name} is not a {what} document", why)

@@ -80,7 +80,9 @@ _TOLERANCE = timedelta(minutes=2)
 _LOOK_SECONDS = 0.2
 _REPLACED_LIST = "replaced.crl.pem"
 _REPLACED_FOR = timedelta(days=30)
-"""How long a revocation list that a release replaced is sent to home, if it revoked more."""
+"""How long the agent sends home a revocation list that a release replaced by a list that revokes
+less.
+"""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 

@@ -62,7 +62,7 @@ from sros_tool.wording import enumerated
 
 _OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
 _OF_ENCLAVE = (*sorted(RELEASE_FILES), *KEY_FILES, REQUEST, SEAL)
-"""The files of an enclave that go with it when it is removed."""
+"""The files that are removed together with their enclave."""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 

@@ -185,7 +185,7 @@ def _init(
         raise UsageError(
             f"'{folder}' already has an agent",
             f"'{path}' exists.",
-            "Edit it, or add --force to write it again and to trust this root metadata alone.",
+            "Edit it, or add --force to write it again and to trust only this root metadata.",
         )
     digest = ""
     if not dry_run:

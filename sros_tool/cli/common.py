@@ -859,7 +859,7 @@ def _read_at_most(path: Path, count: int) -> bytes:
 
 
 _SIGNALS_WITHIN = 100
-"""Milliseconds after which a signal is seen that came just before a wait began."""
+"""Milliseconds after which a signal that came just before a wait is noticed."""
 _PART = 1024 * 1024
 """Number of bytes that are read at a time."""
 

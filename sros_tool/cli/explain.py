@@ -133,7 +133,7 @@ _IGNORED = {
         *("vendor", "all_vendors", "distro", "all_distros"),
     ),
 }
-"""The parameters that have no effect, for each of the options that choose a mode."""
+"""Maps each option that chooses a mode to the parameters that have no effect with it."""
 _GOES_WITH = {"infrastructure": "--reach only", "patterns": "--who only", "robots": "--who only"}
 
 

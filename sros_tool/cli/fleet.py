@@ -363,7 +363,7 @@ _VALIDITIES = {
     "targets": "How long the lists of releases are valid (90d).",
     "root": "How long the list of the keys is valid (365d).",
 }
-"""Roles of the metadata of what is published → help of the options for their validity."""
+"""Role of published metadata → help of the option for its validity."""
 
 
 @fleet.command("publish")
@@ -799,7 +799,7 @@ def _page_rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple
 
 
 _ROBOT = "{robot}"
-"""Stands for the name of each robot that shares a row, as in policies."""
+"""Placeholder, as in policies, for the names of the robots that share a row."""
 
 
 _DURATION = re.compile(r"(?<![\w.])\d+ (?:d|h|min|s)(?: \d+ (?:h|min|s))?(?![\w.])")

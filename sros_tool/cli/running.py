@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from sros_tool.enclave_environment import EnclaveEnvironment
 
 _COMMAND = "sros.command"
-"""The key of ``ctx.meta`` with the words after ``--`` of a `_WithCommand`."""
+"""The key in ``ctx.meta`` for the words that a `_WithCommand` gets after ``--``."""
 _FAST_DDS_PIN = "FASTDDS_PKCS11_PIN"
 """The variable from which Fast DDS takes the PIN of a token (Pkcs11Provider.cpp)."""
 _NO_PIN = (

@@ -411,7 +411,9 @@ def _blocked(denied: list[str], denied_too: set[str], is_allowed: Meets) -> list
 
 
 _FEW_PARTS = 20
-"""Parts of new names that are looked for in all names: for more, comparing takes less time."""
+"""Number of parts of new names up to which each part is searched in all names; with more parts,
+comparing all names is faster.
+"""
 
 
 def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:

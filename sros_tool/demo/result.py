@@ -643,8 +643,9 @@ class UsedLibrary(NamedTuple):
     version: str
     """Version of the DDS in three numbers; empty if the name of the library does not show it."""
     packaged: bool
-    """Whether a package of Debian or Ubuntu has the library, which can carry fixes of later
-    releases."""
+    """Whether the library is from a package of Debian or Ubuntu, which can have fixes of later
+    releases.
+    """
     vulnerabilities: Sequence[str] | None
     """Ids of the known vulnerabilities of this version; null if they are not known."""
     unclear: Sequence[str]

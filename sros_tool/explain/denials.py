@@ -227,7 +227,7 @@ _SEVERAL = Note(
 )
 
 _NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")
-"""Files to include, the largest first: a node without a right in it lacks the include."""
+"""Files to include, the largest first; a node that lacks a right of a file lacks the include."""
 
 
 def learned_from_logs(

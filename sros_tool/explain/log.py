@@ -397,7 +397,9 @@ _DROPPED: Mapping[tuple[str, bool], str] = {
     ("Reply", False): "call",
     ("Declare Queryable", False): "call",
 }
-"""The right of a remote process that is denied, by message kind and whether it came in."""
+"""Maps a message kind, and whether the message came in, to the denied right of the remote
+process.
+"""
 _GRAPH: Mapping[tuple[str, bool], str] = {
     ("Liveliness Token", True): "announce this node, topic or service in the graph",
     ("Liveliness Token", False): "see this node, topic or service in the graph",

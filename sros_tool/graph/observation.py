@@ -169,7 +169,7 @@ _DISCOVERY = "ros_discovery_info"
 # These keep their participants sorted by identifier, and list nodes in that order.
 _ORDERED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_cyclonedds_cpp", "rmw_connextdds")
 _LOG_FLUSH_SECONDS = 0.3
-"""Time to wait before exit, so that the logging thread of Fast DDS prints why it failed."""
+"""Time to wait before exit, so that the logging thread of Fast DDS prints why the node failed."""
 _ATTEMPTS = 5
 
 

@@ -109,11 +109,13 @@ _ZENOH = "zenoh"
 FileKind = Annotated[str, Words((*_KINDS.values(), _ZENOH))]
 _AUTHORITIES = ("identity_ca", "permissions_ca")
 _EXPIRING = ("certificate", "permissions", "crl")
-"""Kinds of files whose expiry on a robot the ledger tells."""
+"""Kinds of files for which the ledger has the expiry of a robot's file."""
 _LONGEST_SILENCE = timedelta(days=1)
-"""From when a robot that fetches is offline, if nothing else is asked for."""
+"""Age of the last message from which a robot that fetches is offline, by default."""
 _SILENCE = timedelta(minutes=30)
-"""From when a robot that fetches, every five minutes by default, may be off."""
+"""Age of the last message from which a robot that fetches (every five minutes by default) may be
+off.
+"""
 _TO_DO = {
     State.RESTART: "restart",
     State.OFFLINE: "find out why",
@@ -124,7 +126,7 @@ _TO_DO = {
     State.UNKNOWN: "find out why",
     State.ANOTHER: "find out why",
 }
-"""State of a robot → what is to be done, if the state alone tells it."""
+"""State of a robot → the remedy, if the state alone decides it."""
 
 
 def _kind_of(path: str) -> str:

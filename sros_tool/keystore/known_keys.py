@@ -58,7 +58,9 @@ def restored_at(keystore: Keystore) -> str:
 
 
 _MOST_NAMES = 200
-"""Enclaves whose keys are looked up one by one; for more, the files of all enclaves are read."""
+"""Number of enclaves up to which keys are looked up one by one; for more, the files of all enclaves
+are read.
+"""
 
 
 class KnownKeys:

@@ -35,14 +35,14 @@ PUBLISHED = "published.json"
 LEDGER = "ledger.jsonl"
 """The log of issued certificates and documents; keystores of ros2/sros2 do not have it.
 
-Of a long ledger it is a link to the last part, whose name fits `SEALED_LEDGER`.
+For a long ledger, it is a link to the last part, whose name matches `SEALED_LEDGER`.
 """
 SEALED_LEDGER = re.compile(r"ledger\.[0-9]{4,9}\.jsonl")
-"""Names of the parts of a long ledger: of the sealed ones, and of the last one."""
+"""Names of the parts of a long ledger, which are sealed except for the last one."""
 LEDGER_HEAD = "ledger.p7s"
 """The number of lines of the ledger and the digest of the last one, signed by a CA."""
 LEDGER_INDEX = ".sros-index"
-"""The index of a long ledger, which is made again where it is missing or does not fit."""
+"""The index of a long ledger; sros makes it again if it is missing or does not match."""
 
 IDENTITY, PERMISSIONS = "identity", "permissions"
 ROLES = (IDENTITY, PERMISSIONS)

@@ -70,7 +70,7 @@ REPORTED = "reported"
 """The ``reason`` of a certificate that only the message of a robot showed: it can be revoked, and
 proves nothing."""
 SAME_KEY = "same key"
-"""The ``reason`` of a CA certificate that has the same key as the CA's certificate before."""
+"""The ``reason`` of a CA certificate that has the same key as the CA's previous certificate."""
 
 
 class Entry(NamedTuple):
@@ -162,16 +162,18 @@ _MOST_BITS = 159
 _MOST_NUMBER = 10**12
 _MOST_KEPT = 16 * 1024 * 1024
 _SEALED_FROM = 16 * 1024 * 1024
-"""Bytes from which a part is sealed: each change copies the last part."""
+"""Size in bytes from which a part is sealed: each change copies the last part."""
 _LINE_BYTES = 450
 """Length of most lines."""
 _HEAD = re.compile(
     rb"sros ledger [12]\nlines ([0-9]{1,12})\nsha256 ([0-9a-f]{64})\n(?:index ([0-9a-f]{64})\n)?"
 )
 _INDEXED_FROM = 2000
-"""Lines from which a ledger has an index: reading a shorter ledger takes less than finding out."""
+"""Number of lines from which a ledger has an index; a shorter ledger is read faster than it is
+looked up.
+"""
 _LINES_PER_LOOKUP = 5
-"""Lines that are read in the time that the index takes to look up a value."""
+"""Number of lines that take as long to read as one look-up in the index."""
 _VALUES = {
     "serial": r'"(?P<serial>[0-7][0-9a-f]{39}|[0-9a-f]{1,39})"',
     "number": r"([1-9][0-9]{0,11})",

@@ -630,7 +630,9 @@ class SignedRights(NamedTuple):
 
 
 _MOST_LOOKUPS = 200
-"""Number of enclaves up to which each is searched in the ledger; for more, all of it is read."""
+"""Number of enclaves up to which the ledger is searched for each one; for more, the whole ledger is
+read.
+"""
 
 
 class _OfLedger:

@@ -186,7 +186,7 @@ def _of_robots(
         if not own:
             if left := _named_after(keystore, name):
                 raise KeystoreError(
-                    f"by its fleet, keystore '{root}' has no enclave of a robot {name}",
+                    f"the fleet in keystore '{root}' gives no enclave to a robot {name}",
                     f"It has {_some(left)}: perhaps the robot left the fleet, or a group.",
                     f"Name the enclaves themselves: {words_for(root, left)}.",
                 )

@@ -634,7 +634,7 @@ def _domains(network: ZenohNetwork, domains: DomainSet, root: Path) -> tuple[int
     chosen = network.domains or tuple(domains)
     if len(chosen) > _MOST_DOMAINS:
         raise UsageError(
-            f"keystore '{root}' is for {len(chosen)} domains, and a Zenoh network for at most "
+            f"keystore '{root}' is for {len(chosen)} domains, but a Zenoh network can have at most "
             f"{_MOST_DOMAINS}",
             "Its rules state every right once for each domain.",
             "Name those that run on Zenoh with `sros zenoh --domain`.",
@@ -838,7 +838,7 @@ _PROOF = {
     "request": (Flow.INGRESS, Message.QUERY),
     "reply": (Flow.EGRESS, Message.QUERY),
 }
-"""The message of each right; written here again, so that errors of the translation show."""
+"""The message of each right, repeated here on purpose, so that errors of the translation show."""
 _ANNOUNCED = {"NN": "", "MP": "publish", "MS": "subscribe", "SC": "request", "SS": "reply"}
 """What each kind of graph token announces: a node, or the use of a right to a name."""
 _TOKEN = re.compile(r"@ros2_lv/([0-9]+)/\*/\*/\*/(..)/([^/]+)/[^/]+/[^/]+(?:/([^/]+)/\*\*)?")

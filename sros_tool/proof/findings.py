@@ -425,9 +425,10 @@ def _gates(world: World) -> Iterator[Apart]:
 
 # ── writing ────────────────────────────────────────────────────────────────────────────────
 
-_HEAD = r"""\ # Requirements that hold for {of} today, for all names that could ever be used. # Keep
-        those that have to hold tomorrow, say why, and delete the others.
-        """
+_HEAD = """\
+# Requirements that hold for {of} today, for all names that could ever be used.
+# Keep those that have to hold tomorrow, say why, and delete the others.
+"""
 
 
 def render_requirements(requirements: Iterable[Requirement], of: str) -> str:

@@ -33,7 +33,7 @@ _MOST_TEXTS = 1000  # of one key
 _MOST_PAIRS = 20_000  # that requirements of one file make of the names of two lists
 _LONGEST_TEXT = 500  # characters of a name or a reason
 EXCEPT = "!"
-"""Prefix of an enclave that a list of enclaves excepts."""
+"""Prefix of an enclave that is excepted from a list of enclaves."""
 _LEVELS = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
 
 

@@ -31,7 +31,9 @@ class SignedConfiguration:
 SIGNED = "holds"
 
 _Files = Mapping[str, SignedConfiguration]
-"""Configurations by enclave and file name, such as "/web session.json5"; or one by `LONE`."""
+"""Configurations by enclave and file name, such as "/web session.json5"; or a single one under the
+key `LONE`.
+"""
 LONE = "the file"
 
 _OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...] = (

@@ -54,7 +54,7 @@ _MOST_KEYS = 5
 _MOST_CHARACTERS = 60
 
 REFUSING_ZENOH: Mapping[str, str] = {SESSION_URI: NO_CONFIGURATION, ROUTER_URI: NO_CONFIGURATION}
-"""Variables with which neither a node nor a router of rmw_zenoh_cpp opens a session."""
+"""Variables that keep nodes and routers of rmw_zenoh_cpp from opening a session."""
 
 
 class PrintedEnvironment(NamedTuple):
@@ -113,7 +113,9 @@ REFUSING: Mapping[str, str] = {
     STRATEGY: "Enforce",
     **REFUSING_ZENOH,
 }
-"""Variables with which rcl starts no node with any RMW, and rmw_zenoh_cpp no router."""
+"""Variables that keep rcl from starting a node with any RMW, and rmw_zenoh_cpp from starting a
+router.
+"""
 
 
 def render_refusal(form: str) -> str:

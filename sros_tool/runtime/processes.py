@@ -55,7 +55,9 @@ _PRODUCTS = {b"fastrtps": "Fast DDS", b"fastdds": "Fast DDS", b"ddsc": "Cyclone 
 _THREE_NUMBERS = re.compile(r"\.so\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
 _MOST_ENTRIES = 10_000
 _MOST_COPIES_SOUGHT = 20
-"""Libraries of one process whose copies are looked for; further ones are of unknown version."""
+"""Maximum number of libraries of a process whose copies are searched; the version of others is
+unknown.
+"""
 _DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
 _ROUTERS = ("rmw_zenohd", "zenohd")
 _BRIDGES = ("zenoh-bridge-ros2dds", "zenoh-bridge-dds")

@@ -88,7 +88,7 @@ class Delivery:
 Route = tuple[ZenohProcess, ...]
 """The two to four processes that a message passes, from the sender to the receiver.
 
-A route of a session and its router is the part on which the rights of one enclave decide.
+A route between a session and its router is the part for which the rights of one enclave decide.
 """
 
 

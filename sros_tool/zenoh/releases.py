@@ -40,7 +40,7 @@ RELEASES = (
     RmwZenohRelease("Kilted", (0, 3, 0), (0, 6, 0)),
     RmwZenohRelease("Lyrical", (0, 7, 0), (0, 7, 0), _BUFFERS),
 )
-"""All supported releases, earliest first; versions of Rolling count to the next distribution."""
+"""All supported releases, earliest first; versions of Rolling belong to the next distribution."""
 
 
 def release_of(version: Version) -> RmwZenohRelease:

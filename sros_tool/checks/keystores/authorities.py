@@ -366,7 +366,9 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
 
 
 _SHOWN, _MOST_LEFT = 5, 20
-"""Limits of a finding's text: enclaves named for each removed robot, and removed robots."""
+"""Maximum numbers in a finding's text: of enclaves for each removed robot, and of removed
+robots.
+"""
 
 
 def _left_enclaves(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]:

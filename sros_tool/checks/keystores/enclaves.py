@@ -43,7 +43,9 @@ from sros_tool.translate import allows_everything
 from sros_tool.validity import BACKDATE, Span, iso, parse_iso
 
 _SAME_DAY = timedelta(days=1)
-"""ros2/sros2 gives a CA and its certificates ten years each, so these expire seconds later."""
+"""ros2/sros2 makes a CA and its certificates valid for ten years each, so the certificates expire
+seconds after the CA.
+"""
 _NOT_LOADABLE = "enclave.not-loadable"
 """The group id of all faults, for `--include` and `--exclude`."""
 

@@ -73,7 +73,7 @@ from sros_tool.wording import counted, first_few
 
 _NAMES_SHOWN = 3
 _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id, TIME_FORMAT.id})
-"""Ids of findings with one cause in all enclaves: a setting, or who signed them."""
+"""Ids of findings with one cause in all enclaves: a setting, or the signer of their files."""
 _OF_SEVERAL_FILES = frozenset(
     {REFUSED.id, SOME_REFUSE.id, CRL_MISSING.id, *(kind.id for kind in upgrade.OF_ENCLAVES)}
 )

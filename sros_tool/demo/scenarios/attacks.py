@@ -384,7 +384,8 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                 _eavesdropping(
                     f"{what} read in the handshake",
                     RowStatus.READABLE,
-                    "certificates and permissions are sent in clear before keys are agreed",
+                    "certificates and permissions are sent unencrypted before the participants "
+                    "agree on keys",
                     OWN,
                     wire,
                 ),

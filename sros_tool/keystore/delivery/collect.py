@@ -79,10 +79,10 @@ from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Not
 from sros_tool.wording import counted, first_few
 
 _MOST_NAMES = 100_000
-"""Names in an inbox that are looked at, to name those of no robot of the fleet."""
+"""Maximum number of names in an inbox that are searched for names without a robot in the fleet."""
 _SHOWN = 5
 _FEW = 4
-"""Number of certificates up to which a ledger without index is searched for each of them."""
+"""Number of certificates up to which a ledger without index is searched for each certificate."""
 
 
 # ── what is done with messages and requests ────────────────────────────────────────────────

@@ -299,7 +299,7 @@ _OF_TIME = frozenset(
         Fault.PERMISSIONS_NOT_YET_VALID,
     }
 )
-"""Faults that files have at one time, and not at another."""
+"""Faults that depend on the time."""
 
 
 def _evaluated(root: Path, name: str, now: datetime) -> EvaluatedEnclave:

@@ -98,15 +98,17 @@ _ONLINE = _ROLES[1:]
 """The roles whose keys have to be in the keystore."""
 _METADATA, _TARGETS, _ARCHIVES = "metadata", "targets", "targets/robots"
 _KEPT = timedelta(days=2)
-"""How long files stay that nothing names any more: robots may be in the middle of an update."""
+"""How long unused files stay: robots may be in the middle of an update."""
 _OURS = re.compile(
     r"metadata/[0-9]+\.(?:targets|snapshot|robots-[0-9a-f]+)\.json"
     r"|targets/robots/[0-9a-f]{64}\.[A-Za-z0-9_]+\.tar\.gz"
     r"|(?:metadata|targets/robots)/\.[^/]+\.new"
 )
-"""Paths in a publishing folder that are removed once nothing names them."""
+"""Paths in a publishing folder that are removed once they are unused."""
 _MOST_SUPERSEDED = 500_000
-"""Number of such paths that are remembered: whoever can write to the folder can make many."""
+"""Maximum number of unused paths that are remembered: anyone who can write to the folder can make
+many.
+"""
 _BEFORE = "before"
 
 

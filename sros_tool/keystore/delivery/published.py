@@ -29,7 +29,7 @@ _SMALL = 64 * 1024
 MOST_NUMBER = 10**12 - 1
 """Highest number of a release, as a seal can state it, and highest version of metadata."""
 BEGIN_AGAIN = "Start again as after a theft of all keys: docs/fetching.md says how."
-"""Remedy for numbers that somebody has counted up as far as they go."""
+"""Remedy if somebody has used up the numbers."""
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 
 

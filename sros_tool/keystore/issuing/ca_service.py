@@ -50,9 +50,8 @@ _SECONDS = 60
 _LOOK = 0.02
 """Seconds between two looks at whether a program that closed its output has ended."""
 _AHEAD = timedelta(hours=1)
-"""How much later than the change of the keystore began a certificate may become valid.
-
-Services count from when they issue, by a clock of their own.
+"""How long after the start of a keystore's change a certificate may become valid: services date
+certificates by their own clock, when they issue.
 """
 _MOST_SERIAL_BITS = 159
 """Largest serial number that a revocation list can have (RFC 5280, 4.1.2.2)."""

@@ -76,7 +76,7 @@ from sros_tool.wording import counted
 
 Result = TypeVar("Result", bound="Changed")
 _NOTED = timedelta(days=1)
-"""How much earlier than asked a certificate of a CA service may expire without a note."""
+"""How much earlier than requested a certificate of a CA service may expire without a note."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
