@@ -212,7 +212,7 @@ def revoke(
     Example:
       $ sros revoke keystore /talker --reason key_compromise
       revoked enclave /talker
-      restart the processes of 2 enclaves for the change to take effect: /listener, ...
+      restart the processes of 2 enclaves for the change to take effect: ...
     """
     from sros_tool.keystore.lifecycle.revoke import revoke as work
     from sros_tool.keystore.reader import Keystore

@@ -142,14 +142,14 @@ def _unrecorded_notes(root: Path, below: list[str], left: list[str]) -> Iterator
     if below:
         yield Note(
             "fleet.revoked-unrecorded",
-            f"Also revoked: {_some(below)}, in the folder of a robot that you revoke. The fleet "
-            "does not record this.",
+            f"Also revoked, although the fleet does not record it: {_some(below)}, in the folder "
+            "of a robot that you revoke.",
         )
     if left:
         yield Note(
             "fleet.unrecorded-enclaves",
-            f"Still valid: {_some(left)}, with the name of a robot that you revoke in the path. "
-            "The fleet does not record whose enclave it is. If the key was on that robot, run "
+            f"Still valid, because the fleet does not record whose it is: {_some(left)}, with the "
+            "name of a robot that you revoke in the path. If the key was on that robot, run "
             f"`sros revoke {quote(str(root))} {words_for(root, left)}`.",
         )
 

@@ -207,7 +207,9 @@ def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChan
                 again[serial].append(name)
     for serial in sorted(again)[:_MOST_SERIALS]:
         names = [each for each in again[serial] if each != KEYSTORE_ITSELF] or [KEYSTORE_ITSELF]
-        who = f"{names[0]} again trusts" if len(names) == 1 else f"{len(names)} enclaves again trust"
+        who = (
+            f"{names[0]} again trusts" if len(names) == 1 else f"{len(names)} enclaves again trust"
+        )
         text = f"{who} anyone who has its key"
         yield SettingChange(Effect.LOOSER, f"certificate {serial:x}", "revoked", "trusted", text)
     if (more := len(again) - _MOST_SERIALS) > 0:

@@ -250,7 +250,7 @@ def test_two_releases_with_one_number_are_refused(home: Home, r1: Robot) -> None
     before = content(r1.folder / "enclaves")
     r1.release = home.release(home.revoked.files, 2)
     done = r1.round()
-    assert any("Another release with the number 2" in problem for problem in done.problems)
+    assert any("has the number 2 of the installed release" in problem for problem in done.problems)
     assert content(r1.folder / "enclaves") == before
     r1.release = home.renewed
     assert r1.round().changed == ("/r1/a",)

@@ -128,7 +128,7 @@ def test_everything_that_an_enclave_may_do_is_shown_by_inspect(keystore: Path) -
     command = refused.err.partition("`sros inspect ")[2].partition("`")[0]
     assert refused.status == 2 and "publish topics" in sros("inspect", command).ok().out
     above = sros("inspect", Path(command).parent)
-    assert above.status == 2 and f"It holds {OTHER}" in above.err
+    assert above.status == 2 and f"It contains {OTHER}" in above.err
     named = above.err.partition("`sros inspect ")[2].partition("`")[0]
     assert "subscribe topics" in sros("inspect", named).ok().out
     chosen = explain(keystore, "--robot", "r1")

@@ -714,7 +714,7 @@ def test_a_key_that_was_replaced_vouches_for_no_other(home: Home) -> None:
     later = DUE + timedelta(days=95)
     for key in (generate_key(), home.key("r1", "/r1/base")):
         why = refused(home, "r1", later, requests=(home.request("r1", key=key),))
-        assert "an earlier key signed the message" in why
+        assert "an earlier key signed it" in why
 
 
 def test_the_grace_after_expiry(home: Home) -> None:

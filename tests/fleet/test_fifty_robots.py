@@ -288,7 +288,7 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     (folder / "fleet.toml").write_text(fleet_file([r for r in ROBOTS if r not in ("r7", "r9")], 6))
     ended = sros(*again, cwd=folder)
     assert ended.status == 2
-    assert "is in domain 6, and the keystore is for domain 0,5" in ended.err
+    assert "is in domain 6, but the keystore is for domain 0,5" in ended.err
     (folder / "one.xml").write_text(
         POLICY.replace('<enclave path="/{robot:carriers}/lift">', "<!--").replace(
             '<enclave path="/dispatcher">', '--><enclave path="/dispatcher">'

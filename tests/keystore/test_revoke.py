@@ -263,7 +263,7 @@ def test_a_list_of_another_authority_is_seen(tmp_path: Path) -> None:
     crls = [root / "public/identity_ca.crl.pem" for root in roots]
     shutil.copy(crls[1], crls[0])
     (problem,) = problems(roots[0] / "enclaves/b")
-    assert "not of the identity CA" in problem
+    assert "the identity CA did not sign it" in problem
     assert not problems(roots[1] / "enclaves/b")
 
 

@@ -279,7 +279,7 @@ def test_what_permissions_allow_by_default_is_refused() -> None:
     ("words", "why"),
     [
         ("--endpoint robot:7447", ""),
-        ("--endpoint robot:7447 --mode peer", "peer mode cannot reach a router at robot"),
+        ("--endpoint robot:7447 --mode peer", "peer mode cannot reach both a router at robot"),
         ("--mode peer --endpoint 127.0.0.1:7447 --endpoint [::1]:7447", ""),
         ("--endpoint one:7447 --endpoint two:7447", "cannot listen at one and two"),
         ("--endpoint one:7447 --endpoint two:7447 --listen [::]:7447", ""),

@@ -173,12 +173,12 @@ def test_a_private_key_is_found_in_every_form_of_openssl(key: PrivateKey, words:
 
 ROUNDS = {
     "pkcs8 -topk8": "trying a passphrase takes 2048 rounds",
-    "pkcs8 -topk8 -iter 1000": "1000 rounds try a passphrase",
+    "pkcs8 -topk8 -iter 1000": "trying a passphrase takes 1000 rounds",
     "pkcs8 -topk8 -iter 600000": "",
     "pkcs8 -topk8 -v1 PBE-SHA1-3DES": "trying a passphrase takes 2048 rounds",
     "pkcs8 -topk8 -scrypt": "",
     "pkcs8 -topk8 -scrypt -scrypt_N 1024": "trying a passphrase takes scrypt with 1024, 8, 1",
-    "pkey -traditional -aes256": "one round of MD5 tries a passphrase",
+    "pkey -traditional -aes256": "trying a passphrase takes one round of MD5",
     "pkey": "",
 }
 

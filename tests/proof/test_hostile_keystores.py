@@ -443,7 +443,7 @@ def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, s
         (without_the_signature, 1, "signature of /router router.json5 holds -> missing: anybody"),
         (rules_that_a_session_does_not_enforce, 1, "access_control/enabled of /web session.json5"),
         (a_session_that_routes, 1, "+ /mux publish topic /cmd_*: such as /cmd_"),
-        (a_certificate_of_another_name, 1, "certificate of /web /web -> /mux: whoever has"),
+        (a_certificate_of_another_name, 1, "certificate of /web /web -> /mux: anyone who has"),
         (in_a_dot_folder, 1, "+ /.h publish topic /cmd_vel"),
         (
             settings('default = "node_basics"', 'default = "everything"'),
@@ -459,8 +459,12 @@ def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, s
         (settings('validity = "1d"', 'validity = "2d"'), 0, "left out: dates, "),
         (without_settings, 1, "later enclaves: permissions.default node_basics -> everything"),
         (without_the_list, 1, "revoked -> trusted: /mux again trusts anyone who has its key"),
-        (an_earlier_list, 1, "revoked -> trusted: 3 enclaves trust whoever has its key again"),
-        (an_earlier_list_for_later_enclaves, 1, "trusted: the keystore trusts whoever has its"),
+        (an_earlier_list, 1, "revoked -> trusted: 3 enclaves again trust anyone who has its key"),
+        (
+            an_earlier_list_for_later_enclaves,
+            1,
+            "trusted: the keystore again trusts anyone who has its",
+        ),
         (
             a_list_of_another_ca,
             2,
@@ -478,7 +482,7 @@ def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, s
         (a_link_without_tls, 2, "without TLS"),
         (no_certificate_asked_for, 2, "it asks for no certificate"),
         (a_subject_with_a_condition, 2, "conditions besides the name: interfaces"),
-        (the_history_of_a_topic, 2, "gets the history of '0/cmd_vel/*/*' alone"),
+        (the_history_of_a_topic, 2, "gets only the history of '0/cmd_vel/*/*'"),
         (a_denial, 2, "it has denials"),
         (a_namespace, 2, "puts a namespace before the keys"),
         (a_second_router, 2, "has the files of several routers"),

@@ -106,7 +106,7 @@ def test_what_two_expressions_have_in_common() -> None:
         ("a/*/@b/**/c$*d", ""),
         ("", "begins"),
         ("a//b", "begins"),
-        ("a/b#", "no characters"),
+        ("a/b#", "not allowed"),
         ("a*", "has to be '$*'"),
         ("$a", "has to be '$*'"),
         ("**/*", "has to be written '*/**'"),
