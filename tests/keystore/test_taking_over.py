@@ -81,7 +81,7 @@ def test_the_first_write_takes_it_over_and_says_so(words: tuple[str, ...], tmp_p
     found = {each["id"] for each in json.loads(sros("check", root, "--json").out)["findings"]}
     assert not found & {"keystore.settings-missing", "keystore.not-in-ledger"}
     assert not Keystore(root).ledger.gaps
-    assert "taken on trust" not in sros("renew", root, "/b/c").ok().err
+    assert "accepted without proof" not in sros("renew", root, "/b/c").ok().err
 
 
 def test_an_enclave_that_ros2_adds_later_is_one_finding(tmp_path: Path) -> None:
@@ -146,9 +146,9 @@ def test_a_keystore_of_version_0_1_is_one_finding_with_one_command(tmp_path: Pat
     ended = sros("check", root, *known)
     assert paragraphs(ended.out) == 1 and "[keystore.ledger-unproven]" in ended.out
     trusted = command_in(ended.out[ended.out.index("If you know") :])
-    assert "taken on trust" in sros(*trusted, "--dry-run").ok().err
+    assert "accepted without proof" in sros(*trusted, "--dry-run").ok().err
     assert sros("renew", root, "/a").status == 2
-    assert "taken on trust" in sros(*trusted).ok().err
+    assert "accepted without proof" in sros(*trusted).ok().err
     sros("check", root, *known).ok()
     sros("renew", root, "/a").ok()
     assert "left-out" not in sros("zenoh", root).ok().err
