@@ -679,8 +679,8 @@ ROOT_ENCLAVE = FindingKind(
     "policy.root-enclave",
     WARNING,
     "an enclave / with the rights of a node, or of several nodes or enclaves",
-    "Every process that is started without an enclave runs in /, and gets all of its rights; "
-    "without an enclave / in the keystore, it does not start.",
+    "A process that names no enclave runs in /, and gets all rights of /; if the keystore has no "
+    "enclave /, the process does not start.",
     "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",
     "Remove the enclave / from the policy once each process has its own enclave: `sros "
     "generate_policy POLICY --enclave-per-node` writes such a policy.",

@@ -173,7 +173,7 @@ def _print_restart(
     if not names:
         return
     number = counted(len(names), "enclave")
-    text = f"restart the processes of {number} for it to take effect: "
+    text = f"restart the processes of {number} for the change to take effect: "
     text += shown_names(names)
     if zenoh and zenoh.files and set(zenoh.restart) != set(names):
         text += f"; of those on Zenoh: {shown_names(zenoh.restart) or 'none'}"

@@ -653,7 +653,7 @@ class _Known:
         entries = self._keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
         marks = [entry for entry in entries if entry.what in (RESTORED, "release")]
         if marks and marks[-1].what == RESTORED:
-            return "robots have what it signed and does not know"
+            return "robots have files that it signed but does not know"
         from sros_tool.keystore.delivery.publish import later_in_folder  # few folders are later
 
         return later_in_folder(self._keystore)
