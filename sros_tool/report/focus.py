@@ -297,10 +297,10 @@ class _System:
         sentence = _sentence(kind, name, senders, receivers, influencing, open_to_all)
         if not is_expression(name) and (kind, name) not in self._known:
             sentence = f"no right states {name} itself, but wildcards match it: {sentence}"
-        domains = {self._domains.get(user, "") for user in senders | receivers}
+        domains = {self._domains.get(user, "") for user in senders | receivers} - {""}
         if len(domains) > 1:
             sentence += "; they are in different ROS domains ("
-            sentence += f"{enumerated(sorted(domains - {''}))}), and reach only those of their own"
+            sentence += f"{enumerated(sorted(domains))}), and reach only those of their own"
         return Focus(
             kind, name, sentence, tuple(sorted(senders)), tuple(sorted(receivers)), influencing
         )

@@ -414,7 +414,7 @@ class _Draft:
             edges=edges,
             focus=tuple(map(self._focus, self._picture.focus)),
         )
-        shown_domains = {self._domains(unit) for unit in self._of.values()}
+        shown_domains = {self._domains(unit) for unit in self._of.values()} - {""}
         units = sorted(
             EqualUnits(
                 self._label(members[0]),

@@ -148,8 +148,8 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
         seen = union([read_source(path, now=drawing.now) for path in drawing.observed])
         read.append(seen.in_enclaves(enclaves_of_nodes(seen.nodes, read[0].nodes)))
     picture = _compared(read, context, use=bool(drawing.observed))
-    if len(domains := {enclave.domains for enclave in picture.enclaves}) > 1:
-        several = enumerated(sorted(domains - {""}))
+    if len(domains := {enclave.domains for enclave in picture.enclaves} - {""}) > 1:
+        several = enumerated(sorted(domains))
         text = f"enclaves are for different ROS domains ({several}), and a name is drawn once for "
         text += "all of them. Information goes only between enclaves with a common domain; what a "
         text += "click on a page shows as reach ignores domains (--focus respects them)."
