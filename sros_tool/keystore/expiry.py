@@ -43,7 +43,7 @@ class Lifetime:
     certificate: Window
     permissions: Window
     came: datetime | None = None
-    """When the certificate was written here; it may be of a CA that back-dates nothing."""
+    """When the certificate was written here: a CA may not back-date its certificates."""
 
     def expires(self) -> datetime:
         """Return the earlier expiry of certificate and permissions."""

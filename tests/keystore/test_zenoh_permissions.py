@@ -42,7 +42,7 @@ USES = {
     "request": (Flow.INGRESS, Message.QUERY), "reply": (Flow.EGRESS, Message.QUERY),
 }  # fmt: skip
 NO_AGREEMENT = "because vendors of DDS do not decide alike"
-ORDER = "because the order of its rules counts"
+ORDER = "because the order of its rules matters"
 
 
 def rule(qualifier: str, topic: str, *partitions: str, domains: DomainSet = ZERO) -> Rule:

@@ -93,7 +93,7 @@ _MOST_BROKEN = 20
 
 Files = dict[str, bytes]
 _Kind = tuple[tuple[str, ...], frozenset[str], tuple[object, ...]]
-"""The paths of an enclave's files, the changed files, and the content on which vendors decide."""
+"""An enclave's paths and changed files, and the content on which vendors decide."""
 
 
 @dataclass(frozen=True, slots=True)
