@@ -15,7 +15,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
-from sros_tool.errors import Note, UsageError
+from sros_tool.errors import Note, PolicyError, UsageError
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
@@ -178,7 +178,17 @@ def read_policy(path: AnyPath) -> Policy:
     """
     from sros_tool.policy import document
 
-    return document.read_policy(Path(path))
+    try:
+        return document.read_policy(Path(path))
+    except PolicyError as error:
+        if error.remedy != document.NAME_THE_FLEET:
+            raise
+        raise PolicyError(
+            error.what,
+            error.why,
+            "Do not read the policy: pass its path to a function with fleet=, such as "
+            "generate(keystore, path, fleet=FLEET_FILE).",
+        ) from error
 
 
 def generate(
@@ -551,6 +561,7 @@ def explain_access(
 def check(
     *paths: AnyPath,
     policies: Iterable[AnyPath | Policy] = (),
+    fleet: AnyPath | None = None,
     severity: Literal["note", "warning", "error"] = "warning",
     strict: bool = False,
     domain: int | None = None,
@@ -562,6 +573,7 @@ def check(
     Args:
         paths: Keystores, enclave folders, policy files, or folders of policy files.
         policies: Policies, or their files, to compare the permissions of keystores with.
+        fleet: The file with the robots that the placeholders of policy files stand for.
         severity: The lowest severity that is returned.
         strict: Include the weaknesses that a keystore's template accepts.
         domain: The ROS domain id that the enclaves have to join.
@@ -583,14 +595,22 @@ def check(
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import FindingFilter
     from sros_tool.checks.targets import Circumstances, path_findings
+    from sros_tool.fleet.expansion import read_policy_for
+    from sros_tool.fleet.fleet_file import read_fleet
 
     levels = {level.word: level for level in Severity}
     if not paths:
         raise UsageError("no path is given to check", "", "Pass at least one path.")
     if severity not in levels:
         raise UsageError(f"unknown severity {severity!r}", "", f"Choose {', '.join(levels)}.")
-    read = tuple(_policy(policy) for policy in _several("policies", policies))
-    at = Circumstances(_moment(now), zone, _domain(domain), read)
+    robots = read_fleet(Path(fleet)) if fleet else None
+    read = tuple(
+        read_policy_for(Path(policy), robots)
+        if robots and isinstance(policy, str | PathLike)
+        else _policy(policy)
+        for policy in _several("policies", policies)
+    )
+    at = Circumstances(_moment(now), zone, _domain(domain), read, fleet=robots)
     findings = dict.fromkeys(finding for path in paths for finding in path_findings(Path(path), at))
     return FindingFilter(severity=levels[severity], strict=strict).choose(findings).shown
 

@@ -8,12 +8,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 import sros_tool
-from sros_tool import DocumentError, KeystoreError, UsageError
+from sros_tool import DocumentError, KeystoreError, PolicyError, UsageError
 from sros_tool.files import policies_dir
 from tests.support.harness import policy_text, publish
 from tests.support.long_form import sometimes
@@ -172,6 +173,26 @@ def test_a_fleet_has_one_policy_and_one_status(tmp_path: Path) -> None:
         sros_tool.fleet_status(made, "r2")
     with pytest.raises(UsageError, match="already parsed policy"):
         sros_tool.generate(made, sros_tool.read_policy(POLICY), fleet=fleet)
+    for read in (sros_tool.read_policy, partial(sros_tool.generate, made)):
+        with pytest.raises(PolicyError, match=r"generate\(keystore, path, fleet=FLEET_FILE\)"):
+            read(policy)
+
+
+def test_a_policy_of_a_fleet_is_checked(tmp_path: Path) -> None:
+    policy, fleet = tmp_path / "robot.xml", tmp_path / "fleet.toml"
+    policy.write_text(policy_text({"/{robot}/a": publish("/{robot}/x")}))
+    fleet.write_text("[robots.r1]\n[robots.r2]\n")
+    made = sros_tool.create_keystore(tmp_path / "ks")
+    sros_tool.generate(made, policy, fleet=fleet)
+
+    def stale() -> list[str]:
+        findings = sros_tool.check(made, policy, policies=[policy], fleet=fleet)
+        assert not {"policy.unreadable", "policy.malformed"} & {each.id for each in findings}
+        return [each.subject for each in findings if each.id == "enclave.stale-permissions"]
+
+    assert stale() == []
+    policy.write_text(policy_text({"/{robot}/a": publish("/{robot}/x", "/y")}))
+    assert stale() == ["/r1/a", "/r2/a"]
 
 
 def test_a_choice_of_a_template_is_found_only_when_asked_for(tmp_path: Path) -> None:

@@ -43,6 +43,7 @@ from sros_tool.wording import counted
 if TYPE_CHECKING:
     from sros_tool.distributions import Distribution
     from sros_tool.explain.audit import Audit, AuditedEnclaves
+    from sros_tool.fleet.robots import Fleet
     from sros_tool.graph.observation import Observation
 
 
@@ -196,8 +197,9 @@ def audit(
         echo(_NOT_ALL, err=True)
     if written:
         policy = shlex.quote(str(source)) if enclaves.what == "policy" else "POLICY"
-        command = f"sros merge_policy {policy} {shlex.quote(str(patch))} --in-place"
-        echo(f"{written}; add it: {command}", err=True)
+        command = f"add it: sros merge_policy {policy} {shlex.quote(str(patch))} --in-place"
+        by_hand = _added_by_hand(source, read_fleet(fleet_file), audited) if fleet_file else ""
+        echo(f"{written}; {by_hand or command}", err=True)
     elif patch is not None:
         stays = f"; the earlier '{patch}' stays" if existed else ""
         said = "no patch is needed" if audited.allowed else _NO_PATCH
@@ -224,6 +226,21 @@ def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:
     return save(patch, document)
 
 
+def _added_by_hand(source: Path, fleet: Fleet, audited: Audit) -> str:
+    """Return where to add the missing rights to a policy with placeholders, "" if it has none."""
+    from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.policy.document import read_policy
+
+    stated = read_policy(source, placeholders=True)
+    policy = FleetPolicy(stated, fleet)
+    if policy.policy() == stated:
+        return ""
+    missing = dict.fromkeys(profile.enclave for profile in audited.missing.profiles)
+    of = dict.fromkeys(policy.stated(name)[0] for name in missing if name in policy)
+    places = [f"{enclave.source} ({enclave.path})" for enclave in of] or [str(source)]
+    return f"add its rights by hand, with placeholders, at {', '.join(places)}"
+
+
 # ── output ──────────────────────────────────────────────────────────────────────────────
 
 
@@ -241,7 +258,7 @@ def _show(audited: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> No
     if audited.unseen:
         number, of = len(audited.expected), len(audited.expected) - len(audited.unseen)
         seen = f"{of} of {counted(number, 'node')} of the {enclaves.what}"
-        verdict = f"only {seen} {'was' if of == 1 else 'were'} seen: {verdict}"
+        verdict = f"only {seen} {'was' if 1 in (of, number) else 'were'} seen: {verdict}"
     if audited.unjudged:
         verdict += f"; not judged: {', '.join(audited.unjudged)}"
     if kept_changing:

@@ -569,9 +569,9 @@ def _change_lines(answer: Answer) -> Iterator[str]:
         if is_expression(right.name):
             yield f"    this also removes the denial of all other names in {right.name}"
     if change.document:
-        if answer.enclave.has_placeholders and policy:
-            place = _shown(policy.source)
-            yield f"    add at {place}, with placeholders for the robot's name and namespace"
+        if answer.enclave.has_placeholders:
+            place = f"at {_shown(policy.source)}" if policy else "to the fleet's policy"
+            yield f"    add {place}, with placeholders for the robot's name and namespace"
         else:
             yield f"    save as {ADDITION}"
         lines = change.document.splitlines()  # without the XML declaration, which is the default

@@ -154,9 +154,18 @@ def open_to_ask(
         keystore=keystore,
         policy=own,
         policy_file=policy_file,
-        has_placeholders=policy != stated,
+        has_placeholders=policy != stated
+        or (policy_file is None and keystore is not None and _is_of_robot(keystore, enclave.name)),
     )
     return AskedEnclave(enclave, policy)
+
+
+def _is_of_robot(keystore: Keystore, enclave: str) -> bool:
+    """Return whether the keystore's fleet has a robot with this enclave."""
+    from sros_tool.fleet.enclaves import robot_of
+
+    fleet = fleet_of(None, keystore)
+    return fleet is not None and robot_of(fleet, enclave) is not None
 
 
 def _not_in_policy(policy: Policy, name: str, file: Path) -> PolicyError:

@@ -85,7 +85,7 @@ class LoadedEnclave(NamedTuple):
     the robot that generated it.
 
     ``keystore`` is the keystore of the enclave, and ``policy`` its part of ``policy_file``, if
-    known; with ``has_placeholders``, the file is for the robots of a fleet.  ``portable`` are its
+    known; with ``has_placeholders``, the policy is for the robots of a fleet.  ``portable`` are its
     permissions if all vendors read them alike, because sros wrote them.  An enclave that is only
     planned has no XML: ``portable`` and ``plain_governance`` replace it.
     """

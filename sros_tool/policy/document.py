@@ -69,6 +69,11 @@ _STEP = re.compile(
     re.ASCII,
 )
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
+NAME_THE_FLEET = (
+    "Name the fleet's file with --fleet FILE. If the verb has no --fleet, write the robot's name "
+    "in place of the placeholder."
+)
+"""The remedy for a policy with placeholders that is read without a fleet."""
 _MAX_INCLUDES = 10_000
 _MAX_DEPTH = 32
 _MAX_ELEMENTS = 200_000
@@ -505,9 +510,7 @@ class _Reader:
         try:
             check_enclave_name(sample(self._owner) if self._owner else path)
         except InvalidNameError as error:
-            raise PolicyError(
-                f"{self._where(element, place)}: {error.what}", error.why, error.remedy
-            ) from error
+            raise self._invalid(error, path, "enclave name", element, place) from error
         blocks = tuple(
             self._profiles(*self._expect(child, at, "profiles"))
             for child, at in self._children(element, place)
@@ -517,6 +520,27 @@ class _Reader:
                 f"{self._where(element, place)}: the enclave {path} has no <profiles>"
             )
         return Enclave(path, blocks, self._source(element, place))
+
+    def _invalid(
+        self,
+        error: InvalidNameError,
+        written: str,
+        what: str,
+        element: etree._Element,
+        place: IncludedFile,
+    ) -> PolicyError:
+        """Return the error for a name, as written, that is not valid with any placeholder's value.
+
+        ``what`` is "enclave name" or "namespace".
+        """
+        where = self._where(element, place)
+        if not has_placeholder(written):
+            return PolicyError(f"{where}: {error.what}", error.why, error.remedy)
+        remedy = ""
+        if written.startswith("{robot"):
+            own = [written.replace("{robot", "{namespace", 1)] if what == "namespace" else []
+            remedy = f"Write {' or '.join(map(_short, (*own, f'/{written}')))}."
+        return PolicyError(f"{where}: {_short(written)} is not a valid {what}", error.why, remedy)
 
     def _profiles(self, element: etree._Element, place: IncludedFile) -> Profiles:
         self._attributes(element, place, optional=("type",))
@@ -542,9 +566,7 @@ class _Reader:
             found = check_namespace(self._sample(ns, element, place, several=False))
             ns = ns.removesuffix("/") if has_placeholder(ns) else found
         except InvalidNameError as error:
-            raise PolicyError(
-                f"{self._where(element, place)}: {error.what}", error.why, error.remedy
-            ) from error
+            raise self._invalid(error, ns, "namespace", element, place) from error
         if sampled and ("/" in sampled or "~" in sampled or expression_problem(sampled)):
             raise PolicyError(
                 f"{self._where(element, place)}: {_short(node)} is not a valid node name",
@@ -702,8 +724,7 @@ class _Reader:
         raise PolicyError(
             f"{where}: {_short(text)} has a placeholder for the robots of a fleet",
             "Without a fleet it has no value.",
-            "Name the fleet's file with --fleet FILE. If the verb has no --fleet, write the "
-            "robot's name in place of the placeholder.",
+            NAME_THE_FLEET,
         )
 
     def _children(

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, NamedTuple
 
 from sros_tool.checks.kind import WARNING, Finding
@@ -22,6 +23,7 @@ from sros_tool.checks.requirements import VACUOUS
 from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
 from sros_tool.errors import DocumentError, PolicyError, SrosError
 from sros_tool.faults import Fault
+from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
 from sros_tool.fleet.fleet_file import read_connections, read_fleet
 from sros_tool.fleet.robots import Fleet, Robot
@@ -63,6 +65,10 @@ _MOST_OUTSIDE = 32 * 1024 * 1024
 No policy is larger.
 """
 _LONGEST = 200  # characters of the target of a link that are shown
+_NOT_USED = (
+    "changes and is not reviewed: no reviewed policy uses it. Name it with --policy, leave it out "
+    "with"
+)
 _OK, _FOUND, _UNDECIDED = 0, 1, 2
 
 
@@ -456,9 +462,12 @@ class _Review:
         if len(changed) > _MOST_CHANGED:
             raise DocumentError(f"the change has more than {_MOST_CHANGED} files")
         names = {entry.id: name for name, entry in changed}
+        shipped = {part.read_bytes() for part in (policies_dir() / "common").rglob("*.xml")}
+        entries = dict(changed)
         for path in self._policies_among(changed, self.head):
-            lines.append(("changes and is not reviewed: no reviewed policy uses it", path))
-            status = self._new_access
+            if self.request.repository.content(entries[path].id) not in shipped:
+                lines.append((f"{_NOT_USED} --leave-out {quote(path)}, or delete it", path))
+                status = self._new_access
         for path in self._used_in_part(changed, reviewed, fleet):
             lines.append(("changes and is used only in part: the rest is not reviewed", path))
             status = self._new_access

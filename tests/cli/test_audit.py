@@ -163,6 +163,19 @@ def test_a_patch_is_merged_and_then_nothing_is_denied(program: Program, tmp_path
     assert not (tmp_path / "more.xml").exists()
     ended = program(graph(LOUD), "robot.xml", *SHORT, "--patch", "add.xml", "--force").ok()
     assert "no patch is needed; the earlier 'add.xml' stays\n" in ended.err
+
+
+def test_a_policy_with_placeholders_is_changed_by_hand(program: Program, tmp_path: Path) -> None:
+    (tmp_path / "robot.xml").write_text(POLICY.replace('"/t"', '"/{robot}/t"'))
+    (tmp_path / "fleet.toml").write_text("[robots.r1]\n")
+    asked = ("robot.xml", *SHORT, "--fleet", "fleet.toml", "--patch", "add.xml")
+    ended = program(graph(LOUD), *asked)
+    where = "robot.xml:1 (/{robot}/t)"
+    by_hand = f"wrote 'add.xml'; add its rights by hand, with placeholders, at {where}\n"
+    assert ended.status == 1 and by_hand in ended.err
+    (tmp_path / "robot.xml").write_text(POLICY.replace('"/t"', '"/r1/t"'))
+    ended = program(graph(LOUD), *asked, "--force")
+    assert "add it: sros merge_policy robot.xml add.xml --in-place" in ended.err
     ended = program(graph(LOUD), "robot.xml", *SHORT, "--patch", "-")
     assert (ended.status, (tmp_path / "-").exists()) == (2, False)
     assert "'-' is not a file name here" in ended.err

@@ -177,6 +177,14 @@ def test_claims_in_a_list(folder: Path) -> None:
     ]
     assert row.wire
     assert row.expected is RowStatus.UNDISTURBED
+    for kind in ("server", "client"):
+        of_action = SERVICES.replace(f'role = "{kind}"', f'role = "action_{kind}"')
+        with pytest.raises(DocumentError, match=r"line 9: .* has the role action_client"):
+            read_scenario(write(folder, of_action))
+    readable = '    { party = "adder", expected = "readable" },\n'
+    silent = SERVICES.replace('"answered', '"not answered').replace(readable, "")
+    with pytest.raises(DocumentError, match=r"adder answers a client .*whom the same server"):
+        read_scenario(write(folder, silent))
 
 
 def test_a_party_that_is_no_table(folder: Path) -> None:

@@ -117,6 +117,11 @@ def test_the_policy_of_a_fleet_is_changed_where_it_is_and_issued_for_all(tmp_pat
     for command in answer(*asked[:-2], "--policy", policy)["commands"]:
         sros(*command.split()[1:]).ok()
     assert explain(*asked).status == 0
+    found = explain(*asked[:3], "/r1/other")
+    fleet = f"-p POLICY --fleet {tmp_path / 'ks' / 'fleet.toml'}"
+    assert f"sros generate_artifacts -k {tmp_path / 'ks'} {fleet}" in found.out
+    assert "add to the fleet's policy, with placeholders" in found.out
+    assert "merge_policy" not in found.out and "create_permission" not in found.out
     single = tmp_path / "single.xml"
     single.write_text(policy_text({"/z": publish("/a"), "/r1/base": publish("/r1/odom", "/b")}))
     found = explain(*asked[:3], "/r1/other", "--policy", single)

@@ -130,6 +130,8 @@ def test_a_policy_without_placeholders_is_the_same() -> None:
         (enclave("/{robot}", "{robot"), "brace"),
         (enclave("/{robot}", "robot}"), "brace"),
         (enclave("/{robot}", "{}"), "not a placeholder"),
+        (enclave("{robot}/a", "/x"), "'{robot}/a' is not a valid enclave name"),
+        (enclave("{robot}/a", "/x"), "Write '/{robot}/a'."),
         (enclave("/{robot}", "~{robot}"), "After '~'"),
         (enclave("/{robot}", "1{robot}"), "starts with a digit"),
         (enclave("{robot}", "/x"), "does not start with '/'"),

@@ -97,12 +97,22 @@ def test_rights_that_move_to_a_second_policy_are_seen(change: Change) -> None:
     one = change.review("--policy", "robot.xml")
     assert one.status == 1
     assert "'second.xml' changes and is not reviewed" in one.out
+    assert "leave it out with --leave-out second.xml, or delete it" in one.out
     assert change.review("--policy", "robot.xml", "--new-access", "allow").status == 0
     change.commit({"second.xml": None, "tests/second.xml": policy_text(WIDER)})
     left = change.review("--policy", "robot.xml", "--leave-out", "tests")
     assert left.status == 0
     assert "policies in 'tests' are not reviewed, as asked" in left.out
     assert change.review("--policy", "robot.xml", "--leave-out", "tests/second.xml").status == 0
+
+
+def test_a_common_part_that_ships_with_sros_needs_no_review(change: Change) -> None:
+    part, name = (change.folder / "common/lifecycle_node.xml").read_text(), "common/new.xml"
+    change.commit({name: part})
+    assert change.review("--policy", "robot.xml").status == 0
+    change.commit({name: part.replace("ALLOW", "DENY")})
+    edited = change.review("--policy", "robot.xml")
+    assert edited.status == 1 and f"'{name}' changes and is not reviewed" in edited.out
 
 
 def test_what_a_partial_clone_lacks_is_not_passed_over(change: Change) -> None:

@@ -332,6 +332,15 @@ def _claim(table: _Table, key: str, claim: Any, parties: Mapping[str, Party]) ->
         if role not in (SPEAKING if relation is Relation.READABLE else _FITTING[side]):
             problem = f"{name} is a {role}, and cannot be the {side} of status {expected!r}"
             raise table.error(key, problem)
+    if relation is Relation.IS_ANSWERED:
+        client, server = (parties[name].role for name in names)
+        if (client is Role.ACTION_CLIENT) is not (server is Role.ACTION_SERVER):
+            problem = f"{names[0]} has the role {client}, and {names[1]} {server}"
+            remedy = (
+                "A client of an action has the role action_client, its server action_server; "
+                "those of a service are client and server."
+            )
+            raise table.error(key, problem, remedy)
     return Claim(relation, names[0], names[1] if len(names) > 1 else "", holds)
 
 
@@ -343,10 +352,14 @@ def _check_controls(table: _Table, claims: Sequence[Claim], controls: Sequence[C
         if _happens(claim) or any(not heard or e.talker == claim.talker for e in happening):
             continue
         who = f"a listener hears {claim.talker}" if claim.talker else "something works"
+        control = "listener that hears the same talker"
+        if claim.relation is Relation.IS_ANSWERED:
+            who = f"{claim.talker} answers a client"
+            control = "client whom the same server answers"
         raise table.error(
             "claim",
             f"no claim or control shows that {who} meanwhile: a crash would look the same",
-            "Add a control, such as a permitted listener that hears the same talker.",
+            f"Add a control, such as a permitted {control}.",
         )
 
 
