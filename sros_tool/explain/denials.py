@@ -67,7 +67,7 @@ class Denial:
     With ``by_rule`` a deny rule denies it, so that an allow rule would not help; with ``remote``
     the permissions of a peer deny it.  ``enclave`` is "" if the log does not name it. ``process``
     is the label of the process that printed the denial, or "", and ``line`` the number of its line,
-    from 1.
+    from 1.  ``folder`` is the folder from which the process loaded its enclave, or "".
     """
 
     topic: str
@@ -78,6 +78,7 @@ class Denial:
     vendor: Vendor = field(default=Vendor.FAST, compare=False)
     process: str = ""
     line: int = field(default=0, compare=False)
+    folder: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,17 +114,19 @@ def read_denials(text: str) -> tuple[Denial, ...]:
 
 def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denial]:
     """Yield the denials in lines of one process, given as pairs of number and text."""
-    enclave = ""
+    enclave = folder = ""
     lines = [line for _, line in numbered]
     for index, (number, line) in enumerate(numbered):
         if named := SECURITY_DIRECTORY.search(line):
-            enclave = named["enclave"] or "/"
+            enclave, folder = named["enclave"] or "/", named["folder"]
         if found := denied_topic(line):
             vendor, match = found
             topic = match["topic"]
             remote, direction = _direction(lines[index : index + 1 + _NEAR_LINES], topic)
             by_rule = "deny" in match["how"].lower()
-            yield Denial(topic, direction, enclave, by_rule, remote, vendor, process, number)
+            yield Denial(
+                topic, direction, enclave, by_rule, remote, vendor, process, number, folder
+            )
 
 
 def _direction(lines: list[str], topic: str) -> tuple[bool, str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import islice
@@ -32,6 +33,7 @@ from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import load_rights
+from sros_tool.keystore.selection import likely_names as likely_enclaves
 from sros_tool.names import ACTION_SEPARATOR, SERVICE_ENDS, check_enclave_name, nodes_served
 from sros_tool.pki.certificates import IDENTITY_DIGITS
 from sros_tool.policy.model import ALLOW
@@ -136,6 +138,11 @@ class SearchedKeystore:
             identity = "".join(word.zfill(8) for word in guid.split(":"))
         return self._by_identity.get(identity[:IDENTITY_DIGITS], "")
 
+    def meant(self, enclave: str) -> tuple[str, ...]:
+        """Return the enclaves that a name may mean; () if the keystore has the enclave."""
+        names = self._keystore.names
+        return () if enclave in names else likely_enclaves(enclave, names)
+
     def enclaves_for(self, node: str) -> tuple[str, ...]:
         """Return the enclaves whose permissions are only for the node with this full name."""
         return self._by_node.get(node, ())
@@ -212,7 +219,7 @@ def explain_log_of(
         str(root or ""),
         SearchedKeystore(root) if root and is_keystore(root) else None,
     )
-    return ExplainedLog(log, findings, _NOTES if findings else ())
+    return ExplainedLog(log, findings, _NOTES if any(e.found for e in findings) else ())
 
 
 _NOTES = (
@@ -499,6 +506,8 @@ class _Examiner:
         )
         if meaning.id.startswith("peer-"):
             return self._peer(plain, hits)
+        if better := self._other_folder(first.fields.get("path", ""), remedy_of):
+            return replace(plain, remedy=better)
         examined = meaning.faults or meaning.id == "service"
         enclave = named if examined else None
         if enclave is None:
@@ -517,6 +526,21 @@ class _Examiner:
             found=tuple(text for text, _ in causes),
             checked=True,
             remedy=" ".join(remedies) if remedies else nothing,
+        )
+
+    def _other_folder(self, path: str, remedy: str) -> str:
+        """Return the remedy if an enclave's folder, which a log misses, is not in this keystore."""
+        place, inside, name = path.rpartition("/enclaves/")
+        if not inside or self._keystore is None:
+            return ""
+        if meant := self._keystore.meant(f"/{name}"):
+            return f"Perhaps you mean {' or '.join(meant)}. {remedy}"
+        if self._find(f"/{name}") is None or Path(place).resolve() == Path(self._root).resolve():
+            return ""
+        command = f"sros env {quote(self._root)} {quote(f'/{name}')}"
+        return (
+            f"ROS_SECURITY_KEYSTORE names {place} and has to be {self._root}: `{command}` prints "
+            "all variables."
         )
 
     def _with_names(self, text: str, enclave: LoadedEnclave | None, hit: _Hit) -> str:
@@ -590,10 +614,12 @@ class _Examiner:
         answer = self._answer(enclave, denial.vendor, _question(denial))
         if answer.allowed:
             facts = ["the present permissions allow it"]
-            remedy = (
+            elsewhere, remedy = self._in_other_folder(denial, enclave)
+            facts += elsewhere
+            remedy = remedy or (
                 "Restart the process: it loaded earlier permissions. If it runs from an export, "
+                "export the enclave again first."
             )
-            remedy += "export the enclave again first."
         else:
             other, better = self._other_node(denial, answer)
             if not other:
@@ -603,6 +629,23 @@ class _Examiner:
         remedy = remedy.replace("ENCLAVE", enclave.name)
         return replace(
             finding, enclave=enclave.name, found=tuple(facts), checked=True, remedy=remedy
+        )
+
+    def _in_other_folder(self, denial: Denial, enclave: LoadedEnclave) -> tuple[list[str], str]:
+        """Return cause and remedy if the process runs from another folder than the enclave's."""
+        folder, loaded = Path(denial.folder), None
+        with suppress(SrosError, OSError):  # the log chooses the path
+            if folder.is_absolute() and enclave.folder and not folder.samefile(enclave.folder):
+                loaded = signed_enclave(None, str(folder), self._context(enclave).at)
+        if loaded is None:
+            return [], ""
+        own = Evaluator(denial.vendor, loaded, self._context(loaded)).answer(_question(denial))
+        if own.allowed:
+            return [f"the process runs from '{folder}', whose permissions also allow it"], (
+                "Restart the process: it loaded earlier permissions."
+            )
+        return [f"the process runs from '{folder}', and there {own.decision.text}"], (
+            f"Export enclave {enclave.name} again, install it there, and restart the process."
         )
 
     def _other_node(self, denial: Denial, answer: Answer) -> tuple[list[str], str]:

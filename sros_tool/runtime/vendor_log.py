@@ -692,9 +692,9 @@ def style_of(line: str) -> Vendor | None:
 # ── the lines around a text ────────────────────────────────────────────────────────────────
 
 SECURITY_DIRECTORY = re.compile(
-    r"Found security directory: \S*?/enclaves(?P<enclave>/\S*)?(?:\s|\Z)"
+    r"Found security directory: (?P<folder>\S*?/enclaves(?P<enclave>/\S*)?)(?:\s|\Z)"
 )
-"""The line in which rcl names the enclave of a process (group ``enclave``)."""
+"""The line in which rcl names the enclave of a process, and its folder (groups)."""
 
 _PROCESS_LABEL = re.compile(
     r"\[(?P<launch>[\w.-]+-\d+)\] "  # ros2 launch: [talker-1]

@@ -775,6 +775,38 @@ def test_a_denied_topic_is_compared_with_what_is_signed(keystore: Path, tmp_path
     assert f"sros explain {keystore} {ENCLAVE} publish /other" in found.out
 
 
+def test_a_process_that_runs_from_another_folder_is_told(keystore: Path, tmp_path: Path) -> None:
+    log, export, topic = tmp_path / "robot.log", tmp_path / "export", "chatter"
+    shutil.copytree(keystore, export)
+    for name, told in (
+        (ENCLAVE, f"the process runs from '{export}/enclaves{ENCLAVE}', whose permissions also"),
+        (OTHER, f"the process runs from '{export}/enclaves{ENCLAVE}', and there "),
+    ):
+        permissions = (keystore / f"enclaves{name}" / "permissions.p7s").read_bytes()
+        (export / f"enclaves{ENCLAVE}" / "permissions.p7s").write_bytes(permissions)
+        log.write_text(
+            f"[INFO] [1.0] [rcl]: Found security directory: {export}/enclaves{ENCLAVE}\n"
+            f"[SECURITY Error] rt/{topic} topic not found in allow rule. check_create_datawriter\n"
+        )
+        assert told in sros("explain", keystore, "--log", log).out
+    log.write_text(log.read_text().replace(str(export), str(keystore)))
+    assert "runs from '" not in sros("explain", keystore, "--log", log).out
+
+
+def test_a_folder_that_is_missing_is_looked_for_in_the_keystore(
+    keystore: Path, tmp_path: Path
+) -> None:
+    log = tmp_path / "robot.log"
+    for folder, told in (
+        (f"/tmp/nowhere/enclaves{ENCLAVE}", f"names /tmp/nowhere and has to be {keystore}: "),
+        (f"{keystore}/enclaves{ENCLAVE}x", f"Perhaps you mean {ENCLAVE}."),
+        (f"{keystore}/enclaves/qqq", "Correct it: `sros list_enclaves"),
+    ):
+        log.write_text(f"rcl: SECURITY ERROR: directory '{folder}' does not exist\n")
+        ended = sros("explain", keystore, ENCLAVE, "--log", log)
+        assert told in ended.out and "only-text" not in ended.err
+
+
 def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
     log = tmp_path / "robot.log"
     for topic, meant in (("front/chatter", True), ("chater", True), ("odom", False)):
