@@ -27,6 +27,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.explain.answer import Evaluator
+from sros_tool.explain.explanation import meant_instead, named_rights
 from sros_tool.explain.question import Part, Question
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.robots import Fleet
@@ -523,13 +524,17 @@ def _denied_to(node: ObservedNode, enclave: str, evaluator: Evaluator) -> Iterat
         for part, decision in answer.parts
         if not decision.outcome.ok
     }
-    for right, needed in _rights_of(node, enclave):
+    used = dict(_rights_of(node, enclave))
+    named = named_rights(answer) if decisions else ()
+    for right, needed in used.items():
         endpoints = tuple(endpoint for endpoint in needed if endpoint in decisions)
         if endpoints:
             by_rule = [
                 endpoint for endpoint in endpoints if decisions[endpoint].reason == _DENY_RULE
             ]
             reason = decisions[(by_rule or endpoints)[0]].clause
+            if not by_rule and (meant := meant_instead(right, used, named)):
+                reason = f"{reason}; {meant}"
             yield DeniedRight(right, (node.fqn,), reason, bool(by_rule), False, endpoints)
 
 

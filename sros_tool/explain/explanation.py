@@ -9,7 +9,7 @@ If the policy is not the cause, the command in the remedy repairs the fault in t
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from shlex import quote
@@ -48,7 +48,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
 from sros_tool.names import NODE_SERVICES, is_expression, nodes_served
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
-from sros_tool.policy.rights import Right, profile_rights
+from sros_tool.policy.rights import Right, order, profile_rights
 from sros_tool.terminal import log_step
 
 
@@ -377,22 +377,46 @@ def likely_names(answer: Answer) -> tuple[str, ...]:
     any other name, they are names with the same last part (a forgotten remapping), or else names
     with a similar spelling.
     """
-    question, enclave = answer.question, answer.enclave
-    names = {
-        right.name
-        for right in _present_rights(enclave.policy, enclave.name, answer)
-        if (right.right, right.qualifier) == (question.right, ALLOW)
-        and not is_expression(right.name)
-    } - {question.name}
-    last = question.name.rpartition("/")[2]
-    same = sorted(name for name in names if name.rpartition("/")[2] == last)
-    if (question.type == "service" and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
+    question = answer.question
+    names = {right.name for right in named_rights(answer) if right.right == question.right}
+    return _similar(question.name, names - {question.name}, of_service=question.type == "service")
+
+
+def meant_instead(right: Right, used: Collection[Right], named: Iterable[Right]) -> str:
+    """Return what a policy may mean instead of a denied right, as a clause; "" for nothing.
+
+    ``used`` are the rights that the node uses, which are meant as they are; ``named`` are the
+    `named_rights` of its enclave.
+    """
+    if right.kind == "dds":
+        return ""
+    others = [other for other in named if other not in used]
+    for other in others:
+        if other.name == right.name and {other.kind, right.kind} == {"services", "actions"}:
+            kind = "an action" if other.kind == "actions" else "a service"
+            return f"the policy has it as {kind} ({other.right})"
+    names = {other.name for other in others if other.right == right.right}
+    similar = _similar(right.name, names, of_service=right.kind == "services")
+    return f"perhaps the policy means {' or '.join(similar)}" if similar else ""
+
+
+def named_rights(answer: Answer) -> tuple[Right, ...]:
+    """Return the rights without wildcards that the enclave of an answer has now, sorted."""
+    present = _present_rights(answer.enclave.policy, answer.enclave.name, answer)
+    named = (r for r in present if r.qualifier is ALLOW and not is_expression(r.name))
+    return tuple(sorted(named, key=order))
+
+
+def _similar(name: str, names: Collection[str], *, of_service: bool) -> tuple[str, ...]:
+    last = name.rpartition("/")[2]
+    same = sorted(other for other in names if other.rpartition("/")[2] == last)
+    if (of_service and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
         return tuple(same) if len(same) <= _SHOWN else ()
     if not names:
         return ()
     from difflib import get_close_matches  # for this alone, which is asked last
 
-    return tuple(get_close_matches(question.name, sorted(names), n=_SHOWN, cutoff=_ALIKE))
+    return tuple(get_close_matches(name, sorted(names), n=_SHOWN, cutoff=_ALIKE))
 
 
 _SHOWN = 3

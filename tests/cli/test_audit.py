@@ -165,6 +165,28 @@ def test_a_patch_is_merged_and_then_nothing_is_denied(program: Program, tmp_path
     assert "no patch is needed; the earlier 'add.xml' stays\n" in ended.err
 
 
+def test_a_name_that_the_policy_may_mean_is_named(program: Program, tmp_path: Path) -> None:
+    also = '<services request="ALLOW"><service>dock</service></services></profile>'
+    (tmp_path / "robot.xml").write_text(POLICY.replace("</profile>", also, 1))
+    services = [f"{way} {topic}" for way, topic in (
+        ("publish", "rq/dock/_action/send_goalRequest"),
+        ("subscribe", "rr/dock/_action/send_goalReply"),
+        ("publish", "rq/dock/_action/cancel_goalRequest"),
+        ("subscribe", "rr/dock/_action/cancel_goalReply"),
+        ("publish", "rq/dock/_action/get_resultRequest"),
+        ("subscribe", "rr/dock/_action/get_resultReply"),
+        ("subscribe", "rt/dock/_action/feedback"),
+        ("subscribe", "rt/dock/_action/status"),
+    )]  # fmt: skip
+    node = ("/", "/", "talker", "01", ["publish rt/chater", *services])
+    ended = program(graph(node), "robot.xml", *SHORT)
+    assert "publish rt/chater; perhaps the policy means /chatter\n" in ended.out
+    assert "; the policy has it as a service (request)\n" in ended.out
+    both = ("/", "/", "talker", "01", ["publish rt/chatter", "publish rt/chater"])
+    ended = program(graph(both), "robot.xml", *SHORT)
+    assert "no rule allows publish rt/chater\n" in ended.out
+
+
 def test_a_policy_with_placeholders_is_changed_by_hand(program: Program, tmp_path: Path) -> None:
     (tmp_path / "robot.xml").write_text(POLICY.replace('"/t"', '"/{robot}/t"'))
     (tmp_path / "fleet.toml").write_text("[robots.r1]\n")
