@@ -132,6 +132,7 @@ def test_a_policy_without_placeholders_is_the_same() -> None:
         (enclave("/{robot}", "{}"), "not a placeholder"),
         (enclave("{robot}/a", "/x"), "'{robot}/a' is not a valid enclave name"),
         (enclave("{robot}/a", "/x"), "Write '/{robot}/a'."),
+        (enclave("/{robot}", "/x", "{robot}"), "Write '{namespace}' or '/{robot}'."),
         (enclave("/{robot}", "~{robot}"), "After '~'"),
         (enclave("/{robot}", "1{robot}"), "starts with a digit"),
         (enclave("{robot}", "/x"), "does not start with '/'"),
