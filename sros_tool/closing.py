@@ -67,6 +67,7 @@ from sros_tool.runtime.processes import (
     SERVICE_NAME,
     Process,
     ProcessEnclave,
+    ProcessOrigin,
     ProcessTable,
     RunningProcesses,
     launch_verb,
@@ -124,7 +125,9 @@ class ClosedProcess(NamedTuple):
     """The id of the user who runs it."""
     unit: str
     """The unit of systemd that starts it alone; empty for a process that is restarted by hand."""
-    known_by: Annotated[str, Words(("process id", "node name", "program", "elimination"))]
+    known_by: Annotated[
+        str, Words(("process id", "node name", "program", "elimination", "enclave"))
+    ]
     """How sros knows that this process has the nodes of the enclave."""
     launch: Sequence[str] = ()
     """The command of the `ros2 launch` that started it; empty for a process of its own."""
@@ -132,6 +135,15 @@ class ClosedProcess(NamedTuple):
     """The id of the Docker container in which it runs; empty outside of containers."""
     rmw: str = ""
     """rmw_zenoh_cpp for a process on Zenoh; empty on DDS."""
+
+    @classmethod
+    def of(
+        cls, process: Process, enclave: str, origin: ProcessOrigin, known_by: str
+    ) -> ClosedProcess:
+        """Return a running process with its enclave and what started it."""
+        start = enclave, process.pid, process.command, origin.folder, process.user, origin.unit
+        rmw = RMW_ZENOH if process.is_zenoh else ""
+        return cls(*start, known_by, origin.launch, origin.container, rmw)
 
     def as_it_runs(self, running: RunningProcesses) -> ClosedProcess:
         """Return a copy with the id that a process with this command has now.
@@ -335,10 +347,7 @@ def assign(
         origin = origins[process.pid]
         del left[process.pid]
         unit = origin.unit if units[origin.unit] == 1 else ""
-        start = enclave, process.pid, process.command, origin.folder, process.user
-        rmw = RMW_ZENOH if process.is_zenoh else ""
-        more = known_by, origin.launch, origin.container, rmw
-        assigned.append(ClosedProcess(*start, unit, *more))
+        assigned.append(ClosedProcess.of(process, enclave, origin._replace(unit=unit), known_by))
 
     for router in [process for process in left.values() if process.is_router]:
         give(router, _ROUTER, "program")
@@ -598,6 +607,8 @@ class OpenRobot:
         closing = self._closing()._replace(steps=steps, dry_run=dry_run)
         if dry_run or is_stopped:
             return closing._replace(problems=problems)
+        if self.observed and len(closing.observed.processes) > len(self.observed.processes):
+            self._write_processes(closing.observed)
         changes = self._write_starts(closing.observed)
         denied = [str(right) for right in self._denied()]
         problems += self._problems(closing.observed, partial=partial)
@@ -611,7 +622,7 @@ class OpenRobot:
         names = {enclave.name for _, enclave in self._secured(running)} - {_OBSERVER}
         secured = {name: name in present for name in sorted(names)}
         if self.observed:
-            observed = self.observed.as_they_run(running)
+            observed = self._with_later(self.observed, running).as_they_run(running)
         if self.policy.exists():
             policy = read_policy(self.policy)
             observed = observed.within(policy)
@@ -621,6 +632,22 @@ class OpenRobot:
         until = self._valid_until()
         started = observed, (), secured, sorted(new), until
         return Closing(self.folder, *started, (), (), (), False, ())
+
+    def _with_later(
+        self, observed: ObservedProcesses, running: RunningProcesses
+    ) -> ObservedProcesses:
+        """Return a copy with the processes that were started in other enclaves since."""
+        known = {_OBSERVER, *(process.enclave for process in observed.processes)}
+        later = []
+        for process, enclave in self._secured(running):
+            if enclave.name not in known:
+                command, argument = process.command, (ROS_ARGS, "--enclave", enclave.name)
+                if command[-3:] == argument:  # sros wrote it
+                    command = command[:-3]
+                origin = process_origin(process.pid)
+                started = replace(process, command=command)
+                later.append(ClosedProcess.of(started, enclave.name, origin, "enclave"))
+        return observed._replace(processes=[*observed.processes, *later])
 
     def _valid_until(self) -> datetime | None:
         """Return when the first enclave of the export expires; None if one cannot be read."""
@@ -650,9 +677,10 @@ class OpenRobot:
                 "",
                 "Start the robot open, and run this again.",
             )
-        if status:
+        if status or (step.guards and output):
             for line in () if step.into else f"{output}{messages}".splitlines():
                 self._shell.say(line)
+        if status:
             mend = "; nothing was signed" if step.guards else ""
             if VIOLATED.id in output:
                 needed = shlex.quote(str(self.requirements))
@@ -703,9 +731,8 @@ class OpenRobot:
         told = _process_ids_of_cyclone(of_cyclone, self.domain)
         observed = assign(nodes, running, self.domain, told)
         processes = [_as_its_unit_starts(process) for process in observed.processes]
-        self.observed = observed._replace(processes=processes)
-        replace_file(self.processes, f"{json.dumps(as_plain(self.observed), indent=2)}\n".encode())
-        number = counted(len(self.observed.processes), "process", "processes")
+        self._write_processes(observed._replace(processes=processes))
+        number = counted(len(processes), "process", "processes")
         self._shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
         learned = json.loads(document)
         lacking = learned["added"] if learned["dry_run"] else ()
@@ -718,6 +745,10 @@ class OpenRobot:
             f"'{self.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "
             f"({first_few(rights, _MOST_NAMES)}); if they are right, add them: {add}"
         )
+
+    def _write_processes(self, observed: ObservedProcesses) -> None:
+        self.observed = observed
+        replace_file(self.processes, f"{json.dumps(as_plain(observed), indent=2)}\n".encode())
 
     def _observation(self) -> Observation:
         """Return the nodes that were observed, without those of enclaves that the policy lacks."""
@@ -804,7 +835,10 @@ class OpenRobot:
         for name in list_enclaves(self.keystore):
             if name not in (_OBSERVER, _ROUTER) and not policy.enclave(name):
                 revoke = f"sros revoke {shlex.quote(str(self.keystore))} {name}"
-                yield f"the policy does not have {name}, and the keystore does: {revoke}"
+                remove = f"rm -r {shlex.quote(str(enclave_path(self.export, name)))}"
+                yield (
+                    f"the policy does not have {name}, and the keystore does: {revoke} && {remove}"
+                )
         for name in sorted({*list_enclaves(self.export)} - {*list_enclaves(self.keystore)}):
             remove = f"rm -r {shlex.quote(str(enclave_path(self.export, name)))}"
             yield f"the export has {name}, and the keystore does not: {remove}"
@@ -833,9 +867,9 @@ class OpenRobot:
         if observed.unknown:
             named = first_few(observed.unknown, _MOST_NAMES)
             yield (
-                f"no node is known of {counted(len(observed.unknown), 'process', 'processes')}: "
-                f"{named}; watch again while they run (--for 1m), start them with "
-                f"-r __node:=NAME, or {silent}"
+                f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "
+                f"{named}; watch again while they run: sros close "
+                f"{shlex.quote(str(self.folder))} --for 1m; otherwise {silent}"
             )
         if observed.elsewhere:
             named = first_few(observed.elsewhere, _MOST_NAMES)
@@ -862,8 +896,12 @@ class OpenRobot:
         self._restart(sorted(open_units), dry_run=dry_run)
         done = [FileChange(action, str(_SYSTEMD / path)) for path, action in changes.items()]
         by_hand = dry_run or prepared.left_by_hand
-        proofs = () if by_hand else self._proofs(observed, _RESTART_SECONDS, partial=partial)
-        return prepared._replace(proofs=proofs, changes=[*prepared.changes, *done])
+        proofs = () if by_hand else self._proofs(prepared, _RESTART_SECONDS, partial=partial)
+        changes = [*prepared.changes, *done]
+        if not proofs:
+            return prepared._replace(changes=changes)
+        now = self._closing()
+        return prepared._replace(proofs=proofs, changes=changes, secured=now.secured, new=now.new)
 
     def _restart(self, units: Sequence[str], *, dry_run: bool) -> None:
         """Let systemd read its units again, and restart some.  Raises `SrosError`."""
@@ -901,6 +939,7 @@ class OpenRobot:
     def undo(self, *, dry_run: bool) -> Closing:
         """Remove the drop-ins of this folder, restart their units, and say what to do by hand."""
         observed = self.observed or ObservedProcesses(self.domain)
+        observed = self._with_later(observed, ProcessTable().look(self._shell.now()))
         drop_ins = self._own_drop_ins(observed)
         for path in drop_ins:
             self._shell.say(f"{'would remove' if dry_run else 'removed'} {path}")
@@ -930,15 +969,12 @@ class OpenRobot:
         closed = [process for process in by_hand if process.enclave in secured]
         for command in dict.fromkeys(process.open_command for process in closed):
             yield f"restart it open: {command}"
-        ended = [
-            process
-            for process in by_hand
-            if process.enclave not in secured and tuple(process.command) not in are_open
-        ]
-        for command in dict.fromkeys(process.open_command for process in ended):
-            self._shell.say(f"it does not run; start it open: {command}")
+        for process in by_hand:
+            if process.enclave not in secured and tuple(process.command) not in are_open:
+                how = f"start it open: {process.open_command}"
+                self._shell.say(f"{process.enclave} does not run; {how}")
         for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
-            yield f"{name} started later; restart it open: {_described(secured[name])}"
+            yield f"{name} runs in an enclave, too; restart it open: {_described(secured[name])}"
 
     # ── the proof ───────────────────────────────────────────────────────────────────────────
 
@@ -947,14 +983,13 @@ class OpenRobot:
         closing = self._closing()._replace(dry_run=dry_run)
         if dry_run:
             return closing
-        proofs = self._proofs(closing.observed, _START_SECONDS, partial=partial)
+        proofs = self._proofs(closing, _START_SECONDS, partial=partial)
         return closing._replace(proofs=proofs)
 
-    def _proofs(
-        self, observed: ObservedProcesses, patience: float, *, partial: bool
-    ) -> list[Proof]:
+    def _proofs(self, closing: Closing, patience: float, *, partial: bool) -> list[Proof]:
         """Wait until each process runs in its enclave, and prove that the robot is closed."""
-        expected = {process.enclave for process in observed.processes}
+        observed = closing.observed
+        expected = {process.enclave for process in observed.processes} | {*closing.new}
         if not expected:
             return [Proof(_CLAIM, False, "no process of the robot is known")]
         table, end = ProcessTable(), time.monotonic() + patience
@@ -972,9 +1007,8 @@ class OpenRobot:
         nodes = self._observation().nodes
         before = make_observation(node for node in nodes if node.enclaves[0] not in missing)
         proof = self._proof_of_processes(len(expected) - len(missing), running)
-        if missing and not proof.fails:
-            without = f"{proof.reason}; no process runs of {', '.join(missing)}"
-            proof = proof._replace(holds=None, reason=without)
+        if missing:
+            proof = proof._replace(reason=f"{proof.reason}; not running: {', '.join(missing)}")
         return [
             proof,
             *self._proof_of_requirements(),
@@ -1003,7 +1037,8 @@ class OpenRobot:
         old = [f"{name} (process {earlier[name]})" for name in missing if name in earlier]
         reasons = [
             f"no secured process of {', '.join(absent)}; start it as {self.start / COMMANDS} says; "
-            f"if it ended: sros explain {shlex.quote(str(self.export))} --log ITS_LOG"
+            f"if it ended: sros explain {shlex.quote(str(self.export))} --log ITS_LOG; "
+            "if it does not always run: --proof --partial"
         ] * bool(absent)
         if old:
             reasons.append(f"earlier files in the processes of {', '.join(old)}; restart them")

@@ -166,7 +166,7 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
     for name in closed.new:
         echo(f"  {name}: new, start it by: sros run {export} {name} -- COMMAND")
     for right in closed.denied:
-        echo(f"used when sros watched, and denied from now on: {right}")
+        echo(f"used when sros watched, and denied now: {right}")
     if closed.denied:
         echo("  if this is not meant, change the policy; if it is, the node may end when it starts")
 
@@ -186,6 +186,8 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
     elif holds:
         asked = all(proof.holds for proof in closed.proofs)
         but = "" if asked else ", except for what was not asked"
+        if missing := [name for name in closed.left if name not in closed.secured]:
+            but += f", without {', '.join(missing)}, not running"
         following = f"; next: bring {folder}/keystore to another machine: it has the CA keys"
         following = following if robot.keystore.exists() else ""
         echo(f"the robot is closed{but}{_until(closed)}{following}", err=True)
@@ -203,7 +205,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
         ask = f"sros close {folder} --proof"
         steps = f"stop the robot, start each process by the commands in {robot.start / COMMANDS}"
         if closed.secured:
-            steps = f"restart them by the commands in {robot.start / COMMANDS}"
+            steps = f"start them by the commands in {robot.start / COMMANDS}"
         if not closed.left:
             following = ask
         elif any(name in observed.units for name in closed.left):
@@ -221,14 +223,17 @@ def _show_undone(robot: OpenRobot, closed: Closing) -> None:
         ask = f"ask again with sros close {shlex.quote(str(robot.folder))} --undo"
         echo(f"the robot is not open yet; next: restart these, and {ask}", err=True)
     else:
-        echo("the robot is open: sros sees no process in an enclave of this folder", err=True)
+        stopped = not any(process.pid for process in closed.observed.processes)
+        state = "no process of the robot runs" if stopped else "the robot is open"
+        echo(f"{state}: sros sees no process in an enclave of this folder", err=True)
 
 
 def _state(closed: Closing, *, applies: bool) -> str:
     """Return how far the processes run closed."""
-    if not closed.secured:
-        return "nothing was closed" if applies else "nothing is closed yet"
     stopped = {process.enclave for process in closed.observed.processes if not process.pid}
+    if not closed.secured:
+        nothing = "nothing was closed" if applies else "nothing is closed yet"
+        return "no process of the robot runs" if stopped >= {*closed.left} else nothing
     words = {
         name: _EARLIER
         if name in closed.secured

@@ -449,7 +449,7 @@ def generate_policy(
         spin_time,
         report,
         secured=enclave is not None,
-        then="the policy is written",
+        then="the result is shown" if dry_run else "the policy is written",
     )
     seen = named(snapshot.observation)
     learned = learn(seen.observation, None if flat else common).noting(seen.notes)

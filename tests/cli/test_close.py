@@ -233,10 +233,8 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     head, _, _ = before.partition('    <enclave path="/listener">')
     policy.write_text(head + enclave + after)
     revoke = "sros revoke robot/keystore /listener"
-    assert (
-        f"the policy does not have /listener, and the keystore does: {revoke}"
-        in robot.close("--apply", status=1).out
-    )
+    said = robot.close("--apply", status=1).out
+    assert f"the policy does not have /listener, and the keystore does: {revoke} && rm -r " in said
     assert robot.restarts == []
     sros(*revoke.split()[1:], cwd=robot.folder).ok()
     robot.remaining = (TALKER,)
@@ -286,7 +284,8 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
         "yes: everything that talked still talks: 2 nodes with 36 endpoints as before",
         "yes: an open listener finds nothing: the observer that saw 2 nodes before sees none",
     ]
-    assert "the robot is closed; next: bring robot/keystore to another machine" in closed.err
+    assert "; next: bring robot/keystore to another machine: it has the CA keys\n" in closed.err
+    assert "the robot is closed, its files are valid until 20" in closed.err
     robot.close("--apply")
     assert len(robot.restarts) == 2  # they run in their enclaves already
     (robot.folder / "robot/keystore").rename(robot.folder / "home")
@@ -320,7 +319,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     ended = robot.close()
     assert "/talker: process 4711, known by its process id: closed\n" in ended.out
     assert "the robot runs closed, except for /listener (open), its files are valid" in ended.err
-    assert "; next: restart them by the commands in robot/start/commands.txt, and ask" in ended.err
+    assert "; next: start them by the commands in robot/start/commands.txt, and ask" in ended.err
     assert "start it by" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
     robot.by_hand = {"/talker", "/listener"}
@@ -334,7 +333,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     robot.by_hand, robot.absent = {"/talker"}, {"/listener"}
     undone = robot.close("--undo", status=1)
     assert undone.out == "restart it open: cd /opt && /opt/run talker\n"
-    assert "it does not run; start it open: cd /opt && /opt/run listener\n" in undone.err
+    assert "/listener does not run; start it open: cd /opt && /opt/run listener\n" in undone.err
     robot.absent = set()
     undone = robot.close("--undo", status=1)
     assert undone.err == (
@@ -351,7 +350,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     late = Process(7, ("/opt/late", "--ros-args"), {}, datetime.now(UTC))
     robot.more = (late,)
     said = robot.close(status=1).out
-    assert "no node is known of 1 process: process 7 (late): /opt/late --ros-args; watch ag" in said
+    assert "saw no node of 1 process: process 7 (late): /opt/late --ros-args; watch again" in said
     robot.close("--partial")
     robot.more = ()
     robot.close()
@@ -386,9 +385,13 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     assert "the robot runs closed, its files are valid until" in robot.close().err
     watching = robot.close("--for", "1s", status=2).err
     assert "the robot runs closed: process 4711 (run), process 4712 (run), process 7" in watching
-    assert "/late started later; restart it open: process 7 (late): /opt/late" in (
-        robot.close("--undo", status=1).out
-    )
+    commands = (robot.folder / "robot/start/commands.txt").read_text()
+    assert f"\n# /late\ncd /opt && sros run {export} /late -- /opt/late --ros-args\n" in commands
+    undone = "restart it open: cd /opt && /opt/late --ros-args\n"
+    assert undone in robot.close("--undo", status=1).out
+    robot.by_hand, robot.more = set(), (replace(late, environment={}),)
+    assert "the robot is open" in robot.close("--undo").err
+    assert "closed yet; next: stop the robot" in robot.close().err
 
 
 def test_a_node_that_does_not_run_always(robot: Robot) -> None:
@@ -398,11 +401,11 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert "no: every process runs in its enclave: no secured process of /listener; st" in ended.out
     ended = robot.close("--proof", "--partial")
     assert (
-        "not asked: every process runs in its enclave: 1 enclave, and no open process; no process "
-        "runs of /listener\n"
+        "yes: every process runs in its enclave: 1 enclave, and no open process; not running: "
+        "/listener\n"
     ) in ended.out
     assert "talks: 1 node with 18 endpoints as before, without /listener\n" in ended.out
-    assert "the robot is closed, except for what was not asked" in ended.err
+    assert "the robot is closed, without /listener, not running, its files are" in ended.err
     robot.absent = set()
     assert "process 4712 (run): in domain 0" in robot.close("--proof", "--partial", status=1).out
     robot.absent = {"/listener", "/talker"}
@@ -522,7 +525,7 @@ def test_units_that_do_not_restart_are_named(robot: Robot) -> None:
 def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     robot.units = UNITS
     robot.more = (Process(5, ("other", "--ros-args"), {}, datetime.now(UTC)),)
-    assert "first:\n  no node is known of 1 process: process 5 (other)" in robot.close(status=1).out
+    assert "first:\n  sros saw no node of 1 process: process 5 (other)" in robot.close(status=1).out
     assert "would not be heard any more (accept: --partial)" in robot.close("--apply", status=1).out
     assert robot.restarts == []
     robot.more = (replace(robot.more[0], pid=6, environment={"ROS_DOMAIN_ID": "1"}),)
