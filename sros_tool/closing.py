@@ -897,11 +897,11 @@ class OpenRobot:
         done = [FileChange(action, str(_SYSTEMD / path)) for path, action in changes.items()]
         by_hand = dry_run or prepared.left_by_hand
         proofs = () if by_hand else self._proofs(prepared, _RESTART_SECONDS, partial=partial)
-        changes = [*prepared.changes, *done]
+        total = [*prepared.changes, *done]
         if not proofs:
-            return prepared._replace(changes=changes)
+            return prepared._replace(changes=total)
         now = self._closing()
-        return prepared._replace(proofs=proofs, changes=changes, secured=now.secured, new=now.new)
+        return prepared._replace(proofs=proofs, changes=total, secured=now.secured, new=now.new)
 
     def _restart(self, units: Sequence[str], *, dry_run: bool) -> None:
         """Let systemd read its units again, and restart some.  Raises `SrosError`."""

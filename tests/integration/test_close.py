@@ -184,8 +184,10 @@ def play_on_zenoh(folder: Path) -> dict[str, Any]:
     with all_running(folder, starts):
         said["closed"] = close("--proof", "--partial", "--json")
     said["undone"] = close("--undo")
-    mark = "restart it open: "
-    starts = [line.removeprefix(mark) for line in said["undone"].out.splitlines()]
+    lines = said["undone"].err.splitlines()
+    starts = [line.partition(" does not run; start it open: ")[2] for line in lines]
+    starts = [start for start in starts if start]
+    assert len(starts) == len(programs), said["undone"]
     with all_running(folder, starts):
         said["open again"] = close("--proof", "--partial", "--json")
         said["undone again"] = close("--undo")
