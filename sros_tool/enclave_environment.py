@@ -163,6 +163,12 @@ def loadable_environment(
     if rmw:
         variables[RMW] = rmw
     notes = () if target else tuple(unknown_distribution(environment))
+    if wanted is None and any(other != domain for other in domains or ()):
+        text = (
+            f"a process in enclave {name} may run in any of the domains {domains}, and runs in "
+            f"{domain}: for another one, add --domain ID."
+        )
+        notes += (Note("env.several-domains", text),)
     if not state.token:
         return EnclaveEnvironment(variables, notes)
     # The module is only the one that the user names for this process: loading it runs its code.

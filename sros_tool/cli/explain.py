@@ -701,7 +701,7 @@ def _show_who(
     ``chosen`` is the vendor that decides, None for Zenoh; ``only`` are --match and --robot.
     """
     from sros_tool.explain.question import ask
-    from sros_tool.explain.who import ask_everybody, callable_action
+    from sros_tool.explain.who import ask_everybody, callable_action, names_meant
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.selection import select_enclaves
@@ -733,7 +733,10 @@ def _show_who(
         _echo(_who_lines(everybody, fleet, asking.domain, keystore.domains))
         echo(f"decided by {decider.title}", err=True)
         if chosen and not kind and not everybody.allowed:
-            hint = callable_action(decider, everybody.question)
+            enclaves = {outcome.enclave for outcome in everybody.outcomes}
+            hint = callable_action(decider, everybody.question) or names_meant(
+                decider, everybody.question, enclaves
+            )
             print_notes([hint] if hint else [])
     print_notes(everybody.notes)
     return 0 if everybody.allowed else 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
@@ -16,6 +16,7 @@ from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, rights_by_domains
 from sros_tool.keystore.selection import likely_names, no_such_enclave
+from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right
 from sros_tool.reach import (
@@ -28,6 +29,7 @@ from sros_tool.reach import (
     unguarded,
 )
 from sros_tool.values import shows
+from sros_tool.wording import first_few
 
 
 class EnclaveOutcome(Protocol):
@@ -117,6 +119,23 @@ def callable_action(decider: Decider, question: Question) -> Note | None:
             text = f"enclaves may {action}: add --type action if it is an action."
             return Note("explain.an-action", text)
     return None
+
+
+def names_meant(decider: Decider, question: Question, enclaves: Container[str]) -> Note | None:
+    """Return a note on names that some of the ``enclaves`` have, and that may be meant instead."""
+    names = sorted(
+        {
+            right.name
+            for right in rights_naming(decider.keystore, "/")
+            if right.right == question.right and right.enclave in enclaves
+        }
+    )
+    last = question.name.rpartition("/")[2]
+    same = [name for name in names if name.rpartition("/")[2] == last and not is_expression(name)]
+    if not same:
+        return None
+    text = f"they may {question.word} {first_few(same, 3)}: perhaps that is meant."
+    return Note("explain.likely-name", text)
 
 
 def in_domains(

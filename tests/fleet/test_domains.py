@@ -179,3 +179,19 @@ def test_robots_of_other_domains_and_groups_are_neither_equal_nor_different(
     assert not [line for line in said("--focus", "/p5/cmd") if "differs" in line]
     focused = said("--focus", "/p5/scan", "--focus", "/up")
     assert not [line for line in focused if "differs" in line]
+
+
+def test_a_process_of_several_domains_is_told_of_them(halls: Path) -> None:
+    for name, words, said in (("/desk", (), True), ("/desk", ("--domain", "20"), False)):
+        ended = sros("env", "ks", name, *words, cwd=halls).ok()
+        assert ("may run in any of the domains 10,20, and runs in 10" in ended.err) is said
+    assert "several" not in sros("env", "ks", "/f02/guard", cwd=halls).ok().err
+
+
+def test_a_name_that_nobody_has_leads_to_that_of_the_robot(halls: Path) -> None:
+    asked = ("explain", "ks", "--who", "publish")
+    ended = sros(*asked, "/north/estop", cwd=halls)
+    assert ended.status == 1 and "they may publish /hall/estop: perhaps that is meant" in ended.err
+    for words in (("/nothing",), ("/plan", "--robot", "p01"), ("/x/plan", "--robot", "p01")):
+        ended = sros(*asked, *words, cwd=halls)
+        assert ended.status == 1 and "perhaps" not in ended.err, ended
