@@ -204,7 +204,8 @@ def _enclave(enclave: DescribedEnclave) -> Iterator[str]:
     yield f"enclave {enclave.path}: {'loadable' if facts.loadable else 'NOT LOADABLE'}"
     for problem in facts.problems:
         yield f"  {problem}"
-    yield f"  subject {facts.subject}, expires {_moment(facts.expires)}"
+    yield f"  expires {_moment(facts.expires)}, by what expires first"
+    yield f"  subject {facts.subject}, certificate until {_moment(facts.valid_until)}"
     identity = _named(facts.identity_ca, facts.identity_ca_sha256)
     permissions = _named(facts.permissions_ca, facts.permissions_ca_sha256)
     yield f"  identity CA {identity}, permissions CA {permissions}"
