@@ -172,7 +172,10 @@ def _topic_rule(expression: str, protection: TopicProtection) -> TopicRule:
 def _values(
     protection: DomainProtection | TopicProtection, rule: type[DomainRule | TopicRule]
 ) -> dict[str, Any]:
-    """Map each attribute of a rule to the value of the ``protection`` field named by ``term``."""
+    """Map the name of each attribute of a rule to its value in ``protection``.
+
+    The attribute's ``term`` is the name of the field of ``protection``.
+    """
     chosen = {attribute: getattr(protection, attribute.term) for attribute in attributes(rule)}
     return {
         attribute.name: value if attribute.is_flag else ProtectionKind(value)

@@ -243,7 +243,7 @@ def test_the_verb_says_and_writes_what_it_can(tmp_path: Path) -> None:
     [
         ("{", (), "Line 1: it ends too early"),
         ("{}", ("-o", "x.xml"), "everybody who gets a connection: none is the name of an enclave"),
-        (rules(puts("demo/**")), ("-o", "x.xml"), "They allow no ROS name"),
+        (rules(puts("demo/**")), ("-o", "x.xml"), "They let nobody publish"),
         ("{}", ("--mode", "peer"), "--from takes no keystore"),
     ],
 )

@@ -112,8 +112,8 @@ def audit(
       $ sros audit keystore --distro lyrical
 
     Exit status: 0 if nothing would be denied and every node of POLICY or KEYSTORE was seen; 1 if
-    something would be denied or, without --partial, was not seen or not judged; 2 if the audit
-    could not be done.
+    something would be denied, or if a node was not seen, something could not be judged or the graph
+    kept changing (--partial accepts these three); 2 if the audit could not be done.
     """
     from sros_tool.explain import audit as audits
     from sros_tool.fleet.fleet_file import read_fleet

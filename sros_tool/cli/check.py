@@ -661,8 +661,9 @@ def _with_enclaves(fleet: Fleet, paths: Sequence[Path]) -> Fleet:
 
 
 def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Finding, str]]:
-    """Merge findings that differ only in the robot; yield each finding with its other robots.
+    """Merge findings that differ only in the robot; yield the first of each group.
 
+    The text that comes with it names the other robots; it is "" if there are none.
     Two findings are merged if they are about the same line of a policy, in enclaves of two robots,
     or in one enclave about names of two robots.
     """

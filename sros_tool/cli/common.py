@@ -237,7 +237,7 @@ def fleets_option(function: Decorated) -> Decorated:
 
 
 def fleets_of(files: Sequence[Path]) -> tuple[Fleet | None, Fleet | None]:
-    """Return the fleets of two policies in the files that --fleet names."""
+    """Read the files that --fleet names; return the fleet of the first and of the second policy."""
     from sros_tool.fleet.fleet_file import read_fleet
 
     if len(files) > 2:
@@ -649,7 +649,7 @@ def enclave_environment(
     accept_key: bool = False,
     target: Path | None = None,
 ) -> EnclaveEnvironment:
-    """Return the environment of an enclave for a process that this process could start now."""
+    """Return the environment of an enclave, after checking that a process can start in it now."""
     from sros_tool.enclave_environment import loadable_environment
 
     return loadable_environment(

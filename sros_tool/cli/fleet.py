@@ -646,7 +646,7 @@ _MOST_LINES, _MOST_GROUPS = 50, 3
 def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) -> Iterator[str]:
     """Yield the counts, the table of robots with what to do, and findings on their DDS.
 
-    Without ``findings``, or named robots, the findings are only counted.
+    Unless ``findings`` is set or robots are named, the findings are only counted.
     """
     status = compared.status
     counts = ", ".join(f"{number} {_word(state)}" for state, number in status.counts.items())
@@ -741,8 +741,9 @@ class _Group(NamedTuple):
 
 
 def _groups(compared: ComparedFleet, robots: Sequence[str]) -> list[_Group]:
-    """Return the robots in groups, each robot alone if ``robots`` are named; the last group has
-    those that are current.
+    """Group robots with the same state, remedy and summary; the last group has the current robots.
+
+    If ``robots`` are named, each robot is a group of its own.
     """
     status, places = compared.status, _places(compared.status.names)
     alike: dict[tuple[str, ...], list[RobotStatus]] = {}

@@ -433,7 +433,7 @@ class _WithCommandAfterDashes(_WithCommand):
     "--target",
     "there",
     metavar="DIR",
-    help="The path of the keystore where the units run. "
+    help="Path of the keystore on the machine where the units run. "
     f"[default: {INSTALLED} for nodes, KEYSTORE for jobs]",
 )
 @click.option(

@@ -402,7 +402,7 @@ def _why_no_policy(subjects: Sequence[RightsBehindRules]) -> str:
     """Return a sentence on the subjects that have rights but are not enclaves."""
     strangers = [_who(rights) for rights in subjects if rights.rights]
     if not strangers:
-        return "They allow no ROS name that anybody may publish, subscribe, call or serve."
+        return "They let nobody publish, subscribe, call or serve any ROS name."
     return (
         f"They allow something to {first_few(strangers, _MOST_KEYS)}: none is the name of "
         "an enclave, such as /talker, in cert_common_names."

@@ -652,12 +652,12 @@ class _Examiner:
         """Return causes and a remedy if the permissions are for a node with another name."""
         node, nodes = serving_node(denial), _served(answer)
         if node and not any(covers(each, node) for each in nodes):
-            homes = self._keystore.enclaves_for(node) if self._keystore else ()
+            enclaves = self._keystore.enclaves_for(node) if self._keystore else ()
             this = f"the permissions are for {_listed(nodes)}, and " if nodes else ""
-            if homes:
-                return [f"{this}this is the node {node}, for which there is {_or(homes)}"], (
+            if enclaves:
+                return [f"{this}this is the node {node}, for which there is {_or(enclaves)}"], (
                     f"Start it in the enclave that is for it: `sros run {quote(self._root)} "
-                    f"{quote(homes[0])} -- COMMAND`."
+                    f"{quote(enclaves[0])} -- COMMAND`."
                 )
             if nodes:
                 return [f"{this}this is the node {node}"], _renamed(nodes[0], node)

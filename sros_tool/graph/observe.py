@@ -189,7 +189,7 @@ class RosGraph:
 
 
 def _require(module: str) -> None:
-    """Raise `UnavailableError` if this Python has no ``rclpy``, or no ``zenoh``."""
+    """Raise `UnavailableError` if this Python lacks ``module`` (rclpy or zenoh)."""
     if importlib.util.find_spec(module) is not None:
         return
     if module == "zenoh":

@@ -113,8 +113,8 @@ _EXPIRING = ("certificate", "permissions", "crl")
 _LONGEST_SILENCE = timedelta(days=1)
 """Age of the last message from which a robot that fetches is offline, by default."""
 _SILENCE = timedelta(minutes=30)
-"""Age of the last message from which a robot that fetches (every five minutes by default) may be
-off.
+"""How old the last message of a fetching robot must be before sros says to check whether the robot
+is on; robots fetch every five minutes by default.
 """
 _TO_DO = {
     State.RESTART: "restart",

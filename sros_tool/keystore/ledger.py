@@ -392,7 +392,7 @@ class LedgerFile:
         return self._readings.get(_EVERY) or self._reading(_NONE, ())
 
     def index_with(self, new: int, reading: _Reading) -> IndexUpdate | None:
-        """Return the index, to add ``new`` lines to it; None for a ledger that gets no index.
+        """Return an index update for ``new`` more lines of the ledger; None if it gets no index.
 
         ``reading`` is the present `end`.  A ledger with a fault gets no index: only who reads all
         of it knows what is certain.

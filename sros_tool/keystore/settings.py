@@ -189,8 +189,8 @@ def edit_remedy(root: Path | str) -> str:
     """Return the remedy for edited files, as a sentence with commands."""
     shown = root if isinstance(root, str) else quote(str(root))
     return (
-        f"`sros update_keystore {shown} --take-edits --dry-run` shows what it would change, "
-        f"`sros update_keystore {shown} --discard-edits` undoes it."
+        f"`sros update_keystore {shown} --take-edits --dry-run` shows what accepting the edits "
+        f"would change; `sros update_keystore {shown} --discard-edits` undoes the edits."
     )
 
 

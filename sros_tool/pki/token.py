@@ -422,7 +422,7 @@ def parse_token_uri(uri: str) -> TokenUri:
     pin_source = options.get("pin-source", "").removeprefix("file:")
     if pin_source and not Path(pin_source).is_absolute():
         raise UsageError(
-            "the pin-source of a PKCS#11 URI is not the path of a file",
+            "the pin-source of a PKCS#11 URI is not an absolute path",
             "sros reads the PIN from a file with an absolute path.",
             "Write pin-source=/PATH/OF/FILE.",
         )

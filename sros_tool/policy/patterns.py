@@ -157,10 +157,10 @@ class _Form:
     def _meets_at(self, piece: frozenset[str]) -> int:
         """Return the positions whose pieces match at least one letter of ``piece``."""
         if piece not in self._meeting:
-            some = 0
+            positions = 0
             for letter in piece:
-                some |= self._at(letter)
-            self._meeting[piece] = some
+                positions |= self._at(letter)
+            self._meeting[piece] = positions
         return self._meeting[piece]
 
     def _at(self, letter: str) -> int:

@@ -27,7 +27,7 @@ _ABSOLUTE = valid_topics("", "")
 def limits_crossing(side: AccessSource) -> bool:
     """Return whether the settings or the fleet of a side limit which names cross."""
     network = _network(side, side)
-    return network is not None and _limited(network)
+    return network is not None and _routers_limit_names(network)
 
 
 def states_routers(side: AccessSource) -> bool:
@@ -43,7 +43,7 @@ def more_crossing(
     More names pass in ``new`` than in ``old``.
     """
     before, after = _network(old, new), _network(new, old)
-    if before is None or not _limited(before):
+    if before is None or not _routers_limit_names(before):
         return
     if after is None:
         if new.later is not None and new.zenoh_files:
@@ -157,7 +157,7 @@ def _text(crossing: _Crossing) -> str:
     return " within ".join(",".join(expressions) for expressions in crossing) or "everything"
 
 
-def _limited(network: ZenohNetwork) -> bool:
+def _routers_limit_names(network: ZenohNetwork) -> bool:
     return bool(network.routers) and any(
         (network.crossing, *(router.crossing for router in network.routers))
     )

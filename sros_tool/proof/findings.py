@@ -247,7 +247,7 @@ def _fact(violation: Violation) -> str:
             if violation.missing:
                 return "does not exist"
             if violation.idle:
-                return "cannot start with its files as they are, which `sros check` shows"
+                return "cannot start with its present files; `sros check` shows why"
             return f"may not {steps[0].does()}"
         case Protected():
             return "its messages are not"

@@ -127,7 +127,10 @@ _UNIQUE = re.compile(",OU=[0-9a-f]{16}(?=</subject_name>)")
 def _digest_of(
     keystore: Keystore, enclaves: Sequence[str], unit: DrawnUnit, names: UnitNames
 ) -> str:
-    """Return a digest of the permissions of a unit without its name; "" if they are unusual."""
+    """Return a digest of a unit's permissions with the unit's name masked.
+
+    It is "" if permissions of the unit cannot be read, or are not in the usual form.
+    """
     texts = {path: _signed_text(keystore, path) for path in enclaves}
     hidden = [
         hashlib.sha256(

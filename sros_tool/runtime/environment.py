@@ -302,7 +302,7 @@ def _is_of_package(command: Sequence[str]) -> bool:
 def zenoh_environment(
     configurations: Mapping[str, str], authority: Path, certificate: Path, key: Path
 ) -> dict[str, str]:
-    """Return the variables with which rmw_zenoh_cpp runs in an enclave, or does not start.
+    """Return variables with which rmw_zenoh_cpp runs in an enclave; if it cannot, it exits.
 
     Args:
         configurations: maps `SESSION_URI` and `ROUTER_URI` to absolute paths of files; processes of

@@ -199,7 +199,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "enclave-missing", _ROS,
         r"SECURITY ERROR: unable to find a folder matching the (?:\w+ )?name '(?P<path>[^']*)'",
-        "no folder of the keystore is for the enclave {path}",
+        "the keystore has no folder for the enclave {path}",
         "Correct the name: `sros list_enclaves KEYSTORE` shows all names.",
     ),
     _text(

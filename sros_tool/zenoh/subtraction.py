@@ -352,8 +352,9 @@ def _chunks_less(wide: str, denied: frozenset[str]) -> Chunks:
 
 
 class _Place(NamedTuple):
-    """Names that begin with ``read``, and whose rest ``wide`` matches and ``denied`` does not.
+    """The names that begin with ``read`` and continue with text that ``wide`` matches.
 
+    No chunk of ``denied`` matches that text.
     ``letters`` are the letters that the rest may have: names with other letters are already kept.
     """
 
@@ -406,7 +407,7 @@ class _Letters:
         return self._by_next_letter(place._replace(denied=denied))
 
     def _by_next_letter(self, place: _Place) -> Iterator[_Place]:
-        """Yield the places into which the next letter divides a place; ``wide`` begins with "*"."""
+        """Split a place by its next letter, and yield the parts; ``wide`` must begin with "*"."""
         read, wide, denied, letters = place
         if wide == "*" and not any("*" in chunk for chunk in denied):
             # A chunk with a letter that no denied one has is allowed, whatever its other letters.
@@ -460,7 +461,10 @@ def _after(letter: str, chunks: Iterable[str]) -> tuple[str, ...]:
 
 
 def _joined(expressions: set[Chunks]) -> set[Chunks]:
-    """Return fewer expressions for the same keys: ``**`` replaces an expression for each length."""
+    """Return fewer expressions for the same keys: one with ``**`` replaces others.
+
+    It replaces those that differ from it only in their number of chunks.
+    """
     joined = {
         tuple(canonical(expression).split("/")) if expression else expression
         for expression in expressions

@@ -193,7 +193,7 @@ class VendorTraits:
     needs_domain_rule: bool = True
     """A participant does not start in a domain that the governance does not list."""
     shares_open_topics: bool = False
-    """A participant still exchanges unprotected topics with peers that refuse it.
+    """A participant still exchanges data on unprotected topics with peers that refuse it.
 
     Access control in the direction of the participant prevents this (measured).
     """

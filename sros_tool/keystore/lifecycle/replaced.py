@@ -151,10 +151,10 @@ class IssuedEarlier:
 def with_ledger(
     keystore: Keystore, replaced: Collection[ReplacedRights], now: datetime
 ) -> tuple[ReplacedRights, ...]:
-    """Return replaced rights with the latest expiry of what the ledger has of their enclaves.
+    """Return the replaced rights, each with the latest expiry that the ledger has for its enclave.
 
-    It may have permissions that work longer than those that are replaced: a robot has them if the
-    keystore was restored from a backup.
+    The ledger may have permissions that work longer than those that are replaced: a robot has them
+    if the keystore was restored from a backup.
     """
     if not replaced:
         return ()
