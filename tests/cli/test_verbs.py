@@ -396,7 +396,9 @@ def test_create_keystore_by_options(tmp_path: Path) -> None:
     verified = json.loads(sros("verify", tmp_path / "ks", "--json").out)["enclaves"][0]
     assert enclave["expires"] == verified["valid_until"] < enclave["valid_until"]
     for place in ("ks", "ks/enclaves/a"):
-        assert f"expires {enclave['expires']}\n" in sros("inspect", tmp_path / place).ok().out
+        shown = sros("inspect", tmp_path / place).ok().out
+        assert f"expires {enclave['expires']}" in shown
+    assert f"certificate until {enclave['valid_until']}\n" in shown
     assert (
         described["authorities"]["identity"]["subject"]
         == (described["authorities"]["permissions"]["subject"])

@@ -680,7 +680,7 @@ def test_home_is_older_than_its_robots(field: Field) -> None:
     assert field.status()["older"] is None
     (field.folder / "less.xml").write_text(POLICY.replace("/y", "/z"))
     less = ("generate_artifacts", "-k", "ks", "-p", "less.xml", "--fleet", "fleet.toml")
-    assert "/dispatcher: its lost rights work at least until" in field.run(*less).err
+    assert "/dispatcher: the rights that it lost still work at least until" in field.run(*less).err
     timestamp = field.folder / "pub/metadata/timestamp.json"
     for damaged in (b'{"signed": {"version": 9999999999}}', b"[]", b"x", b"{" * 9999):
         timestamp.write_bytes(damaged)

@@ -221,12 +221,12 @@ def lasting_text(root: Path, replaced: ReplacedRights) -> str:
     if not (replaced.loses() and (replaced.works_until or longer)):
         return ""
     if replaced.works_until:
-        work = f"work {'at least ' if longer else ''}until {iso(replaced.works_until)}"
+        work = f"still work {'at least ' if longer else ''}until {iso(replaced.works_until)}"
     else:
         work = "may still work"
     command = f"`sros renew {quote(str(root))} {quote(replaced.enclave)} --revoke-old`"
     return (
-        f"{replaced.enclave}: its lost rights {work} for whoever "
+        f"{replaced.enclave}: the rights that it lost {work} for whoever "
         "kept its earlier permissions and its key, and in its processes until they are restarted. "
         f"To end that, run {command}, and restart all processes, first those of this enclave."
     )
