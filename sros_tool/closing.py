@@ -636,11 +636,14 @@ class OpenRobot:
     def _with_later(
         self, observed: ObservedProcesses, running: RunningProcesses
     ) -> ObservedProcesses:
-        """Return a copy with the processes that were started in other enclaves since."""
+        """Return a copy with the processes that were started in other enclaves since.
+
+        Only of users who can read the enclaves: the command of a process is proposed to be run.
+        """
         known = {_OBSERVER, *(process.enclave for process in observed.processes)}
         later = []
         for process, enclave in self._secured(running):
-            if enclave.name not in known:
+            if enclave.name not in known and process.user in (0, self.export.stat().st_uid):
                 command, argument = process.command, (ROS_ARGS, "--enclave", enclave.name)
                 if command[-3:] == argument:  # sros wrote it
                     command = command[:-3]

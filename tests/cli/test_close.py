@@ -379,6 +379,10 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     export = robot.folder / "robot/export"
     environment = secured_environment(export, "/late", 0)
     late = robot.with_its_files(replace(late, environment=environment))
+    robot.more = (replace(late, user=os.geteuid() + 1),)
+    robot.close()
+    commands = (robot.folder / "robot/start/commands.txt").read_text()
+    assert "/opt/late" not in commands, "another user cannot propose what is run"
     robot.more = (replace(late, started=datetime.now(UTC) - timedelta(days=1)),)
     assert "closed, except for /late (with earlier files), its files" in robot.close().err
     robot.more = (replace(late, started=datetime.now(UTC) + timedelta(days=1)),)
