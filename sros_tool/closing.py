@@ -1011,7 +1011,8 @@ class OpenRobot:
         before = make_observation(node for node in nodes if node.enclaves[0] not in missing)
         proof = self._proof_of_processes(len(expected) - len(missing), running)
         if missing:
-            proof = proof._replace(reason=f"{proof.reason}; not running: {', '.join(missing)}")
+            state = "not seen" if running.unseen or running.hidden else "not running"
+            proof = proof._replace(reason=f"{proof.reason}; {state}: {', '.join(missing)}")
         return [
             proof,
             *self._proof_of_requirements(),

@@ -187,7 +187,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
         asked = all(proof.holds for proof in closed.proofs)
         but = "" if asked else ", except for what was not asked"
         if missing := [name for name in closed.left if name not in closed.secured]:
-            but += f", without {', '.join(missing)}, not running"
+            but += f", without a process of {', '.join(missing)}"
         following = f"; next: bring {folder}/keystore to another machine: it has the CA keys"
         following = following if robot.keystore.exists() else ""
         echo(f"the robot is closed{but}{_until(closed)}{following}", err=True)

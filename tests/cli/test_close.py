@@ -409,7 +409,10 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
         "/listener\n"
     ) in ended.out
     assert "talks: 1 node with 18 endpoints as before, without /listener\n" in ended.out
-    assert "the robot is closed, without /listener, not running, its files are" in ended.err
+    assert "the robot is closed, without a process of /listener, its files are" in ended.err
+    robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
+    assert "; not seen: /listener\n" in robot.close("--proof", "--partial").out
+    robot.unseen = ()
     robot.absent = set()
     assert "process 4712 (run): in domain 0" in robot.close("--proof", "--partial", status=1).out
     robot.absent = {"/listener", "/talker"}
