@@ -503,7 +503,7 @@ def explain_access(
             the enclave, the policy or the keystore have an action and no service of that name.
         vendor: "fastdds" (2.14, or that of ``distribution``), "cyclonedds" (0.10, likewise), or
             another name that `sros explain --vendor` takes, such as "fastdds-3.2".
-        distribution: A distribution of ROS 2, such as "lyrical", whose release of ``vendor``
+        distribution: A ROS 2 distribution, such as "lyrical", whose release of ``vendor``
             decides.
         policy: The policy of the enclave, or its file, in which to find the ``policy_lines``.
         domain: The ROS domain id; by default 0, or the first domain of the governance.
@@ -636,9 +636,9 @@ def check_requirements(
         template: The keystore template, by name or file, whose protection a policy gets. Without
             it, the default template is assumed where the policy states no protection, and a finding
             reports this.
-        vendor: The only vendor of DDS to decide for, or "zenoh"; every measured one and Zenoh by
+        vendor: The only DDS vendor to decide for, or "zenoh"; every measured one and Zenoh by
             default.
-        distribution: The distribution of ROS 2, such as "lyrical", whose DDS decides; without
+        distribution: The ROS 2 distribution, such as "lyrical", whose DDS decides; without
             ``vendor``, all that it ships.
         domain: The only ROS domain id to decide for; by default one of each group of domains that
             the keystore's documents treat alike.
@@ -696,7 +696,7 @@ def new_access(
 
     Args:
         base: The state before the change: a policy, a folder of policies, a keystore, an exported
-            enclave, permissions, a Zenoh configuration, or policies at a revision of git, such as
+            enclave, permissions, a Zenoh configuration, or policies at a git revision, such as
             "git:main:policies/robot.xml".
         head: The state after the change: any of these.
         fleet: The file with the robots that the placeholders of policies stand for.

@@ -124,7 +124,7 @@ class ClosedProcess(NamedTuple):
     user: int
     """The id of the user who runs it."""
     unit: str
-    """The unit of systemd that starts it alone; empty for a process that is restarted by hand."""
+    """The systemd unit that starts it alone; empty for a process that is restarted by hand."""
     known_by: Annotated[
         str, Words(("process id", "node name", "program", "elimination", "enclave"))
     ]
@@ -207,7 +207,7 @@ class ObservedProcesses(NamedTuple):
 
     @property
     def units(self) -> dict[str, str]:
-        """The units of systemd that start a process alone, by its enclave."""
+        """The systemd units that start a process alone, by its enclave."""
         return {process.enclave: process.unit for process in self.processes if process.unit}
 
     def as_they_run(self, running: RunningProcesses) -> ObservedProcesses:
@@ -234,9 +234,9 @@ class ObservedProcesses(NamedTuple):
         )
 
     def by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
-        """Map the shell commands for what no unit of systemd starts alone to its processes.
+        """Map the shell commands for what no systemd unit starts alone to its processes.
 
-        A router of Zenoh comes first: nodes wait for it.
+        A Zenoh router comes first: nodes wait for it.
         """
         launches = {
             tuple(process.launch): process.enclave
@@ -881,7 +881,7 @@ class OpenRobot:
     # ── applying ────────────────────────────────────────────────────────────────────────────
 
     def apply(self, prepared: Closing, *, partial: bool, dry_run: bool) -> Closing:
-        """Restart the units of systemd that do not run in their enclaves, with drop-ins.
+        """Restart the systemd units that do not run in their enclaves, with drop-ins.
 
         Proves that the robot is closed, if nothing is left to do by hand.
         """

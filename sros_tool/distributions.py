@@ -1,4 +1,4 @@
-"""The distributions of ROS 2: the DDS and Zenoh that they ship, and by whose rules sros decides.
+"""The ROS 2 distributions: the DDS and Zenoh that they ship, and by whose rules sros decides.
 
 Source: ``ros2.repos`` of the branches of ros2/ros2 and their release tags, November 2026; REP-2000.
 """
@@ -53,7 +53,7 @@ class Shipped(NamedTuple):
 
 
 class Distribution(NamedTuple):
-    """A distribution of ROS 2.
+    """A ROS 2 distribution.
 
     ``until`` is the month in which its support ends.  ``stands_for`` is an unsupported distribution
     in whose place this one is used, or "".
@@ -155,7 +155,7 @@ def find_distribution(name: str) -> Distribution:
     """
     if distribution_problem(name):
         raise UsageError(
-            f"{name!r} is not a distribution of ROS 2 that sros knows",
+            f"{name!r} is not a ROS 2 distribution that sros knows",
             f"It knows {', '.join(DISTRIBUTIONS)}.",
             "Name one of them.",
         )

@@ -179,7 +179,7 @@ class Fault(Enum):
     TOKEN_URI = (
         "token-uri",
         "a key.p11 that does not name a key on a token",
-        "Either no node of ROS 2 finds the key, or whoever can read the file has the PIN.",
+        "Either no ROS 2 node finds the key, or whoever can read the file has the PIN.",
         "RFC 7512; rmw_dds_common of ROS 2 Jazzy (security.cpp); libp11 0.4.12 (eng_parse.c).",
         "Write one line into {path}: pkcs11:token=TOKEN;object=LABEL;type=private, and for a file "
         "with the PIN, ?pin-source=file:PATH after it.",

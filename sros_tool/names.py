@@ -70,7 +70,7 @@ DISTRIBUTIONS = (
     "ardent", "bouncy", "crystal", "dashing", "eloquent", "foxy", "galactic", "humble", "iron",
     "jazzy", "kilted", "lyrical", "rolling",
 )  # fmt: skip
-"""The distributions of ROS 2, in the order of their release; rolling is always the latest."""
+"""The ROS 2 distributions, in the order of their release; rolling is always the latest."""
 
 ACTION_SEPARATOR = "/_action/"
 """Separates the name of an action from the names of its services and topics."""
@@ -97,10 +97,10 @@ _MAX_EXPRESSION = 2000  # characters; the names that an expression can match hav
 
 
 def distribution_problem(name: str) -> str:
-    """Return why ``name`` is not a distribution of ROS 2, as a sentence; "" if it is one."""
+    """Return why ``name`` is not a ROS 2 distribution, as a sentence; "" if it is one."""
     if name in DISTRIBUTIONS:
         return ""
-    return f"It is not a distribution of ROS 2 that sros knows: {', '.join(DISTRIBUTIONS)}."
+    return f"It is not a ROS 2 distribution that sros knows: {', '.join(DISTRIBUTIONS)}."
 
 
 def has_type_descriptions(distribution: str) -> bool:

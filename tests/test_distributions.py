@@ -1,4 +1,4 @@
-"""The distributions of ROS 2, and the vendor by whose rules each one is decided."""
+"""The ROS 2 distributions, and the vendor by whose rules each one is decided."""
 
 from __future__ import annotations
 

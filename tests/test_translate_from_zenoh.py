@@ -1,4 +1,4 @@
-"""Rules of Zenoh, whoever wrote them, become rights in ROS terms: never more than they allow."""
+"""Zenoh rules, whoever wrote them, become rights in ROS terms: never more than they allow."""
 
 from __future__ import annotations
 

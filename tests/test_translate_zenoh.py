@@ -1,4 +1,4 @@
-"""Rights of policies become access control of Zenoh: exactly, or an error with the place."""
+"""Rights of policies become Zenoh access control: exactly, or an error with the place."""
 
 from __future__ import annotations
 

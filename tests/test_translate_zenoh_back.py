@@ -1,4 +1,4 @@
-"""Rules of Zenoh in ROS terms: the inverse of what sros writes, and never more than they allow."""
+"""Zenoh rules in ROS terms: the inverse of what sros writes, and never more than they allow."""
 
 from __future__ import annotations
 

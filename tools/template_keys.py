@@ -84,7 +84,7 @@ KEYS: tuple[Key, ...] = (
         "",
         "distributions",
         '["jazzy", "lyrical"]',
-        "names of distributions of ROS 2",
+        "names of ROS 2 distributions",
         "the distributions that the keystore is for; `sros check` decides like the DDS of "
         "each distribution",
         "any of them",

@@ -30,7 +30,7 @@ _SOURCE = re.compile(r"(?:https?://[!-~]+|/.*)\Z")
 
 
 class Unit(NamedTuple):
-    """A unit of systemd, and the enclaves in which its processes run."""
+    """A systemd unit, and the enclaves in which its processes run."""
 
     name: str
     enclaves: tuple[str, ...]

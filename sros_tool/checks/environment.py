@@ -356,7 +356,7 @@ FILE_NOT_FOUND = FindingKind(
 UNREAD = FindingKind(
     "runtime.zenoh-unread",
     WARNING,
-    "a configuration of Zenoh that sros cannot read",
+    "a Zenoh configuration that sros cannot read",
     "Zenoh reads forms that sros does not: YAML, TOML, lists in place of objects, pipes, more than "
     "16 MiB. So sros does not know whether the configuration enforces anything.",
     _SOURCE,
@@ -374,7 +374,7 @@ TOO_OLD = FindingKind(
 OVERRIDDEN = FindingKind(
     "runtime.zenoh-overridden",
     WARNING,
-    "ZENOH_CONFIG_OVERRIDE changes what a configuration of Zenoh protects",
+    "ZENOH_CONFIG_OVERRIDE changes what a Zenoh configuration protects",
     "Zenoh applies it after the file, in nodes and in the router, so it can switch off access "
     "control, TLS and everything else that the file states.",
     _SOURCE,
@@ -383,7 +383,7 @@ OVERRIDDEN = FindingKind(
 NO_CERTIFICATE = FindingKind(
     "runtime.zenoh-no-certificate",
     ERROR,
-    "a configuration of Zenoh with TLS, but without the paths of certificates and keys",
+    "a Zenoh configuration with TLS, but without the paths of certificates and keys",
     "No session opens with it, and no router starts.",
     "Zenoh 1.10.2, measured.",
     f"Name the paths in ZENOH_CONFIG_OVERRIDE. {OWN_CONFIGURATION}",

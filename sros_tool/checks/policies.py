@@ -482,7 +482,7 @@ NO_PARAMETERS = FindingKind(
 RELATIVE_GLOBAL = FindingKind(
     "policy.relative-global-name",
     ERROR,
-    "a global topic of ROS 2 that is written as a relative name",
+    "a global ROS 2 topic that is written as a relative name",
     "/rosout, /parameter_events and /clock are absolute also for nodes in a namespace, so the "
     "rule allows a topic that no node uses. Sample policies of ros2/sros2 have this mistake.",
     "rcl 9 (logging_rosout.h: /rosout); rclcpp 28 (/parameter_events, /clock).",
@@ -890,7 +890,7 @@ MALFORMED = FindingKind(
     ERROR,
     "a policy that cannot be read",
     "No verb of sros can use it.",
-    "SROS2 policy XML 0.2.0 (policy.xsd of ros2/sros2) and the names of ROS 2.",
+    "SROS2 policy XML 0.2.0 (policy.xsd of ros2/sros2) and the ROS 2 names.",
     "Correct it at the reported place.",
 )
 DUPLICATE = FindingKind(

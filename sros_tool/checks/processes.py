@@ -453,7 +453,7 @@ PROCESS_OTHER_KEYSTORE = FindingKind(
 ZENOH_UNREAD = FindingKind(
     "runtime.zenoh-process-unread",
     WARNING,
-    "a process of Zenoh whose configuration sros cannot read",
+    "a Zenoh process whose configuration sros cannot read",
     "Zenoh reads forms that sros does not, such as YAML, and a process without an RMW chooses its "
     "configuration itself. sros does not know whether the process enforces anything.",
     "Zenoh 1.10.2, measured.",

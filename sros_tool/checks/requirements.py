@@ -45,7 +45,7 @@ ASSUMED = FindingKind(
 NOT_CROSSING = FindingKind(
     "requirement.not-crossing",
     NOTE,
-    "a required right whose data does not pass between routers of Zenoh",
+    "a required right whose data does not pass between Zenoh routers",
     "The enclave and an enclave at another router have the right, but the routers do not forward "
     "the name to each other.",
     "The requirements file, and the router.json5 of both routers.",

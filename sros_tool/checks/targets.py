@@ -35,7 +35,7 @@ class Circumstances:
     ``distribution`` is the ROS 2 distribution of the nodes of policies; "" is the latest.
     ``vendors`` are the DDS vendors of the nodes, or ``zenoh``; () if they may use any.
     ``fleet`` has the robots that placeholders in policies stand for.  ``opened`` has the
-    keystores that are already open, by path.  ``advisories`` are known vulnerabilities of DDS; None
+    keystores that are already open, by path.  ``advisories`` are known DDS vulnerabilities; None
     for those that ship with sros.  ``sample`` are the enclaves of a keystore that are checked with
     the keystore itself; None for all.
     """
@@ -59,7 +59,7 @@ class Circumstances:
 def path_findings(path: Path, at: Circumstances) -> list[Finding]:
     """Return the findings at a path: a policy, a keystore, an enclave, or a folder of policies.
 
-    A file ``*.json5``, ``*.json`` or ``*.yaml`` is a configuration of Zenoh.  Raises
+    A file ``*.json5``, ``*.json`` or ``*.yaml`` is a Zenoh configuration.  Raises
     `DocumentError` for any other path.
     """
     if path.suffix in (".json5", ".json", ".yaml", ".yml") and not path.is_dir():

@@ -1,4 +1,4 @@
-"""Kinds of findings about an update to another distribution of ROS 2; `sros_tool.proof` decides.
+"""Kinds of findings about an update to another ROS 2 distribution; `sros_tool.proof` decides.
 
 They are also used for keystores that are for several distributions, if these decide differently.
 """

@@ -1,4 +1,4 @@
-"""Checks of a configuration of Zenoh, as rmw_zenoh reads it for a router or a session."""
+"""Checks of a Zenoh configuration, as rmw_zenoh reads it for a router or a session."""
 
 from __future__ import annotations
 
@@ -237,7 +237,7 @@ _COMPARISON = 20
 
 
 def configuration_findings(path: Path) -> Iterator[Finding]:
-    """Yield the findings in a configuration of Zenoh; one that cannot be read is a finding too."""
+    """Yield the findings in a Zenoh configuration; one that cannot be read is a finding too."""
     data = read_bytes(path, "Zenoh configuration")
     try:
         document = parse_configuration(data, str(path))
@@ -504,7 +504,7 @@ Verb = Annotated[str, Words(VERBS.values()), "The right."]
 
 
 class AllowedName(NamedTuple):
-    """A right to a name of ROS."""
+    """A right to a ROS name."""
 
     right: Verb
     name: str

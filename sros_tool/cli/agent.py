@@ -95,7 +95,7 @@ def agent() -> None:
 )  # fmt: skip
 @click.option(
     "--unit", "units", metavar="UNIT=ENCLAVE,...", multiple=True,
-    help="A unit of systemd, and the enclaves in which it runs; in the order of the restarts. Can "
+    help="A systemd unit, and the enclaves in which it runs; in the order of the restarts. Can "
     "be repeated.",
 )  # fmt: skip
 @click.option(

@@ -167,7 +167,7 @@ _VENDORS = (*(vendor.value for vendor in MEASURED), _ZENOH)
     "Report only findings for the nodes and the DDS of this ROS 2 distribution, such as lyrical. "
     "[default: the distributions in the keystore's settings; $ROS_DISTRO for nodes in policies]"
 )
-@all_distros_option("Report the findings for all supported distributions of ROS 2.")
+@all_distros_option("Report the findings for all supported ROS 2 distributions.")
 @distro_option(
     "Report only the differences after an update to this ROS 2 distribution, from the present "
     "one: --distro, else the keystore's settings, else $ROS_DISTRO.",
@@ -573,7 +573,7 @@ def _findings_here(
     """Return the runtime findings on this machine, for the environment variables given.
 
     ``insecure_rmws`` maps RMWs that were found not to enforce security to the evidence.
-    ``libraries`` are installed libraries of DDS, and ``advisories`` are the
+    ``libraries`` are installed DDS libraries, and ``advisories`` are the
     known vulnerabilities; None for those that ship with sros.
     """
     from sros_tool.checks.runtime import RuntimeState, runtime_findings

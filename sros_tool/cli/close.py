@@ -59,9 +59,7 @@ def _run(words: Sequence[str], live: bool) -> tuple[int, str, str]:
 @click.option(
     "--domain", "domain_text", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or 0]"
 )
-@click.option(
-    "--apply", "applies", is_flag=True, help="Restart the robot's units of systemd secured."
-)
+@click.option("--apply", "applies", is_flag=True, help="Restart the robot's systemd units secured.")
 @click.option("--proof", "proves", is_flag=True, help="Prove that the robot is closed.")
 @click.option("--undo", "undoes", is_flag=True, help="Restart these units open again.")
 @click.option(
@@ -89,7 +87,7 @@ def close(
     CA keys, and the files that start each process secured. Each step is a command, which is
     printed. Existing files are kept: edit policy.xml and requirements.toml, and run it again.
 
-    Nothing is closed before --apply, which restarts the processes that are units of systemd, and
+    Nothing is closed before --apply, which restarts the processes that are systemd units, and
     shows the commands for all others. --proof checks that every process runs in its enclave, that
     everything that talked still talks, and that an open listener finds nothing; --apply does it
     too, if nothing is left to do by hand. --undo goes back.

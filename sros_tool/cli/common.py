@@ -138,7 +138,7 @@ def allow_refusal_option(function: Decorated) -> Decorated:
 def _complete_distribution(
     _ctx: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[str]:
-    """Complete the supported distributions of ROS 2."""
+    """Complete the supported ROS 2 distributions."""
     from sros_tool.distributions import SUPPORTED
 
     return [known.name for known in SUPPORTED if known.name.startswith(incomplete)]
@@ -174,7 +174,7 @@ advisories_option = click.option(
     "--advisories",
     metavar="FILE",
     type=PATH,
-    help="Also take known vulnerabilities of DDS from FILE, in the OSV format (JSON).",
+    help="Also take known DDS vulnerabilities from FILE, in the OSV format (JSON).",
 )
 
 

@@ -188,7 +188,7 @@ def _refuse_ignored(mode: str) -> None:
     "Decide as the DDS of this ROS 2 distribution does, such as lyrical: its default, or the one "
     "of $RMW_IMPLEMENTATION or --vendor. [default: $ROS_DISTRO]"
 )
-@all_distros_option("Compare the decisions of all supported distributions of ROS 2.")
+@all_distros_option("Compare the decisions of all supported ROS 2 distributions.")
 @click.option(
     "--at",
     "moment",
@@ -291,7 +291,7 @@ def explain(
     root, rest = _split(words, keystore, verb=0 if who else 1)
     if reach:
         if vendor not in (None, _ZENOH):
-            text = "It follows the rights, which are the same for all vendors of DDS."
+            text = "It follows the rights, which are the same for all DDS vendors."
             raise UsageError("--reach takes only --vendor zenoh", text, "Leave it out.")
         stated = policy, fleet_file
         zenoh = bool(_why_zenoh(vendor, root))
@@ -377,7 +377,7 @@ def _circumstances(
 
 
 def _why_zenoh(vendor: str | None, root: Path | None) -> str:
-    """Return the reason to ask Zenoh and not a vendor of DDS, or ""."""
+    """Return the reason to ask Zenoh and not a DDS vendor, or ""."""
     from sros_tool.keystore.layout import has_zenoh_files, is_keystore
     from sros_tool.runtime.rmw import RMW
 

@@ -86,7 +86,7 @@ def fleet() -> None:
     help="Print the format of Ansible's dynamic inventory scripts.",
 )
 def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
-    """Print the robots of KEYSTORE as an inventory of Ansible.
+    """Print the robots of KEYSTORE as an Ansible inventory.
 
     Robots are hosts and groups are groups. Variables of a host are ansible_host, ansible_user,
     sros_robot, sros_namespace, sros_domain, sros_router, sros_crossing,

@@ -191,8 +191,8 @@ class _SeveralEnclavesAndPolicies(SeveralValues):
     help="Policies whose enclaves are created, with the permissions that the policies state.",
 )
 @fleet_option(
-    "The robots that the placeholders of the policies stand for: a TOML file, or an inventory of "
-    "Ansible."
+    "The robots that the placeholders of the policies stand for: a TOML file, or an Ansible "
+    "inventory."
 )
 @click.option(
     "--template",

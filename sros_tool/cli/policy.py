@@ -190,20 +190,20 @@ def diff_policy(
     """Compare the rights that A and B give: "-" is only in A, "+" only in B.
 
     A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, or
-    configurations of Zenoh such as router.json5. Permissions and rules of Zenoh are shown in ROS
+    Zenoh configurations such as router.json5. Permissions and Zenoh rules are shown in ROS
     terms; the signature of permissions is verified if the permissions CA is next to them. If A or B
     covers only some enclaves, only these are compared. Lines that differ only in the robot of a
     fleet are shown as one. For two policies, the protection that they demand is compared, too.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
 
-    With --no-new-access, A and B can also be folders of policies, and policies at a revision of
-    git, as git:REVISION:PATH. The exit status is 0 only if B gives no enclave any access that A
-    does not give, with no vendor, in no domain and for no name, and protects nothing less; it is 2
-    if that cannot be decided. sros assumes that a policy is signed with access control of
-    everything. If A is a policy, a keystore B with less protection than the template production
-    gives more access; a policy B lowers no protection. The last line says what is assumed and what
-    is left out, such as dates.
+    With --no-new-access, A and B can also be folders of policies, and policies at a git revision,
+    as git:REVISION:PATH. The exit status is 0 only if B gives no enclave any access that A does not
+    give, with no vendor, in no domain and for no name, and protects nothing less; it is 2 if that
+    cannot be decided. sros assumes that a policy is signed with access control of everything. If A
+    is a policy, a keystore B with less protection than the template production gives more access; a
+    policy B lowers no protection. The last line says what is assumed and what is left out, such as
+    dates.
 
     Example:
       $ sros diff_policy robot.xml keystore
@@ -226,7 +226,7 @@ def diff_policy(
         return _show_new_access(a, b, fleets_of(fleet_files), form)
     if any(str(path).startswith("git:") and not path.exists() for path in (a, b)):
         raise UsageError(
-            "a revision of git can only be compared with --no-new-access", "", "Add the option."
+            "a git revision can only be compared with --no-new-access", "", "Add the option."
         )
     with progress("reading"):
         fleets = fleets_of(fleet_files)

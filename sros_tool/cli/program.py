@@ -267,7 +267,7 @@ _PHRASES = {
     "demo": "run the demo",
     "policies": "show the policies",
     "crl": "show or sign the revocation list",
-    "zenoh": "write the files of Zenoh",
+    "zenoh": "write the Zenoh files",
     "completion": "print the completion script",
     "doctor": "examine this machine",
     "audit": "audit the robot",

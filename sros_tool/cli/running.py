@@ -187,7 +187,7 @@ def env(
     The strategy is Enforce: a process that cannot run in the enclave does not start. If the enclave
     cannot be used, sros prints variables with which no node starts. With rmw_zenoh_cpp, which
     ignores ROS_SECURITY_*, the variables also name the configuration that `sros zenoh` wrote, and
-    override variables of Zenoh that are set.
+    override Zenoh variables that are set.
 
     A container gets the files of the enclave from an export in DIR (Compose), or from a Secret
     (Kubernetes). Without --image, merge the output with a definition that names an image.
@@ -480,7 +480,7 @@ def units(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Write units of systemd to FOLDER: nodes in ENCLAVE..., and timers (--job).
+    """Write systemd units to FOLDER: nodes in ENCLAVE..., and timers (--job).
 
     A node runs in its enclave or not at all, sees the keys of no other enclave, and gets no right
     that a ROS node does not need. COMMAND is its program; the default is the file in

@@ -179,7 +179,7 @@ def zenoh(
     if off and (given or further or crossing):
         raise UsageError("--off takes no other choice of the network", "", "Leave one of them out.")
     network = None if off else _network(settings, given, further, crossing)
-    with progress("writing the files of Zenoh"):
+    with progress("writing the Zenoh files"):
         work = of_one_state(set_zenoh) if only_check else set_zenoh
         result = work(root, network, now=now(), keyring=keyring(), dry_run=dry_run or only_check)
     # A document and the signed one next to it are written together.
@@ -210,7 +210,7 @@ def zenoh(
         result = replace(result, notes=notes)
     if not result.changes:
         without = f", and {counted(len(left_out), 'enclave')} without a file" if left_out else ""
-        echo(f"the files of Zenoh are up to date{without}", err=True)
+        echo(f"the Zenoh files are up to date{without}", err=True)
     print_follow_up(result, restart=not (dry_run or only_check))
     if only_check and (result.changes or left_out):
         raise SystemExit(1)
@@ -282,7 +282,7 @@ def _domains(text: str | None) -> str:
 
 
 def _document(path: str) -> str:
-    """Return the path of the document to which a file of Zenoh belongs."""
+    """Return the path of the document to which a Zenoh file belongs."""
     return path.removesuffix(".p7s").removesuffix(".json5") + ".json5"
 
 
@@ -435,7 +435,7 @@ def _left_out(subjects: Sequence[RightsBehindRules]) -> Iterator[Note]:
         )
     yield Note(
         "zenoh.node-names",
-        "rules of Zenoh name no nodes: in the policy, each node has the last part of its enclave's "
+        "Zenoh rules name no nodes: in the policy, each node has the last part of its enclave's "
         "name, and all names of topics and services are absolute. Write the real namespaces and "
         "names of the nodes into it: on Zenoh, others do not see a node that the policy does not "
         "name.",

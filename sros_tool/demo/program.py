@@ -71,7 +71,7 @@ class DemoOptions:
     is the template of that keystore, or production; the default ``topic`` is one that the cast may
     use.  ``only`` selects the rows whose names contain one of its words.  ``accept_open`` names the
     rows of attacks that may succeed because of the user's keystore.  ``advisories`` are the known
-    vulnerabilities of DDS; None for those that ship with sros.
+    DDS vulnerabilities; None for those that ship with sros.
     """
 
     template: Template | None = None

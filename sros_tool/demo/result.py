@@ -598,7 +598,7 @@ class DemoResult:
     left_out: int = 0
     """Number of rows that `--only` left out."""
     libraries: tuple[UsedLibrary, ...] = ()
-    """Libraries of DDS that the processes had loaded, with their known vulnerabilities; an empty
+    """DDS libraries that the processes had loaded, with their known vulnerabilities; an empty
     list if none was seen."""
 
     @property
@@ -636,7 +636,7 @@ _UNKNOWN = "its version is not known, or no advisory is about it"
 
 
 class UsedLibrary(NamedTuple):
-    """A library of DDS that processes of the demo had loaded, and its known vulnerabilities."""
+    """A DDS library that processes of the demo had loaded, and its known vulnerabilities."""
 
     product: str
     """Name of the DDS."""
@@ -669,7 +669,7 @@ class UsedLibrary(NamedTuple):
 def used_libraries(
     rows: Iterable[RowResult], advisories: Sequence[Advisory] | None = None
 ) -> tuple[UsedLibrary, ...]:
-    """Return the libraries of DDS that processes of the rows had loaded, sorted.
+    """Return the DDS libraries that processes of the rows had loaded, sorted.
 
     ``advisories`` are the known vulnerabilities; None for those that ship with sros.
     """

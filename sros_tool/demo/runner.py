@@ -602,7 +602,7 @@ class _PartyProcess:
         return mapped_segments(self._process.pid)
 
     def dds(self) -> tuple[MappedLibrary, ...]:
-        """Return the libraries of DDS that the process has mapped; empty if it has ended."""
+        """Return the DDS libraries that the process has mapped; empty if it has ended."""
         return dds_of(self._process.pid)
 
     def ask_to_end(self) -> None:

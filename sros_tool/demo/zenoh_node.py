@@ -108,7 +108,7 @@ class _ZenohNode:
         return hashlib.blake2b(token.encode(), digest_size=16).digest()
 
     def publisher(self, name: str) -> Hear:
-        """Return a function that publishes a text; ``name`` may have wildcards of Zenoh."""
+        """Return a function that publishes a text; ``name`` may have Zenoh wildcards."""
         kind = _type_of(name, _MESSAGE)
         gid = _GID if "*" in name else self._announce("MP", name, kind)
         key, numbers = self._key_of(name, kind), itertools.count(1)
@@ -143,7 +143,7 @@ class _ZenohNode:
     def client(self, name: str) -> Call:
         """Return a function that sends a request to a service, and passes on each reply.
 
-        ``name`` may have wildcards of Zenoh.
+        ``name`` may have Zenoh wildcards.
         """
         kind = _type_of(name, _SERVICE)
         gid = _GID if "*" in name else self._announce("SC", name, kind)

@@ -59,7 +59,7 @@ class VendorExplanation(NamedTuple):
 
 @shows("distribution", "release", "measured", "decided_as", "outcome", "reason", "text")
 class DistributionAnswer(NamedTuple):
-    """The decision of a DDS that a distribution of ROS 2 ships."""
+    """The decision of a DDS that a ROS 2 distribution ships."""
 
     shipped: Shipped
     answer: Answer

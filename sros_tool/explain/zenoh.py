@@ -252,7 +252,7 @@ class WhoOnZenoh(NamedTuple):
 class ZenohEvaluator:
     """An evaluator of questions about the enclaves of one keystore, reusable for many questions.
 
-    Raises `KeystoreError` if the keystore has no configurations of Zenoh, no configuration of a
+    Raises `KeystoreError` if the keystore has no Zenoh configurations, no configuration of a
     router, or routers that are not connected to each other: what they enforce is then unknown.
     """
 
@@ -295,7 +295,7 @@ class ZenohEvaluator:
                 f"`sros zenoh {quote(str(self.root))}`.",
             )
         raise KeystoreError(
-            f"keystore '{self.root}' has no configurations of Zenoh",
+            f"keystore '{self.root}' has no Zenoh configurations",
             "Without them its enclaves cannot open a session, and rmw_zenoh with files of its own "
             "runs without any access control.",
             f"Write them: `sros zenoh {quote(str(self.root))}`.",
@@ -899,14 +899,14 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def written(self) -> str:
-        """What to do if the files of Zenoh do not match the permissions, or ""."""
+        """What to do if the Zenoh files do not match the permissions, or ""."""
         if self.answer.of_router:
             return "" if self.allowed else "Give the node an enclave of its own."
         if self.allowed is self.permitted and not self.out_of_date:
             return ""
         text = "Look at the files"
         if self.out_of_date:
-            text = "Write the files of Zenoh as the permissions are"
+            text = "Write the Zenoh files as the permissions are"
         command = f"sros zenoh {quote(str(self.root))}"
         return f"{text}: `{command}`; then restart the processes that it names."
 

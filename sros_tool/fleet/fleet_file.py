@@ -1,4 +1,4 @@
-"""Files that name the robots of a fleet: TOML, or inventories of Ansible.
+"""Files that name the robots of a fleet: TOML, or Ansible inventories.
 
 In an inventory, robots are hosts, and groups of robots are groups.  Static inventories in YAML can
 be read, and the output of ``ansible-inventory --list`` in JSON or YAML.  Source: Ansible's
@@ -62,7 +62,7 @@ _OF_ROBOT = "{robot}"
 
 
 def read_fleet(path: Path) -> Fleet:
-    """Return the fleet in a TOML file, or in an inventory of Ansible in YAML or JSON.
+    """Return the fleet in a TOML file, or in an Ansible inventory in YAML or JSON.
 
     The end of the name tells which: .yml, .yaml and .json are inventories.
 
@@ -83,7 +83,7 @@ def read_fleet(path: Path) -> Fleet:
             raise
         raise DocumentError(
             f"'{path}' is not a fleet file in TOML",
-            "It looks like an inventory of Ansible in INI.",
+            "It looks like an Ansible inventory in INI.",
             f"Convert it with `ansible-inventory -i {quote(str(path))} --list > hosts.json`, and "
             "name hosts.json.",
         ) from error

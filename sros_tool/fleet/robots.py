@@ -44,7 +44,7 @@ class Robot(NamedTuple):
     host name or IP address, ``user`` the account there ("": the default of ssh).  ``groups`` are
     sorted.  ``router`` is the address (``HOST:PORT``) at which sessions and other routers connect
     to its Zenoh router, or "" if it has none; ``crossing`` are the names that may pass between that
-    router and others, if not all may.  ``distribution`` is its distribution of ROS 2 ("": those of
+    router and others, if not all may.  ``distribution`` is its ROS 2 distribution ("": those of
     the keystore).  ``renewal`` is `RENEWAL_ALLOWED` if `sros fleet collect` may sign its requests
     for renewal; ``renewal_grace`` is a duration, such as ``30d``, for which a certificate is still
     accepted with such a request after its expiry ("": none).
@@ -160,7 +160,7 @@ def name_problem(name: str) -> str:
             "digit at its start, such as r7."
         )
     if name in _OF_ANSIBLE:
-        return "In an inventory of Ansible this name means something else."
+        return "In an Ansible inventory this name means something else."
     return ""
 
 

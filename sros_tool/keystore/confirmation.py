@@ -92,7 +92,7 @@ _PEM = re.compile(rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERT
 
 
 class Seen(StrEnum):
-    """Where a robot saw a library of DDS."""
+    """Where a robot saw a DDS library."""
 
     PROCESS = "process"
     """At least one running process has loaded it."""
@@ -101,7 +101,7 @@ class Seen(StrEnum):
 
 
 class RobotLibrary(NamedTuple):
-    """A library of DDS on a robot."""
+    """A DDS library on a robot."""
 
     product: str
     """Name of the DDS, such as ``Fast DDS``."""
@@ -117,7 +117,7 @@ class RobotDds(NamedTuple):
     """The DDS of a robot, as the robot saw it."""
 
     libraries: tuple[RobotLibrary, ...]
-    """The libraries of DDS; an empty list if the robot saw none."""
+    """The DDS libraries; an empty list if the robot saw none."""
     unseen: int
     """Number of processes that could not be looked at, so that other libraries may be in use."""
 
@@ -681,7 +681,7 @@ def _dds_from(value: Any, what: str) -> RobotDds:
     if type(unseen) is not int or not 0 <= unseen <= _MOST_UNSEEN:
         raise _refused(what, "its number of unseen processes is not a number")
     if not isinstance(listed, list) or len(listed) > _MOST_LIBRARIES:
-        raise _refused(what, f"its libraries of DDS are not a list of at most {_MOST_LIBRARIES}")
+        raise _refused(what, f"its DDS libraries are not a list of at most {_MOST_LIBRARIES}")
     libraries = []
     for library in listed:
         if not isinstance(library, dict) or library.keys() != set(RobotLibrary._fields):

@@ -857,7 +857,7 @@ def _by_kind(rights: Iterable[tuple[str, str, str]]) -> RightNames:
     return table
 
 
-# ── configurations of Zenoh ───────────────────────────────────────────────────────────────
+# ── Zenoh configurations ──────────────────────────────────────────────────────────────────
 
 
 _ABOUT_THE_CONTENT = (

@@ -56,7 +56,7 @@ def load_fleet(keystore: Keystore) -> Fleet | None:
 
 
 def stated_distributions(keystore: Keystore, enclave: str) -> tuple[str, ...]:
-    """Return the distributions of ROS 2 that an enclave is for; () if nothing states any.
+    """Return the ROS 2 distributions that an enclave is for; () if nothing states any.
 
     They are the distribution of its robot in the fleet, or else those in the keystore's settings.
 
@@ -71,7 +71,7 @@ def stated_distributions(keystore: Keystore, enclave: str) -> tuple[str, ...]:
 
 
 def of_several_distributions(keystore: Keystore) -> dict[tuple[str, ...], list[str]]:
-    """Map tuples of several distributions of ROS 2 to the enclaves that are for all of them.
+    """Map tuples of several ROS 2 distributions to the enclaves that are for all of them.
 
     Enclaves whose settings or fleet cannot be read are left out: another finding reports that.
     """

@@ -270,7 +270,7 @@ def _digests(keystore: Keystore, name: str) -> Iterator[str]:
         return  # a damaged file, which no DDS loads; `sros check` reports it
 
 
-# ── participants of DDS ────────────────────────────────────────────────────────────────────
+# ── DDS participants ───────────────────────────────────────────────────────────────────────
 
 
 def enclaves_by_identity(keystore: Keystore) -> dict[str, str]:

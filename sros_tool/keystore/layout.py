@@ -89,7 +89,7 @@ CRL_FILE = "crl.pem"
 OPTIONAL_FILES = (CRL_FILE,)
 
 SESSION_FILE, ROUTER_FILE = "session.json5", "router.json5"
-"""The configurations of Zenoh for the processes of an enclave, and for the router's enclave."""
+"""The Zenoh configurations for the processes of an enclave, and for the router's enclave."""
 ZENOH_SIGNED = {SESSION_FILE: "session.p7s", ROUTER_FILE: "router.p7s"}
 """Zenoh configurations and their copies signed by the permissions CA, which only sros verifies."""
 ZENOH_FILES = (*ZENOH_SIGNED, *ZENOH_SIGNED.values())
@@ -371,7 +371,7 @@ def enclaves_below(root: Path, name: str) -> tuple[str, ...]:
 
 
 def has_zenoh_files(root: Path, *, hidden: bool = False) -> bool:
-    """Return whether any enclave that this user can read has a configuration of Zenoh.
+    """Return whether any enclave that this user can read has a Zenoh configuration.
 
     With ``hidden``, as `search_enclaves`.
     """

@@ -329,7 +329,7 @@ class VendorParticipant:
             )
         stopped = None if join.outcome.ok else join
         if stopped is None and self.access is not None:
-            stopped = self.access.governed(ROS_DISCOVERY_TOPIC)  # every node of ROS 2 opens it
+            stopped = self.access.governed(ROS_DISCOVERY_TOPIC)  # every ROS 2 node opens it
         if stopped is None:
             return ()
         file = GOVERNANCE_FILE if stopped.reason in _OF_GOVERNANCE else PERMISSIONS_FILE

@@ -362,7 +362,7 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
         text = f"{path}: it puts a namespace before the keys, which this answer ignores."
         notes.append(Note("rights.zenoh-namespace", text))
     if rules.left_out:
-        text = f"{path}: {len(rules.left_out)} key expressions are no names of ROS, and left out, "
+        text = f"{path}: {len(rules.left_out)} key expressions are no ROS names, and left out, "
         text += f"such as {rules.left_out[0][:80]}."
         notes.append(Note("rights.zenoh-no-name", text))
     return RightsSource(

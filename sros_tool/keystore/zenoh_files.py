@@ -462,7 +462,7 @@ def zenoh_documents(
     for router in network.router_names():
         if router not in names:
             raise KeystoreError(
-                f"keystore '{root}' has no enclave {router}, and the router of Zenoh needs it",
+                f"keystore '{root}' has no enclave {router}, and the Zenoh router needs it",
                 "Its certificate shows to all others that the process is the router.",
                 f"Create it with `sros create_enclave {quote(str(root))} {router}`, name "
                 "another one with `sros zenoh --router NAME`, or end the network with `sros zenoh "

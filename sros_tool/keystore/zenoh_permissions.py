@@ -1,4 +1,4 @@
-"""The ROS rights in signed permissions, for Zenoh, if all vendors of DDS decide alike.
+"""The ROS rights in signed permissions, for Zenoh, if all DDS vendors decide alike.
 
 Anybody may have written the permissions.  Zenoh has no partitions, and its rules have no order.  A
 ROS node opens its topics in the default partition.  What an earlier rule decides is subtracted from
@@ -64,10 +64,10 @@ def grant_for_all(document: bytes, name: str, subject: str) -> Grant | None:
             read[reader] = read_permissions_as(vendor, document)
         chosen = _grant_for(vendor, read[reader], subject, at)
         if isinstance(chosen, Refusal):
-            raise DocumentError(f"{name} are not accepted by every vendor of DDS: {chosen.text}")
+            raise DocumentError(f"{name} are not accepted by every DDS vendor: {chosen.text}")
         if (chosen.rules, chosen.default_allow) != (grant.rules, grant.default_allow):
             raise DocumentError(
-                f"{name} are not the same for every vendor of DDS: {vendor.title} uses other rules"
+                f"{name} are not the same for every DDS vendor: {vendor.title} uses other rules"
             )
     return grant
 
@@ -98,7 +98,7 @@ def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
 
     Raises:
         PolicyError: it is uncertain which ROS names a right or a denial is about, what no rule
-            names is allowed, vendors of DDS do not decide alike, or the order of the rules counts
+            names is allowed, DDS vendors do not decide alike, or the order of the rules counts
             in a way that Zenoh does not have.
     """
     source = Source(f"the permissions of {enclave}", 0)
@@ -284,7 +284,7 @@ def _refused(
             f"{reason} ({', '.join(together(of))})" for reason, of in reasons.items()
         )
         return PolicyError(
-            f"{what}, because vendors of DDS do not {'read its rules' if are_alike else 'decide'} "
+            f"{what}, because DDS vendors do not {'read its rules' if are_alike else 'decide'} "
             "alike",
             f"{differing[:1].upper()}{differing[1:]}.",
             _REMEDY,

@@ -615,7 +615,7 @@ def fingerprints(pem: bytes) -> frozenset[str]:
     return frozenset(map(digest, load_certificates(pem, "the certificate of a CA")))
 
 
-# ── participants of DDS ────────────────────────────────────────────────────────────────────
+# ── DDS participants ───────────────────────────────────────────────────────────────────────
 
 IDENTITY_DIGITS = 12
 _FIRST_BIT = 1 << (4 * IDENTITY_DIGITS - 1)

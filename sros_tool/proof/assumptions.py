@@ -165,7 +165,7 @@ def _assumed(base: AccessSource, head: AccessSource) -> Iterator[str]:
             whose = "its enclaves without a robot" if side.fleet else "it"
             yield f"{name} names no domains: for {whose}, the domains of {other} count"
         if against.zenoh is not None:
-            yield f"{name} has the settings of Zenoh that sros writes"
+            yield f"{name} has the Zenoh settings that sros writes"
 
 
 def left_out(base: AccessSource, head: AccessSource) -> tuple[str, ...]:
@@ -194,7 +194,7 @@ def _left_out(base: AccessSource, head: AccessSource) -> Iterator[str]:
         if side.later is not None and other.later is None:
             yield f"what {name} gives to enclaves that are created later"
         if limits_crossing(side) and not states_routers(other):
-            yield f"what {name} lets cross between routers of Zenoh"
+            yield f"what {name} lets cross between Zenoh routers"
         if side.zenoh_files and not other.zenoh_files:
             yield f"where the Zenoh processes of {name} listen and connect"
         if side.scope is not None and other.scope is None:

@@ -49,7 +49,7 @@ def more_crossing(
         if new.later is not None and new.zenoh_files:
             meaning = "what passes between routers is not known"
             yield SettingChange(
-                Effect.LOOSER, "settings of Zenoh", "limit crossing", "missing", meaning
+                Effect.LOOSER, "Zenoh settings", "limit crossing", "missing", meaning
             )
         return
     kept = {*before.router_names()} & {*after.router_names()}

@@ -104,7 +104,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class KeptUse:
-    """A use that does not pass between routers of Zenoh to or from the enclaves ``others``."""
+    """A use that does not pass between Zenoh routers to or from the enclaves ``others``."""
 
     use: Use
     others: tuple[str, ...]

@@ -107,7 +107,7 @@ class Decided:
 
     ``assumed`` are requirements that hold only with the assumed protection of the default template,
     each with a name whose protection the policy does not state.  ``kept`` are requirements that
-    hold, each with a use that does not pass between routers of Zenoh.
+    hold, each with a use that does not pass between Zenoh routers.
     """
 
     violations: tuple[Violation, ...]

@@ -152,7 +152,7 @@ class Growth:
     gained: tuple[SettingChange, ...]
     """The settings that protect more in HEAD, as changes from HEAD back to BASE."""
     worlds: tuple[str, ...]
-    """The compared DDS vendors, and Zenoh if a side has rules of Zenoh."""
+    """The compared DDS vendors, and Zenoh if a side has Zenoh rules."""
     domains: tuple[int, ...]
     """The compared ROS domains: one for each group of domains with the same rules."""
     assumed: tuple[str, ...]
@@ -229,7 +229,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     Raises:
         DocumentError: the comparison cannot be decided: there are too many wildcards, or
             permissions that a vendor does not accept; or, if nothing else is new, demands of
-            protection contradict each other or settings of Zenoh are unknown.
+            protection contradict each other or Zenoh settings are unknown.
     """
     limit = SearchLimit()
     scope = None
@@ -272,7 +272,7 @@ def _less(
 ) -> Iterator[SettingChange]:
     """Yield changes by which ``new`` protects less than ``old``, or lets more names cross.
 
-    With ``rules``, rules between routers of Zenoh are compared, too, unless the settings state the
+    With ``rules``, rules between Zenoh routers are compared, too, unless the settings state the
     cause: new rights would change these rules.
     """
     yield from less_protection(old, new, limit)
@@ -361,9 +361,9 @@ def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
 
 
 def _zenoh_domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
-    """Return one domain for each group of domains with the same rules of Zenoh.
+    """Return one domain for each group of domains with the same Zenoh rules.
 
-    Domains of sides without rules of Zenoh are included.
+    Domains of sides without Zenoh rules are included.
     """
     domains: set[DomainSet] = set()
     for side, other in ((base, head), (head, base)):

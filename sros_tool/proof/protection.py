@@ -131,11 +131,11 @@ def less_protection(
     yield from _certified_otherwise(old, new)
     if old.kind == new.kind == "keystore" and old.zenoh is not None and new.zenoh is None:
         text = "nothing enforces on Zenoh what its files enforced"
-        yield SettingChange(Effect.LOOSER, "files of Zenoh", "present", "missing", text)
+        yield SettingChange(Effect.LOOSER, "Zenoh files", "present", "missing", text)
     if old.routers and not {*new.routers} <= {*old.routers}:
         text = "anyone who poses as the router reads and changes everything that passes"
         before, after = (", ".join(side.routers) for side in (old, new))
-        yield SettingChange(Effect.LOOSER, "router of Zenoh", before, after, text)
+        yield SettingChange(Effect.LOOSER, "Zenoh router", before, after, text)
     if new.zenoh_files:
         yield from looser_settings(old.zenoh_files, new.zenoh_files)
     if old.protections and new.protections is not None:

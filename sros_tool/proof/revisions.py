@@ -1,4 +1,4 @@
-"""Policies at a revision of git, read without checking out files."""
+"""Policies at a git revision, read without checking out files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NOWHERE = Path("/dev/null/git")
 
 @dataclass(frozen=True, slots=True)
 class Revision:
-    """A file or folder at a revision of git; ``path`` is relative to the top of the repository.
+    """A file or folder at a git revision; ``path`` is relative to the top of the repository.
 
     ``commit`` is the full id that ``name`` stood for when the revision was read.
     """

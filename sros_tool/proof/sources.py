@@ -1,7 +1,7 @@
 """Read the access of one side of a comparison.
 
-A side is a policy, keystore, permissions, a configuration of Zenoh, or policies at a revision of
-git.
+A side is a policy, keystore, permissions, a Zenoh configuration, or policies at a git
+revision.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class AccessSource:
 
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh"; ``shown`` is its name.
     ``permissions`` are what DDS loads for each enclave, or would load after signing.  ``rights``
-    are the rights in ROS terms.  ``zenoh`` are the rights that rules of Zenoh give, None without
+    are the rights in ROS terms.  ``zenoh`` are the rights that Zenoh rules give, None without
     rules; if there are no permissions, ``key_domains`` maps them to the ROS domains in their keys,
     None for a wildcard.  ``enforcers`` are these rules, ``routers`` the enclaves of routers.
     ``passing`` maps each of several routers to the rights that it gives to the others.  ``scope``
@@ -118,7 +118,7 @@ class AccessSource:
     ``trusts`` maps enclaves and `KEYSTORE_ITSELF` to their trust; None if it is not known.
     ``later`` are the settings for enclaves that are created later, or None.  ``certified`` has the
     facts about the certificate of each enclave that has one.  ``zenoh_files`` are the
-    configurations of Zenoh, by enclave and file name.
+    Zenoh configurations, by enclave and file name.
     """
 
     shown: str
@@ -285,7 +285,7 @@ def _certified(folders: Mapping[str, Path]) -> dict[str, CertifiedEnclave]:
 
 
 def _zenoh_file(path: Path, document: ConfigurationDocument) -> SignedConfiguration:
-    """Return a configuration of Zenoh with the state of the signature next to it."""
+    """Return a Zenoh configuration with the state of the signature next to it."""
     signed = ZENOH_SIGNED.get(path.name)
     authority = permissions_ca_for(path)
     if signed is None or not os.path.lexists(path.with_name(signed)):

@@ -77,13 +77,13 @@ from sros_tool.validity import window
 from sros_tool.zenoh.access import AccessControl, Enforcement
 
 _ZENOH = "zenoh"
-"""Name of the world of Zenoh."""
+"""Name of the Zenoh world."""
 WORLDS = (*(vendor.value for vendor in MEASURED), _ZENOH)
 """The worlds that are decided: the measured vendors, and Zenoh."""
 _PLANNED = timedelta(days=365)
 """The assumed validity of permissions that are not signed yet."""
 _OF_EVERY_NODE = ((True, ROS_DISCOVERY_TOPIC), (False, ROS_DISCOVERY_TOPIC))
-"""Access to topics without which no node of ROS 2 starts on DDS: (whether it writes, topic)."""
+"""Access to topics without which no ROS 2 node starts on DDS: (whether it writes, topic)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class System:
     """The worlds of a policy or keystore.
 
     ``file`` is its path, ``rights`` are the allowed rights as it states them, and ``places`` tells
-    where it states them.  ``left_out`` is the reason why there is no world of Zenoh, if Zenoh
+    where it states them.  ``left_out`` is the reason why there is no Zenoh world, if Zenoh
     cannot enforce the policy.
     """
 
@@ -122,7 +122,7 @@ def load_system(
         domain: the ROS domain; for a keystore, None stands for all domains.
         fleet: the robots that fill in placeholders of a policy.
         only: the names of the wanted worlds, from `WORLDS`; () stands for all. A keystore without
-            configurations of Zenoh has no world of Zenoh.
+            Zenoh configurations has no Zenoh world.
         template: the template of the keystore for which a policy is meant.
         opened: the keystore at ``path``, if it is open already.
 
@@ -209,7 +209,7 @@ def policy_system(
 def _planned_zenoh(
     policy: Policy, control: AccessControl, domain: int, stated: Mapping[str, TopicAccess]
 ) -> World:
-    """Return the world of Zenoh with the rules that sros would write for a policy.
+    """Return the Zenoh world with the rules that sros would write for a policy.
 
     Only ROS names are decided, because only for them the rules have the same meaning as the policy.
     """
@@ -485,7 +485,7 @@ def _zenoh_worlds(
     own.
 
     Raises:
-        KeystoreError: there are no configurations of Zenoh, or it is unclear what they enforce.
+        KeystoreError: there are no Zenoh configurations, or it is unclear what they enforce.
     """
     root, source = keystore.root, load_zenoh_rights(keystore, hidden=True)
     for note in source.notes:
@@ -493,7 +493,7 @@ def _zenoh_worlds(
             raise KeystoreError(
                 f"what Zenoh enforces in keystore '{root}' is not known: {note.text.rstrip('.')}",
                 "",
-                "Write its files again with `sros zenoh`, or name a vendor of DDS with --vendor.",
+                "Write its files again with `sros zenoh`, or name a DDS vendor with --vendor.",
             )
     enforcers = source.enforcers
     domains = (domain,) if domain is not None else domains_of(enforcers) or (0,)

@@ -1,4 +1,4 @@
-"""Find what changes for a keystore or policy with another distribution of ROS 2.
+"""Find what changes for a keystore or policy with another ROS 2 distribution.
 
 The signed files stay the same, but another release of DDS reads them.  For each enclave, the rules
 of both releases decide whether it joins and which topics it may use, for all names at once.
@@ -371,7 +371,7 @@ _KINDS: Mapping[str, FindingKind] = {
 
 
 class DecisionChange(NamedTuple):
-    """A decision on an enclave that differs between two distributions of ROS 2."""
+    """A decision on an enclave that differs between two ROS 2 distributions."""
 
     kind: str
     enclave: str

@@ -233,7 +233,7 @@ def _starting(ordered: list[str], begin: str) -> range:
 
 
 class Crossing:
-    """The topics that routers of Zenoh pass on to each other, by the rules of the receiving router.
+    """The topics that Zenoh routers pass on to each other, by the rules of the receiving router.
 
     ``router_of`` maps enclaves to the routers that they connect to, and each router to itself;
     ``rules`` maps routers to their access control.
@@ -297,7 +297,7 @@ class World:
         starts with their files as they are: they may do what their rights give, but are able to do
         nothing.  ``lenders`` maps an enclave to others whose permissions it can use as well.  These
         count for what it may do, but not for what it must be able to do.  ``crossing`` is what
-        passes between several routers of Zenoh; None if all enclaves reach each other.
+        passes between several Zenoh routers; None if all enclaves reach each other.
         """
         self.title = title
         self.confirm_own = confirm

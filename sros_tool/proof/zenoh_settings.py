@@ -22,7 +22,7 @@ from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration
 
 @dataclass(frozen=True, slots=True)
 class SignedConfiguration:
-    """A configuration of Zenoh; ``signature`` is "holds", "missing" or "broken"."""
+    """A Zenoh configuration; ``signature`` is "holds", "missing" or "broken"."""
 
     document: ConfigurationDocument
     signature: str
@@ -135,7 +135,7 @@ def looser_settings(old: _Files, new: _Files) -> Iterator[SettingChange]:
         for key, before, after, meaning in _changes(old, place, file):
             files[key, before, after, meaning].append(place)
     for (key, before, after, meaning), places in files.items():
-        of = places[0] if len(places) == 1 else f"{len(places)} files of Zenoh"
+        of = places[0] if len(places) == 1 else f"{len(places)} Zenoh files"
         yield SettingChange(Effect.LOOSER, f"{key} of {of}", before, after, meaning)
 
 
@@ -151,7 +151,7 @@ def unknown_settings(old: _Files, new: _Files) -> Iterator[str]:
             if one.get(path) != other.get(path) and not known and not gives:
                 files[path].append(place)
     for path, places in files.items():
-        of = places[0] if len(places) == 1 else f"{len(places)} files of Zenoh"
+        of = places[0] if len(places) == 1 else f"{len(places)} Zenoh files"
         yield f"the setting {path[:80]} of {of}, whose effect sros does not know"
 
 

@@ -54,7 +54,7 @@ _OVERLAYS = {
     "use": Overlay("use", "allowed, never observed", "observed, not allowed"),
     "change": Overlay("change", "removed", "added"),
     "drift": Overlay("drift", "only in the policy", "only in what was signed"),
-    "worlds": Overlay("worlds", "not in the rules of Zenoh", "only in the rules of Zenoh"),
+    "worlds": Overlay("worlds", "not in the Zenoh rules", "only in the Zenoh rules"),
 }
 """The kinds of comparisons of two sources, by name, with their labels."""
 _ONE_WAY = ("publish", "subscribe")

@@ -93,7 +93,7 @@ def focused(
     wanted = dict.fromkeys(meant for word in words for meant in system.meant(word))
     focuses = tuple(system.focus(kind, name) for kind, name in wanted)
     if routers > 1:
-        left_out = f"; what passes between the {routers} routers of Zenoh is not considered"
+        left_out = f"; what passes between the {routers} Zenoh routers is not considered"
         focuses = tuple(replace(focus, sentence=f"{focus.sentence}{left_out}") for focus in focuses)
     picture = system.with_shortest_paths(replace(picture, focus=focuses))
     flow = FocusFlow.of(picture)

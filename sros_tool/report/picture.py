@@ -272,7 +272,7 @@ class Overlay(NamedTuple):
     """The kind of an overlay of two sources.
 
     ``kind`` is use (allowed and observed), change (before and after), drift (policy and keystore)
-    or worlds (rights and rules of Zenoh); ``first`` and ``second`` label a right that only the
+    or worlds (rights and Zenoh rules); ``first`` and ``second`` label a right that only the
     first or second side has.
     """
 

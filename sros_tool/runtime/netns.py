@@ -162,7 +162,7 @@ def _add_multicast_route(control: socket.socket) -> None:
 def _keep_off_ports_of_dds() -> None:
     """Stop the kernel from assigning ports of DDS domains to sockets that bind to any free port.
 
-    From domain 102 on, the ports of DDS are in the range from which Linux assigns free ports: a
+    From domain 102 on, the DDS ports are in the range from which Linux assigns free ports: a
     participant could not join if its port was assigned to another socket.
     """
     with contextlib.suppress(OSError):  # a container may forbid it

@@ -50,7 +50,7 @@ _DDS_LIBRARIES = re.compile(
     rb"(?:\.abi3|\.cpython-[\w-]+)?\.so[^/\n]*?)( \(deleted\))?$",
     re.MULTILINE,
 )
-"""Matches a mapped library of DDS, only at a line's start: a process may map thousands of files."""
+"""Matches a mapped DDS library, only at a line's start: a process may map thousands of files."""
 _PRODUCTS = {b"fastrtps": "Fast DDS", b"fastdds": "Fast DDS", b"ddsc": "Cyclone DDS"}
 _THREE_NUMBERS = re.compile(r"\.so\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
 _MOST_ENTRIES = 10_000
@@ -97,7 +97,7 @@ class Process:
 
     ``started`` is the earliest moment at which it can have loaded its files.  ``libraries`` are the
     names of the libraries of ROS 2, DDS and Zenoh that it has mapped, such as "libddsc", and
-    ``dds`` the libraries of DDS with their versions.  ``network`` names its network
+    ``dds`` the DDS libraries with their versions.  ``network`` names its network
     namespace; "" is the namespace of this process.  ``enclave`` is the enclave that it names, if it
     asks for security, and ``configuration`` the file that it names for Zenoh.
     """
@@ -372,7 +372,7 @@ def with_files(process: Process, root: ProcessRoot, folder: str) -> Process:
 
 
 def dds_of(pid: int) -> tuple[MappedLibrary, ...]:
-    """Return the libraries of DDS that a process has mapped; empty if that cannot be seen."""
+    """Return the DDS libraries that a process has mapped; empty if that cannot be seen."""
     try:
         folder = os.open(f"/proc/{pid}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
@@ -436,7 +436,7 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
 
 
 def _mapped_dds(maps: bytes) -> tuple[MappedLibrary, ...]:
-    """Return the libraries of DDS in /proc/PID/maps, with the versions in their names."""
+    """Return the DDS libraries in /proc/PID/maps, with the versions in their names."""
     return tuple(
         MappedLibrary(_PRODUCTS[name], _version(path), path, replaced)
         for path, name, replaced in sorted(
@@ -449,7 +449,7 @@ def _mapped_dds(maps: bytes) -> tuple[MappedLibrary, ...]:
 
 
 def installed_dds(top: Path = Path("/")) -> tuple[MappedLibrary, ...]:
-    """Return the libraries of DDS in the folders of ROS and of packages below ``top``.
+    """Return the DDS libraries in the folders of ROS and of packages below ``top``.
 
     Environment variables are not used: in a login by ssh they do not name the folder of ROS.
     """
@@ -474,7 +474,7 @@ _LIBRARY_FOLDERS = (
 class ProcessOrigin(NamedTuple):
     """How a process was started: each part is empty if it has none, has ended, or hides it.
 
-    ``unit`` is its system service of systemd, ``folder`` its working directory, ``launch`` the
+    ``unit`` is its systemd system service, ``folder`` its working directory, ``launch`` the
     command of the ``ros2 launch`` that started it, or that it is, and ``container`` the id of its
     Docker container.
     """
@@ -514,7 +514,7 @@ def launch_verb(command: Sequence[str]) -> int:
 
 
 SERVICE_NAME = r"\w[\w:.@\\-]*\.service"
-"""The name of a service of systemd, as a regular expression."""
+"""The name of a systemd service, as a regular expression."""
 _SERVICE = re.compile(
     r"^(?:0:|\d+:name=systemd):/system\.slice/(?:.*/)?(" + SERVICE_NAME + r")$", re.M | re.A
 )

@@ -1,4 +1,4 @@
-"""Units of systemd: nodes that run in their enclaves, and the regular work on a keystore.
+"""systemd units: nodes that run in their enclaves, and the regular work on a keystore.
 
 A node gets only what a ROS node over DDS or Zenoh needs: sockets of IP, the list of network
 interfaces (netlink), shared memory, devices, and its own enclave, but no other enclaves.
@@ -25,7 +25,7 @@ from sros_tool.xml import read_bytes
 
 
 class WrittenUnits(NamedTuple):
-    """The units of systemd that were written."""
+    """The systemd units that were written."""
 
     keystore: NamedKeystore
     dry_run: DryRun

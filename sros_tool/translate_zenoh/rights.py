@@ -1,4 +1,4 @@
-"""Translation between ROS policies and access control of Zenoh: never more rights, and none lost.
+"""Translation between ROS policies and Zenoh access control: never more rights, and none lost.
 
 The second translation next to `translate`.  Key expressions, messages and tokens are those of
 rmw_zenoh (ros2/rmw_zenoh, docs/design.md).  `rights_in_rules` is the inverse for what sros writes;
@@ -155,7 +155,7 @@ def remote_of(
     which every node needs; `graph_rules` says which ``nodes`` the enclave may announce.
 
     Raises:
-        PolicyError: rules of Zenoh cannot express a right; the text names the place.
+        PolicyError: Zenoh rules cannot express a right; the text names the place.
     """
     rules: list[AccessRule] = []
     made_of: dict[tuple[Flow, tuple[Message, ...]], list[Difference]] = {}
@@ -432,7 +432,7 @@ def _chunks_of_part(texts: list[str]) -> list[list[str]]:
     return expressions
 
 
-# ── rules of Zenoh in ROS terms ────────────────────────────────────────────────────────────
+# ── Zenoh rules in ROS terms ────────────────────────────────────────────────────────────
 
 _USE = {
     (Flow.INGRESS, Message.PUT): "publish",
@@ -697,7 +697,7 @@ def _rights(
 def _keys_of(domain: str, name: str) -> tuple[str, ...]:
     if _number_of_chunks(name) > _MOST_NAMES:
         raise DocumentError(
-            f"the rules of Zenoh for {name} cannot be compared",
+            f"the Zenoh rules for {name} cannot be compared",
             f"Its wildcards stand for more than {_MOST_NAMES} key expressions.",
             "Name it with fewer wildcards.",
         )

@@ -1,4 +1,4 @@
-"""Access control of Zenoh: rules for remote processes, and what they decide.
+"""Zenoh access control: rules for remote processes, and what they decide.
 
 `AccessControl` is what sros writes: its subjects are certificates, and its default is to deny.  A
 denial inside a wider permission stops neither queries nor puts with a wildcard key (measured with

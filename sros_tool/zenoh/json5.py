@@ -24,7 +24,7 @@ The router of a thousand enclaves has less than half of this number.
 _MOST_WITHOUT_LINES = 200_000
 """Maximum number of tokens of JSON5 that is not plain JSON, if lines are not needed.
 
-The default configuration of Zenoh has a fiftieth of this number.
+The default Zenoh configuration has a fiftieth of this number.
 """
 
 

@@ -1,4 +1,4 @@
-"""The releases of rmw_zenoh in the supported distributions of ROS 2, and what they add.
+"""The releases of rmw_zenoh in the supported ROS 2 distributions, and what they add.
 
 The files that sros writes work with all of these releases. Source: ros2/rmw_zenoh, its changelogs,
 rmw_publisher_data.cpp and rmw_subscription_data.cpp.
@@ -15,7 +15,7 @@ Version = tuple[int, int, int]
 
 
 class RmwZenohRelease(NamedTuple):
-    """The versions of rmw_zenoh_cpp in one distribution of ROS 2, from ``begin`` on.
+    """The versions of rmw_zenoh_cpp in one ROS 2 distribution, from ``begin`` on.
 
     ``least`` is the first version that has `_LEAST_ZENOH` and reads ZENOH_CONFIG_OVERRIDE.
     ``below_topics`` are key expressions below the key of a topic, on which a publisher also sends,

@@ -1,4 +1,4 @@
-"""Permissions with which nodes of ROS 2 cannot start, or that allow them nothing."""
+"""Permissions with which ROS 2 nodes cannot start, or that allow them nothing."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_only_vendors_that_let_the_enclave_in_are_named(bench: Bench) -> None:
 
 
 def test_a_program_of_dds_alone_is_no_error(bench: Bench) -> None:
-    """Twin: a name of ROS makes the same names a warning."""
+    """Twin: a ROS name makes the same names a warning."""
     bench.sign("enclaves/base/permissions.p7s", names_of_dds)
     found = found_in(bench)
     assert [(each.id, each.severity) for each in found] == [("permissions.not-for-ros", NOTE)]
@@ -147,8 +147,8 @@ def test_a_program_of_dds_alone_is_no_error(bench: Bench) -> None:
         ("rt/$(env ROBOT)/chatter", "fill in the template"),
         ("rt/~/chatter", "in place of ~"),
         ("rt/a, rt/b", "a <topic> for every name"),
-        ("rt/2nd", "is not a name of ROS"),
-        ("rt//*", "no name of ROS"),
+        ("rt/2nd", "is not a ROS name"),
+        ("rt//*", "no ROS name"),
         ("rt/café", "é"),
         ("chatter*", "write rt/chatter*"),
     ],

@@ -1,4 +1,4 @@
-"""Findings about libraries of DDS with known vulnerabilities."""
+"""Findings about DDS libraries with known vulnerabilities."""
 
 from __future__ import annotations
 

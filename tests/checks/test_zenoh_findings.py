@@ -1,4 +1,4 @@
-"""Findings about configurations of Zenoh: each is found, and not in a sound one."""
+"""Findings about Zenoh configurations: each is found, and not in a sound one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each finding about configurations of Zenoh: what is changed in a sound one to bring it about."""
+"""Each finding about Zenoh configurations: what is changed in a sound one to bring it about."""
 
 from __future__ import annotations
 

@@ -199,7 +199,7 @@ def test_more_wildcards_than_can_be_decided_are_one_error(
 
 @pytest.fixture(scope="module")
 def keystore(folder: Path) -> Path:
-    """A keystore of the policy, with its configurations of Zenoh; only to be read."""
+    """A keystore of the policy, with its Zenoh configurations; only to be read."""
     sros("generate_artifacts", "-k", "ks", "-p", "robot.xml", cwd=folder).ok()
     sros("zenoh", "ks", cwd=folder).ok()
     return folder / "ks"

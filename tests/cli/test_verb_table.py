@@ -27,7 +27,7 @@ NO_JSON = {
     "run": "its output is that of the command",
     "completion": "its output is a script",
     "fleet report": "its output is the JSON of a confirmation",
-    "fleet inventory": "its output is an inventory of Ansible",
+    "fleet inventory": "its output is an Ansible inventory",
 }
 READS = {
     "list_enclaves", "inspect", "verify", "diff_policy", "explain", "check", "doctor", "env",

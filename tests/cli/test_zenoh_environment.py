@@ -315,7 +315,7 @@ def test_completion_of_rmw(keystore: Path) -> None:
 def test_who_reads_while_another_writes_sees_one_state(
     keystore: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between the permissions and the file of Zenoh, somebody changes both."""
+    """Between the permissions and the Zenoh file, somebody changes both."""
     words = ("env", keystore, "/a", *ZENOH)
     before = sros(*words)
     real, waiting = zenoh_files.open_zenoh, ["more.xml"]

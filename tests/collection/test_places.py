@@ -142,7 +142,7 @@ def test_killed_at_any_step_it_becomes_old_or_new(
 
 @pytest.mark.skipif(not shutil.which("unshare"), reason="unshare is needed")
 def test_a_process_that_sees_one_enclave_goes_on_to_see_only_that(place: Place) -> None:
-    """A unit of systemd mounts the folder of its enclave over an empty one, as here."""
+    """A systemd unit mounts the folder of its enclave over an empty one, as here."""
     before = {**OLD, "enclaves/b/cert.pem": b"other"}
     install(place, before)
     top = place.path + "/enclaves"

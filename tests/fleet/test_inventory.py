@@ -1,4 +1,4 @@
-"""Inventories of Ansible in place of fleet files, read as Ansible reads them."""
+"""Ansible inventories in place of fleet files, read as Ansible reads them."""
 
 from __future__ import annotations
 

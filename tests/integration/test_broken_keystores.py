@@ -131,7 +131,7 @@ def findings(bench: Bench, zone: str) -> set[str]:
     """What `sros check` finds, on a host in that time zone, and the exit status that it gives."""
     policy = bench.root.with_name("policy.xml")
     options = ("--domain", "0", "--policy", policy, "--exclude", "policy.*", "--json")
-    words = ("check", "keystore", bench.root, *options)  # its nodes are no nodes of ROS 2
+    words = ("check", "keystore", bench.root, *options)  # its nodes are no ROS 2 nodes
     before = os.environ.get("TZ")
     try:
         os.environ["TZ"] = zone

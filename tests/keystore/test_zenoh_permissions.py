@@ -1,4 +1,4 @@
-"""Permissions that other programs wrote give no more on Zenoh than with any vendor of DDS."""
+"""Permissions that other programs wrote give no more on Zenoh than with any DDS vendor."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ USES = {
     "publish": (Flow.INGRESS, Message.PUT), "subscribe": (Flow.EGRESS, Message.PUT),
     "request": (Flow.INGRESS, Message.QUERY), "reply": (Flow.EGRESS, Message.QUERY),
 }  # fmt: skip
-NO_AGREEMENT = "because vendors of DDS do not decide alike"
+NO_AGREEMENT = "because DDS vendors do not decide alike"
 ORDER = "because the order of its rules matters"
 
 
@@ -103,7 +103,7 @@ def test_what_every_vendor_decides_is_said(rules: list[Rule], names: list[str]) 
                 ),
                 rule("allow", "rt/a*", "*", domains=DomainSet((DomainRange(0, None),))),
             ],
-            "publish rt/a cannot be expressed in Zenoh, because vendors of DDS do not read its "
+            "publish rt/a cannot be expressed in Zenoh, because DDS vendors do not read its "
             "rules alike. Rule 1 allows publish rt/a by rt/* (Fast DDS); rule 1 allows",
         ),
         (
@@ -258,21 +258,21 @@ def test_the_grant_that_every_vendor_takes(document: bytes) -> None:
         # Cyclone DDS takes a grant whose subject has all attributes of the certificate's.
         (
             permissions(grant(OTHERS, subject="CN=/t,O=x"), grant(OWN, subject="CN=/t")),
-            "are not the same for every vendor of DDS: Cyclone DDS 0.10 uses other rules",
+            "are not the same for every DDS vendor: Cyclone DDS 0.10 uses other rules",
         ),
         (
             permissions(grant(OTHERS, subject=" CN=/t"), grant(OWN, subject="CN=/t")),
-            "are not the same for every vendor of DDS: Fast DDS 2.14 uses other rules",
+            "are not the same for every DDS vendor: Fast DDS 2.14 uses other rules",
         ),
         (
             permissions(grant(OWN, OTHERS, subject="CN=/t")).replace(
                 b"rt/secret", b"rt/<!-- -->secret"
             ),
-            "are not the same for every vendor of DDS: Fast DDS 2.14 uses other rules",
+            "are not the same for every DDS vendor: Fast DDS 2.14 uses other rules",
         ),
         (
             permissions(grant(OWN, subject="CN=/t", end="2300-01-01T00:00:00Z")),
-            "are not accepted by every vendor of DDS: Cyclone DDS 0.10: grant 'g' expired",
+            "are not accepted by every DDS vendor: Cyclone DDS 0.10: grant 'g' expired",
         ),
     ],
 )

@@ -87,11 +87,11 @@ TOPICS = [
 
 @dataclass(frozen=True)
 class Drawn:
-    """A side of a comparison: a policy, a keystore, or a file of Zenoh.
+    """A side of a comparison: a policy, a keystore, or a Zenoh file.
 
     ``robots`` are the domains of r1 and r2 in a fleet file, or None without one: of a policy, or as
     the keystore recorded them.  ``domains`` are those of the signed permissions of enclaves.
-    ``flips`` are the places in `FLIPS` of settings of Zenoh.
+    ``flips`` are the places in `FLIPS` of Zenoh settings.
     """
 
     kind: str
@@ -114,7 +114,7 @@ FLIPS: tuple[tuple[str, object, str], ...] = (
     ("downsampling", [], "unknown"),
     ("queries_default_timeout", 5, "harmless"),
 )
-"""Settings of Zenoh with a value that is not the usual one, and what that means."""
+"""Zenoh settings with a value that is not the usual one, and what that means."""
 SETTINGS = ("production", "development", "sros2")
 """What later enclaves get: each template gives them more than the one before."""
 
@@ -142,7 +142,7 @@ def draw(dice: Random) -> Drawn:
 
 
 def _on_zenoh(drawn: Drawn, dice: Random) -> Drawn:
-    """The side with other domains, settings and signature of its file of Zenoh."""
+    """The side with other domains, settings and signature of its Zenoh file."""
     flips = frozenset(dice.sample(range(len(FLIPS)), dice.choice((0, 0, 1, 2))))
     domains, signed = dice.choice(("0", "7", "0,7")), dice.random() < 0.85
     return replace(drawn, zenoh=domains, flips=flips, signed=signed)
@@ -384,7 +384,7 @@ def _write_keystore(drawn: Drawn, root: Path) -> None:
 
 
 def configuration(drawn: Drawn) -> bytes:
-    """The file of the router of Zenoh, which allows what the policy does in some domains."""
+    """The file of the Zenoh router, which allows what the policy does in some domains."""
     rights = []
     for each in drawn.policy.enclaves:
         stated = {int(domain): stated_rights(each) for domain in drawn.zenoh.split(",")}
@@ -423,7 +423,7 @@ class Side:
         self._rights = policy_rights(Policy(tuple(self._stated.values())))
 
     def enclaves(self) -> Set[str]:
-        """The enclaves that it has, or has rules of Zenoh for."""
+        """The enclaves that it has, or has Zenoh rules for."""
         return self._stated.keys()
 
     def _in_domain(self, enclave: str, domain: int) -> bool:

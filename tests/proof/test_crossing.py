@@ -77,7 +77,7 @@ def without_settings(keystore: Path, _: Path) -> None:
             0,
             "- more protection: crossing of router /r1/router",
         ),
-        (without_settings, 1, "settings of Zenoh limit crossing -> missing: what passes"),
+        (without_settings, 1, "Zenoh settings limit crossing -> missing: what passes"),
         (rules_of_the_wide_one, 1, "rules of router /router for router /r1/router without -> wi"),
     ],
 )
@@ -136,7 +136,7 @@ def test_requirements_and_pictures_know_of_routers(routed: Path, tmp_path: Path)
         assert not any(text in out for text in not_said), out
         assert all((f"[{identity}]" in out) is (kept in said) for identity in FOUND), out
     drawn = sros("view", str(routed / "wide"), "--focus", "/r1/scan", "-o", tmp_path / "wide.svg")
-    assert "what passes between the 2 routers of Zenoh is not considered" in drawn.err
+    assert "what passes between the 2 Zenoh routers is not considered" in drawn.err
 
 
 def test_a_review_compares_what_crosses(routed: Path, tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_a_review_compares_what_crosses(routed: Path, tmp_path: Path) -> None:
 
 
 def test_a_policy_says_nothing_of_crossing_and_that_is_said(routed: Path) -> None:
-    said = "what BASE lets cross between routers of Zenoh"
+    said = "what BASE lets cross between Zenoh routers"
     assert said in no_new_access(routed, "narrow", "robot.xml")[1]
     assert said not in no_new_access(routed, "wide", "robot.xml")[1]
 

@@ -81,7 +81,7 @@ def questions(base: Drawn, head: Drawn) -> Iterator[tuple[str, Style, Decide]]:
 
 @pytest.mark.parametrize("part", range(8 if LONG else 1))
 def test_random_pairs_against_single_questions(tmp_path: Path, part: int) -> None:
-    """Policies, keystores, fleets and files of Zenoh: what is new is found, and nothing else."""
+    """Policies, keystores, fleets and Zenoh files: what is new is found, and nothing else."""
     seen: Counter[str] = Counter()
     parts = 8 if LONG else 1
     for number in range(part, PAIRS, parts):
@@ -158,7 +158,7 @@ def check_pair(folder: Path, base: Drawn, head: Drawn, name: str) -> Counter[str
 SAID = {
     "signature": "signature of",
     "later": "later enclaves",
-    "files": "files of Zenoh",
+    "files": "Zenoh files",
     "protect": "protect ",
     "data or metadata": "protection.",
 }

@@ -1,4 +1,4 @@
-"""Units of systemd: what the real systemd reads in them, also with hostile names and words."""
+"""systemd units: what the real systemd reads in them, also with hostile names and words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configurations of Zenoh in the shapes that others write."""
+"""Zenoh configurations in the shapes that others write."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def self_limiting(
 
 
 def denying() -> str:
-    """A router that denies something inside of what it allows, in part by no name of ROS."""
+    """A router that denies something inside of what it allows, in part by no ROS name."""
     rule = {"messages": ["put"], "flows": ["ingress"]}
     return json.dumps(
         {

@@ -1,4 +1,4 @@
-"""Configurations of Zenoh are read with Zenoh's defaults; what Zenoh refuses is refused."""
+"""Zenoh configurations are read with Zenoh's defaults; what Zenoh refuses is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What any access control of Zenoh decides: subjects, ALLOW, DENY and the default."""
+"""What any Zenoh access control decides: subjects, ALLOW, DENY and the default."""
 
 from __future__ import annotations
 

@@ -539,17 +539,17 @@ NO_TOPIC_RULE = FindingKind(
     ERROR,
     "topics without a topic rule",
     "If no topic rule matches, the endpoint cannot be created; without a rule for "
-    "ros_discovery_info no node of ROS 2 starts.",
+    "ros_discovery_info no ROS 2 node starts.",
     f"{_GOVERNANCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
     "Add a rule for * at the end.",
 )
 NO_OTHER_TOPIC_RULE = FindingKind(
     "governance.only-ros-topics",
     NOTE,
-    "topic rules for names of ROS only",
+    "topic rules for ROS names only",
     "A program that uses DDS without ROS can create no endpoint.",
     f"{_GOVERNANCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
-    "Nothing to do if all programs are nodes of ROS 2. Otherwise add a rule for * at the end.",
+    "Nothing to do if all programs are ROS 2 nodes. Otherwise add a rule for * at the end.",
 )
 UNREACHABLE_TOPIC_RULE = FindingKind(
     "governance.unreachable-rule",

@@ -189,7 +189,7 @@ def keystore_findings(
 
 
 def _stated(keystore: CheckedKeystore, names: Sequence[str]) -> dict[str, tuple[Distribution, ...]]:
-    """Map the enclaves that are for certain distributions of ROS 2 to these distributions."""
+    """Map the enclaves that are for certain ROS 2 distributions to these distributions."""
     by_enclave = {}
     for name in names:
         with suppress(SrosError):  # it is a finding

@@ -30,8 +30,8 @@ NO_ROS_NAME = FindingKind(
 NOT_FOR_ROS = FindingKind(
     "permissions.not-for-ros",
     NOTE,
-    "permissions without any name of ROS 2",
-    "No node of ROS 2 can run in this enclave: a node needs ros_discovery_info, and the DDS names "
+    "permissions without any ROS 2 name",
+    "No ROS 2 node can run in this enclave: a node needs ros_discovery_info, and the DDS names "
     "of ROS topics begin with rt/, those of services with rq/ and rr/.",
     _MAPPING,
     "Nothing to do if a program uses DDS without ROS. Otherwise give the enclave a policy: `sros "
@@ -130,10 +130,10 @@ def ros_name_problem(text: str) -> str:
         return _foreign_problem(name)
     if is_expression(name):
         possible = "//" not in name and any(overlap(name, known) for known in _OF_ROS)
-        return "" if possible else f"{name!r} matches no name of ROS{_meant(name)}"
+        return "" if possible else f"{name!r} matches no ROS name{_meant(name)}"
     if _TYPE.match(name):
         return f"{name!r} is the name of a type: write the name of the topic"
-    return f"{name!r} is not a name of ROS{_meant(name)}"
+    return f"{name!r} is not a ROS name{_meant(name)}"
 
 
 def has_foreign_letters(name: str) -> bool:

@@ -166,7 +166,7 @@ def evaluate(
         enclave: the enclave.
         vendors: the vendors that its nodes may use.
         domain: the ROS domain to join; None for the domains in the enclave's documents.
-        distributions: the distributions of ROS 2 that it is for, which findings name.
+        distributions: the ROS 2 distributions that it is for, which findings name.
     """
     keystore = enclave.keystore
     there = loaded(enclave.name, enclave.folder, enclave.state, at=keystore.now)
@@ -388,7 +388,7 @@ def _example(expression: str) -> str:
 NO_NODE = FindingKind(
     "enclave.node-cannot-start",
     ERROR,
-    "permissions with which no ordinary node of ROS 2 can start",
+    "permissions with which no ordinary ROS 2 node can start",
     "A node of rclpy or rclcpp creates these endpoints when it starts, and exits if one of them is "
     "denied. Nodes that were created without these endpoints do not need them, but every process "
     "needs ros_discovery_info.",
@@ -587,7 +587,7 @@ def with_causes(findings: Sequence[Finding]) -> list[Finding]:
             same[finding.text].append(finding)
     causes = {
         text: Cause(
-            f"{counted(len(group), 'enclave')} in which no ordinary node of ROS 2 can start",
+            f"{counted(len(group), 'enclave')} in which no ordinary ROS 2 node can start",
             f"In {some_names([finding.subject for finding in group])}, {text}. {NO_NODE.why}",
             group[0].remedy,
             len(group),

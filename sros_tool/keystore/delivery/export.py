@@ -267,7 +267,7 @@ def _evaluated_until(files: Mapping[str, bytes], state: OpenedEnclave, now: date
     """Return the first moment at which files without problems may have one, whatever the list.
 
     It is ``now`` for files whose evaluation looks at revocation lists in other ways: there are
-    lists in the file of a CA, or configurations of Zenoh.
+    lists in the file of a CA, or Zenoh configurations.
     """
     by_name = {path.rpartition("/")[2]: data for path, data in files.items()}
     authorities = [by_name[file] for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)]

@@ -214,7 +214,7 @@ class ZenohFileState(NamedTuple):
 
 
 class EnclaveWithoutZenoh(NamedTuple):
-    """An enclave that has no configuration of Zenoh, and no rights there."""
+    """An enclave that has no Zenoh configuration, and no rights there."""
 
     enclave: str
     """The enclave."""
@@ -223,7 +223,7 @@ class EnclaveWithoutZenoh(NamedTuple):
 
 
 class KeystoreZenoh(NamedTuple):
-    """The configurations of Zenoh of a keystore's enclaves."""
+    """The Zenoh configurations of a keystore's enclaves."""
 
     keystore: NamedKeystore
     dry_run: DryRun

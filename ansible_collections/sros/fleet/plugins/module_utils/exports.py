@@ -228,7 +228,7 @@ _MOST_LIBRARIES, _LONGEST_PATH = 100, 200
 
 
 def _dds_here() -> dict:
-    """Return the libraries of DDS that processes have loaded, or that are installed.
+    """Return the DDS libraries that processes have loaded, or that are installed.
 
     A wheel's library, whose name does not show its version, is of unknown version.
     """
