@@ -835,7 +835,7 @@ class _Search:
         self._taken = _Taken(name for name in taken if node.truth(_asked_of(name)))
 
     def shortest(self, limit: SearchLimit, longest: int | None) -> str | None:
-        """Return a shortest name, or None if there is no name."""
+        """Return a shortest name of the set, or None if the set is empty."""
         machine, taken = self._machine, self._taken
         start = machine.start, 0
         costs = {start: 0}

@@ -38,7 +38,8 @@ def fenced(text: str, language: str = "text") -> str:
 def bounded(items: Iterable[str], most: int, rest: str) -> str:
     """Return ``items`` as a Markdown list of at most ``most`` characters.
 
-    Items that do not fit are counted in a last one; ``rest`` says where they are, as a clause.
+    A last item counts those that do not fit, followed by ``rest``, a clause that says where to
+    read them.
     """
     lines: list[str] = []
     left, out = most, 0

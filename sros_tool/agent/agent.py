@@ -299,8 +299,8 @@ class _Round:
         if release.number == state.accepted and self._differs_from_accepted(release):
             self._problems.append(
                 f"The published release has the number {release.number} of the installed release, "
-                "but other files: the keystore at home comes from a backup, or somebody else "
-                "publishes. Nothing was changed. At home: `sros fleet publish KEYSTORE PUB "
+                "but other files: the keystore comes from a backup, or somebody else publishes. "
+                "Nothing was changed. Where the keystore is: `sros fleet publish KEYSTORE PUB "
                 "--restored`."
             )
             return Installation()
@@ -548,7 +548,9 @@ class _Round:
             return None
         text = max(lists, key=list_number).public_bytes(Encoding.PEM).decode()
         if len(text) > LONGEST_LIST:
-            self._problems.append("The revocation list here is too long for a message to home.")
+            self._problems.append(
+                "The revocation list here is too long for the message of this robot."
+            )
             return None
         return text
 
@@ -579,7 +581,7 @@ class _Round:
                 refused.append(f"{name}: {error}")
         why = f" ({refused[0]})" if refused else ""
         self._problems.append(
-            f"No enclave has a key and a certificate that can sign the message to home{why}."
+            f"No enclave has a key and a certificate that can sign the message of this robot{why}."
         )
         return b""
 

@@ -108,7 +108,7 @@ def pin_root(state: Path, data: bytes, *, now: datetime) -> str:
             FetchProblem.NOT_SIGNED,
             "the file is not the root metadata of a publishing folder",
             f"{_sentence(error)}",
-            "Use the root.json that `sros fleet publish` wrote into PUB/metadata at home.",
+            "Use the root.json that `sros fleet publish` wrote into PUB/metadata.",
         ) from error
     if root.signed.is_expired(now):
         raise FetchError(
@@ -256,7 +256,7 @@ def _number(target: TargetFile | None, source: str, robot: str) -> int:
             FetchProblem.NOT_FOR_ROBOT,
             f"nothing is published for the robot {robot} in {source}",
             "It is not in the fleet, or all its enclaves were revoked.",
-            "Look at it at home with `sros fleet status KEYSTORE`.",
+            "Where the keystore is, run `sros fleet status KEYSTORE`.",
         )
     if target.length > OF_ONE_ROBOT.packed:
         raise FetchError(
@@ -281,7 +281,7 @@ def _read(path: Path, robot: str, number: int) -> Release:
             FetchProblem.NOT_FOR_ROBOT,
             f"the release that is published for {robot} belongs to {release.robot}",
             "Somebody with the keys of the metadata put it there, or a robot was renamed.",
-            "Nothing was changed. Look into it at home.",
+            "Nothing was changed. Find out who published it.",
         )
     if release.number != number:
         raise FetchError(
@@ -303,17 +303,17 @@ def _explained(error: Exception, source: str, now: datetime) -> FetchError:
         return FetchError(
             FetchProblem.EXPIRED,
             f"the metadata in {source} has expired",
-            f"{why} The clock here shows {iso(now)}. Home no longer publishes, or somebody "
-            "withholds the new files.",
-            f"Run `sros fleet publish` at home; {_CLOCK}.",
+            f"{why} The clock here shows {iso(now)}. Nothing is published any more, or "
+            "somebody withholds the new files.",
+            f"Where the keystore is, run `sros fleet publish`; {_CLOCK}.",
         )
     if isinstance(error, exceptions.BadVersionNumberError):
         return FetchError(
             FetchProblem.ROLLED_BACK,
             f"the files in {source} are older than files that this robot has seen",
             why,
-            "Nothing was changed. If home or the folder comes from a backup: `sros fleet publish "
-            "KEYSTORE PUB --restored` at home.",
+            "Nothing was changed. If the keystore or the folder comes from a backup, run `sros "
+            "fleet publish KEYSTORE PUB --restored` where the keystore is.",
         )
     if isinstance(error, exceptions.DownloadLengthMismatchError):
         return FetchError(

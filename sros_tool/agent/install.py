@@ -218,8 +218,8 @@ def _check_release(
     if release.number < installed:
         raise KeystoreError(
             f"release {release.number} is older than release {installed}, which this robot had",
-            "The keystore at home may come from a backup. Nothing was changed.",
-            "At home: `sros fleet publish KEYSTORE PUB --restored`.",
+            "The keystore may come from a backup. Nothing was changed.",
+            "Where the keystore is, run `sros fleet publish KEYSTORE PUB --restored`.",
         )
 
 
@@ -266,16 +266,19 @@ def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) ->
             raise KeystoreError(
                 f"the revocation list for {name} in the release is older than the one here",
                 f"The present list has the number {number}, the release has {has}: revoked "
-                "enclaves would be trusted again. The keystore at home may come from a backup. "
+                "enclaves would be trusted again. The keystore may come from a backup. "
                 "Nothing was changed.",
-                "At home: `sros fleet collect KEYSTORE INBOX`, which takes the list from the "
-                "message of this robot, then publish again.",
+                "Where the keystore is, run `sros fleet collect KEYSTORE INBOX`, which takes the "
+                "list from the message of this robot, then publish again.",
             )
 
 
 @lru_cache(maxsize=8)
 def newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationList | None:
-    """Return the list with the highest number in a file that one of ``authorities`` signed."""
+    """Return the newest revocation list in ``data``, of those that one of ``authorities`` signed.
+
+    The list number decides; None if there is none, or a file cannot be read.
+    """
     try:
         signers = load_certificates(authorities, IDENTITY_CA_FILE)
         lists = read_lists(data, CRL_FILE) if data else ()
@@ -369,8 +372,8 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
     if same_authority and newer:
         raise KeystoreError(
             "it has newer files than the release",
-            f"{newer[0]}; if home comes from a backup, run `sros renew KEYSTORE --all` and publish "
-            "there",
+            f"{newer[0]}; if the keystore comes from a backup, run `sros renew KEYSTORE --all` "
+            "where it is, and publish",
         )
 
 

@@ -329,7 +329,7 @@ def value_text(environment: Mapping[str, str], name: str) -> str:
     return f"{name} is not set" if value is None else f"{name} is {value!r}"
 
 
-_SOURCE = "rmw_zenoh_cpp (zenoh_config.cpp); 1.10.2 of Zenoh measured."
+_SOURCE = "rmw_zenoh_cpp (zenoh_config.cpp); Zenoh 1.10.2, measured."
 OWN_CONFIGURATION = (
     "`sros zenoh KEYSTORE` writes the configuration of each enclave, where the CA keys are; `sros "
     "env KEYSTORE ENCLAVE` and `sros run KEYSTORE ENCLAVE -- COMMAND...` set the variables of an "
@@ -368,7 +368,7 @@ TOO_OLD = FindingKind(
     "an rmw_zenoh that is too old for the files that sros writes",
     "No session opens in an enclave: an earlier rmw_zenoh does not read ZENOH_CONFIG_OVERRIDE, and "
     "its Zenoh does not accept all settings.",
-    "Changelogs of rmw_zenoh_cpp; wheels of Zenoh measured.",
+    "Changelogs of rmw_zenoh_cpp; Zenoh wheels, measured.",
     "Install a later version of the same distribution.",
 )
 OVERRIDDEN = FindingKind(

@@ -97,7 +97,7 @@ EVERYBODY = FindingKind(
     "A subject matches any value of a property that it does not state. Interfaces and protocols "
     "are not identities, and a process chooses its own zid. So the rules apply to everyone who "
     "gets a connection.",
-    "Zenoh 1.9 (authorization.rs); 1.10.2 measured.",
+    "Zenoh 1.9 (authorization.rs); measured with 1.10.2.",
     'Name each enclave by "cert_common_names".',
 )
 SELF_LIMITING = FindingKind(
@@ -562,7 +562,7 @@ class ReadConfiguration(NamedTuple):
 
 
 def subject_rights(behind: RightsBehindRules) -> SubjectRights:
-    """Return the rights of a subject for the output."""
+    """Return the rights of a subject as the JSON output has them."""
     return SubjectRights(
         behind.subject or None,
         behind.names,

@@ -50,7 +50,7 @@ class _Agent(Verb, VerbGroup):
 
 @click.group("agent", cls=_Agent)
 def agent() -> None:
-    """On a robot: fetch its releases from home, install them, and confirm.
+    """On a robot: fetch its published releases, install them, and confirm.
 
     Example:
       $ sros agent init /etc/sros/keystore --robot r1 --root root.json \\
@@ -73,7 +73,7 @@ def agent() -> None:
 @click.option(
     "--root", "root_file", metavar="FILE", required=True, type=PATH,
     help=(
-        "The first root metadata (root.json) that home published; with it, the agent verifies "
+        "The first root metadata (root.json) of the publishing folder; with it, the agent verifies "
         "everything else."),
 )  # fmt: skip
 @click.option(
@@ -130,7 +130,7 @@ def _init(
 
     FOLDER is where `sros import` or a play installs this robot's enclaves. The agent runs as its
     owner. Compare the printed SHA-256 of the root metadata with the SHA-256 that `sros fleet
-    publish` printed at home.
+    publish` printed.
 
     Example:
       $ sros agent init /etc/sros/keystore --robot r1 --root root.json \\
@@ -244,7 +244,7 @@ def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool
       $ sros agent run /etc/sros/keystore --once
       release 12: changed 2 enclaves
       restart due: /r1/camera, /r1/lidar
-      sent to home
+      message sent
       $ sros agent run /etc/sros/keystore --interval 10m
 
     The exit status of --once is 0 if nothing is wrong, and 1 if something is.
@@ -305,7 +305,7 @@ def _round_lines(folder: Path, done: Round) -> Iterator[str]:
     yield from _due_lines(folder, done.restart, done.unseen)
     if done.requests:
         yield f"asked for renewal of {counted(done.requests, 'enclave')}"
-    yield "sent to home" if done.sent else "not sent to home"
+    yield "message sent" if done.sent else "message not sent"
 
 
 def _due_lines(folder: Path, due: Sequence[str], unseen: Sequence[str]) -> Iterator[str]:

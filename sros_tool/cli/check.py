@@ -767,7 +767,7 @@ _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
     "report",
     metavar="FILE",
     type=PATH,
-    help="Also write a report for a bug report to FILE: versions, environment and "
+    help="Also write FILE, to attach to a bug report: versions, environment and "
     "findings, without secrets and without names of hosts, users and paths.",
 )
 @force_option

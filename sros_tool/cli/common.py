@@ -174,7 +174,7 @@ advisories_option = click.option(
     "--advisories",
     metavar="FILE",
     type=PATH,
-    help="Also take known DDS vulnerabilities from FILE, in the OSV format (JSON).",
+    help="Also look for the DDS vulnerabilities that FILE lists, in the OSV format (JSON).",
 )
 
 

@@ -392,8 +392,8 @@ _VALIDITIES = {
 @click.option(
     "--new-folder",
     is_flag=True,
-    help="Publish although PUB has nothing that the keystore published before: it is another "
-    "folder, or the folder was lost.",
+    help="Publish to PUB although it lacks everything that the keystore published before: it is "
+    "a new folder, or replaces one that was lost.",
 )
 @dry_run_option
 @json_option
@@ -673,9 +673,9 @@ def _facts(compared: ComparedFleet) -> Iterator[str]:
         "--restored`; docs/howto/home_is_lost.md says what else"
     )
     if status.older:
-        yield f"home is older than its robots: {status.older}. Publish with {command}"
+        yield f"the keystore is older than its robots: {status.older}. Publish with {command}"
     elif any(robot.state == "later" for robot in status.robots):
-        yield f"home may be older than its robots: if the keystore was restored, {command}"
+        yield f"the keystore may be older than its robots: if it was restored, {command}"
     if status.stage != "complete":
         behind = sum(robot.stage != status.stage for robot in status.robots if robot.enclaves)
         yield f"CA rotation: {status.stage}; {counted(behind, 'robot')} not there yet"

@@ -68,7 +68,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
             "deployment", "Install a signed answer on the robot.", attribute="import_verb"
         ),
         "fleet": VerbEntry("fleet", "Which robots have what? Publish it to them."),
-        "agent": VerbEntry("agent", "On a robot: fetch what home publishes, install it, confirm."),
+        "agent": VerbEntry("agent", "On a robot: fetch published releases, install them, confirm."),
         "zenoh": VerbEntry("zenoh", "Write the files that make Zenoh enforce policies."),
     },
     "Policy": {
@@ -135,7 +135,7 @@ _VERBOSE = click.Option(
     count=True,
     expose_value=False,
     callback=_report_steps,
-    help="Log what sros does on standard error; -vv logs more details.",
+    help="Log to standard error what sros does; -vv logs more details.",
 )
 
 

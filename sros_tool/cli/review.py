@@ -474,7 +474,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
         case RightsChange(before=before, after=after):
             return rights_markdown(before, after)
         case DroppedRequirements(chosen=chosen):
-            title = "### The requirements changed: these are decided as they were before"
+            title = "### The requirements changed: these are checked as they were before"
             return f"{title}\n\n{findings(chosen)}"
         case ExpiryCheck(due=due, unreadable=unreadable):
             lines = [describe_lifetime(lifetime, request.at) for lifetime in due]

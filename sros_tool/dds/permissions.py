@@ -353,7 +353,7 @@ Meets = Callable[[str], bool]
 
 
 def _meets_text(names: Sequence[str]) -> Meets:
-    """Return a `Meets` that only tests whether one expression matches the text of the other."""
+    """Return a predicate: the text of an expression matches one of ``names``, or the reverse."""
     return lambda name: any(fnmatchcase(each, name) or fnmatchcase(name, each) for each in names)
 
 

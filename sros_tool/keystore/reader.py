@@ -1053,7 +1053,8 @@ class _EnclaveFiles:
         grant = permissions.grant_of(subject)
         if grant is None:
             others = ", ".join(each.subject for each in permissions.grants)
-            text = f"it has no grant for {subject}, only for {others or 'nobody'}"
+            only = f", only for {others}" if others else ""
+            text = f"it has no grant for {subject}{only}"
             self._add(name, text, Fault.PERMISSIONS_SUBJECT)
             return
         try:

@@ -1,7 +1,7 @@
 """The Zenoh configurations of a keystore: those that exist, their faults, and those it needs.
 
-Zenoh itself verifies nothing: each configuration has to be the document that the permissions CA
-signed next to it, and to state the rights of the enclave's signed permissions.
+Zenoh itself verifies nothing, so each configuration must be identical to the document in the
+signed message next to it, and state the rights of the enclave's signed permissions.
 `sros_tool.keystore.issuing.zenoh` writes them.
 """
 
@@ -159,7 +159,7 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
             problems.append(ZenohProblem(file, text, ZenohFault.OUT_OF_DATE))
     certified = common_name_of(state.certificate.subject) if state.certificate else name
     if configurations and certified != name:
-        text = f"its common name is {certified or '(none)'}, by which Zenoh knows the process"
+        text = f"Zenoh identifies the process by its common name, which is {certified or '(none)'}"
         problems.append(ZenohProblem(CERTIFICATE_FILE, text, ZenohFault.OTHER_NAME))
     return OpenedZenoh(present, configurations, tuple(problems))
 
@@ -786,8 +786,8 @@ class _RightsReader:
             raise KeystoreError("its certificate is revoked")
         if (certified := common_name_of(certificate.subject)) != name:
             raise KeystoreError(
-                f"its certificate has the common name {certified or '(none)'!r}, by which Zenoh "
-                "knows a process"
+                f"Zenoh identifies a process by the common name of its certificate, which is "
+                f"{certified or '(none)'!r}"
             )
         return certificate
 

@@ -68,10 +68,10 @@ class CommitFiles:
         return self.repository.find(self.commit, path)
 
     def file(self, path: str) -> Path | None:
-        """Write the file at a path of the commit; return its location, or None without such a file.
+        """Write the file at a path of the commit; return its location, or None if nothing is there.
 
         Raises:
-            DocumentError: the path is not a file, but for instance a link.
+            DocumentError: the path is no regular file: for instance, it is a link.
         """
         entry = self.entry(path)
         if entry is None:

@@ -108,7 +108,10 @@ ROS_TOPICS = NameSet.union(
 
 @dataclass(frozen=True, slots=True)
 class Meeting:
-    """An enclave that may use some topics: the ``stated`` ones, and perhaps others by wildcards."""
+    """An enclave that may use some of the topics in question.
+
+    Its rights name the ``stated`` topics; with ``wild``, their wildcards may match further ones.
+    """
 
     enclave: str
     names: NameSet
@@ -332,7 +335,10 @@ class World:
         return any(self.confirm_own(name, writes, topic) for name in able)
 
     def lender(self, enclave: str, writes: bool, topic: str) -> str:
-        """Return the enclave whose permissions another one needs to use a topic; "" for none."""
+        """Return another enclave whose permissions let ``enclave`` use a topic.
+
+        "" if the enclave's own permissions are enough, or no others fit.
+        """
         if enclave not in self.lenders or self.confirm_own(enclave, writes, topic):
             return ""
         others = self.lenders[enclave]

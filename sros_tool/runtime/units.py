@@ -354,7 +354,7 @@ def _agent(folder: str, *, user: str, sros: str, writable: Sequence[str] = ()) -
         _check_program(sros),
     )
     places = " ".join((root, *(f"-{_check_path(place, 'the inbox')}" for place in writable)))
-    what = f"Keep the enclaves in {root} as home publishes them"
+    what = f"Keep the enclaves in {root} as they are published"
     # It asks the kernel whether the clock is set; without capabilities it cannot set it anyway.
     closed = _CLOSED.replace("ProtectClock=yes\n", "")
     service = f"""\
@@ -370,7 +370,7 @@ User={_check_user(user)}
 Nice=10
 TimeoutStartSec=30min
 ExecStart={program} agent run {root} --once
-# What is wrong is in the message to home, and in `sros agent status`.
+# What is wrong is in the message of the robot, and in `sros agent status`.
 SuccessExitStatus=1
 ReadWritePaths={places}
 UMask=0077

@@ -116,7 +116,7 @@ _ALL = (
 )  # fmt: skip
 
 _CHECK = "`sros explain KEYSTORE ENCLAVE --log LOG` finds the cause in the enclave."
-_FILE = "If ROS_SECURITY_LOG_FILE is set: `sros explain --log FILE`, with the file that it names."
+_FILE = "If ROS_SECURITY_LOG_FILE names a file, run `sros explain --log FILE` with it."
 _CHECK_OR_FILE = f"{_CHECK} {_FILE}"
 _RENEW = "Renew it: `sros renew KEYSTORE ENCLAVE`."
 _SIGN = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."

@@ -200,7 +200,10 @@ def _listed(name: str) -> list[str]:
 
 
 def _parts(name: str) -> tuple[str, ...]:
-    """Return a name as chunks of tokens: a star at its beginning may also stand for nothing."""
+    """Return the token chunks that match a name.
+
+    There are two if the name begins with ``*/``, because the star can match nothing.
+    """
     if name.startswith("*"):
         rest = name.lstrip("*")
         return (*([_part(rest)] if rest.startswith("/") else []), _part(f"/*{rest}"))

@@ -1,10 +1,10 @@
-"""Translation between ROS policies and Zenoh access control: never more rights, and none lost.
+"""Translation between ROS policies and Zenoh access control, without adding or losing rights.
 
-The second translation next to `translate`.  Key expressions, messages and tokens are those of
-rmw_zenoh (ros2/rmw_zenoh, docs/design.md).  `rights_in_rules` is the inverse for what sros writes;
-key expressions of others may stand for fewer names than its result, since a ``*`` of ROS also
-stands for parts with slashes, and never for more.  `rights_behind` reads rules that others wrote:
-a name is given only if the rules allow every key that it stands for.
+`translate` does the same for DDS.  Key expressions, messages and tokens are those of
+rmw_zenoh (ros2/rmw_zenoh, docs/design.md).  `rights_in_rules` reads back the rules that
+sros writes.  For other rules its result can be too wide, because a ROS ``*`` also matches slashes;
+it is never too narrow.  `rights_behind` reads the rules of others: a name is in its result only if
+the rules allow every key of that name.
 """
 
 from __future__ import annotations

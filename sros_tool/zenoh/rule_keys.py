@@ -103,7 +103,10 @@ class RuleKeys:
     """
 
     def __init__(self, expressions: frozenset[str], made_of: tuple[Difference, ...]) -> None:
-        """Keep the key expressions, and the differences from which they were made, if known."""
+        """Sort the key expressions by kind.
+
+        ``made_of`` are the set differences that the expressions write out; () if unknown.
+        """
         wide = [expression for expression in expressions if "*" in _ENDS.sub("", expression)]
         self.plain = expressions.difference(wide)
         self.tokens = KeyExpressions(

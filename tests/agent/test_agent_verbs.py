@@ -98,7 +98,7 @@ def test_from_home_to_the_robot_and_back(world: World) -> None:
     first = world.agent().ok()
     said, sent = first.out.splitlines()
     assert said.startswith("release ") and said.endswith(": nothing new")
-    assert sent == "sent to home"
+    assert sent == "message sent"
     assert world.collected()["outcome"] == "kept"
     assert world.status()["state"] == "current"
     world.run("revoke", "ks", "--robot", "r2").ok()
@@ -150,7 +150,7 @@ def test_a_robot_that_was_away_for_a_month_goes_on(world: World) -> None:
     world.go_to(datetime.now(UTC) + timedelta(days=30))
     frozen = world.agent()
     assert frozen.status == 1 and "expired" in frozen.err and "set the clock" in frozen.err
-    assert "sent to home" in frozen.out
+    assert "message sent" in frozen.out
     assert snapshot(world.folder / "robot/enclaves") == before
     world.run("renew", "ks", "/r1/a").ok()
     world.run("fleet", "publish", "ks", "pub").ok()

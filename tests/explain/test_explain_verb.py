@@ -581,7 +581,7 @@ def test_a_change_invents_no_node(by_policy: bool, tmp_path: Path) -> None:
     root, policy = tmp_path / "ks", tmp_path / "p.xml"
     sros("create_keystore", root, "--template", "production").ok()
     sros("create_enclave", root, "/arm/driver").ok()
-    if by_policy:  # one whose permissions name no node, also not by a wildcard
+    if by_policy:  # one whose permissions name no node, not even by a wildcard
         policy.write_text(
             '<policy version="0.2.0"><enclaves><enclave path="/arm/driver"><profiles>'
             '<profile ns="/" node="n"><topics publish="ALLOW"><topic>/y</topic></topics></profile>'

@@ -667,12 +667,14 @@ def test_home_is_older_than_its_robots(field: Field) -> None:
         shutil.copytree(backup, field.root, symlinks=True)
         if away:
             (field.folder / "pub").rename(kept)
-            assert "home is older" not in sros("fleet", "status", "ks", cwd=field.folder).out
+            assert (
+                "the keystore is older" not in sros("fleet", "status", "ks", cwd=field.folder).out
+            )
             assert field.send("r1").status == 1
         rows = field.run("fleet", "status", "ks", status=1).out
         why = "robots have files that it signed" if away else "'.*/pub' has later releases"
         command = rf"`sros fleet publish ks {field.folder}/pub --restored`"
-        assert re.search(rf"home is older than its robots: {why}.*{command}", rows), rows
+        assert re.search(rf"the keystore is older than its robots: {why}.*{command}", rows), rows
         assert not field.status()["complete"] and in_force() == {False}
         assert "work at least until" in field.run("renew", "ks", "--all", "--dry-run").err
     kept.rename(field.folder / "pub")

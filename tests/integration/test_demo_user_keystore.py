@@ -1,4 +1,4 @@
-"""Keystores and scenarios of users, over a real DDS."""
+"""Users' own keystores and scenarios, over a real DDS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What reads a keystore imports nothing that writes one, also not by way of others."""
+"""What reads a keystore imports nothing that writes one, directly or indirectly."""
 
 from __future__ import annotations
 

@@ -176,12 +176,12 @@ HOME_OR_ROBOT = FindingKind(
     ERROR,
     "a keystore with keys that must not be on a robot",
     "The keys belong where the keystore is kept. On a robot, an attacker who gets a CA key can "
-    "create any enclave, with any rights. The files do not show whether this folder is at home or "
-    "on a robot.",
+    "create any enclave, with any rights. The files do not show whether this folder is on a "
+    "robot.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "At home, keep the keys, and run `sros check KEYSTORE`. On a robot, put an export in its "
-    "place (`sros distribute_key KEYSTORE ENCLAVE TARGET` at home); if others had access, replace "
-    "the CAs (`sros rotate_ca`).",
+    "Where the keystore belongs, keep the keys, and run `sros check KEYSTORE`. On a robot, replace "
+    "it by an export (made with `sros distribute_key KEYSTORE ENCLAVE TARGET`); if others had "
+    "access, replace the CAs (`sros rotate_ca`).",
 )
 UNREADABLE = FindingKind(
     "keystore.file-unreadable",

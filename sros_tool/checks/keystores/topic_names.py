@@ -130,10 +130,10 @@ def ros_name_problem(text: str) -> str:
         return _foreign_problem(name)
     if is_expression(name):
         possible = "//" not in name and any(overlap(name, known) for known in _OF_ROS)
-        return "" if possible else f"{name!r} matches no ROS name{_meant(name)}"
+        return "" if possible else f"{name!r} matches no valid ROS name{_meant(name)}"
     if _TYPE.match(name):
         return f"{name!r} is the name of a type: write the name of the topic"
-    return f"{name!r} is not a ROS name{_meant(name)}"
+    return f"{name!r} is not a valid ROS name{_meant(name)}"
 
 
 def has_foreign_letters(name: str) -> bool:

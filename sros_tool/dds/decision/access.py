@@ -336,7 +336,10 @@ def _named(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
 
 
 def _usable_expression(traits: VendorTraits, text: str) -> str:
-    """Return an expression, or one that matches every name if it crashes the vendor's process."""
+    """Return the expression as the vendor reads it.
+
+    An empty expression that crashes the vendor becomes ``*``, because it crashes for every name.
+    """
     text = _trimmed(traits, text)
     return text or "*" if traits.crashes_on_empty_texts else text
 

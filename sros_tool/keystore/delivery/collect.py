@@ -731,7 +731,7 @@ def _revoke_again(
     if keyring.ca_service(root, IDENTITY, Keystore(root).template):
         # Its list is for all sites, and everybody can have it: nobody else has to wait.
         text = (
-            f"{have} a revocation list of the CA service that the keystore does not know: take it "
+            f"{have} a revocation list of the CA service that the keystore lacks: import it "
             f"with `sros crl {quote(str(root))} --refresh --crl FILE`"
         )
         return "", [Note("fleet.later-list", text)] if telling else [], []

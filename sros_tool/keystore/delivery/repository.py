@@ -267,8 +267,8 @@ def _not_ours(folder: Path, why: str) -> KeystoreError:
     return KeystoreError(
         f"'{folder}' has metadata that this keystore did not write",
         f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
-        "Name another folder; or, if it is the folder of this keystore and was damaged, remove its "
-        f"folder {_METADATA}, and publish again with --new-folder.",
+        "Name another folder. If this keystore published to it before, and it is damaged, remove "
+        f"'{folder / _METADATA}', and publish again with --new-folder.",
     )
 
 

@@ -793,8 +793,8 @@ def _make_successors(
             f"the identity CA of keystore '{change.root}' is a CA service",
             "sros cannot replace its CA.",
             "Replace the permissions CA alone, with --permissions. If the service has a later "
-            "certificate for the same key, take it with --same-key --identity-ca FILE; for another "
-            "key, make a new keystore.",
+            "certificate for the same key, import it with --same-key --identity-ca FILE; for "
+            "another key, make a new keystore.",
         )
     for file, serves in files.items():
         if wanted & set(serves) and not set(serves) <= wanted:
