@@ -103,7 +103,7 @@ def test_a_denial_takes_its_names_away() -> None:
 
 def test_without_access_control_and_by_default() -> None:
     (found,) = behind('{mode: "peer"}')
-    assert (found.names, found.own) == (None, False)
+    assert (found.names, found.self_limiting) == (None, False)
     assert {(each.right, each.name) for each in found.rights} == {
         (right, "/*") for right in ("publish", "subscribe", "request", "reply")
     }
@@ -119,7 +119,7 @@ def test_session_files_of_zenoh_security_tools() -> None:
     )  # fmt: skip
     router, talker = behind(text)
     assert not router.rights
-    assert talker.own
+    assert talker.self_limiting
     assert [(each.right, each.name, each.lacks) for each in talker.rights] == [
         ("publish", "/chatter", ()),
         ("publish", "/rosout", ()),

@@ -260,7 +260,7 @@ def _check_names(checked: _CheckedPolicy) -> Iterator[Finding]:
                 f"{statement.name} is one of the {kind}, not of the {statement.right.kind}",
             )
         if statement.allows:
-            yield from _breadth(statement)
+            yield from _broad_right(statement)
 
 
 def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
@@ -403,7 +403,7 @@ def _belongs(statement: _Statement) -> str:
     return "topics" if name in _GLOBAL_TOPICS or action_part(name)[1] in ACTION_TOPICS else ""
 
 
-def _breadth(statement: _Statement) -> Iterator[Finding]:
+def _broad_right(statement: _Statement) -> Iterator[Finding]:
     name, right = statement.name, statement.right.right
     if right == "publish" and name == "/clock":
         yield statement.found(SETS_CLOCK, f"{statement.right.enclave} may publish /clock")

@@ -255,7 +255,7 @@ def document_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     for setting in document.unknown:
         yield _at(document, UNKNOWN_SETTING, setting, f"Zenoh up to 1.10 has no {setting}")
     yield from _links(document)
-    yield from _openness(document)
+    yield from _open_features(document)
     if not document.access.enabled:
         kind = ROUTER_WITHOUT_RULES if document.mode is Mode.ROUTER else SESSION_WITHOUT_RULES
         yield _at(document, kind, f"{_ACCESS}/enabled", "access_control is off")
@@ -322,7 +322,7 @@ def _listed(document: ConfigurationDocument) -> str:
     return "not limited" if document.protocols is None else ", ".join(document.protocols) or "none"
 
 
-def _openness(document: ConfigurationDocument) -> Iterator[Finding]:
+def _open_features(document: ConfigurationDocument) -> Iterator[Finding]:
     for kind, on, path in (
         (SHARED_MEMORY, document.shared_memory, "transport/shared_memory"),
         (MULTICAST, document.multicast, "scouting/multicast"),
@@ -566,7 +566,7 @@ def subject_rights(behind: RightsBehindRules) -> SubjectRights:
     return SubjectRights(
         behind.subject or None,
         behind.names,
-        behind.own,
+        behind.self_limiting,
         [AllowedName(VERBS[r.right], r.name, r.domain, r.lacks) for r in behind.rights],
         unsaid=[KeyRight(VERBS[right], key) for right, key in behind.unsaid],
         denied=[KeyRight(VERBS[right], key) for right, key in behind.denied],

@@ -364,7 +364,7 @@ def _lines(document: ConfigurationDocument, subjects: Sequence[RightsBehindRules
     for rights in subjects:
         if not (rights.rights or rights.unsaid or rights.denied):
             continue
-        obeys = ", by rules that bind only itself" if rights.own else ""
+        obeys = ", by rules that bind only itself" if rights.self_limiting else ""
         yield f"{_who(rights)}{obeys}"
         for right in VERBS:
             stated = [one for one in rights.rights if one.right == right]
@@ -391,7 +391,7 @@ def _kind(document: ConfigurationDocument) -> str:
 
 
 def _who(rights: RightsBehindRules) -> str:
-    if rights.own:
+    if rights.self_limiting:
         return f"the process itself ({rights.subject})"
     if rights.names is None:
         return f"everybody who gets a connection{f' ({rights.subject})' if rights.subject else ''}"

@@ -23,7 +23,12 @@ from sros_tool.keystore.layout import (
     has_enclave,
     is_keystore,
 )
-from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave_of, loaded
+from sros_tool.keystore.participant import (
+    JoinContext,
+    LoadedEnclave,
+    load_enclave_of,
+    loaded_enclave,
+)
 from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.values import Words, shows
 
@@ -214,7 +219,7 @@ def _in_folder(folder: Path, at: datetime) -> LoadedEnclave:
 
     state = open_enclave(folder, now=at)
     name = common_name_of(state.certificate.subject) if state.certificate else ""
-    return loaded(name, folder, state, at=at)
+    return loaded_enclave(name, folder, state, at=at)
 
 
 def _planned_enclave(

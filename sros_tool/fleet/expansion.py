@@ -176,7 +176,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         """Return the different names that a name expands to: one name, or one for each robot."""
         if not has_placeholder(name):
             if name != written and (problem := _name_problem(name)):
-                raise _not_valid(name, problem, source)
+                raise _invalid_name(name, problem, source)
             return (name,)
         key = name, source
         names = self._names.get(key)
@@ -191,7 +191,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         for robot in self._members(placeholders_of(parts)[0].group, source):
             name = "".join(map(str, fill(parts, robot.name, robot.namespace, plural=True)))
             if problem := _name_problem(name):
-                raise _not_valid(name, problem, source)
+                raise _invalid_name(name, problem, source)
             yield name
 
 
@@ -212,7 +212,7 @@ def _name_problem(name: str) -> str:
     return "It is a namespace, not a name." if name == "/" else expression_problem(name)
 
 
-def _not_valid(name: str, problem: str, source: Source) -> PolicyError:
+def _invalid_name(name: str, problem: str, source: Source) -> PolicyError:
     return PolicyError(f"{source}: with the values of the fleet, {name!r} is not valid", problem)
 
 

@@ -869,9 +869,9 @@ def fleet_metrics(
     place = {"keystore": str(status.keystore.absolute())}
     robots = [({**place, "robot": robot.robot}, robot) for robot in status.robots]
 
-    def of_robots(number: Callable[[RobotStatus], int | None]) -> tuple[Sample, ...]:
-        numbers = ((number(robot), labels) for labels, robot in robots)
-        return tuple(Sample(value, labels) for value, labels in numbers if value is not None)
+    def per_robot(value: Callable[[RobotStatus], int | None]) -> tuple[Sample, ...]:
+        values = ((value(robot), labels) for labels, robot in robots)
+        return tuple(Sample(known, labels) for known, labels in values if known is not None)
 
     return (
         Metric(
@@ -894,7 +894,7 @@ def fleet_metrics(
         Metric(
             "sros_fleet_confirmed_timestamp_seconds",
             "When the last confirmation of a robot was received, in seconds since 1970.",
-            of_robots(lambda robot: int(robot.received.timestamp()) if robot.received else None),
+            per_robot(lambda robot: int(robot.received.timestamp()) if robot.received else None),
         ),
         Metric(
             "sros_fleet_expiry_timestamp_seconds",
@@ -910,30 +910,30 @@ def fleet_metrics(
             "sros_fleet_restarts_due",
             "Number of enclaves whose processes may still run with earlier files, for robots that "
             "say it.",
-            of_robots(lambda robot: None if robot.restart is None else len(robot.restart)),
+            per_robot(lambda robot: None if robot.restart is None else len(robot.restart)),
         ),
         Metric(
             "sros_fleet_revocation_list_in_force",
             "Whether the present revocation list is in force on a robot (1), or not, or it is not "
             "known (0).",
-            of_robots(
+            per_robot(
                 lambda robot: None if robot.crl_in_force is None else int(robot.crl_in_force)
             ),
         ),
         Metric(
             "sros_fleet_release",
             "Number of the release that a robot installed last, for robots that fetch.",
-            of_robots(lambda robot: robot.release),
+            per_robot(lambda robot: robot.release),
         ),
         Metric(
             "sros_fleet_published_release",
             "Number of the release that was published last for a robot.",
-            of_robots(lambda robot: robot.published),
+            per_robot(lambda robot: robot.published),
         ),
         Metric(
             "sros_fleet_clock_ahead_seconds",
             "How far the clock of a robot was ahead when its confirmation was received.",
-            of_robots(
+            per_robot(
                 lambda robot: (
                     int((robot.clock - robot.received).total_seconds())
                     if robot.clock and robot.received

@@ -138,15 +138,15 @@ class LoadedEnclave(NamedTuple):
 
 def load_enclave(name: str, folder: Path, *, at: datetime) -> LoadedEnclave:
     """Return the enclave that DDS would load from a folder at the time ``at``."""
-    return loaded(name, folder, open_enclave(folder, now=at), at=at)
+    return loaded_enclave(name, folder, open_enclave(folder, now=at), at=at)
 
 
 def load_enclave_of(keystore: Keystore, name: str, *, at: datetime) -> LoadedEnclave:
     """Return an enclave of a keystore as DDS would load it at the time ``at``."""
-    return loaded(name, keystore.folder(name), keystore.enclave(name, now=at), at=at)
+    return loaded_enclave(name, keystore.folder(name), keystore.enclave(name, now=at), at=at)
 
 
-def loaded(name: str, folder: Path, state: OpenedEnclave, *, at: datetime) -> LoadedEnclave:
+def loaded_enclave(name: str, folder: Path, state: OpenedEnclave, *, at: datetime) -> LoadedEnclave:
     """Return the enclave that DDS would load from a folder that was opened at the time ``at``."""
     governance, permissions = (
         _document(state, file) for file in (GOVERNANCE_FILE, PERMISSIONS_FILE)
@@ -429,7 +429,7 @@ def evaluated(
     ``domain`` is the ROS domain to join; None for the first domain of its documents.
     """
     number = domain if domain is not None else next(iter(state.joined_domains() or ()), 0)
-    there, context = loaded(name, folder, state, at=at), JoinContext(number, at, zone)
+    there, context = loaded_enclave(name, folder, state, at=at), JoinContext(number, at, zone)
     participants = tuple(VendorParticipant(vendor, there, context) for vendor in vendors)
     return EvaluatedEnclave(accepted_state(state, participants), participants)
 

@@ -499,24 +499,24 @@ def signature_matches(certificate: x509.Certificate, authority: x509.Certificate
 
 
 def is_signed(
-    made: x509.Certificate | x509.CertificateRevocationList,
-    signed: bytes,
+    signed_object: x509.Certificate | x509.CertificateRevocationList,
+    tbs_bytes: bytes,
     authority: x509.Certificate,
 ) -> bool:
-    """Return whether the key of ``authority`` signed ``signed``, a part of ``made``."""
-    key, signature = authority.public_key(), made.signature
-    if not isinstance(key, _SIGNING_KEYS.get(made.signature_algorithm_oid, ())):
+    """Return whether the key of ``authority`` signed ``tbs_bytes``, a part of ``signed_object``."""
+    key, signature = authority.public_key(), signed_object.signature
+    if not isinstance(key, _SIGNING_KEYS.get(signed_object.signature_algorithm_oid, ())):
         return False
     try:
-        digest = made.signature_hash_algorithm
+        digest = signed_object.signature_hash_algorithm
         if isinstance(key, ec.EllipticCurvePublicKey) and digest:
-            key.verify(signature, signed, ec.ECDSA(digest))
+            key.verify(signature, tbs_bytes, ec.ECDSA(digest))
         elif isinstance(key, rsa.RSAPublicKey) and digest:
-            pss = made.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
-            scheme = made.signature_algorithm_parameters if pss else padding.PKCS1v15()
-            key.verify(signature, signed, scheme, digest)  # type: ignore[arg-type]
+            pss = signed_object.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
+            scheme = signed_object.signature_algorithm_parameters if pss else padding.PKCS1v15()
+            key.verify(signature, tbs_bytes, scheme, digest)  # type: ignore[arg-type]
         elif isinstance(key, (ed25519.Ed25519PublicKey, ed448.Ed448PublicKey)):
-            key.verify(signature, signed)
+            key.verify(signature, tbs_bytes)
         else:
             return False
     except (InvalidSignature, UnsupportedAlgorithm, ValueError, TypeError):

@@ -35,7 +35,7 @@ def states_routers(side: AccessSource) -> bool:
     return _network(side, side) is not None
 
 
-def more_crossing(
+def added_crossing(
     old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
     """Yield the changes of settings and fleet file that let more names pass between Zenoh routers.
@@ -89,7 +89,7 @@ def _moved(
                 break
 
 
-def more_passed_on(
+def looser_router_rules(
     old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
     """Yield changes of routers' rules by which they allow other routers more than in ``old``.

@@ -42,7 +42,7 @@ from sros_tool.proof.requirements import (
     RightNames,
     Widest,
 )
-from sros_tool.proof.worlds import Meeting, Topics, World, named, shortest, valid_topics
+from sros_tool.proof.worlds import Topics, TopicUser, World, named, shortest, valid_topics
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS
 
 
@@ -364,7 +364,7 @@ def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness 
     others: tuple[str, ...] = ()
     for right, names in requirement.rights:
         for expression in names:
-            holders: dict[str, list[tuple[_Part, Meeting]]] = {}
+            holders: dict[str, list[tuple[_Part, TopicUser]]] = {}
             for part in _doing(right):
                 for met in world.side(part.writes).meeting(part.topics(expression), limit):
                     holders.setdefault(met.enclave, []).append((part, met))
@@ -384,7 +384,7 @@ def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness 
 
 
 def _uses_of(
-    name: str, enclave: str, right: str, parts: Iterable[tuple[_Part, Meeting]]
+    name: str, enclave: str, right: str, parts: Iterable[tuple[_Part, TopicUser]]
 ) -> Iterator[Use]:
     """Yield the uses of a name by an enclave, one for each part of the right."""
     for part, met in parts:
@@ -395,7 +395,7 @@ def _uses_of(
 
 def _shared_by(
     world: World,
-    holders: Collection[Sequence[tuple[_Part, Meeting]]],
+    holders: Collection[Sequence[tuple[_Part, TopicUser]]],
     count: int,
     expression: str,
     limit: SearchLimit,

@@ -37,7 +37,7 @@ from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.model import ALLOW, Source
 from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.assumptions import assumptions, completed, domains_of_robots, left_out
-from sros_tool.proof.crossing import more_crossing, more_passed_on
+from sros_tool.proof.crossing import added_crossing, looser_router_rules
 from sros_tool.proof.protection import contradiction, less_protection
 from sros_tool.proof.sources import AT, AccessSource
 from sros_tool.proof.worlds import ROS_TOPICS, domains_of, enforced_access, is_enforced
@@ -276,8 +276,8 @@ def _less(
     cause: new rights would change these rules.
     """
     yield from less_protection(old, new, limit)
-    crossing = tuple(more_crossing(old, new, limit))
-    yield from crossing or (more_passed_on(old, new, limit) if rules else ())
+    crossing = tuple(added_crossing(old, new, limit))
+    yield from crossing or (looser_router_rules(old, new, limit) if rules else ())
 
 
 def _not_compared(base: AccessSource, head: AccessSource) -> Iterator[str]:

@@ -107,7 +107,7 @@ ROS_TOPICS = NameSet.union(
 
 
 @dataclass(frozen=True, slots=True)
-class Meeting:
+class TopicUser:
     """An enclave that may use some of the topics in question.
 
     Its rights name the ``stated`` topics; with ``wild``, their wildcards may match further ones.
@@ -146,7 +146,7 @@ class Side:
         self._topics = sorted(self.exact)
         self._backwards = sorted(name[::-1] for name in self.exact)
 
-    def meeting(self, topics: Topics, limit: SearchLimit) -> list[Meeting]:
+    def meeting(self, topics: Topics, limit: SearchLimit) -> list[TopicUser]:
         """Return the enclaves that may use some of the topics, sorted.
 
         An enclave without ``stated`` topics may be listed wrongly: whether it may really use a
@@ -167,7 +167,7 @@ class Side:
             self._any
         )
         return [
-            Meeting(each, self.of[each], tuple(stated.get(each, ())), each in wild)
+            TopicUser(each, self.of[each], tuple(stated.get(each, ())), each in wild)
             for each in sorted(wild.union(stated))
         ]
 
@@ -402,7 +402,7 @@ class World:
         )
         return next(filter(None, (*stated, *examples)), None)
 
-    def use(self, met: Meeting, topics: Topics, limit: SearchLimit) -> str | None:
+    def use(self, met: TopicUser, topics: Topics, limit: SearchLimit) -> str | None:
         """Return the best example of ``topics`` that an enclave may use, or None."""
         if met.wild:
             return self.example(met.names, topics, limit)

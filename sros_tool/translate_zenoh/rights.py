@@ -603,14 +603,14 @@ class StatedName:
 class RightsBehindRules:
     """The rights that rules give to the processes that match a subject.
 
-    ``names`` are the common names of their certificates, None for any.  With ``own``, they are
-    rights of the process that has the rules, which can ignore them.  ``unsaid`` are rights and keys
-    that no ROS name expresses exactly; ``denied`` are denied rights and keys.
+    ``names`` are the common names of their certificates, None for any.  If ``self_limiting``, they
+    are rights of the process that has the rules, which can ignore them.  ``unsaid`` are rights and
+    keys that no ROS name expresses exactly; ``denied`` are denied rights and keys.
     """
 
     subject: str
     names: tuple[str, ...] | None
-    own: bool
+    self_limiting: bool
     rights: tuple[StatedName, ...]
     unsaid: tuple[tuple[str, str], ...]
     denied: tuple[tuple[str, str], ...]
@@ -625,10 +625,12 @@ def rights_behind(document: ConfigurationDocument) -> tuple[RightsBehindRules, .
     access, limit = document.access, ComparisonLimit()
     if not access.enabled:
         rules = (AclRule("", True, tuple(Flow), tuple(Message), ("**",)),)
-        return (_rights("", None, False, rules, limit),)
-    own = is_self_limiting(document)
+        return (_rights_of_subject("", None, False, rules, limit),)
+    self_limiting = is_self_limiting(document)
     return tuple(
-        _rights(subject.id, subject.cert_common_names, own, _rules(access, subject), limit)
+        _rights_of_subject(
+            subject.id, subject.cert_common_names, self_limiting, _rules(access, subject), limit
+        )
         for subject in access.subjects
         if access.rules_of(subject.id) or access.allows_by_default
     )
@@ -652,10 +654,10 @@ def _rules(access: Enforcement, subject: AclSubject) -> tuple[AclRule, ...]:
     return (*rules, AclRule("", True, tuple(Flow), tuple(Message), ("**",)))
 
 
-def _rights(
+def _rights_of_subject(
     subject: str,
     names: tuple[str, ...] | None,
-    own: bool,
+    self_limiting: bool,
     rules: Sequence[AclRule],
     limit: ComparisonLimit,
 ) -> RightsBehindRules:
@@ -664,7 +666,7 @@ def _rights(
     denied: list[tuple[str, str]] = []
 
     def keys(flow: Flow, message: Message, *, allows: bool = True) -> list[str]:
-        seen = flow.opposite() if own else flow
+        seen = flow.opposite() if self_limiting else flow
         stated = (
             untyped(key)
             for rule in rules
@@ -690,7 +692,9 @@ def _rights(
     order = sorted(
         of_subject, key=lambda stated: (RIGHT_ORDER[stated.right], stated.name, stated.domain)
     )
-    return RightsBehindRules(subject, names, own, tuple(order), tuple(unsaid), tuple(denied))
+    return RightsBehindRules(
+        subject, names, self_limiting, tuple(order), tuple(unsaid), tuple(denied)
+    )
 
 
 @lru_cache(maxsize=_MOST_NAMES)
@@ -829,7 +833,7 @@ def enclave_of(rights: RightsBehindRules) -> tuple[str, ...]:
     For a session that limits itself, the name is the id of the subject: zenoh_security_tools writes
     the node's name there, and uses the enclave of that name.
     """
-    named = rights.names or ((f"/{rights.subject}",) if rights.own else ())
+    named = rights.names or ((f"/{rights.subject}",) if rights.self_limiting else ())
     return tuple(name for name in named if _is_enclave(name))
 
 

@@ -167,12 +167,12 @@ def verifications(
         return of_message(self, content, signer)
 
     def is_signed(
-        made: x509.Certificate | x509.CertificateRevocationList,
-        signed: bytes,
+        signed_object: x509.Certificate | x509.CertificateRevocationList,
+        tbs_bytes: bytes,
         authority: x509.Certificate,
     ) -> bool:
-        verified[signed, authority] += 1
-        return of_certificate(made, signed, authority)
+        verified[tbs_bytes, authority] += 1
+        return of_certificate(signed_object, tbs_bytes, authority)
 
     monkeypatch.setattr(smime.Signature, "_verify", verify)
     for module in (certificates, crl):

@@ -310,7 +310,7 @@ def _below(
                 yield from links.check(path)
                 continue
             yield from _writers(path, info, trusted)
-            yield from _openness(path, root, info.st_mode, home)
+            yield from _open_folder(path, root, info.st_mode, home)
         if parent == root and AGENT in folders:
             folders.remove(AGENT)  # of `sros agent`, closed to others
         inside = os.path.relpath(parent, root)
@@ -375,7 +375,7 @@ def _interrupted(parent: Path, root: str) -> Finding:
     return INTERRUPTED.found(root, text, str(parent / STAGE))
 
 
-def _openness(path: str, root: str, mode: int, home: bool) -> Iterator[Finding]:
+def _open_folder(path: str, root: str, mode: int, home: bool) -> Iterator[Finding]:
     inside = Path(path).relative_to(root)
     # Others cannot enter what is below a closed top folder.
     asked = inside.parts[0] in _KEY_FOLDERS and (len(inside.parts) == 1 or not home)

@@ -30,7 +30,7 @@ from sros_tool.keystore.participant import (
     RefusalCause,
     VendorParticipant,
     accepted_state,
-    loaded,
+    loaded_enclave,
 )
 from sros_tool.keystore.reader import OpenedEnclave
 from sros_tool.names import (
@@ -169,7 +169,7 @@ def evaluate(
         distributions: the ROS 2 distributions that it is for, which findings name.
     """
     keystore = enclave.keystore
-    there = loaded(enclave.name, enclave.folder, enclave.state, at=keystore.now)
+    there = loaded_enclave(enclave.name, enclave.folder, enclave.state, at=keystore.now)
     numbers = (domain,) if domain is not None else example_domains(enclave.state)
     by_domain = {
         number: {

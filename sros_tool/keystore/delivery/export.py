@@ -248,7 +248,7 @@ def released_enclave(root: Path, name: str, now: datetime) -> ReleasedEnclave:
     if lasting or (evaluation.problems and not problems):
         raise _not_running(root, name, lasting or evaluation.problems)
     _check_zenoh(root, enclave_path(root, name), name, state)
-    _check_no_authority(enclave_path(root, name), state)
+    _check_not_ca_key(enclave_path(root, name), state)
     files = released_files(root, name)
     until = now if problems else _evaluated_until(files, state, now)
     return ReleasedEnclave(files, "; ".join(map(str, problems)), until)
@@ -324,7 +324,7 @@ def _files_of(root: Path, name: str, evaluation: EvaluatedEnclave) -> dict[str, 
     """
     folder, state = enclave_path(root, name), evaluation.state
     _check_zenoh(root, folder, name, state)
-    _check_no_authority(folder, state)
+    _check_not_ca_key(folder, state)
     return _read_files(root, name, _FILES)
 
 
@@ -348,7 +348,7 @@ def _read_files(root: Path, name: str, wanted: Iterable[str]) -> dict[str, bytes
     return files
 
 
-def _check_no_authority(folder: Path, state: OpenedEnclave) -> None:
+def _check_not_ca_key(folder: Path, state: OpenedEnclave) -> None:
     """Raise `KeystoreError` if the key of an enclave is the key of a CA."""
     if any(
         authority and state.certificate and authority.public_key() == state.certificate.public_key()

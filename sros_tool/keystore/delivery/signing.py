@@ -387,7 +387,7 @@ class _Signer:
         present = change.keystore.certificate_of(name) if renew else None
         _check_key(request, known, present)
         if not (self._replace_keys and self._keep_only_key_of(request)):
-            _check_file_of_key(change.keystore, request, present)
+            _check_same_key(change.keystore, request, present)
         if not renew and not named and known.revoked_before([name]):
             raise KeystoreError(
                 f"enclave {name} was revoked in keystore '{root}'",
@@ -522,7 +522,7 @@ def _check_key(request: SigningRequest, known: KnownKeys, present: x509.Certific
         known.refuse_second(request.public_key, request.name, remedy)
 
 
-def _check_file_of_key(
+def _check_same_key(
     keystore: Keystore, request: SigningRequest, present: x509.Certificate | None
 ) -> None:
     """Raise `KeystoreError` if the keystore has another key for the enclave of a request."""
