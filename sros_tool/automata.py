@@ -664,7 +664,7 @@ def _around(node: _Node, best: Callable[[Surroundings], tuple[int, int]]) -> Sur
 
 
 def _roughness(around: Surroundings) -> tuple[int, int]:
-    """Return a sort key for sets by which long prefixes and suffixes come first."""
+    """Return a sort key for sets that puts long prefixes and suffixes first."""
     told = min((len(a.prefix) + len(a.suffix) for a in around.automata), default=_LAST)
     return -told, -len(around.exact)
 
@@ -767,7 +767,10 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
 
 
 def _width(around: Surroundings) -> tuple[int, int]:
-    """Return a sort key for sets by which few automata come first, if their names differ."""
+    """Return a sort key that puts sets with few automata first.
+
+    Small sets with an automaton without prefix and suffix come after other small sets.
+    """
     if len(around.automata) > _FEW:
         return len(around.automata), 0
     rough, _ = _roughness(around)

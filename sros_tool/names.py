@@ -18,7 +18,7 @@ MAX_COMMON_NAME = 64
 """Longest enclave name in characters: the limit of an X.509 common name (RFC 5280)."""
 
 ROS_DISCOVERY_TOPIC = "ros_discovery_info"
-"""The DDS topic by which every ROS 2 participant announces its nodes (rmw_dds_common)."""
+"""The DDS topic on which every ROS 2 participant announces its nodes (rmw_dds_common)."""
 
 PARAMETER_SERVICES = (
     "describe_parameters",

@@ -145,7 +145,7 @@ def fetch_release(
         state: the agent's folder, ``FOLDER/.agent``, with the pinned root.
         source: the publishing folder: ``https://…``, ``http://…``, or the path of a folder.
         robot: the name of this robot.
-        now: the present time, by which metadata expires.
+        now: the present time, which decides whether metadata has expired.
         installed: the number of the installed release; 0 if none is.
         client_certificate: certificate and key for TLS.
         tls_ca: CA certificates (PEM) of the server; None: those of the system.

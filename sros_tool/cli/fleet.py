@@ -411,7 +411,7 @@ def _publish(
 
     PUB has plain files for any web server, bucket or USB stick, and no private key: for each robot
     an archive with the files of its enclaves, sealed by the permissions CA, and metadata of The
-    Update Framework, by which `sros agent` on the robot refuses old, mixed or forged files. Run
+    Update Framework, with which `sros agent` on the robot refuses old, mixed or forged files. Run
     this verb after each change, and before the timestamp expires, for example each hour. Archives
     of unchanged robots stay; archives of robots that were revoked or left the fleet are removed.
 

@@ -472,7 +472,7 @@ def _widest(
 
 
 def _width(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
-    """Return a sort key by which wider grants have greater keys."""
+    """Return a sort key that puts wider grants last."""
     size = sum(
         len(criteria.topics)
         for rule in grant.rules

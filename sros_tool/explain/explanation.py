@@ -247,7 +247,7 @@ _NO_RULE = frozenset({"no-rule", "default"})
 
 
 def _smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | None:
-    """Return the smallest change of the policy by which the vendor allows a denied question.
+    """Return the smallest change of the policy that makes the vendor allow a denied question.
 
     The change is for the enclave's policy or, if there is none, for the rights in its permissions.
     Returns None if no policy could allow the question.

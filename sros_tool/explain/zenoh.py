@@ -180,7 +180,7 @@ class ZenohAnswer:
 
     @property
     def wildcard(self) -> str:
-        """The first key expression with a wildcard by which a check decides, or ""."""
+        """The first key expression with a wildcard that decides a check, or ""."""
         return self.wildcards[0].expression if self.wildcards else ""
 
     @property

@@ -227,7 +227,7 @@ _OF_POLICIES = (
     *((b"<policy", b"version"), (b"<enclaves", b"path"), (b"<profile", b" ns=")),
     *((b"<topics", b"ALLOW"), (b"<services", b"ALLOW"), (b"<actions", b"ALLOW")),
 )
-"""Texts by which an XML file is recognized as a policy, or as a part of one."""
+"""Texts that mark an XML file as a policy, or as a part of one."""
 _EBCDIC = b"\x4c\x6f\xa7\x94"
 """The beginning of an XML file in EBCDIC (XML 1.0, appendix F)."""
 _ENCODING = re.compile(rb"encoding ?= ?[\"']([^\"']*)")

@@ -66,7 +66,7 @@ def added_crossing(
 def _moved(
     before: ZenohNetwork, after: ZenohNetwork, enclaves: set[str], limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield changes by which enclaves move to another router, where more of their names pass."""
+    """Yield moves of enclaves to another router that lets more of their names pass."""
     places: dict[tuple[str, str], str] = {}
     for enclave in sorted(enclaves):
         places.setdefault((_router(before, enclave), _router(after, enclave)), enclave)
@@ -92,7 +92,7 @@ def _moved(
 def looser_router_rules(
     old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield changes of routers' rules by which they allow other routers more than in ``old``.
+    """Yield changes of routers' rules that allow other routers more than in ``old``.
 
     A removed router counts only if the settings do not say which router its enclaves connect to
     now.

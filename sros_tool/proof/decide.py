@@ -257,7 +257,7 @@ def _use(enclave: str, right: str, part: _Part, topics: Topics, topic: str) -> U
 
 
 def _better(use: Use) -> tuple[int, str, str]:
-    """Return a sort key for uses, by which short names come first."""
+    """Return a sort key for uses that puts short names first."""
     return len(use.name), use.name, use.enclave
 
 

@@ -89,7 +89,7 @@ class Gain:
 
     @property
     def denied_by(self) -> Right | None:
-        """The right by which the other side denies the name; null without one."""
+        """The right that denies the name on the other side; null without one."""
         return self.denied
 
 
@@ -270,7 +270,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
 def _less(
     old: AccessSource, new: AccessSource, limit: SearchLimit, *, rules: bool
 ) -> Iterator[SettingChange]:
-    """Yield changes by which ``new`` protects less than ``old``, or lets more names cross.
+    """Yield changes that make ``new`` protect less than ``old``, or let more names cross.
 
     With ``rules``, rules between Zenoh routers are compared, too, unless the settings state the
     cause: new rights would change these rules.

@@ -786,7 +786,7 @@ class _Review:
 
 
 def _decisive_first(where: str) -> tuple[bool, str]:
-    """Return a sort key by which variables of Ansible come before the hosts that have them."""
+    """Return a sort key that puts Ansible variables before the hosts that have them."""
     return not any(part in where for part in ("ansible_", "sros_")), where
 
 

@@ -467,7 +467,7 @@ _USES: dict[tuple[bool, str], tuple[tuple[Flow, Message], ...]] = {
     (True, "rr"): ((_IN, Message.REPLY), (_IN, Message.DECLARE_QUERYABLE)),
     (False, "rr"): ((_OUT, Message.REPLY), (_OUT, Message.DECLARE_QUERYABLE)),
 }
-"""The Zenoh messages by which a process writes or reads topics with a prefix.
+"""The Zenoh messages with which a process writes or reads topics with a prefix.
 
 All of them have to pass: replies without the offer to reply belong to the history of topics.
 """

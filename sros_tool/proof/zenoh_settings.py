@@ -125,7 +125,7 @@ _GIVING = (
 
 
 def looser_settings(old: _Files, new: _Files) -> Iterator[SettingChange]:
-    """Yield the changes of settings by which ``new`` permits more than ``old``.
+    """Yield the changes of settings that make ``new`` permit more than ``old``.
 
     A file that ``old`` lacks is compared with a file as sros writes it, and its endpoints with the
     endpoints of all files of ``old``.

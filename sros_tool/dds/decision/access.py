@@ -648,7 +648,7 @@ class Access:
     def ruled_topics(self, verb: AccessVerb) -> NameSet:
         """Return `topics`, and also names that DDS does not accept, which ROS 2 never uses.
 
-        For two vendors by which documents have the same meaning, these sets are mostly equal.
+        If two vendors read documents alike, these sets are mostly equal.
         """
         from sros_tool.automata import NameSet
 

@@ -27,7 +27,7 @@ _Document = TypeVar("_Document", Governance, Permissions)
 def _readers(
     reader: DocumentReader,
 ) -> tuple[Callable[[bytes], Governance], Callable[[bytes], Permissions]]:
-    """Return the functions by which a vendor parses governance and permissions."""
+    """Return the vendor's parsers for governance and permissions."""
     match reader:
         case DocumentReader.FAST:
             from sros_tool.dds.decision import fastdds

@@ -83,7 +83,7 @@ class PublishedRobot(NamedTuple):
     """What was published last for a robot, and what it was made from.
 
     ``content`` is the SHA-256 of the list of its files, ``files`` a digest of the state of these
-    files in the keystore (inode, size and times), by which an unchanged robot is known.
+    files in the keystore (inode, size and times), which show that a robot is unchanged.
     """
 
     release: PublishedRelease
