@@ -244,6 +244,8 @@ def _picture(
         ),
         findings=tuple(dict.fromkeys(finding for source in sources for finding in source.findings)),
         unread=tuple(units for source in sources for units in source.unread),
+        join_needs_right=governance is not None
+        and all(rule.enable_join_access_control for rule in governance.domain_access_rules),
     )
 
 
@@ -304,15 +306,23 @@ def _enclaves(
 
 
 def _domains_of(sources: Sequence[PictureSource]) -> dict[str, str]:
-    """Map enclaves to their ROS domains as text, by the last source that says them."""
+    """Map enclaves to their ROS domains as text, by the last source that says them.
+
+    The text is "" for an enclave with a right that holds in every domain.
+    """
     domains: dict[str, str] = {}
     for source in sources:
         of_source: dict[str, list[tuple[int, int]]] = defaultdict(list)
+        everywhere: set[str] = set()
         for some, rights in source.in_domains.items():
-            ranges = [(part.first or 0, part.last or 0) for part in some.ranges] if some else []
-            for enclave in {right.enclave for right in rights}:
-                of_source[enclave] += ranges
+            enclaves = {right.enclave for right in rights}
+            if some is None:
+                everywhere |= enclaves
+                continue
+            for enclave in enclaves:
+                of_source[enclave] += ((part.first or 0, part.last or 0) for part in some.ranges)
         domains |= {name: str(DomainSet.of(*of_source[name])) for name in of_source}
+        domains |= dict.fromkeys(everywhere, "")
     return domains
 
 

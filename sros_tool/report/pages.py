@@ -123,6 +123,7 @@ def _data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[s
         "headlines": picture.headlines,
         "overlay": as_plain(picture.overlay),
         "of_every_node": OF_EVERY_NODE,
+        "join_needs_right": picture.join_needs_right,
         "enclaves": [_enclave(enclave) for enclave in picture.enclaves],
         "bundles": [_bundle(each) for each in fold(picture.names, picture.edges, apart=True)],
         "scenes": [_scene(each) for each in scenes],
@@ -141,7 +142,7 @@ def _enclave(enclave: PicturedEnclave) -> dict[str, Any]:
         for statement in enclave.statements
         if is_expression(statement.name)
     ]
-    return {**as_plain(enclave), "statements": wild}
+    return {**as_plain(enclave), "statements": wild, "domains": enclave.domains}
 
 
 def _with_deny(value: dict[str, Any]) -> dict[str, Any]:

@@ -488,6 +488,8 @@ class Picture:
     different: tuple[DifferentUnit, ...] = ()
     """Units that differ slightly from equal ones."""
     unread: tuple[UnreadUnits, ...] = ()
+    join_needs_right: bool = False
+    """Whether an enclave can join only ROS domains in which it has a right."""
 
     @property
     def headlines(self) -> tuple[str, ...]:

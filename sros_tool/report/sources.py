@@ -151,8 +151,11 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     if len(domains := {enclave.domains for enclave in picture.enclaves} - {""}) > 1:
         several = enumerated(sorted(domains))
         text = f"enclaves are for different ROS domains ({several}), and a name is drawn once for "
-        text += "all of them. Information goes only between enclaves with a common domain; what a "
-        text += "click on a page shows as reach ignores domains (--focus respects them)."
+        text += "all of them. Information goes only between enclaves with a common domain"
+        if any(_rights_differ_by_domain(source) for source in read):
+            text += "; a click on a page takes each right of an enclave for a right in all domains "
+            text += "of the enclave (--focus takes each right only in its own)"
+        text += "."
         finding = PicturedFinding("view.domains", "note", text)
         picture = replace(picture, findings=(*picture.findings, finding))
     if drawing.focus:
@@ -162,6 +165,12 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
         picture = _with_requirements(picture, drawing.requirements, drawing, read[0].keystore)
     folding = Folding.of(picture, robots)
     return replace(picture, equal=folding.equal, different=folding.different), folding
+
+
+def _rights_differ_by_domain(source: PictureSource) -> bool:
+    """Return whether an enclave has different rights in different ROS domains."""
+    enclaves = [{right.enclave for right in rights} for rights in source.in_domains.values()]
+    return sum(map(len, enclaves)) > len(set[str]().union(*enclaves))
 
 
 def _routers(keystore: Keystore | None) -> int:

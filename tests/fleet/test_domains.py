@@ -7,13 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.harness import policy_text, publish, sros
-
-
-def subscribe(*names: str) -> str:
-    """Return a group of topics to subscribe to, as XML."""
-    return publish(*names).replace("publish", "subscribe")
-
+from tests.support.harness import policy_text, publish, sros, subscribe
 
 FLEET = """
 [groups]

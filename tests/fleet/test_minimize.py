@@ -7,12 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.harness import policy_text, publish, sros
-
-
-def subscribe(*names: str) -> str:
-    return publish(*names).replace("publish=", "subscribe=")
-
+from tests.support.harness import policy_text, publish, sros, subscribe
 
 FLEET = """[robots.r1]
 namespace = "/hall/r1"

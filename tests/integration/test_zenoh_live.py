@@ -13,16 +13,12 @@ from typing import Any
 import pytest
 
 from tests.support.children import run
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import policy_text, publish, sros, subscribe
 
 pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
 
 pytestmark = pytest.mark.zenoh
 WORLD = Path(__file__).with_name("zenoh_world.py")
-
-
-def subscribe(*names: str) -> str:
-    return publish(*names).replace("publish", "subscribe")
 
 
 POLICY = policy_text(

@@ -20,13 +20,9 @@ import zenoh
 
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 from tests.integration.zenoh_world import PAUSE, World, key, text, until
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import policy_text, sros, subscribe
 
 ROUTER, TALKER, LISTENER, OTHER = "/router", "/talker", "/listener", "/other"
-
-
-def subscribe(*names: str) -> str:
-    return publish(*names).replace("publish", "subscribe")
 
 
 class Robot:

@@ -32,7 +32,7 @@ from tests.report.pictures import (
     large_policy,
     new_page,
 )
-from tests.support.harness import policy_text, sros
+from tests.support.harness import policy_text, publish, sros, subscribe
 from tests.support.long_form import some
 
 if TYPE_CHECKING:
@@ -223,17 +223,53 @@ def test_the_flow_agrees_with_the_one_that_explain_follows(
             differs = {"writing": upstream, "some names": (name, upstream) == ("/scan", False)}
             if differs.get(open_to_all):
                 assert distance != distances(by_permissions, name, upstream)
-            page.fill("#search", name)
-            page.keyboard.press("Enter")
-            assert page.inner_text("#details h2") == name
-            page.click("text=What reaches it" if upstream else "text=What it reaches")
-            summary = page.inner_text("#summary")
-            found = re.search(r"(\d+) enclaves? can .* within 2 hops(?:, (\d+) over)?", summary)
-            assert found, summary
-            asked = (name, upstream, summary)
-            assert int(found[1]) == sum(hops <= 2 for hops in distance.values()), asked
-            assert int(found[2] or found[1]) == len(distance), asked
-            page.click("#back")
+            assert shown_flow(page, name, upstream) == counts(distance), (name, upstream)
+
+
+def counts(distance: dict[str, int]) -> tuple[int, int]:
+    """How many enclaves are within two hops, and how many at all."""
+    return sum(hops <= 2 for hops in distance.values()), len(distance)
+
+
+def shown_flow(page: Page, name: str, upstream: bool) -> tuple[int, int]:
+    """What the page says after a click, as `counts` does."""
+    page.fill("#search", name)
+    page.keyboard.press("Enter")
+    assert page.inner_text("#details h2") == name
+    page.click("text=What reaches it" if upstream else "text=What it reaches")
+    summary = page.inner_text("#summary")
+    found = re.search(r"(\d+) enclaves? can .* within 2 hops(?:, (\d+) over)?", summary)
+    assert found, summary
+    page.click("#back")
+    return int(found[1]), int(found[2] or found[1])
+
+
+OF_ROBOTS = {
+    "/{robot:seeing}/eye": subscribe("/lift") + publish("/scan"),
+    "/{robot:driving}/pilot": subscribe("/scan") + publish("/go"),
+    "/{robot:lifting}/boss": publish("/lift"),
+}
+ROBOTS = """
+[groups]
+seeing = {}
+driving = {}
+lifting = {}
+[robots]
+a = { groups = ["seeing", "driving"], domain = 10 }
+b = { groups = ["driving"], domain = 20 }
+c = { groups = ["seeing", "lifting"], domain = 30 }
+"""
+
+
+def test_a_flow_stays_in_its_ros_domain(browser: Browser, tmp_path: Path) -> None:
+    (tmp_path / "p.xml").write_text(policy_text(OF_ROBOTS))
+    (tmp_path / "f.toml").write_text(ROBOTS)
+    sros("view", "p.xml", "--fleet", "f.toml", "-o", "p.html", cwd=tmp_path).ok()
+    with opened(browser, tmp_path / "p.html") as page:
+        # Both pilots, and the eye of a: no eye is in the domain of b.
+        assert shown_flow(page, "/go", True) == (3, 3)
+        # Both eyes, and the pilot of a: the pilot of b hears no eye.
+        assert shown_flow(page, "/lift", False) == (3, 3)
 
 
 def test_hops_can_be_added_up_to_all(browser: Browser, robot_page: Path) -> None:

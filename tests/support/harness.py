@@ -348,6 +348,11 @@ def publish(*names: str) -> str:
     return f'<topics publish="ALLOW">{topics}</topics>'
 
 
+def subscribe(*names: str) -> str:
+    """Return a group of topics to subscribe to, as XML."""
+    return publish(*names).replace("publish", "subscribe", 1)
+
+
 def with_includes(policy: str) -> str:
     """Return a policy's text that declares the prefix xi of XInclude."""
     return policy.replace("<policy", '<policy xmlns:xi="http://www.w3.org/2001/XInclude"', 1)

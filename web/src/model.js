@@ -14,9 +14,11 @@ export const sends = (tie) => SENDS.has(tie.right);
 
 export class Model {
   #sides = new Map();
+  #parts;
 
   constructor(data) {
     Object.assign(this, data);
+    this.#parts = partsOfDomains(data.enclaves);
     for (const bundle of data.bundles) bundle.ties = rowsOf(bundle.ties);
     for (const scene of data.scenes) {
       scene.cards = rowsOf(scene.cards);
@@ -112,13 +114,26 @@ export class Model {
     return ties;
   }
 
-  // All ends of one direction: of each bundle, and with their bundles of each enclave.
+  // The parts of the ROS domains in which an enclave is, for one of its rights: with a name that is
+  // open to everybody, it is in every domain that it can join.
+  #partsOf({ enclave, open }) {
+    return open && !this.join_needs_right ? this.#parts.all : this.#parts.of.get(enclave);
+  }
+
+  // All ends of one direction: of each bundle in each part of the domains, and with their bundles
+  // of each enclave.
   #side(writing) {
     if (!this.#sides.has(writing)) {
-      const of = new Map(this.bundles.map((bundle) => [bundle, this.#ends(bundle, writing)]));
+      const of = new Map(this.bundles.map((bundle) => [bundle, new Map()]));
       const by = new Map(this.enclaves.map(({ path }) => [path, []]));
-      for (const [bundle, ties] of of) {
-        for (const tie of ties) by.get(tie.enclave).push({ tie, bundle });
+      for (const [bundle, inPart] of of) {
+        for (const tie of this.#ends(bundle, writing)) {
+          by.get(tie.enclave).push({ tie, bundle });
+          for (const part of this.#partsOf(tie)) {
+            if (!inPart.has(part)) inPart.set(part, []);
+            inPart.get(part).push(tie);
+          }
+        }
       }
       this.#sides.set(writing, { of, by });
     }
@@ -127,41 +142,72 @@ export class Model {
 
   // Where information comes from that reaches a name (or where it goes from there).  Steps lead
   // from enclaves to names and on; each enclave has the number of hops at which it is first met.
-  // A service or an action carries both ways: requests there, replies back.
+  // A service or an action carries both ways: requests there, replies back.  Information stays in
+  // its ROS domain, so a bundle is met in each part of the domains by itself.
   flow(kind, name, upstream) {
     const start = this.bundle(kind, name);
     const [near, far] = [this.#side(upstream), this.#side(!upstream)];
     const hops = new Map();
     const steps = [];
-    const met = new Set([start]);
-    let front = [start];
+    const taken = { true: new Set(), false: new Set() };
+    const step = (hop, bundle, tie, isNear) => {
+      if (taken[isNear].has(tie)) return;
+      taken[isNear].add(tie);
+      steps.push({ hop, bundle, tie, near: isNear });
+    };
+    const met = new Map(this.#parts.all.map((part) => [part, new Set()]));
+    const meet = (bundle, part) => !met.get(part).has(bundle) && met.get(part).add(bundle);
+    let front = this.#parts.all.filter((part) => meet(start, part)).map((part) => [start, part]);
     for (let hop = 1; front.length; hop += 1) {
       const reached = new Set();
-      for (const bundle of front) {
-        const others = far.of.get(bundle);
-        for (const tie of near.of.get(bundle)) {
+      for (const [bundle, part] of front) {
+        const others = far.of.get(bundle).get(part) ?? [];
+        for (const tie of near.of.get(bundle).get(part) ?? []) {
           // What only the enclave itself sends, or receives, is no flow to it.
           if (hop === 1 && others.length && others.every((each) => each.enclave === tie.enclave)) continue;
           if (!hops.has(tie.enclave)) {
             hops.set(tie.enclave, hop);
             reached.add(tie.enclave);
           }
-          if (hops.get(tie.enclave) === hop) steps.push({ hop, bundle, tie, near: true });
+          if (hops.get(tie.enclave) === hop) step(hop, bundle, tie, true);
         }
       }
       front = [];
       for (const path of reached) {
         for (const { tie, bundle } of far.by.get(path)) {
-          if (met.has(bundle)) continue;
-          steps.push({ hop, bundle, tie, near: false });
-          front.push(bundle);
+          const parts = this.#partsOf(tie).filter((part) => !met.get(part).has(bundle));
+          if (!parts.length) continue;
+          step(hop, bundle, tie, false);
+          for (const part of parts) front.push([bundle, part]);
         }
       }
-      front = [...new Set(front)];
-      for (const bundle of front) met.add(bundle);
+      front = front.filter(([bundle, part]) => meet(bundle, part));
     }
     return { start, hops, steps };
   }
+}
+
+// The ROS domains of all enclaves, divided so that each enclave is in a part as a whole or not at
+// all.  An enclave whose domains are not known is in every part.
+function partsOfDomains(enclaves) {
+  const ranges = new Map(
+    enclaves.map(({ path, domains }) => [
+      path,
+      (domains || "").split(",").filter(Boolean).map((range) => {
+        const [first, last = first] = range.split("-").map(Number);
+        return [first, last];
+      }),
+    ]),
+  );
+  const edges = new Set([...ranges.values()].flat().flatMap(([first, last]) => [first, last + 1]));
+  const firsts = [...edges].sort((a, b) => a - b);
+  const all = firsts.length ? firsts.map((_, part) => part) : [0];
+  const of = new Map();
+  for (const [path, own] of ranges) {
+    const isIn = (part) => own.some(([first, last]) => first <= firsts[part] && firsts[part] <= last);
+    of.set(path, own.length ? all.filter(isIn) : all);
+  }
+  return { all, of };
 }
 
 // A table as it stands in the page: first the keys, then the values of each row.
