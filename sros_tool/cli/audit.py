@@ -103,6 +103,7 @@ def audit(
       $ sros audit robot.xml
       /talker publish topic /status (/talker): no rule allows publish rt/status
       1 right would be denied of 2 nodes with 47 endpoints, on Fast DDS 2.14
+      to allow what is denied, add --patch missing.xml to this command: ...
       $ sros audit robot.xml --watch 1h --patch missing.xml
       watching for 3600 s, or until Ctrl-C; then the result is shown
       denied: /talker publish topic /status (/talker): no rule allows ...
@@ -200,6 +201,8 @@ def audit(
         command = f"add it: sros merge_policy {policy} {shlex.quote(str(patch))} --in-place"
         by_hand = _added_by_hand(source, read_fleet(fleet_file), audited) if fleet_file else ""
         echo(f"{written}; {by_hand or command}", err=True)
+    elif patch is None and audited.missing.profiles:
+        echo(_TO_ALLOW, err=True)
     elif patch is not None:
         stays = f"; the earlier '{patch}' stays" if existed else ""
         said = "no patch is needed" if audited.allowed else _NO_PATCH
@@ -210,6 +213,10 @@ def audit(
 _NOT_ALL = (
     "the exit status is 1, because something was not seen or could not be decided: --watch finds "
     "nodes that start later, and --partial accepts this"
+)
+_TO_ALLOW = (
+    "to allow what is denied, add --patch missing.xml to this command: it writes missing rights "
+    "as a policy, and names the command that adds them"
 )
 _NO_PATCH = "no patch was written: no added right would allow what is denied"
 

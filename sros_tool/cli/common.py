@@ -437,7 +437,8 @@ def complete_keystore_and_enclave(
 
     from sros_tool.keystore.layout import is_keystore, search_enclaves
 
-    given = ctx.params.get("words") or ()
+    path = ctx.params.get("path")
+    given = ctx.params.get("words") or ((path,) if path else ())
     root = Path(given[0]) if given else Path(os.environ.get(KEYSTORE_VARIABLE, ""))
     if given or (os.environ.get(KEYSTORE_VARIABLE) and incomplete.startswith("/")):
         names = search_enclaves(root)[0] if is_keystore(root) else ()

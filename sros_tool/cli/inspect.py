@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sros_tool.cli.common import PATH, json_option, now, print_json, verb
+from sros_tool.cli.common import (
+    PATH,
+    complete_keystore_and_enclave,
+    json_option,
+    now,
+    print_json,
+    verb,
+)
 from sros_tool.terminal import echo
 from sros_tool.validity import iso
 from sros_tool.wording import counted
@@ -41,6 +48,7 @@ _INDENT = "  "
 
 @verb("inspect")
 @click.argument("path", type=PATH)
+@click.argument("enclave", required=False, shell_complete=complete_keystore_and_enclave)
 @click.option(
     "--ca",
     "authority",
@@ -54,8 +62,10 @@ _INDENT = "  "
     "their current state.",
 )
 @json_option
-def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) -> int:
-    """Show the contents of PATH.
+def inspect(
+    path: Path, enclave: str | None, authority: Path | None, history: bool, as_json: bool
+) -> int:
+    """Show the contents of PATH, or of an ENCLAVE of the keystore PATH.
 
     PATH is a keystore, an enclave's folder, a file of certificates, a revocation list, a private
     key, a Zenoh configuration or a signed document (.p7s). The exit status is 1 if an enclave
@@ -81,6 +91,10 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
 
     if not path.exists():
         raise DocumentError(f"'{path}' does not exist")
+    if enclave is not None:
+        if history:
+            raise UsageError("--history is for a whole keystore", "", f"Leave {enclave} out.")
+        path = _enclave_of(path, enclave)
     if history:
         return _show_history(path, as_json)
     described = describe(path, now=now(), authority=authority)
@@ -101,6 +115,18 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
     if signature and not signature.signed:  # documents in clear, such as governance.xml, exist
         return 1 if authority or path.suffix == ".p7s" else 0
     return 1 if signature and signature.signature_verified is False else 0
+
+
+def _enclave_of(root: Path, name: str) -> Path:
+    """Return the folder of an enclave of a keystore."""
+    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.selection import no_such_enclave
+
+    keystore = Keystore(root)
+    names = keystore.names
+    if name not in names:
+        raise no_such_enclave(keystore, name, names)
+    return keystore.folder(name)
 
 
 def _show_history(root: Path, as_json: bool) -> int:

@@ -39,10 +39,17 @@ def test_nothing_would_be_denied(program: Program) -> None:
     assert ended == Ended(0, "", summary)
 
 
+TO_ALLOW = (
+    "to allow what is denied, add --patch missing.xml to this command: it writes missing rights "
+    "as a policy, and names the command that adds them"
+)
+
+
 def test_something_would_be_denied_and_nothing_is_written(program: Program, tmp_path: Path) -> None:
     ended = program(graph(LOUD), "robot.xml", *SHORT)
     summary = "1 right would be denied of 1 node with 2 endpoints, on Fast DDS 2.14\n"
-    assert ended == Ended(1, DENIED, summary)
+    assert (ended.status, ended.out) == (1, DENIED)
+    assert ended.err == f"{summary}{TO_ALLOW}\n"
     assert [each.name for each in tmp_path.iterdir()] == ["robot.xml"]
 
 
@@ -224,7 +231,8 @@ def test_a_denial_by_a_rule_is_not_patched(program: Program, tmp_path: Path) -> 
 def test_a_watch_tells_each_denial_when_it_is_seen(program: Program) -> None:
     ended = program(graph(LOUD), "robot.xml", "--watch", "1s")
     assert (ended.status, ended.out) == (1, DENIED)
-    watching, denied, _ = ended.err.splitlines()
+    watching, denied, _, to_allow = ended.err.splitlines()
+    assert to_allow == TO_ALLOW
     assert watching == "watching for 1 s, or until Ctrl-C; then the result is shown"
     assert denied == f"denied: {DENIED.strip()}"
 

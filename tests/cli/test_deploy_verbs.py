@@ -175,6 +175,10 @@ def test_from_the_request_to_a_running_process(keystore: Path, tmp_path: Path) -
     assert NAME in sros("list_enclaves", keystore).ok().out
     assert sros("inspect", keystore, "--history").ok().out.count(NAME) == 3
     assert f"{NAME}  key on its robot, expires" in sros("inspect", keystore).ok().out
+    folder = sros("inspect", tmp_path / "robot" / FOLDER).ok().out
+    assert sros("inspect", tmp_path / "robot", NAME).ok().out == folder
+    missing = sros("inspect", keystore, f"{NAME}s")
+    assert missing.status == 2 and f"Perhaps you mean {NAME}." in missing.err
     ended = sros("distribute_key", keystore, NAME, tmp_path / "out")
     assert ended.status == 2
     assert "It was made on its robot and stays there" in ended.err
