@@ -35,7 +35,7 @@ from sros_tool.enclave_environment import loadable_environment
 from sros_tool.errors import DocumentError, SrosError, UnavailableError, UsageError
 from sros_tool.explain.audit import DeniedRight, audit, audited_enclaves
 from sros_tool.files import policies_dir, remove_file, replace_file
-from sros_tool.folders import make_folders
+from sros_tool.folders import Folder, make_folders
 from sros_tool.graph.learn import common_parts, is_tool, stable_name
 from sros_tool.graph.observation import (
     PUBLISH,
@@ -45,7 +45,13 @@ from sros_tool.graph.observation import (
     from_json,
     make_observation,
 )
-from sros_tool.keystore.layout import CLOSED_POLICY, CLOSED_PROCESSES, enclave_path, list_enclaves
+from sros_tool.keystore.layout import (
+    CLOSED_POLICY,
+    CLOSED_PROCESSES,
+    enclave_folder,
+    enclave_path,
+    list_enclaves,
+)
 from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.reader import FilesReadOnce, open_enclave
 from sros_tool.owners import other_writers, replaceable_on_the_way
@@ -295,6 +301,8 @@ class Closing(NamedTuple):
     """When the first enclave of the export expires, in UTC; null without an export."""
     denied: Sequence[str]
     """What the observed nodes do and the keystore denies them, as sentences."""
+    newly_denied: Sequence[str]
+    """The part of `denied` that the keystore did not deny before this command."""
     problems: Sequence[str]
     """Reasons why the robot is not closed yet, or not open again, with what to do."""
     proofs: Sequence[Proof]
@@ -594,6 +602,9 @@ class OpenRobot:
                 "A new keystore would have other CAs.",
                 "Bring it back to change the robot; --proof and --undo need only the export.",
             )
+        denied_before: Sequence[str] = ()
+        with suppress(SrosError):  # the steps say what is wrong
+            denied_before = self._denied() if self.export.exists() and self.seen.exists() else ()
         steps, problems, is_stopped = [], [], False
         for step in self.steps(duration):
             state = "kept" if step.made and step.made.exists() else "open"
@@ -609,10 +620,13 @@ class OpenRobot:
             return closing._replace(problems=problems)
         if self.observed and len(closing.observed.processes) > len(self.observed.processes):
             self._write_processes(closing.observed)
-        changes = self._write_starts(closing.observed)
-        denied = [str(right) for right in self._denied()]
+        changes = [*self._write_starts(closing.observed), *self._remove_left_enclaves()]
+        denied = self._denied()
+        newly = [right for right in denied if right not in denied_before]
         problems += self._problems(closing.observed, partial=partial)
-        return closing._replace(denied=denied, problems=problems, changes=changes)
+        return closing._replace(
+            denied=denied, newly_denied=newly, problems=problems, changes=changes
+        )
 
     def _closing(self) -> Closing:
         """Return the processes of the enclaves that the policy has, as they run now."""
@@ -631,7 +645,7 @@ class OpenRobot:
         new -= {_OBSERVER} if self.observed else new
         until = self._valid_until()
         started = observed, (), secured, sorted(new), until
-        return Closing(self.folder, *started, (), (), (), False, ())
+        return Closing(self.folder, *started, (), (), (), (), False, ())
 
     def _with_later(
         self, observed: ObservedProcesses, running: RunningProcesses
@@ -814,7 +828,27 @@ class OpenRobot:
         files |= {COMMANDS: _text(lines), _SERVICES: _text(services)}
         changes = unit_changes(self.start, files, force=True)
         write_units(self.start, files, changes)
-        return [FileChange(action, str(self.start / path)) for path, action in changes.items()]
+        written = [FileChange(action, str(self.start / path)) for path, action in changes.items()]
+        left = [path for path in self.start.glob("*.env") if path.name not in files]
+        for path in left:
+            remove_file(path)
+        return [*written, *(FileChange("remove", str(path)) for path in left)]
+
+    def _remove_left_enclaves(self) -> list[FileChange]:
+        """Remove from the export the enclaves that keystore and policy do not have any more."""
+        left = {*list_enclaves(self.export)} - {*list_enclaves(self.keystore)}
+        with Folder(self.export) as export:
+            for inside in map(enclave_folder, left):
+                for entry in (f"{inside}/{name}" for name in export.names(inside)):
+                    if not stat.S_ISDIR(export.mode(entry)):
+                        export.unlink(entry)
+            for name in sorted(left, reverse=True):  # inner ones first
+                if not export.names(enclave_folder(name)):
+                    export.rmdir(enclave_folder(name))
+        paths = [enclave_path(self.export, name) for name in sorted(left)]
+        for path in paths:
+            self._shell.say(f"removed {path}: its enclave is not in the keystore any more")
+        return [FileChange("remove", str(path)) for path in paths]
 
     def _mark(self) -> str:
         """Return the first line of each drop-in that is made for this folder."""
@@ -825,7 +859,11 @@ class OpenRobot:
         """The keystore, or the policy if the keystore was brought to another machine."""
         return self.keystore if self.keystore.exists() else self.policy
 
-    def _denied(self) -> Sequence[DeniedRight]:
+    def _denied(self) -> list[str]:
+        """Return what the keystore denies to the nodes as they were observed, as sentences."""
+        return [str(right) for right in self._denied_rights()]
+
+    def _denied_rights(self) -> Sequence[DeniedRight]:
         """Return what the keystore denies to the nodes as they were observed."""
         context = JoinContext(self.domain, self._shell.now(), self._shell.zone)
         vendor = chosen_vendor(None, None, self._shell.environment)[0]
@@ -838,13 +876,7 @@ class OpenRobot:
         for name in list_enclaves(self.keystore):
             if name not in (_OBSERVER, _ROUTER) and not policy.enclave(name):
                 revoke = f"sros revoke {shlex.quote(str(self.keystore))} {name}"
-                remove = f"rm -r {shlex.quote(str(enclave_path(self.export, name)))}"
-                yield (
-                    f"the policy does not have {name}, and the keystore does: {revoke} && {remove}"
-                )
-        for name in sorted({*list_enclaves(self.export)} - {*list_enclaves(self.keystore)}):
-            remove = f"rm -r {shlex.quote(str(enclave_path(self.export, name)))}"
-            yield f"the export has {name}, and the keystore does not: {remove}"
+                yield f"the policy does not have {name}, and the keystore does: {revoke}"
         owner, export = self.export.stat().st_uid, self.export.absolute()
         users = sorted({process.user for process in observed.processes})
         for user in users:
@@ -1088,7 +1120,7 @@ class OpenRobot:
 
         Processes of the enclaves ``missing`` do not run.
         """
-        claim, denied = "everything that talked still talks", self._denied()
+        claim, denied = "everything that talked still talks", self._denied_rights()
         words = ("audit", str(self._rights), "--keystore", str(self.export), "--enclave", _OBSERVER)
         step = _Step(
             (*words, "--domain", str(self.domain), "--json", *["--partial"] * bool(missing))

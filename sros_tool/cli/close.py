@@ -26,7 +26,7 @@ from sros_tool.cli.common import (
 from sros_tool.errors import UsageError
 from sros_tool.terminal import echo
 from sros_tool.validity import iso
-from sros_tool.wording import enumerated
+from sros_tool.wording import counted, enumerated
 
 if TYPE_CHECKING:
     from sros_tool.closing import ClosedProcess, Closing, OpenRobot
@@ -163,10 +163,13 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
     export = shlex.quote(str(robot.export.absolute()))
     for name in closed.new:
         echo(f"  {name}: new, start it by: sros run {export} {name} -- COMMAND")
-    for right in closed.denied:
+    for right in closed.newly_denied:
         echo(f"used when sros watched, and denied now: {right}")
-    if closed.denied:
+    if closed.newly_denied:
         echo("  if this is not meant, change the policy; if it is, the node may end when it starts")
+    if stays := len(closed.denied) - len(closed.newly_denied):
+        rights = counted(stays, "right")
+        echo(f"{rights} used when sros watched: denied as before (--json has all)")
 
 
 def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) -> None:
