@@ -24,8 +24,8 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
     """Measure ``sros explain --who`` and ``--reach``, and the proof of permissions to sign."""
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.dds.domains import DomainSet
+    from sros_tool.explain.answer import ask
     from sros_tool.explain.asking import AskingContext
-    from sros_tool.explain.question import ask
     from sros_tool.explain.vendors import VendorOfKeystore
     from sros_tool.keystore.issuing.proof import prove
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts

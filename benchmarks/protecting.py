@@ -26,10 +26,8 @@ from benchmarks.ping_pong import ENDS, TOPICS
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.forger import encrypted, signed, unprotected
-from sros_tool.demo.program import find_backend
-from sros_tool.demo.runner import base_environment
-from sros_tool.demo.scenarios.model import Role
-from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC
+from sros_tool.demo.program import base_environment, find_backend
+from sros_tool.demo.scenarios.model import DEFAULT_TOPIC, Role
 from sros_tool.errors import SrosError
 from sros_tool.files import policies_dir
 from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts

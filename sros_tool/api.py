@@ -521,10 +521,9 @@ def explain_access(
         (True, 'rule 1 allows publish rt/chatter by rt/chatter')
     """
     from sros_tool.dds.decision.vendors import Vendor
-    from sros_tool.explain.answer import Evaluator
+    from sros_tool.explain.answer import Evaluator, ask
     from sros_tool.explain.asking import AskedEnclave, AskingContext, meant, signed_enclave
     from sros_tool.explain.explanation import explain
-    from sros_tool.explain.question import ask
     from sros_tool.keystore.reader import Keystore as OpenedOnce
 
     question = ask(action, name, kind)

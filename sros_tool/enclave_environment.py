@@ -240,8 +240,7 @@ def _check_dates_here(name: str, keystore: Keystore, vendor: Vendor, context: Jo
 
     Fast DDS reads their dates, which are in UTC, as local time.
     """
-    from sros_tool.explain.answer import Evaluator
-    from sros_tool.explain.question import ask
+    from sros_tool.explain.answer import Evaluator, ask
     from sros_tool.keystore.participant import load_enclave_of
 
     if not context.zone.utcoffset(context.at.replace(tzinfo=None)):

@@ -142,10 +142,10 @@ def test_nothing_imports_from_above_or_beside() -> None:
         ),
         (
             "def late():\n    import sros_tool.cli.program",
-            "demo/runner.py",
+            "demo/program.py",
             ["sros_tool.cli.program"],
         ),
-        ("from ..cli import program", "demo/runner.py", ["sros_tool.cli.program"]),
+        ("from ..cli import program", "demo/program.py", ["sros_tool.cli.program"]),
         ("from sros_tool import dds", "policy/model.py", ["sros_tool.dds"]),
         ("from sros_tool.pki import keys", "errors.py", ["sros_tool.pki.keys"]),
         ("import rclpy", "runtime/rmw.py", ["rclpy"]),

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import http.client
 import os
+import ssl
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -16,19 +18,13 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import quote, urlsplit
 
 from cryptography.hazmat.primitives.serialization import Encoding
 
+from sros_tool.agent.connection import GuardedConnection
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
-from sros_tool.agent.inbox import send
 from sros_tool.agent.install import Installation, install_release, made_at, newest_list
-from sros_tool.agent.renewal import (
-    Renewals,
-    drop_installed_keys,
-    enclave_key,
-    renewals,
-    waiting_keys,
-)
 from sros_tool.agent.running import (
     EnclaveProcesses,
     Systemd,
@@ -39,13 +35,15 @@ from sros_tool.agent.running import (
 )
 from sros_tool.agent.settings import AgentSettings, agent_folder
 from sros_tool.agent.state import read_seal, read_state, write_seal, write_state
-from sros_tool.errors import SrosError
-from sros_tool.files import remove_file, replace_file
+from sros_tool.errors import SrosError, UnavailableError
+from sros_tool.files import remove_file, replace_file, staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     LONGEST_LIST,
     LONGEST_PROBLEM,
+    MESSAGE_FILE,
     MOST_PROBLEMS,
+    MOST_REQUESTS,
     Confirmation,
     EnclaveExpiry,
     RobotClock,
@@ -55,11 +53,13 @@ from sros_tool.keystore.confirmation import (
 )
 from sros_tool.keystore.delivery.archive import listed_digests
 from sros_tool.keystore.delivery.release import Release, sealed_robot
+from sros_tool.keystore.issuing.tokens import place_in
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
     IDENTITY_CA_FILE,
     KEY_FILE,
+    KEY_URI_FILE,
     ROUTER_FILE,
     enclave_folder,
     enclave_path,
@@ -69,9 +69,10 @@ from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, open_enclave, read_certificate
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import validity_of
+from sros_tool.pki.certificates import make_request, validity_of
 from sros_tool.pki.crl import list_number, load_crl
-from sros_tool.pki.token import Secrets
+from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
+from sros_tool.pki.token import Secrets, open_enclave_key
 from sros_tool.runtime.processes import RunningProcesses, boot_id
 from sros_tool.validity import elapsed, iso, time_of_file
 from sros_tool.xml import read_bytes
@@ -305,7 +306,7 @@ class _Round:
             )
             return Installation()
         names = tuple({*release.enclaves(), *search_enclaves(self._folder)[0]})
-        keys = waiting_keys(self._folder, names)
+        keys = _waiting_keys(self._folder, names)
         replaced = self._revocation_list(names)
 
         def before(ran: Sequence[str]) -> None:
@@ -347,7 +348,7 @@ class _Round:
         self._save()
         self._is_in_step = not installation.kept
         self._drop_replaced_list(names)
-        drop_installed_keys(self._folder, keys)
+        _drop_installed_keys(self._folder, keys)
         return installation
 
     def _certain_with(self, release: Release, certain: datetime) -> datetime:
@@ -445,7 +446,7 @@ class _Round:
         )
 
     def _renewals(self, names: Iterable[str]) -> Renewals:
-        asked = renewals(
+        asked = _renewals(
             self._folder,
             names,
             now=self._machine.now,
@@ -574,7 +575,7 @@ class _Round:
         refused: list[str] = []
         for name, certificate in order:
             try:
-                key = enclave_key(self._folder, name, self._machine.secrets)
+                key = _enclave_key(self._folder, name, self._machine.secrets)
                 if key.public_key() == certificate.public_key():
                     return smime.sign(render_confirmation(confirmation), certificate, key)
             except (SrosError, OSError) as error:
@@ -643,3 +644,188 @@ def _sentence(error: SrosError) -> str:
     text = str(error)
     begun = text if text.startswith("http") else text[:1].upper() + text[1:]
     return begun + ("" if text.endswith(".") else ".")
+
+
+def send(
+    inbox: str,
+    robot: str,
+    message: bytes,
+    *,
+    client_certificate: ClientCertificate | None = None,
+    tls_ca: Path | None = None,
+) -> None:
+    """Put a message into the inbox, in place of the robot's last one.
+
+    Args:
+        inbox: ``https://…``, ``http://…``, or the path of a folder.
+        robot: the name of this robot.
+        message: the signed message.
+        client_certificate: certificate and key for TLS.
+        tls_ca: CA certificates (PEM) of the server; None: those of the system.
+
+    Raises:
+        UnavailableError: the inbox cannot be reached, or does not take the message.
+    """
+    if not inbox.startswith(("https://", "http://")):
+        _write_message(Path(inbox), robot, message)
+        return
+    what = f"the inbox {inbox} does not take the message"
+    try:
+        url = urlsplit(inbox)
+        where = f"{url.path.rstrip('/')}/{quote(robot)}/{MESSAGE_FILE}"
+        context = None
+        if url.scheme == "https":
+            context = ssl.create_default_context(cafile=str(tls_ca) if tls_ca else None)
+            if client_certificate:
+                context.load_cert_chain(client_certificate.certificate, client_certificate.key)
+        port = url.port or (443 if context else 80)
+        with GuardedConnection(url.hostname or "", port, context) as connection:
+            headers = {"Content-Type": "application/pkcs7-mime", "User-Agent": "sros"}
+            connection.request("PUT", where, message, headers)
+            reply = connection.getresponse()
+            if connection.is_cut_off:  # what came may be a part of the answer
+                raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
+    except (OSError, http.client.HTTPException, ValueError) as error:
+        raise UnavailableError(
+            what, f"{error}.", ("The agent tries again at its next run.")
+        ) from error
+    if not 200 <= reply.status < 300:
+        raise UnavailableError(
+            what, f"It answers {reply.status} to PUT {where}.", "See the log of the server."
+        )
+
+
+def _write_message(inbox: Path, robot: str, message: bytes) -> None:
+    try:
+        with Folder(inbox) as folder:
+            if not folder.is_folder(robot):
+                folder.mkdir(robot, 0o755)
+        with staged_file(inbox / robot / MESSAGE_FILE, message, mode=0o644) as put_in_place:
+            put_in_place()
+    except OSError as error:
+        raise UnavailableError(
+            f"the message cannot be written into '{inbox}'",
+            f"{error.strerror or error}.",
+            "The agent tries again at its next run.",
+        ) from error
+
+
+_NEW_KEYS = "new-keys"
+
+
+def _is_due(file: Path, now: datetime) -> bool:
+    """Return whether at most a third of the life of the certificate in ``file`` is left.
+
+    A file that does not change is never written again, so that its time tells how long the
+    certificate has been here.
+
+    Raises:
+        SrosError: it cannot be read.
+    """
+    validity = validity_of(read_certificate(file))
+    here_since = time_of_file(file.stat().st_mtime)
+    return now >= validity.not_after - validity.life(here_since) / 3
+
+
+def _enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
+    """Return the private key of an enclave on this robot, from its file or its token.
+
+    Raises:
+        SrosError: there is none, or it cannot be used.
+    """
+    place = enclave_path(folder, name)
+    if (place / KEY_FILE).exists():
+        return load_key(read_bytes(place / KEY_FILE, "private key"), f"of enclave {name}")
+    return open_enclave_key(place_in(place / KEY_URI_FILE), secrets)
+
+
+class Renewals(NamedTuple):
+    """The signing requests (PEM) for a message, and who has to sign it.
+
+    Only the enclave itself can vouch for its new key, with its present one.  So of the enclaves
+    that ask with a new key, a message has the request of one, ``signer``; every hour it is another.
+    """
+
+    requests: tuple[str, ...]
+    signer: str | None
+    problems: tuple[str, ...]
+    """Sentences on enclaves without a request."""
+
+
+def _renewals(
+    folder: Path, names: Iterable[str], *, now: datetime, new_key: bool, secrets: Secrets
+) -> Renewals:
+    """Return requests for the enclaves ``names`` whose certificates expire.
+
+    With ``new_key``, they are for new keys, which wait next to the present ones until their
+    certificates are installed; a key on a token stays.  ``secrets`` is asked for the PIN of a
+    token.
+    """
+    requests: list[str] = []
+    problems: list[str] = []
+    with_new_keys: list[str] = []
+    for name in names:
+        place = enclave_path(folder, name)
+        try:
+            if not _is_due(place / CERTIFICATE_FILE, now) or len(requests) == MOST_REQUESTS - 1:
+                continue
+            if new_key and (place / KEY_FILE).exists():
+                with_new_keys.append(name)
+                continue
+            requests.append(make_request(_enclave_key(folder, name, secrets), name).decode())
+        except (SrosError, OSError) as error:
+            problems.append(f"{name} cannot be renewed: {error}")
+    signer = None
+    if with_new_keys:
+        signer = with_new_keys[int(now.timestamp()) // 3600 % len(with_new_keys)]
+        try:
+            requests.append(make_request(_waiting_key(folder, signer), signer).decode())
+        except (SrosError, OSError) as error:
+            problems.append(f"{signer} cannot be renewed: {error}")
+    return Renewals(tuple(requests), signer, tuple(problems))
+
+
+def _key_file(name: str) -> str:
+    """Return the path, in the agent's folder, of the new key of an enclave."""
+    return f"{_NEW_KEYS}/{hashlib.sha256(name.encode()).hexdigest()[:32]}.pem"
+
+
+def _waiting_key(folder: Path, name: str) -> PrivateKey:
+    """Return the new key of an enclave that waits for its certificate, made if there is none.
+
+    Raises:
+        SrosError: the key cannot be read.
+        OSError: the key cannot be written.
+    """
+    own = agent_folder(folder)
+    path = own / _key_file(name)
+    if os.path.lexists(path):
+        return load_key(read_bytes(path, "private key"), f"of enclave {name}")
+    with Folder(own) as opened:
+        if not opened.is_folder(_NEW_KEYS):
+            opened.mkdir(_NEW_KEYS, 0o700)
+    key = generate_key()
+    with staged_file(path, key_pem(key)) as put_in_place:
+        put_in_place()
+    return key
+
+
+def _waiting_keys(folder: Path, names: Iterable[str]) -> dict[str, PrivateKey]:
+    """Return the new keys that wait for their certificates, by enclave."""
+    keys = {}
+    for name in names:
+        path = agent_folder(folder) / _key_file(name)
+        if os.path.lexists(path):
+            with suppress(SrosError):
+                keys[name] = load_key(read_bytes(path, "private key"), f"of enclave {name}")
+    return keys
+
+
+def _drop_installed_keys(folder: Path, keys: Mapping[str, PrivateKey]) -> None:
+    """Remove the new keys that are installed."""
+    for name, key in keys.items():
+        with suppress(SrosError, OSError):
+            path = enclave_path(folder, name) / KEY_FILE
+            present = load_key(read_bytes(path, "private key"), f"of enclave {name}")
+            if present.public_key() == key.public_key():
+                remove_file(agent_folder(folder) / _key_file(name))

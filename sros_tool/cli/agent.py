@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from sros_tool.agent.agent import Round
     from sros_tool.agent.settings import AgentSettings, Unit
-    from sros_tool.agent.status import AgentStatus
+    from sros_tool.agent.state import AgentStatus
 
 _INTERVAL = "5m"
 _MOST_ROOT = 512 * 1024
@@ -151,8 +151,7 @@ def _init(
         settings_from,
         write_settings,
     )
-    from sros_tool.agent.state import read_state, write_state
-    from sros_tool.agent.status import InitializedAgent
+    from sros_tool.agent.state import InitializedAgent, read_state, write_state
     from sros_tool.files import parse_toml
     from sros_tool.keystore.delivery.robot import read_pin
 
@@ -340,7 +339,7 @@ def _status(folder: Path, max_age: str, as_json: bool) -> int:
 
     The exit status is 0 if nothing is wrong or due, and 1 if something is.
     """
-    from sros_tool.agent.status import agent_status
+    from sros_tool.agent.state import agent_status
     from sros_tool.validity import parse_duration
 
     oldest = parse_duration(max_age)

@@ -363,9 +363,8 @@ def _requirements(
     """
     if not files:
         return None
-    from sros_tool.proof.dropped import dropped_findings
     from sros_tool.proof.findings import requirement_findings
-    from sros_tool.proof.requirements import read_all_requirements
+    from sros_tool.proof.requirements import dropped_findings, read_all_requirements
 
     read = read_all_requirements(files)
     path = _one_path(family, paths, "--requirements") if read else None
@@ -956,8 +955,8 @@ def metrics(
     The exit status is 0 even if there are findings. The exit status is 2 if the keystore cannot be
     examined; then FILE does not change, so alert also on an old sros_examined_timestamp_seconds.
     """
+    from sros_tool.checks.formats import keystore_metrics
     from sros_tool.checks.keystores.keystore import keystore_findings
-    from sros_tool.checks.keystores.metrics import keystore_metrics
     from sros_tool.keystore.reader import Keystore
     from sros_tool.prometheus import KeystoreMetrics, render_metrics
 

@@ -230,8 +230,7 @@ def demo(
 def _run_by_hand(ctx: click.Context, role: str, backend: str, topic: str | None) -> NoReturn:
     """Run a node until it is stopped, and end with its exit status."""
     from sros_tool.demo.backend import HandNode, run_by_hand
-    from sros_tool.demo.scenarios.model import Role
-    from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC, check_topic
+    from sros_tool.demo.scenarios.model import DEFAULT_TOPIC, Role, check_topic
 
     for parameter in ctx.command.params:
         chosen = ctx.get_parameter_source(parameter.name or "")

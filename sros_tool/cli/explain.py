@@ -45,10 +45,9 @@ if TYPE_CHECKING:
 
     from sros_tool.dds.domains import DomainSet
     from sros_tool.distributions import Distribution
-    from sros_tool.explain.answer import Answer
+    from sros_tool.explain.answer import Answer, Question
     from sros_tool.explain.asking import AskedEnclave, AskingContext
     from sros_tool.explain.log import LogFinding
-    from sros_tool.explain.question import Question
     from sros_tool.explain.vendors import Comparison, DdsExplanation, ZenohBeside
     from sros_tool.explain.who import Decider, Everybody, FollowedReach
     from sros_tool.explain.zenoh import CheckedLink, ZenohAnswer, ZenohExplanation
@@ -418,7 +417,7 @@ def _policy_alone(root: Path | None, asked: AskedEnclave, policy: Path | None) -
 
 def _question(root: Path | None, rest: tuple[str, ...], kind: str | None) -> Question:
     """Return the question in the words after the keystore: enclave, operation and name."""
-    from sros_tool.explain.question import ask
+    from sros_tool.explain.answer import ask
 
     if not 2 <= len(rest) <= 3:
         remedy = "Write for example `sros explain /talker publish /chatter`."
@@ -700,7 +699,7 @@ def _show_who(
 
     ``chosen`` is the vendor that decides, None for Zenoh; ``only`` are --match and --robot.
     """
-    from sros_tool.explain.question import ask
+    from sros_tool.explain.answer import ask
     from sros_tool.explain.who import ask_everybody, callable_action, names_meant
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.reader import Keystore

@@ -30,7 +30,10 @@ from sros_tool.demo.scenarios.attacks import (
     revoked_joining,
 )
 from sros_tool.demo.scenarios.model import (
+    DEFAULT_TOPIC,
+    DENIED_TOPIC,
     OWN,
+    SERVICE,
     STATUS_OF,
     Party,
     Role,
@@ -38,7 +41,6 @@ from sros_tool.demo.scenarios.model import (
     RowStatus,
     Scenario,
 )
-from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC, DENIED_TOPIC, SERVICE
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.issuing.keyring import Keyring

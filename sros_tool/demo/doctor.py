@@ -32,7 +32,7 @@ from sros_tool import __version__
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
 from sros_tool.demo.scenarios.communication import ISOLATION
-from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC
+from sros_tool.demo.scenarios.model import DEFAULT_TOPIC
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
 from sros_tool.runtime.processes import MappedLibrary

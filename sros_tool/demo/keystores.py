@@ -23,6 +23,7 @@ from sros_tool.demo.forger import (
     name_of,
 )
 from sros_tool.demo.scenarios.model import (
+    DENIED_TOPIC,
     FOREIGN,
     OWN,
     Identity,
@@ -32,7 +33,6 @@ from sros_tool.demo.scenarios.model import (
     Scenario,
     SoundKeystore,
 )
-from sros_tool.demo.scenarios.policies import DENIED_TOPIC
 from sros_tool.demo.scenarios.zenoh_forger import start_network, zenoh_variables
 from sros_tool.errors import SrosError
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE

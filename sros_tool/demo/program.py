@@ -1,22 +1,35 @@
-"""Run the whole demo: check options, make keystores, choose a backend, run scenarios."""
+"""Run the whole demo: check options, make keystores, choose a backend, run the rows of scenarios.
+
+A row's window starts when all its processes are ready, also on a busy machine.  It has the same
+length for expected silence and expected messages; only a brief row that expects no silence ends
+early.  No process outlives the process that started it.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
+import logging
+import math
+import os
+import shlex
 import shutil
 import signal
 import socket
+import subprocess
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+import uuid
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
+from typing import NamedTuple
 
 from sros_tool.dds.advisories import Advisory
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
@@ -30,22 +43,58 @@ from sros_tool.demo.backend import (
     zenoh_backend,
 )
 from sros_tool.demo.casting import CastMember, UserKeystore, open_user_keystore
-from sros_tool.demo.keystores import KeystoreSpec, create_keystores
+from sros_tool.demo.keystores import KeystoreSet, KeystoreSpec, create_keystores
 from sros_tool.demo.result import (
     DemoResult,
     KeystoreSummary,
+    PartyRecord,
+    RowRecord,
     RowResult,
     ScenarioResult,
+    judge_row,
     used_libraries,
 )
-from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios.communication import ISOLATION
-from sros_tool.demo.scenarios.model import Row, Scenario, joined
-from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC, check_topic
+from sros_tool.demo.scenarios.model import (
+    CALLING,
+    DEFAULT_TOPIC,
+    DENIALS,
+    SPEAKING,
+    Claim,
+    Party,
+    Relation,
+    Role,
+    Row,
+    RowStatus,
+    Scenario,
+    Wire,
+    check_topic,
+    joined,
+    together,
+)
+from sros_tool.demo.wire import (
+    Injection,
+    Wiretap,
+    bound_ports,
+    mapped_segments,
+    shared_memory,
+    with_changed_bit,
+)
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.names import dds_names
-from sros_tool.runtime.netns import Isolation, Progress, run_isolated, try_isolation
+from sros_tool.runtime.events import Event, EventKind, EventReader
+from sros_tool.runtime.netns import (
+    ENDING_SIGNALS,
+    Isolation,
+    Progress,
+    RowNetwork,
+    end_with_starter,
+    run_isolated,
+    try_isolation,
+)
+from sros_tool.runtime.processes import MappedLibrary, dds_of
+from sros_tool.runtime.vendor_log import plain_text
 from sros_tool.values import versioned
 
 _DEFAULT_DOMAIN = 80
@@ -61,6 +110,21 @@ _ZENOH_WINDOW = 2.0
 
 _HOST = "host"
 """Value of --network that stands for the network of this machine."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Time limits in seconds: for the start, for the window of a row, and for all rows.
+
+    ``wave`` is for one group of parallel rows, so that many rows get more time than ``total``.  All
+    limits except ``window`` exist only to detect hanging processes, also on slow machines.
+    """
+
+    start: float = 60.0
+    window: float = 5.0
+    longest_window: float = 30.0
+    total: float = 180.0
+    wave: float = 90.0
 
 
 @dataclass(frozen=True)
@@ -396,3 +460,574 @@ def _isolation(network: str) -> Isolation:
     if network == _HOST:
         return Isolation(False, "--network host was given")
     return try_isolation()
+
+
+_LOG = logging.getLogger(__name__)
+
+_TICK = 0.05
+"""Seconds between two reads of the processes' reports."""
+
+_GRACE = 0.3
+"""Seconds in which messages on the wire may still arrive after a window closes."""
+
+
+class _Patience(NamedTuple):
+    """Time limits in seconds, which are longer when an undecided row is tried again.
+
+    ``lifetime`` is the lifetime of a short-lived certificate.  A process that should be refused
+    tries to connect for ``connect`` seconds.
+    """
+
+    lifetime: int
+    connect: float
+
+
+_PATIENCE = (_Patience(8, 2.0), _Patience(20, 8.0), _Patience(60, 30.0))
+
+_AFTER_EXPIRY = 2.0
+"""Seconds that a row continues after a certificate's expiry."""
+
+_ENOUGH_MESSAGES = 3
+_AFTER_ENOUGH = 2.0
+_SHORTEST_BRIEF = 1.0
+_SECONDS_TO_END = 2.0
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """The rows to run, and the settings to run them with.
+
+    ``domains`` has one domain per row; ``topic`` is absolute; ``period`` is in seconds.  With
+    ``own_networks``, each row gets a separate network namespace.
+    """
+
+    rows: tuple[Row, ...]
+    domains: tuple[int, ...]
+    backend: Backend
+    keystores: KeystoreSet
+    topic: str
+    folder: Path
+    limits: Limits = field(default_factory=Limits)
+    period: float = 0.1
+    own_networks: bool = False
+    started: float = field(default_factory=time.monotonic)
+
+    @property
+    def rows_at_once(self) -> int:
+        """The number of groups of rows to run in parallel; rows of a group share processes."""
+        # Routers of one machine listen at the same port.
+        return 1 if self.backend.on_zenoh and not self.own_networks else self.backend.rows_at_once
+
+
+def run_rows(plan: RunPlan, progress: Progress) -> list[RowResult]:
+    """Run the rows of a plan; return their results in order."""
+    return asyncio.run(_Runner(plan, progress).run())
+
+
+class _Runner:
+    """A runner of a plan's rows, as many in parallel as the backend allows."""
+
+    def __init__(self, plan: RunPlan, progress: Progress) -> None:
+        self._plan = plan
+        self._progress = progress
+        self._mark = uuid.uuid4().hex[:8]
+        self._slots = asyncio.Semaphore(plan.rows_at_once)
+        self._end = 0.0
+        self._finished = 0
+
+    async def run(self) -> list[RowResult]:
+        plan = self._plan
+        groups = worlds(plan.rows)
+        waves = math.ceil(len(groups) / plan.rows_at_once)
+        self._end = time.monotonic() + max(plan.limits.total, waves * plan.limits.wave)
+        loop, task = asyncio.get_running_loop(), asyncio.current_task()
+        assert task is not None
+        for number in ENDING_SIGNALS:
+            loop.add_signal_handler(number, task.cancel)
+        results: dict[int, RowResult] = {}
+        for played in await asyncio.gather(*map(self._run, groups)):
+            results |= played
+        return [results[index] for index in range(len(plan.rows))]
+
+    def _text(self, index: int, party: Party) -> str:
+        """Return a talker's text, unique among all rows."""
+        return f"Hello World from the {party.name} {self._mark}-{index}"
+
+    async def _run(self, group: Sequence[int]) -> dict[int, RowResult]:
+        """Run rows that share their processes; return their results by index."""
+        rows, domain = [self._plan.rows[index] for index in group], self._plan.domains[group[0]]
+        skipped = {row.name: why for row in rows if (why := self._why_skipped(row))}
+        inapplicable = {row.name for row in rows if self._plan.keystores.inapplicable(row)}
+        tried = [row for row in rows if row.name not in skipped]
+        played = RowRecord(rows[0], domain)
+        if tried:
+            async with self._slots:
+                for patience in _PATIENCE if self._plan.backend.on_zenoh else _PATIENCE[:1]:
+                    played = await self._play(group[0], together(tried), patience)
+                    observed = (judge_row(replace(played, row=row)).observed for row in tried)
+                    if RowStatus.UNDECIDED not in observed:
+                        break
+        results = {}
+        for index, row in zip(group, rows, strict=True):
+            record = replace(
+                played,
+                row=row,
+                skipped=skipped.get(row.name, played.skipped),
+                applies=row.name not in inapplicable,
+            )
+            result = results[index] = judge_row(record)
+            self._finished += 1
+            self._progress(
+                f"[{self._finished}/{len(self._plan.rows)}] {row.name}: {result.observed}"
+            )
+        return results
+
+    def _why_skipped(self, row: Row) -> str:
+        if why := self._plan.keystores.inapplicable(row):
+            return why
+        handshake = any(claim.wire in (Wire.TOPIC, Wire.CERTIFICATE) for claim in row.claims)
+        if (handshake or row.replay or row.impersonate) and not self._plan.own_networks:
+            return "the row needs a separate network namespace"
+        return self._plan.keystores.problem(row)
+
+    async def _play(self, index: int, row: Row, patience: _Patience) -> RowRecord:
+        plan, domain = self._plan, self._plan.domains[index]
+        folder = plan.folder / f"row_{index + 1:02}"
+        shutil.rmtree(folder, ignore_errors=True)  # of an attempt with less patience
+        folder.mkdir(parents=True)
+        expiry = None
+        if row.short_lived:
+            identity, lifetime = row.talking.identity, patience.lifetime
+            seconds = plan.keystores.shorten(identity, lifetime, self._elapsed())
+            expiry = time.monotonic() + seconds
+        processes: dict[str, _PartyProcess] = {}
+        tap: Wiretap | None = None
+        segments: frozenset[Path] = frozenset()
+        memory: Mapping[str, int] = {}
+        network = RowNetwork(own=self._plan.own_networks)
+        try:
+            with network.entered():
+                if row.tapped:
+                    tap = self._listen_in(index, row)
+                    if tap.problem:
+                        return RowRecord(row, domain, skipped=tap.problem)
+            for turn in sorted({party.turn for party in row.parties}):
+                await self._settled(processes.values())
+                with network.entered():
+                    for party in row.parties:
+                        if party.turn == turn:
+                            started = self._start(index, row, party, folder, patience)
+                            processes[party.name] = started
+            window = await self._watch(row, processes, expiry)
+            libraries = frozenset[MappedLibrary]().union(
+                *(process.dds() for process in processes.values())
+            )
+            if _in_memory(row):
+                texts = {name: process.text for name, process in processes.items()}
+                segments = frozenset().union(
+                    *(process.segments() for process in processes.values())
+                )
+                memory = shared_memory(texts, segments)
+            ports = frozenset[int]().union(*(process.ports() for process in processes.values()))
+            wire = tap.count(ports) if tap and row.wire else {}
+            injected = None
+            if tap and row.replay and window:
+                secured = row.party(row.replay).identity.keystore is not None
+                lease = plan.backend.seconds_until_forgotten if secured else 0.0
+                injected = await _replay_packets(processes[row.replay], tap, lease)
+            if tap and row.impersonate and window:
+                injected = await _forge_packets(processes[row.impersonate], tap)
+        finally:
+            try:
+                await _end_softly(processes.values())
+            finally:
+                for process in processes.values():
+                    process.end()
+                for path in segments:  # processes of Zenoh leave them
+                    path.unlink(missing_ok=True)
+                if tap is not None:
+                    tap.close()
+                network.close()
+        records = {name: process.record() for name, process in processes.items()}
+        return RowRecord(
+            row, domain, records, window, wire, injected, expiry, memory, libraries=libraries
+        )
+
+    def _elapsed(self) -> float:
+        """Return the seconds since the plan was made."""
+        return time.monotonic() - self._plan.started
+
+    async def _settled(self, processes: Collection[_PartyProcess]) -> bool:
+        """Wait until all processes are settled; return False if that takes too long."""
+        deadline = min(time.monotonic() + self._plan.limits.start, self._end)
+        while not all(process.settled for process in processes):
+            if time.monotonic() > deadline:
+                return False
+            await asyncio.sleep(_TICK)
+        return True
+
+    def _listen_in(self, index: int, row: Row) -> Wiretap:
+        texts = {party.name: self._text(index, party) for party in row.parties}
+        topic = self._plan.backend.wire_name(self._plan.topic, self._plan.domains[index])
+        return Wiretap(texts, topic, replayed=bool(row.replay or row.impersonate))
+
+    def _start(
+        self, index: int, row: Row, party: Party, folder: Path, patience: _Patience
+    ) -> _PartyProcess:
+        plan, domain = self._plan, self._plan.domains[index]
+        topic = plan.keystores.topic(party, plan.topic)
+        options = ["--topic", topic, "--period", str(plan.period)]
+        text = self._text(index, party)
+        if party.role in SPEAKING or (plan.backend.on_zenoh and party.role in CALLING):
+            options += ["--text", text]
+        if party.role is Role.ACTION_CLIENT:
+            servers = [party for party in row.parties if party.role is Role.ACTION_SERVER]
+            options += ["--server", self._text(index, servers[0])] if len(servers) == 1 else []
+        if party.role is Role.OBSERVER:
+            for other in row.parties:
+                if other.role in (Role.TALKER, Role.SERVER) and (other.other_topic or other.topic):
+                    options += ["--also", plan.keystores.topic(other, plan.topic)]
+        if plan.backend.on_zenoh:
+            options += ["--size", str(party.size)] if party.size else []
+            options += ["--patience", str(patience.connect)] if _is_refused(party, row) else []
+        environment = base_environment(os.environ)
+        secured = party.identity.keystore is not None
+        denied = any(
+            (claim.relation is Relation.IS_REFUSED and claim.subject == party.name)
+            or (claim.denied and party.intruder)
+            for claim in row.claims
+        )
+        backend = plan.backend
+        environment |= backend.environment(
+            party.role,
+            wire=row.tapped,
+            denied=denied,
+            secured=secured,
+        )
+        environment |= plan.keystores.environment(party.identity, domain)
+        if backend.on_zenoh:
+            command = backend.zenoh_command(party.role, options, plan.keystores.announced(party))
+        else:
+            names = plan.keystores.node_names(party)
+            command = backend.command(party.role, options, names, secured=secured)
+        return _PartyProcess(
+            party.name,
+            command,
+            environment,
+            folder,
+            topic=topic,
+            text=text,
+            through=backend.library(party.role, secured=secured),
+        )
+
+    async def _watch(
+        self, row: Row, processes: Mapping[str, _PartyProcess], expiry: float | None
+    ) -> tuple[float, float] | None:
+        limits = self._plan.limits
+        if not await self._settled(processes.values()):
+            return None
+        if _is_decided_by_start(row):
+            now = time.monotonic()
+            return now, now
+        needed = [processes[party.name] for party in row.parties if _is_needed(party, row)]
+        if not all(process.running for process in needed):
+            return None
+        if row.meanwhile is not None:
+            self._plan.keystores.change(row.party(row.claims[0].subject).identity, row.meanwhile)
+        start = time.monotonic()
+        shortest = max(start + limits.window, (expiry or 0.0) + _AFTER_EXPIRY)
+        shortest = min(shortest, self._end)
+        longest = min(max(start + limits.longest_window, shortest), self._end)
+        claims = (*row.claims, *row.controls)
+        positive = [claim for claim in claims if claim.holds]
+        silence = not row.brief or expiry is not None
+        silence = silence or any(_awaits_silence(claim, row, processes) for claim in claims)
+        enough_at = None
+        while True:
+            now = time.monotonic()
+            if enough_at is None and all(
+                _is_hopeless(claim, row, processes) or self._is_met(claim, processes)
+                for claim in positive
+            ):
+                enough_at = now
+            if enough_at is not None:
+                if not silence and now >= start + _SHORTEST_BRIEF:
+                    break
+                if silence and now >= max(shortest, enough_at + _AFTER_ENOUGH):
+                    break
+            if now >= longest or any(process.ended for process in needed):
+                break
+            await asyncio.sleep(_TICK)
+        await asyncio.sleep(_GRACE)
+        return start, now
+
+    def _is_met(self, claim: Claim, processes: Mapping[str, _PartyProcess]) -> bool:
+        """Return whether the events that a claim expects were observed often enough."""
+        events = processes[claim.subject].look()
+        if claim.relation in (Relation.HEARS, Relation.IS_ANSWERED, Relation.EXECUTES):
+            mark = f"{processes[claim.talker].text}: "
+            heard = [e for e in events if e.kind is EventKind.HEARD and e.text.startswith(mark)]
+            return len(heard) >= _ENOUGH_MESSAGES
+        if claim.relation in (Relation.SEES, Relation.LOSES):
+            topic = processes[claim.talker].topic
+            seen = any(event.publishers.get(topic) for event in events)
+            lost = seen and not events[-1].publishers.get(topic)
+            return lost if claim.relation is Relation.LOSES else seen
+        return True
+
+
+def _is_hopeless(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
+    """Return whether a claim can no longer hold: its intruder was refused, or has ended."""
+    names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
+    return not all(processes[name].running for name in names)
+
+
+def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
+    """Return whether a claim expects silence that could still end, so needs the full time."""
+    if claim.holds or claim.relation in (Relation.HEARS_AGAIN, Relation.BELIEVES):
+        return False
+    names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
+    return claim.denied not in DENIALS or all(processes[name].running for name in names)
+
+
+def worlds(rows: Sequence[Row]) -> list[list[int]]:
+    """Return groups of rows that can share processes, as indexes of rows."""
+    groups: dict[object, list[int]] = {}
+    for index, row in enumerate(rows):
+        groups.setdefault(row.world or index, []).append(index)
+    return list(groups.values())
+
+
+def _in_memory(row: Row) -> bool:
+    return any(claim.wire is Wire.MEMORY for claim in row.claims)
+
+
+def _is_needed(party: Party, row: Row) -> bool:
+    """Return whether a row needs a party to run: no claim expects the party's refusal."""
+    refused = {claim.subject for claim in row.claims if claim.relation is Relation.IS_REFUSED}
+    return not party.intruder and party.name not in refused
+
+
+def _is_refused(party: Party, row: Row) -> bool:
+    """Return whether a row expects that a party's connection is refused."""
+    return any(
+        claim.denied and party.intruder and party.name in (claim.subject, claim.talker)
+        for claim in row.claims
+    )
+
+
+def _is_decided_by_start(row: Row) -> bool:
+    decided = (Relation.IS_REFUSED, Relation.STARTS)
+    return all(claim.relation in decided for claim in (*row.claims, *row.controls))
+
+
+async def _end_softly(processes: Collection[_PartyProcess]) -> None:
+    """Send SIGTERM, and wait up to `_SECONDS_TO_END` for last log lines and reports."""
+    for process in processes:
+        process.ask_to_end()
+    latest = time.monotonic() + _SECONDS_TO_END
+    while time.monotonic() < latest and not all(process.gone for process in processes):
+        await asyncio.sleep(_TICK)
+
+
+_AFTER_REPLAY = 2.0
+_LONGEST_PAUSE = 0.5
+_REPLAY_ROUNDS = 2
+_LAST_PACKETS = 20
+"""Number of a talker's last packets to send again; some of them contain messages."""
+_CHANGED_PLACES = 8
+_AFTER_FORGERY = 1.0
+
+
+async def _replay_packets(talker: _PartyProcess, tap: Wiretap, lease: float) -> Injection:
+    """End a talker, then send its captured packets again, with pauses shortened.
+
+    A listener that still knows the talker, for up to ``lease`` seconds, takes them for duplicates.
+    """
+    packets = tap.packets(talker.ports())
+    await _end_softly([talker])
+    await asyncio.sleep(lease + _GRACE)
+    started = time.monotonic()
+    # Twice, since the listener may use the first round only to discover the talker.
+    for _ in range(_REPLAY_ROUNDS):
+        for before, packet in zip([*packets[:1], *packets], packets, strict=False):
+            await asyncio.sleep(min(packet.time - before.time, _LONGEST_PAUSE))
+            tap.send(packet.packet)
+    await asyncio.sleep(_AFTER_REPLAY)
+    return Injection(len(packets), started)
+
+
+async def _forge_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
+    """Suspend a talker, then send changed copies of its last packet of every length.
+
+    An attacker need not know which packet has a message, or where.  For every sequence number,
+    there are copies with a bit changed in each place, because a reader drops malformed copies.
+    """
+    talker.hold()
+    await asyncio.sleep(_GRACE)
+    last = {
+        len(packet.packet): packet.packet for packet in tap.packets(talker.ports())[-_LAST_PACKETS:]
+    }
+    places = range(_CHANGED_PLACES)
+    changed = [
+        with_changed_bit(packet, 1 + later, (later + turn) % len(places), len(places))
+        for packet in last.values()
+        for later in places
+        for turn in places
+    ]
+    sent = [packet for packet in changed if packet]
+    started = time.monotonic()
+    for packet in sent:
+        tap.send(packet)
+    await asyncio.sleep(_AFTER_FORGERY)
+    return Injection(len(sent), started)
+
+
+_PREFIXES_LEFT_OUT = ("ROS_SECURITY_",)
+
+
+_VARIABLES_LEFT_OUT = frozenset(
+    {
+        "CYCLONEDDS_URI",
+        "RUST_LOG",
+        "ZENOH_CONFIG_OVERRIDE",
+        "ZENOH_ROUTER_CONFIG_URI",
+        "ZENOH_SESSION_CONFIG_URI",
+        "FASTDDS_BUILTIN_TRANSPORTS",
+        "FASTDDS_DEFAULT_PROFILES_FILE",
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+        "RMW_FASTRTPS_USE_QOS_FROM_XML",
+        "RMW_IMPLEMENTATION",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE",
+        "ROS_DISCOVERY_SERVER",
+        "ROS_DOMAIN_ID",
+        "ROS_LOCALHOST_ONLY",
+        "ROS_STATIC_PEERS",
+    }
+)
+
+
+def base_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return ``environment`` without variables that change discovery or security of DDS."""
+    return {
+        name: value
+        for name, value in environment.items()
+        if name not in _VARIABLES_LEFT_OUT and not name.startswith(_PREFIXES_LEFT_OUT)
+    } | {"PYTHONUNBUFFERED": "1"}
+
+
+class _PartyProcess:
+    """A running process of a row; report and log are in ``folder`` under ``name``."""
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        folder: Path,
+        *,
+        topic: str,
+        text: str = "",
+        through: str = "",
+    ) -> None:
+        stem = name.replace(" ", "_")
+        self.name = name
+        self.topic = topic
+        self.text = text
+        self._through = through
+        self._log = folder / f"{stem}.log"
+        report = folder / f"{stem}.jsonl"
+        self._reader = EventReader(report)
+        self._events: list[Event] = []
+        self._own_status: int | None = None
+        self._asked = False
+        self._ports: frozenset[int] = frozenset()
+        with self._log.open("wb") as output:
+            self._process = subprocess.Popen(
+                [*command, "--report", str(report)],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                env={**environment, "ROS_LOG_DIR": str(folder / "ros_log")},
+                start_new_session=True,
+                preexec_fn=end_with_starter(),
+            )
+        _LOG.info("started process %d, %s: %s", self._process.pid, name, shlex.join(command))
+
+    def look(self) -> list[Event]:
+        """Return all reports of the process so far, oldest first."""
+        ended = self._process.poll()
+        self._events += self._reader.new_events()
+        if ended is not None and self._own_status is None and not self._asked:
+            self._own_status = ended
+        return self._events
+
+    @property
+    def settled(self) -> bool:
+        """Whether the process is ready, was refused, or has failed or ended."""
+        events = self.look()
+        return self._own_status is not None or any(
+            event.kind in (EventKind.READY, EventKind.REFUSED, EventKind.FAILED) for event in events
+        )
+
+    @property
+    def running(self) -> bool:
+        """Whether the process was ready and has not ended by itself."""
+        events = self.look()
+        return self._own_status is None and any(event.kind is EventKind.READY for event in events)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process has ended by itself."""
+        self.look()
+        return self._own_status is not None
+
+    def ports(self) -> frozenset[int]:
+        """Return the ports that the process has bound; after its end, the last known ones."""
+        self._ports = bound_ports(self._process.pid) or self._ports
+        return self._ports
+
+    def segments(self) -> frozenset[Path]:
+        """Return the segments of shared memory that the process maps."""
+        return mapped_segments(self._process.pid)
+
+    def dds(self) -> tuple[MappedLibrary, ...]:
+        """Return the DDS libraries that the process has mapped; empty if it has ended."""
+        return dds_of(self._process.pid)
+
+    def ask_to_end(self) -> None:
+        """Send SIGTERM; an end after that does not count as `ended`."""
+        self.look()
+        self._asked = True
+        with suppress(ProcessLookupError):
+            self._process.terminate()
+            self._process.send_signal(signal.SIGCONT)
+
+    def hold(self) -> None:
+        """Suspend the process; `end` can still kill it."""
+        with suppress(ProcessLookupError):
+            self._process.send_signal(signal.SIGSTOP)
+
+    @property
+    def gone(self) -> bool:
+        """Whether the process has ended, for any reason."""
+        return self._process.poll() is not None
+
+    def end(self) -> None:
+        """Kill the process and its children."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+    def record(self) -> PartyRecord:
+        """Return the record of the process; call it after `end`."""
+        # A node that was asked to end may report a failure, which does not count.
+        late = [event for event in self._reader.new_events() if event.kind is not EventKind.FAILED]
+        return PartyRecord(
+            text=self.text,
+            topic=self.topic,
+            through=self._through,
+            events=(*self._events, *late),
+            output=plain_text(self._log.read_text(encoding="utf-8", errors="replace")),
+            status=self._own_status,
+        )

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError
-from sros_tool.explain.answer import Evaluator
-from sros_tool.explain.question import Question, about_action
+from sros_tool.explain.answer import Evaluator, Question, about_action
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     PERMISSIONS_FILE,

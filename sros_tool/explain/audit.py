@@ -26,9 +26,8 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import Note, PolicyError, UsageError
-from sros_tool.explain.answer import Evaluator
+from sros_tool.explain.answer import Evaluator, Part, Question
 from sros_tool.explain.explanation import meant_instead, named_rights
-from sros_tool.explain.question import Part, Question
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.robots import Fleet
 from sros_tool.graph.learn import (

@@ -26,11 +26,11 @@ from sros_tool.explain.answer import (
     GroupEdit,
     PolicyChange,
     Provenance,
+    Question,
     deciding_lines,
     lines_of_right,
     recorded_policy,
 )
-from sros_tool.explain.question import Question
 from sros_tool.faults import AT_HOME, FAULTS, REPLACE, Fault
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,

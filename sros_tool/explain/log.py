@@ -20,11 +20,10 @@ from typing import NamedTuple
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, SrosError, UsageError
-from sros_tool.explain.answer import Answer, Evaluator
+from sros_tool.explain.answer import Answer, Evaluator, Part, Question, ask
 from sros_tool.explain.asking import AskingContext, signed_enclave
 from sros_tool.explain.denials import Denial, read_denials, serving_node
 from sros_tool.explain.explanation import likely_names, remedy
-from sros_tool.explain.question import Part, Question, ask
 from sros_tool.faults import Fault
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.known_keys import enclaves_by_identity

@@ -11,10 +11,9 @@ from sros_tool.dds.decision.vendors import PRINCIPAL, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.distributions import SUPPORTED, Shipped
 from sros_tool.errors import Note, SrosError
-from sros_tool.explain.answer import Answer, Evaluator, Provenance
+from sros_tool.explain.answer import Answer, Evaluator, Provenance, Question, ask
 from sros_tool.explain.asking import Asked, AskedEnclave, AskingContext, ZenohInBrief, meant
 from sros_tool.explain.explanation import explain, likely_names
-from sros_tool.explain.question import Question, ask
 from sros_tool.keystore.layout import (
     SETTINGS,
     ZENOH_SIGNED,

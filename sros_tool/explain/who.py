@@ -9,8 +9,8 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note
+from sros_tool.explain.answer import Question, about_action, ask
 from sros_tool.explain.asking import rights_naming, taken_for_action
-from sros_tool.explain.question import Question, about_action, ask
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.reader import Keystore

@@ -20,10 +20,9 @@ from typing import Annotated, Literal, NamedTuple
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
-from sros_tool.explain.answer import Answer, Evaluator, PolicyChange, StatedInPolicy
+from sros_tool.explain.answer import Answer, Evaluator, PolicyChange, Question, StatedInPolicy
 from sros_tool.explain.asking import Asked, AskedEnclave, AskingContext, ZenohInBrief, meant
 from sros_tool.explain.explanation import explain
-from sros_tool.explain.question import Question
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     IDENTITY_CA_FILE,

@@ -14,8 +14,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance
 from sros_tool.dds.permissions import Permissions
 from sros_tool.fleet.enclaves import robot_of
-from sros_tool.proof.crossing import limits_crossing, states_routers
-from sros_tool.proof.protection import strict_protection
+from sros_tool.proof.protection import limits_crossing, states_routers, strict_protection
 from sros_tool.proof.sources import ALL_DOMAINS, AccessSource
 from sros_tool.translate import governance_for
 from sros_tool.zenoh.configuration import Mode

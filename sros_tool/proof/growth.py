@@ -37,8 +37,12 @@ from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.model import ALLOW, Source
 from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.assumptions import assumptions, completed, domains_of_robots, left_out
-from sros_tool.proof.crossing import added_crossing, looser_router_rules
-from sros_tool.proof.protection import contradiction, less_protection
+from sros_tool.proof.protection import (
+    added_crossing,
+    contradiction,
+    less_protection,
+    looser_router_rules,
+)
 from sros_tool.proof.sources import AT, AccessSource
 from sros_tool.proof.worlds import ROS_TOPICS, domains_of, enforced_access, is_enforced
 from sros_tool.proof.zenoh_settings import unknown_settings

@@ -44,11 +44,15 @@ from sros_tool.proof.commit_files import (
     used_whole,
     users_of,
 )
-from sros_tool.proof.dropped import dropped_findings, dropped_requirements
 from sros_tool.proof.findings import requirement_findings
 from sros_tool.proof.growth import Growth, compare_access
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
-from sros_tool.proof.requirements import Requirement, read_requirements
+from sros_tool.proof.requirements import (
+    Requirement,
+    dropped_findings,
+    dropped_requirements,
+    read_requirements,
+)
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
 from sros_tool.proof.system import System, load_system, policy_system
 from sros_tool.values import Words

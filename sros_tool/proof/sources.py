@@ -57,7 +57,7 @@ from sros_tool.pki.crl import embedded_lists, load_crl, names_issuers, refusal_o
 from sros_tool.policy.document import PolicyFiles, policy_files, read_policy, refuse_fallbacks
 from sros_tool.policy.model import Enclave, Policy, Source, StatedProtection, stated_protections
 from sros_tool.policy.rights import Right, placed_rights, policy_rights
-from sros_tool.proof.revisions import PREFIX, Revision, find_revision
+from sros_tool.proof.commit_files import PREFIX, Revision, find_revision
 from sros_tool.proof.zenoh_settings import LONE, SIGNED, SignedConfiguration
 from sros_tool.translate import permissions_for
 from sros_tool.validity import iso, window

@@ -63,11 +63,11 @@ from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.document import ConfigurationDocument
 from sros_tool.zenoh.key_expressions import ANY_CHUNKS, ANY_PART, canonical, includes, intersects
 from sros_tool.zenoh.releases import RELEASES
-from sros_tool.zenoh.rule_keys import Difference
 from sros_tool.zenoh.subtraction import (
     MOST_EXPRESSIONS,
     CannotSubtract,
     Chunks,
+    Difference,
     subtract_all,
 )
 

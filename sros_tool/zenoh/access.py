@@ -19,7 +19,7 @@ from typing import NamedTuple, Protocol
 
 from sros_tool.automata import NameSet
 from sros_tool.zenoh.key_expressions import KeyExpressions, includes, names_of
-from sros_tool.zenoh.rule_keys import Difference, RuleKeys, keys_of
+from sros_tool.zenoh.subtraction import Difference, RuleKeys, keys_of
 
 
 class Message(StrEnum):

@@ -1,13 +1,14 @@
-"""Subtract key expressions from a key expression; the result is a union of key expressions.
+"""The keys of access-control rules: allowed key expressions without the denied ones.
 
 Zenoh does not enforce a denial inside a wider permission, so rules may only allow.  All expressions
-are tuples of chunks.  The result is exact for keys whose chunks are ROS names.  Because ROS names
-use few letters, ``*`` without ``ab`` can be listed: every chunk that contains a letter other than a
-and b, that begins with a letter other than a, and so on.
+are tuples of chunks.  A subtraction is exact for keys whose chunks are ROS names.  Because ROS
+names use few letters, ``*`` without ``ab`` can be listed: every chunk that contains a letter other
+than a and b, that begins with a letter other than a, and so on.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -18,9 +19,13 @@ from sros_tool.zenoh.key_expressions import (
     ANY_CHUNK,
     ANY_CHUNKS,
     ANY_PART,
+    KeyExpressions,
+    TooManyExpressions,
     canonical,
     chunks_intersect,
+    common,
     common_chunks,
+    intersects,
     sequence_includes,
     sequences_intersect,
 )
@@ -74,34 +79,34 @@ def _not_covered(some: frozenset[Chunks]) -> list[Chunks]:
     for expression in sorted(
         some, key=lambda chunks: (-chunks.count(ANY_CHUNKS), len(chunks), chunks)
     ):
-        if not any(covers(other, expression) for other in wide):
+        if not any(_covers(other, expression) for other in wide):
             left.append(expression)
             if "*" in "".join(expression) and len(wide) < _MOST_COMPARED:
                 wide.append(expression)
     return [
         expression
         for expression in left
-        if not any(o != expression and covers(o, expression) for o in wide)
+        if not any(o != expression and _covers(o, expression) for o in wide)
     ]
 
 
 def _subtract(wide: Chunks, denied: Iterable[Chunks]) -> set[Chunks]:
     """Return expressions for the keys that ``wide`` includes and ``denied`` does not."""
-    without = frozenset(expression for expression in denied if meet(expression, wide))
+    without = frozenset(expression for expression in denied if _meet(expression, wide))
     if not without:
         return {wide}
-    if any(covers(expression, wide) for expression in without):
+    if any(_covers(expression, wide) for expression in without):
         return set()
     left: set[Chunks] = set()
     for part in _parts(wide, without):
         left |= _less(
-            part, frozenset(expression for expression in without if meet(expression, part))
+            part, frozenset(expression for expression in without if _meet(expression, part))
         )
         _check_number(len(left))
     return _joined(left)
 
 
-def meet(first: Chunks, second: Chunks) -> bool:
+def _meet(first: Chunks, second: Chunks) -> bool:
     """Return whether both expressions include a common key."""
     for end in (0, -1) if first and second else ():
         if first[end] != second[end] and "*" not in first[end] + second[end]:
@@ -124,7 +129,7 @@ def _check_number(number: int, most: int = _MOST_STEPS) -> None:
         raise CannotSubtract
 
 
-def covers(wide: Chunks, narrow: Chunks) -> bool:
+def _covers(wide: Chunks, narrow: Chunks) -> bool:
     """Return whether ``wide`` includes all keys of ``narrow``; only True is certain."""
     if wide.count(ANY_CHUNKS) != 1:
         return sequence_includes(wide, narrow)
@@ -204,7 +209,7 @@ def _less(wide: Chunks, denied: frozenset[Chunks]) -> frozenset[Chunks]:
     """
     if not denied:
         return frozenset((wide,))
-    if any(covers(expression, wide) for expression in denied):
+    if any(_covers(expression, wide) for expression in denied):
         return frozenset()
     if wide[0] != ANY_CHUNKS:
         return _by_first_chunk(wide, denied)
@@ -238,7 +243,7 @@ def _by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]
     tails: dict[str, set[Chunks]] = {}
     for expression in denied:
         for chunk, tail in _openings(expression):
-            if common_chunks(first, chunk) and meet(tail, rest):
+            if common_chunks(first, chunk) and _meet(tail, rest):
                 tails.setdefault(chunk, set()).add(tail)
     always = {chunk for chunk in tails if _matches(chunk, first)}
     some = tuple(sorted(tails.keys() - always))
@@ -517,3 +522,215 @@ def _one_shorter(chunks: Chunks) -> Chunks | None:
 def _or_shorter(chunks: Chunks) -> Chunks:
     at = chunks.index(ANY_CHUNKS)
     return (*chunks[: at - 1], *chunks[at:])
+
+
+_MANY, _FEW = 65536, 1024
+
+
+class Difference(NamedTuple):
+    """The keys of allowed names without the keys of denied names.
+
+    A key is the chunk ``begin``, the name, and ``end``: "", or "/" and further chunks.
+    """
+
+    begin: str
+    end: str
+    allowed: frozenset[Chunks]
+    denied: frozenset[Chunks]
+
+    def names(self) -> frozenset[Chunks]:
+        """Return key expressions for the names that are left.
+
+        Raises:
+            CannotSubtract: no or too many key expressions: see `subtract_all`.
+        """
+        return subtract_all(self.allowed, self.denied)
+
+    def below(self, end: str) -> Difference:
+        """Return the keys with ``end`` behind each key of this difference."""
+        return self._replace(end=f"{self.end}/{end}")
+
+    def include(self, name: str) -> bool:
+        """Return whether the difference has a name without wildcards, such as ``robot/chatter``."""
+        return _searched(self.allowed).include(name) and not _searched(self.denied).include(name)
+
+    def include_all(self, begin: str, name: Chunks, end: str) -> bool:
+        """Return whether the difference has all keys of an expression; False may be wrong."""
+        return (
+            begin == self.begin
+            and _common_end(end, self.end) == end
+            and any(_covers(expression, name) for expression in self.allowed)
+            and not any(_meet(expression, name) for expression in self.denied)
+        )
+
+    def common(self, other: Difference) -> list[str]:
+        """Return key expressions for the keys that both differences have.
+
+        Raises:
+            CannotSubtract: no or too many key expressions: see `subtract_all`.
+            TooManyExpressions: the shared allowed names take too many key expressions.
+        """
+        end = _common_end(self.end, other.end)
+        if self.begin != other.begin or end is None:
+            return []
+        names = subtract_all(_common(self.allowed, other.allowed), self.denied | other.denied)
+        return [canonical((self.begin, *name)) + end for name in names]
+
+
+def _common_end(one: str, other: str) -> str | None:
+    """Return what two endings share, or None; "/**" in one includes the other."""
+    end, longer = sorted((one, other), key=len)
+    return end if longer in (end, f"{end}/{ANY_CHUNKS}") else None
+
+
+@lru_cache(maxsize=_FEW)
+def _searched(expressions: frozenset[Chunks]) -> KeyExpressions:
+    return KeyExpressions("/".join(chunks) for chunks in expressions)
+
+
+@lru_cache(maxsize=_FEW)
+def _common(some: frozenset[Chunks], others: frozenset[Chunks]) -> frozenset[Chunks]:
+    """Return expressions for what some expressions and others match."""
+    if some == others:
+        return some
+    return frozenset(
+        tuple(expression.split("/"))
+        for first in some
+        for second in others
+        for expression in common("/".join(first), "/".join(second))
+    )
+
+
+class RuleKeys:
+    """The keys that the key expressions of a rule include.
+
+    ``plain`` are keys of a single name, with wildcards only in the type, in its hash and behind it.
+    ``tokens`` are graph tokens with wildcards; ``differences`` are all other keys.  ``is_plain``
+    says that there are only plain keys.
+    """
+
+    def __init__(self, expressions: frozenset[str], made_of: tuple[Difference, ...]) -> None:
+        """Sort the key expressions by kind.
+
+        ``made_of`` are the set differences that the expressions write out; () if unknown.
+        """
+        wide = [expression for expression in expressions if "*" in _ENDS.sub("", expression)]
+        self.plain = expressions.difference(wide)
+        self.tokens = KeyExpressions(
+            expression for expression in wide if expression.startswith("@")
+        )
+        self.differences = made_of or _differences(wide)
+        self.is_plain = not wide and not made_of
+        self._has_plain_tokens = any(expression.startswith("@") for expression in self.plain)
+
+    def include(self, key: str) -> bool:
+        """Return whether the differences of the rule have all keys of an expression."""
+        begin, name, end = _parted(key)
+        chunks = tuple(name.split("/"))
+        return any(difference.include_all(begin, chunks, end) for difference in self.differences)
+
+    def common(self, other: RuleKeys) -> tuple[str, ...]:
+        """Return expressions that together include the keys of both, and no others, sorted.
+
+        Raises:
+            TooManyExpressions: there are too many.
+        """
+        shared = self.plain & other.plain
+        if self.is_plain and other.is_plain:
+            return _in_order(shared) if shared else ()
+        if self._plain_may_be_in(other):
+            shared |= _plain_in(self.plain, other)
+        if other._plain_may_be_in(self):
+            shared |= _plain_in(other.plain, self)
+        if self.tokens.all and other.tokens.all:
+            shared |= _common_of_tokens(self.tokens, other.tokens)
+        if self.differences and other.differences:
+            shared |= _common_of_differences(self.differences, other.differences)
+        return _in_order(shared) if shared else ()
+
+    def _plain_may_be_in(self, wide: RuleKeys) -> bool:
+        return bool(
+            (self.plain and wide.differences) or (self._has_plain_tokens and wide.tokens.all)
+        )
+
+
+@lru_cache(maxsize=_MANY)
+def _in_order(expressions: frozenset[str]) -> tuple[str, ...]:
+    return tuple(sorted(expressions))
+
+
+@lru_cache(maxsize=_MANY)
+def keys_of(expressions: frozenset[str], made_of: tuple[Difference, ...] = ()) -> RuleKeys:
+    """Return the keys that expressions include; equal arguments give the same object (a cache)."""
+    return RuleKeys(expressions, made_of)
+
+
+_TYPE = "/$*::$*/*"
+"""Any type with its hash, which follow the name in a key."""
+_ENDS = re.compile(rf"{re.escape(_TYPE)}(?:/\*\*)?(?:/@adv/\*\*)?\Z")
+
+
+def _parted(expression: str) -> tuple[str, str, str]:
+    """Return the parts of a key expression before, in and after the name."""
+    begin, _, rest = expression.partition("/")
+    name, of_type, below = rest.partition(_TYPE)
+    return begin, name, of_type + below
+
+
+def _differences(expressions: Iterable[str]) -> tuple[Difference, ...]:
+    """Return the keys of expressions that are not graph tokens."""
+    names: dict[tuple[str, str], set[Chunks]] = {}
+    for expression in expressions:
+        if not expression.startswith("@"):
+            begin, name, end = _parted(expression)
+            names.setdefault((begin, end), set()).add(tuple(name.split("/")))
+    return tuple(
+        Difference(*place, frozenset(of), frozenset()) for place, of in sorted(names.items())
+    )
+
+
+@lru_cache(maxsize=_MANY)
+def _plain_in(plain: frozenset[str], wide: RuleKeys) -> frozenset[str]:
+    keys: set[str] = set()
+    for key in plain:
+        begin, name, end = _parted(key)
+        if begin.startswith("@"):
+            keys.update([key] if wide.tokens.include(key) else _common_with_all(key, wide.tokens))
+            continue
+        for difference in wide.differences:
+            common_end = _common_end(end, difference.end)
+            if begin == difference.begin and common_end is not None and difference.include(name):
+                keys.add(f"{begin}/{name}{common_end}")
+    return frozenset(keys)
+
+
+@lru_cache(maxsize=_MANY)
+def _common_of_differences(
+    some: tuple[Difference, ...], others: tuple[Difference, ...]
+) -> frozenset[str]:
+    try:
+        shared = [key for first in some for second in others for key in first.common(second)]
+    except CannotSubtract:
+        raise TooManyExpressions from None
+    return frozenset(shared)
+
+
+@lru_cache(maxsize=_MANY)
+def _common_of_tokens(one: KeyExpressions, other: KeyExpressions) -> frozenset[str]:
+    if one.all == other.all:
+        return one.all
+    shared = {token for token in one.all if other.include(token)}
+    not_included = [token for token in one.all if token not in shared]
+    for token in other.all if not_included else ():
+        if one.include(token):
+            shared.add(token)
+        else:
+            # Tokens of `one` that `other` includes are shared as they are.
+            overlapping = (wide for wide in not_included if intersects(token, wide))
+            shared.update(*(common(token, wide) for wide in overlapping))
+    return frozenset(KeyExpressions(shared).needed())
+
+
+@lru_cache(maxsize=_MANY)
+def _common_with_all(key: str, wide: KeyExpressions) -> tuple[str, ...]:
+    return tuple(shared for token in wide.all for shared in common(key, token))

@@ -14,8 +14,7 @@ from sros_tool.demo.backend import choose_backend
 from sros_tool.demo.nodes import split_ros_args
 from sros_tool.demo.program import DemoOptions, run_demo
 from sros_tool.demo.result import DemoResult, RowResult, ScenarioResult, demo_table
-from sros_tool.demo.scenarios.model import Role, RowStatus
-from sros_tool.demo.scenarios.policies import check_topic, talking_policy
+from sros_tool.demo.scenarios.model import Role, RowStatus, check_topic, talking_policy
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.stacks import ProbeEnclave, Stack

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.demo import backend, runner
+from sros_tool.demo import backend, program
 from sros_tool.demo.result import (
     PartyRecord,
     RowRecord,
@@ -90,7 +90,7 @@ def test_an_attacker_in_another_enclave_obeys_no_rules_of_its_own() -> None:
 
 def test_rows_of_one_world_share_their_processes() -> None:
     rows = joined(ZENOH_SCENARIOS).rows
-    groups = [[rows[index] for index in group] for group in runner.worlds(rows)]
+    groups = [[rows[index] for index in group] for group in program.worlds(rows)]
     assert sorted(row.name for group in groups for row in group) == sorted(ROWS)
     for group in groups:
         world = together(group)

@@ -16,9 +16,8 @@ import pytest
 from sros_tool.dds.decision.answers import Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.explain.answer import Evaluator
+from sros_tool.explain.answer import Evaluator, Question, ask
 from sros_tool.explain.explanation import explain, policy_of
-from sros_tool.explain.question import Question, ask
 from sros_tool.files import policies_dir
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, plan_enclave
 from sros_tool.keystore.template import load_template

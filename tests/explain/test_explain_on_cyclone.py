@@ -11,8 +11,7 @@ import pytest
 
 from sros_tool.cli.common import now
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.explain.answer import Evaluator
-from sros_tool.explain.question import Part, Question, ask
+from sros_tool.explain.answer import Evaluator, Part, Question, ask
 from sros_tool.files import policies_dir
 from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.participant import JoinContext, load_enclave

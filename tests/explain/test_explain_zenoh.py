@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from sros_tool.cli.common import now
-from sros_tool.explain.question import ask
+from sros_tool.explain.answer import ask
 from sros_tool.explain.zenoh import ZenohEvaluator
 from sros_tool.keystore.reader import Keystore
 from sros_tool.policy.document import read_policy

@@ -14,8 +14,7 @@ import pytest
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.explain.answer import Evaluator
-from sros_tool.explain.question import Part, Question
+from sros_tool.explain.answer import Evaluator, Part, Question
 from sros_tool.files import policies_dir
 from sros_tool.graph.observation import Endpoint
 from sros_tool.keystore.participant import JoinContext, plan_enclave

@@ -11,8 +11,8 @@ import pytest
 import sros_tool.dds.decision as decision
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.errors import UsageError
+from sros_tool.explain.answer import TYPES, WORDS, ask
 from sros_tool.explain.explanation import _BY_REASON, remedy
-from sros_tool.explain.question import TYPES, WORDS, ask
 from sros_tool.faults import FAULTS, Fault
 from sros_tool.names import dds_names
 

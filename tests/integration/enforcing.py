@@ -13,7 +13,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import CYCLONE, RCLPY, Backend, choose_backend
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
 from sros_tool.demo.scenarios.communication import ISOLATION
-from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC
+from sros_tool.demo.scenarios.model import DEFAULT_TOPIC
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
 

@@ -15,7 +15,7 @@ import pytest
 
 from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, Vendor
 from sros_tool.explain.answer import Evaluator
-from sros_tool.explain.question import ask as question
+from sros_tool.explain.answer import ask as question
 from sros_tool.keystore.participant import JoinContext, load_enclave
 from tests.checks.bench import SECRET, Bench
 from tests.integration.broken_keystores import HARMLESS, MATCHED, MORE, ROWS, Breakage

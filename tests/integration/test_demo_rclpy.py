@@ -16,7 +16,7 @@ import pytest
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY, Backend, choose_backend
 from sros_tool.demo.keystores import KeystoreSet, KeystoreSpec, create_keystores
-from sros_tool.demo.runner import Limits, RunPlan, run_rows
+from sros_tool.demo.program import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios import SCENARIOS
 from sros_tool.demo.scenarios.communication import ACTIONS, COMPOSITION, ISOLATION, SERVICES, TALKER
 from sros_tool.demo.scenarios.model import UNSECURED, RowStatus

@@ -16,8 +16,8 @@ import pytest
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.keystores import KeystoreSet
+from sros_tool.demo.program import Limits, RunPlan, run_rows
 from sros_tool.demo.result import RowResult
-from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios.communication import ROWS
 from sros_tool.demo.scenarios.model import UNSECURED, Row, RowStatus
 from sros_tool.errors import SrosError, UnavailableError

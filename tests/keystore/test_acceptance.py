@@ -9,8 +9,7 @@ from cryptography import x509
 
 from sros_tool.dds.decision.answers import Outcome
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
-from sros_tool.explain.answer import Evaluator
-from sros_tool.explain.question import ask
+from sros_tool.explain.answer import Evaluator, ask
 from sros_tool.keystore.participant import JoinContext, load_enclave
 from tests.dds.decision_documents import allow, governance, grant, permissions, publish, subscribe
 from tests.dds.signer_rows import (

@@ -28,7 +28,6 @@ from sros_tool.policy.model import (
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.proof.decide import Witness, decide
-from sros_tool.proof.dropped import dropped_requirements
 from sros_tool.proof.requirements import (
     Apart,
     AtMost,
@@ -40,6 +39,7 @@ from sros_tool.proof.requirements import (
     Protected,
     Requirement,
     Widest,
+    dropped_requirements,
 )
 from sros_tool.proof.system import policy_system
 from tests.proof.brute_force import TOPICS, Finite, breaches, finite

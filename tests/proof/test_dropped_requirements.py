@@ -5,8 +5,12 @@ from __future__ import annotations
 import pytest
 
 from sros_tool.files import policies_dir
-from sros_tool.proof.dropped import dropped_requirements
-from sros_tool.proof.requirements import Requirement, parse_requirements, read_requirements
+from sros_tool.proof.requirements import (
+    Requirement,
+    dropped_requirements,
+    parse_requirements,
+    read_requirements,
+)
 from sros_tool.values import as_plain
 
 

@@ -15,11 +15,11 @@ from sros_tool.names import expression_problem
 from sros_tool.policy.patterns import matches
 from sros_tool.translate_zenoh.rights import chunks_of
 from sros_tool.zenoh.key_expressions import canonical
-from sros_tool.zenoh.rule_keys import Difference
 from sros_tool.zenoh.subtraction import (
     MOST_EXPRESSIONS,
     CannotSubtract,
     Chunks,
+    Difference,
     subtract_all,
 )
 from tests.support.children import LONG

@@ -68,9 +68,9 @@ from sros_tool.demo.scenarios.model import (
     RowStatus,
     Scenario,
     SoundKeystore,
+    check_topic,
 )
 from sros_tool.demo.scenarios.on_zenoh import ZENOH_SCENARIOS
-from sros_tool.demo.scenarios.policies import check_topic
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import read_toml
 from sros_tool.policy.document import read_policy

@@ -15,7 +15,9 @@ from sros_tool.demo import forger
 from sros_tool.demo.forger import Forge, Undefended
 from sros_tool.demo.scenarios.model import (
     FOREIGN,
+    GUEST,
     OWN,
+    SERVICE,
     UNSECURED,
     Claim,
     Condition,
@@ -30,12 +32,12 @@ from sros_tool.demo.scenarios.model import (
     Variant,
     Wire,
     answered,
+    attacked_policy,
     hears,
     known_open,
     talker_and_listener,
     tries,
 )
-from sros_tool.demo.scenarios.policies import GUEST, SERVICE, attacked_policy
 
 # ── kinds of attacks ───────────────────────────────────────────────────────────────────────
 # Each function returns a row with the party "attacker".  The victims, and the controls unless

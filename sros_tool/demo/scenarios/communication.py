@@ -12,8 +12,10 @@ from typing import NamedTuple
 from sros_tool.demo import forger
 from sros_tool.demo.forger import Undefended
 from sros_tool.demo.scenarios.model import (
+    ACTION,
     FOREIGN,
     OWN,
+    SERVICE,
     UNSECURED,
     Claim,
     Identity,
@@ -24,16 +26,12 @@ from sros_tool.demo.scenarios.model import (
     RowStatus,
     Scenario,
     answered,
+    composed_policy,
     hears,
     known_open,
-    talker_and_listener,
-)
-from sros_tool.demo.scenarios.policies import (
-    ACTION,
-    SERVICE,
-    composed_policy,
     shipped_action_policy,
     shipped_service_policy,
+    talker_and_listener,
     talking_policy,
 )
 

@@ -14,7 +14,9 @@ from sros_tool.demo import forger
 from sros_tool.demo.forger import STOLEN
 from sros_tool.demo.scenarios import zenoh_forger
 from sros_tool.demo.scenarios.model import (
+    ACTION,
     OWN,
+    SERVICE,
     UNSECURED,
     Claim,
     Identity,
@@ -31,8 +33,8 @@ from sros_tool.demo.scenarios.model import (
     known_open,
     talker_and_listener,
     tries,
+    zenoh_policy,
 )
-from sros_tool.demo.scenarios.policies import ACTION, SERVICE, zenoh_policy
 
 _ROUTER = "/router"
 _PEERS, _CLIENTS = "peers", "clients"

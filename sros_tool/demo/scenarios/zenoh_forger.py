@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sros_tool.demo.forger import STOLEN, KeystoreCopy
-from sros_tool.demo.scenarios.policies import zenoh_policy
+from sros_tool.demo.scenarios.model import zenoh_policy
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     IDENTITY_CA_FILE,

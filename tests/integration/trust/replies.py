@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from sros_tool.dds.decision.answers import Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain.answer import Evaluator
-from sros_tool.explain.question import ask as question
+from sros_tool.explain.answer import ask as question
 from sros_tool.keystore.participant import JoinContext, load_enclave
 from tests.integration.fastdds import fastdds_vendor
 from tests.integration.trust.drawing import Case, make
