@@ -20,7 +20,7 @@ VACUOUS = FindingKind(
     "It protects nothing: perhaps a name is misspelled or was changed, or the exceptions cover "
     "every enclave.",
     "The requirements file.",
-    "Correct the name or the exceptions, or remove the requirement.",
+    "Correct the name, here or in the policy (was a topic renamed?), or remove the requirement.",
 )
 DROPPED = FindingKind(
     "requirement.dropped",

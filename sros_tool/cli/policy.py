@@ -36,7 +36,7 @@ from sros_tool.wording import counted, first_few
 if TYPE_CHECKING:
     from sros_tool.fleet.robots import Fleet
     from sros_tool.keystore.issuing.size import MinimizedEnclave
-    from sros_tool.keystore.rights import RightsSource
+    from sros_tool.keystore.rights import RightsSource, SourcesDifference
     from sros_tool.policy.merge import Merged
     from sros_tool.policy.model import StatedProtection
     from sros_tool.policy.rights import RightsDifference
@@ -191,8 +191,9 @@ def diff_policy(
 
     A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, or
     Zenoh configurations such as router.json5. Permissions and Zenoh rules are shown in ROS
-    terms; the signature of permissions is verified if the permissions CA is next to them. If A or B
-    covers only some enclaves, only these are compared. Lines that differ only in the robot of a
+    terms; the signature of permissions is verified if the permissions CA is next to them. "!" is a
+    right of B whose other side only A has. If A or B covers only some enclaves, only these are
+    compared. Lines that differ only in the robot of a
     fleet are shown as one. For two policies, the protection that they demand is compared, too.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
@@ -239,7 +240,7 @@ def diff_policy(
         echo_lines(rights_markdown(first, second))
     else:
         lines = _difference_lines(difference, first.fleet, second.fleet)
-        for line in (*lines, *_protection_lines(protections)):
+        for line in (*lines, *_protection_lines(protections), *unanswered_lines(compared)):
             echo(line)
         count = len(difference.only_first) + len(difference.only_second)
         of = f" of {', '.join(sorted(compared.scope))}" if compared.scope else ""
@@ -277,6 +278,8 @@ def rights_markdown(first: RightsSource, second: RightsSource) -> str:
         if signed:
             parts.append(f"**{len(signed)} {title}**")
             parts.append(bounded(map(code, signed), _MOST_LINES, rest))
+    if unanswered := list(unanswered_lines(compared)):
+        parts += ["**Nobody answers any more**", bounded(map(code, unanswered), _MOST_LINES, rest)]
     notes = [f"{note.id}: {note.text}" for note in (*first.notes, *second.notes)]
     if notes:
         parts += ["**Notes**", bounded(map(code, notes), 4000, rest)]
@@ -289,6 +292,16 @@ def rights_markdown(first: RightsSource, second: RightsSource) -> str:
     elif lines and drawn:
         parts.append(fenced(drawn, "mermaid"))
     return "\n\n".join((title, *parts)) + "\n"
+
+
+def unanswered_lines(compared: SourcesDifference) -> Iterator[str]:
+    """Yield a line for each right that the change leaves without the other side."""
+    from sros_tool.policy.model import OTHER_SIDE
+
+    for right in compared.unanswered:
+        other = OTHER_SIDE[right.right].replace("reply", "serve")
+        text = f"{right.enclave} may {right.right} {right.name}, but no enclave may {other} it"
+        yield f"! {text} any more"
 
 
 def _protection_lines(protections: Iterable[tuple[str, StatedProtection]]) -> list[str]:

@@ -370,24 +370,28 @@ def _text(result: Review) -> list[str]:
     for step in result.steps:
         subject = f" {result.shown(step.subject)}" if step.subject else ""
         lines.append(f"{step.kind}{subject}: {_sentence(result, step)}")
-        if step.status:
-            said = _reasons(step)
-            more = [f"and {len(said) - _MOST_REASONS} more (--summary FILE has all)"]
-            shown = said[:_MOST_REASONS] + more * (len(said) > _MOST_REASONS)
-            lines += [f"  {result.shown(line)}" for line in shown]
+        said = _reasons(step)
+        more = [f"and {len(said) - _MOST_REASONS} more (--summary FILE has all)"]
+        shown = said[:_MOST_REASONS] + more * (len(said) > _MOST_REASONS)
+        lines += [f"  {result.shown(line)}" for line in shown]
     return [*lines, _verdict(result)]
 
 
 def _reasons(step: ReviewStep) -> list[str]:
-    """Return why a step failed: its findings, or the new access."""
+    """Return what a reviewer has to read: new access, also if it is accepted; rights that nobody
+    answers any more; the findings of a failed step.
+    """
     from sros_tool.checks.registry import ChosenFindings
-    from sros_tool.cli.policy import added_lines
-    from sros_tool.proof.review import AccessChange, DroppedRequirements
+    from sros_tool.cli.policy import added_lines, unanswered_lines
+    from sros_tool.keystore.rights import compare_sources
+    from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange
 
     match step.content:
         case AccessChange(after=after, growth=growth):
             return added_lines(after, growth)
-        case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen):
+        case RightsChange(before=before, after=after):
+            return [*unanswered_lines(compare_sources(before, after))]
+        case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen) if step.status:
             return [
                 f"{finding.place}: {finding.severity.word}: {finding.text} [{finding.id}]"
                 for finding in chosen.shown

@@ -527,13 +527,12 @@ def check_keystore(root: Path) -> None:
                 "It is a file.",
                 "Name the folder of a keystore.",
             )
-        raise KeystoreError(
-            f"'{root}' is not a valid keystore",
-            "It does not exist."
-            if not root.exists()
-            else f"It has no {ENCLAVES} folder, or has neither a CA, a governance nor an enclave.",
-            _instead_of(root),
-        )
+        why = f"It has no {ENCLAVES} folder, or has neither a CA, a governance nor an enclave."
+        if not root.exists():
+            parent = next((path for path in root.parents[-2::-1] if not path.exists()), None)
+            why = "It does not exist."
+            why += f" Nor does '{parent}': its disk may not be mounted." if parent else ""
+        raise KeystoreError(f"'{root}' is not a valid keystore", why, _instead_of(root))
 
 
 def _instead_of(root: Path) -> str:
@@ -542,7 +541,8 @@ def _instead_of(root: Path) -> str:
         return f"It is a folder in the keystore '{around}': name that keystore."
     if similar := similar_keystores(root):
         return f"Perhaps you mean '{similar[0]}'."
-    return f"Make one with `sros create_keystore {quote(str(root))}`."
+    create = f"sros create_keystore {quote(str(root))}"
+    return f"Name the keystore; if you have none yet, make one with `{create}`."
 
 
 def keystore_around(folder: Path) -> Path | None:

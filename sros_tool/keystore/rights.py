@@ -8,6 +8,7 @@ rights that its access control gives other enclaves.
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -39,14 +40,12 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import FilesReadOnce, Keystore
+from sros_tool.names import is_expression
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import (
-    Policy,
-    StatedProtection,
-    stated_protections,
-)
+from sros_tool.policy.model import DENY, Policy, StatedProtection, stated_protections
+from sros_tool.policy.patterns import Names
 from sros_tool.policy.rights import Right, RightsDifference, Rules, compare, policy_rights
 from sros_tool.translate import grant_rights
 from sros_tool.values import Words, shows
@@ -554,6 +553,9 @@ class PolicyDifference(NamedTuple):
     """Rights that only one side has."""
     protections: Sequence[DifferentProtection]
     """Protection that only one of two policies demands."""
+    unanswered: Sequence[Right]
+    """Rights of B to subscribe, request or call, whose other side an enclave of A has, and no
+    enclave of B."""
 
 
 class SourcesDifference(NamedTuple):
@@ -564,6 +566,8 @@ class SourcesDifference(NamedTuple):
     rights: RightsDifference
     protections: Sequence[tuple[str, StatedProtection]]
     """Protections that only one of two policies states, with "-" for the first or "+"."""
+    unanswered: Sequence[Right]
+    """As in `PolicyDifference`; empty if only some enclaves were compared."""
 
     def __bool__(self) -> bool:
         return bool(self.rights or self.protections)
@@ -577,11 +581,38 @@ def compare_sources(first: RightsSource, second: RightsSource) -> SourcesDiffere
     scope = None
     if first.scope is None or second.scope is None:
         scope = second.scope if first.scope is None else first.scope
-    return SourcesDifference(
-        scope,
-        compare(first.rights, second.rights, scope),
-        _protection_differences(first, second),
+    difference = compare(first.rights, second.rights, scope)
+    unanswered = () if scope else _unanswered(difference.only_first, second.rights)
+    protections = _protection_differences(first, second)
+    return SourcesDifference(scope, difference, protections, unanswered)
+
+
+def _unanswered(lost: Iterable[Right], rights: Iterable[Right]) -> list[Right]:
+    """Return the ``rights`` to an exact name whose other side only rights that were ``lost`` allow.
+
+    For example, a right to subscribe to a topic that no enclave may publish any more.
+    """
+    had: dict[str, Names] = {}
+    has: dict[str, Names] = {}
+    for names, some in ((had, lost), (has, rights)):
+        stated: dict[str, set[str]] = defaultdict(set)
+        for right in some:
+            if right.qualifier is not DENY:
+                stated[right.right].add(right.name)
+        names |= {right: Names(sorted(stated[right])) for right in _OFFERING.values()}
+    return sorted(
+        right
+        for right in rights
+        if (offering := _OFFERING.get(right.right))
+        and right.qualifier is not DENY
+        and not is_expression(right.name)
+        and had[offering].meets(right.name)
+        and not has[offering].meets(right.name)
     )
+
+
+_OFFERING = {"subscribe": "publish", "request": "reply", "call": "execute"}
+"""Right to use a name → the right to offer it."""
 
 
 def _protection_differences(
@@ -614,6 +645,7 @@ def policy_difference(
             for sign, right in compared.rights.lines()
         ],
         [DifferentProtection(_SIDES[sign], stated) for sign, stated in compared.protections],
+        compared.unanswered,
     )
 
 

@@ -87,11 +87,11 @@ class Witness:
 class Verdict:
     """The decision on a requirement in one world.
 
-    ``witness`` is None if the requirement holds.  ``empty`` are names and enclaves in the
-    requirement that the world does not have.  ``always`` is a clause that says why the requirement
-    cannot fail whatever rights enclaves get, or "".  ``assumed`` is a name whose protection is
-    assumed because the policy does not state it, or "".  ``kept`` is a demanded use that does not
-    pass between Zenoh routers, so other enclaves do not get it; or None.
+    ``witness`` is None if the requirement holds.  ``empty`` are clauses on enclaves in the
+    requirement that do not exist, and on names that no enclave may use.  ``always`` is a clause
+    that says why the requirement cannot fail whatever rights enclaves get, or "".  ``assumed`` is a
+    name whose protection is assumed because the policy does not state it, or "".  ``kept`` is a
+    demanded use that does not pass between Zenoh routers, so other enclaves do not get it; or None.
     """
 
     requirement: Requirement
@@ -555,7 +555,7 @@ def _uses(hop: TopicHop) -> Iterator[Use]:
 
 
 def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterator[str]:
-    """Yield names and enclaves in a requirement that do not occur in the world."""
+    """Yield clauses on enclaves in a requirement that do not exist, and on names without users."""
     patterns: tuple[str, ...] = ()
     match requirement:
         case Only():
@@ -568,7 +568,7 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
         if not any(
             fnmatchcase(enclave, pattern.removeprefix(EXCEPT)) for enclave in world.enclaves
         ):
-            yield f"enclave {pattern}"
+            yield f"there is no enclave {pattern}"
     match requirement:
         case Only() | AtMost() | NotBoth():
             sides = (
@@ -579,18 +579,18 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
             for right, names in sides:
                 for name in names:
                     if not _anybody(world, _doing(right), name, limit):
-                        yield _named(right, name)
+                        yield f"no enclave may {right} {_named(right, name)}"
         case Nobody():
             for right, names in requirement.rights:
                 other = OTHER_SIDE[right]
                 for name in names:
                     if not _anybody(world, (*_doing(other), *_doing(right)), name, limit):
-                        yield _named(right, name)
+                        yield f"no enclave may use {_named(right, name)}"
         case Protected():
             for kind, name in requirement.names:
                 parts = [part for right in RIGHTS[kind] for part in _doing(right)]
                 if not _anybody(world, parts, name, limit):
-                    yield f"{kind.removesuffix('s')} {name}"
+                    yield f"no enclave may use {kind.removesuffix('s')} {name}"
 
 
 def _always(requirement: Requirement, world: World) -> str:

@@ -165,7 +165,7 @@ def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
     first, *others = verdicts
     empty = [name for name in first.empty if all(name in other.empty for other in others)]
     if empty:
-        yield f"nothing has {_listed(empty)}"
+        yield _listed(empty)
     if all(verdict.always for verdict in verdicts):
         yield first.always
 

@@ -152,7 +152,7 @@ def test_a_folder_that_is_no_keystore_leads_to_the_one_that_was_meant(keystore: 
     for path, said in (
         (inside, f"It is a folder in the keystore '{keystore}': name that keystore."),
         (misspelt, f"It does not exist. Perhaps you mean '{keystore}'."),
-        (keystore.with_name("other"), "Make one with `sros create_keystore "),
+        (keystore.with_name("other"), "if you have none yet, make one with `sros create_keystore "),
     ):
         assert said in sros("list_enclaves", path).err
         assert said in sros("explain", path, "/a", "publish", "/x").err

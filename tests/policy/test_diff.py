@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -11,6 +12,7 @@ from sros_tool.names import ACTION_SERVICES
 from sros_tool.policy.model import ALLOW, DENY, Policy
 from sros_tool.policy.rights import Right, Rules, compare, policy_rights
 from tests.policy.drawn_policies import PATHS, listed, meant, policies
+from tests.support.harness import policy_text, publish, sros, subscribe
 
 
 def right(name: str, word: str = "publish", enclave: str = "/a") -> Right:
@@ -90,3 +92,14 @@ def test_wildcards_of_the_other_side_are_told() -> None:
     wide = [right("/*", "request"), right("/*", "subscribe")]
     difference = compare([right("/f", "call"), right("/x")], wide)
     assert difference.covered == {right("/f", "call"): (wide[1], wide[0])}
+
+
+def test_a_right_without_its_other_side_is_named(tmp_path: Path) -> None:
+    reader = {"/b": subscribe("/x", "/never")}
+    for name, topics in (("a.xml", ("/x",)), ("b.xml", ("/y",)), ("c.xml", ("/y", "/*"))):
+        (tmp_path / name).write_text(policy_text({"/a": publish(*topics), **reader}))
+    renamed = sros("diff_policy", "a.xml", "b.xml", cwd=tmp_path)
+    lost = "! /b may subscribe /x, but no enclave may publish it any more"
+    assert [line for line in renamed.out.splitlines() if line.startswith("!")] == [lost]
+    assert renamed.status == 1
+    assert "!" not in sros("diff_policy", "a.xml", "c.xml", cwd=tmp_path).out

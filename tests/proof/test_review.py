@@ -99,6 +99,8 @@ def test_rights_that_move_to_a_second_policy_are_seen(change: Change) -> None:
     assert "'second.xml' changes and is not reviewed" in one.out
     assert "leave it out with --leave-out second.xml, or delete it" in one.out
     assert change.review("--policy", "robot.xml", "--new-access", "allow").status == 0
+    allowed = change.review("--policy", "robot.xml\nsecond.xml", "--new-access", "allow").out
+    assert "\n  + /evil publish topic /x" in allowed
     change.commit({"second.xml": None, "tests/second.xml": policy_text(WIDER)})
     left = change.review("--policy", "robot.xml", "--leave-out", "tests")
     assert left.status == 0
