@@ -147,6 +147,7 @@ def _library_findings(
 ) -> Iterator[Finding]:
     """Yield one finding for each library; ``users`` maps it to clauses on where it is used."""
     used = shipped_advisories() if advisories is None else advisories
+    said: dict[str, str] = {}
     for library, clauses in users.items():
         if not any(advisory.product == library.product for advisory in used):
             continue
@@ -161,9 +162,12 @@ def _library_findings(
             kind = KNOWN_VULNERABILITIES
             if library.packaged:
                 kind = PACKAGE_VULNERABILITIES
-            text = f"{place}{by}, {_described(known.known, library.version)}"
+            described = _described(known.known, library.version)
             if known.unclear:
-                text += f". {_unclear(known.unclear)}"
+                described += f". {_unclear(known.unclear)}"
+            if (first := said.setdefault(f"{name}: {described}", place)) != place:
+                described = f"with the same vulnerabilities as {first}"
+            text = f"{place}{by}, {described}"
             yield kind.found(name, text, remedy=_remedy(kind, library))
         elif known.unclear:
             text = f"{place}{by}. {_unclear(known.unclear)}"

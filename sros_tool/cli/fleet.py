@@ -894,8 +894,9 @@ def _dds_counts(compared: ComparedFleet) -> Iterator[str]:
     status, outdated = compared.status, compared.outdated_dds
     if outdated:
         robots = _runs(outdated, status.names, status.groups)
+        only = "the exit status is 1 only for a DDS" if status.complete else "a DDS"
         yield (
-            f"a DDS to upgrade, for known vulnerabilities: {robots}; "
+            f"{only} to upgrade, for known vulnerabilities: {robots}; "
             f"which: `sros fleet status {quote(str(status.keystore))} --robot {outdated[0]}`"
         )
     elif list(_dds_findings(compared)):

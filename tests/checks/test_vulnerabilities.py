@@ -51,6 +51,14 @@ def test_one_finding_for_each_library(path: str, version: str, identity: str) ->
     assert "ros-jazzy-fastrtps" in finding.remedy or "/opt" not in path
 
 
+def test_vulnerabilities_of_a_release_are_listed_once() -> None:
+    paths = ("/opt/ros/jazzy/lib/libfastrtps.so.2.14.5", "/venv/lib/libfastrtps.so.2.14.5")
+    libraries = [MappedLibrary("Fast DDS", "2.14.5", path) for path in paths]
+    first, second = vulnerability_findings(running(), libraries)
+    assert "CVE-2025-62599" in first.text
+    assert second.text == f"'{paths[1]}', with the same vulnerabilities as '{paths[0]}'"
+
+
 def test_a_mended_release_has_no_known_vulnerability() -> None:
     library = MappedLibrary("Fast DDS", "3.2.5", "/opt/ros/kilted/lib/libfastdds.so.3.2.5")
     (finding,) = vulnerability_findings(running(library))
