@@ -10,8 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 
-from sros_tool.dds.decision.access import Access, GovernedDomain
-from sros_tool.dds.decision.answers import Decision, Outcome
+from sros_tool.dds.decision.access import Access, Decision, GovernedDomain, Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule

@@ -42,7 +42,7 @@ from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import Keystore, open_enclave
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction import recovery as locking
+from sros_tool.keystore.transaction import transaction as locking
 from sros_tool.keystore.transaction.stage import staged_name
 from sros_tool.xml import read_bytes
 from tests.conftest import MEMORY, POLICY

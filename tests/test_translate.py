@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision.access import Access, GovernedDomain
-from sros_tool.dds.decision.answers import AccessVerb, Outcome
+from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain, Outcome
 from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import Style, Vendor
 from sros_tool.dds.domains import DomainSet

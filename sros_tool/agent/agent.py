@@ -67,7 +67,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, open_enclave, read_certificate
-from sros_tool.keystore.transaction.recovery import tidy
+from sros_tool.keystore.transaction.transaction import tidy
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import make_request, validity_of
 from sros_tool.pki.crl import list_number, load_crl

@@ -46,8 +46,7 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.keystore.reader import OpenedEnclave, open_enclave, weaknesses
-from sros_tool.keystore.transaction.recovery import tidy
-from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.transaction.transaction import Transaction, tidy
 from sros_tool.pki.certificates import (
     digest,
     load_certificates,

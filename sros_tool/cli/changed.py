@@ -138,7 +138,7 @@ def _print_closed(root: Path, changes: Sequence[Change]) -> None:
 
 def rights_lines(root: Path, replaced: Sequence[ReplacedRights], *, dry_run: bool) -> Iterator[str]:
     """Yield a line for every right that an enclave loses or gains; robots of a fleet in one."""
-    from sros_tool.fleet.enclaves import folded
+    from sros_tool.fleet.robots import folded
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.reader import Keystore
 

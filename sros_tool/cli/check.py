@@ -666,7 +666,7 @@ def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Findi
     Two findings are merged if they are about the same line of a policy, in enclaves of two robots,
     or in one enclave about names of two robots.
     """
-    from sros_tool.fleet.enclaves import name_of_robots, path_of_robots
+    from sros_tool.fleet.robots import name_of_robots, path_of_robots
 
     groups: dict[object, list[tuple[Finding, str]]] = {}
     number: Counter[object] = Counter()

@@ -749,7 +749,7 @@ def _who_lines(
     The enclaves of a fleet are grouped by robot.  ``domain`` is that of --domain, ``domains`` are
     those of the keystore: where some of them alone allow it, they are named.
     """
-    from sros_tool.fleet.enclaves import folded
+    from sros_tool.fleet.robots import folded
 
     able = [outcome for outcome in everybody.outcomes if outcome.allowed]
     lines = []
@@ -828,7 +828,7 @@ def _followed_lines(followed: FollowedReach) -> Iterator[str]:
 
     The enclaves of a fleet are grouped by robot.
     """
-    from sros_tool.fleet.enclaves import folded
+    from sros_tool.fleet.robots import folded
     from sros_tool.reach import path_text
 
     reach = followed.reach

@@ -315,7 +315,7 @@ def _difference_lines(
     difference: RightsDifference, first: Fleet | None, second: Fleet | None
 ) -> list[str]:
     """Return the lines for a difference; lines that differ only in the robot are merged."""
-    from sros_tool.fleet.enclaves import folded
+    from sros_tool.fleet.robots import folded
 
     lines: list[tuple[str, str, str]] = []
     for sign, right in difference.lines():
@@ -705,7 +705,7 @@ def _removed_lines(base: AccessSource, growth: Growth) -> list[str]:
 
 
 def _folded(side: AccessSource, sign: str, gains: Iterable[Gain], growth: Growth) -> list[str]:
-    from sros_tool.fleet.enclaves import folded
+    from sros_tool.fleet.robots import folded
 
     lines = [(gain.enclaves[0], f"{sign} {_gain_text(sign, gain, growth)}") for gain in gains]
     return list(folded(side.fleet, lines))
@@ -738,7 +738,7 @@ def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
 
 
 def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
-    from sros_tool.fleet.enclaves import folded
+    from sros_tool.fleet.robots import folded
     from sros_tool.reach import path_text
 
     reached = [

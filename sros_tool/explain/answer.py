@@ -14,8 +14,8 @@ from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Annotated, NamedTuple
 
-from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import (
+from sros_tool.dds.decision.access import (
+    Access,
     AccessVerb,
     Decision,
     Outcome,

@@ -166,7 +166,7 @@ def open_to_ask(
 
 def _is_of_robot(keystore: Keystore, enclave: str) -> bool:
     """Return whether the keystore's fleet has a robot with this enclave."""
-    from sros_tool.fleet.enclaves import robot_of
+    from sros_tool.fleet.robots import robot_of
 
     fleet = fleet_of(None, keystore)
     return fleet is not None and robot_of(fleet, enclave) is not None

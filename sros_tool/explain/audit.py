@@ -21,7 +21,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.access import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance

@@ -16,7 +16,7 @@ from shlex import quote
 
 from lxml import etree
 
-from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.access import AccessVerb
 from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import SrosError

@@ -17,7 +17,7 @@ from pathlib import Path
 from shlex import quote
 from typing import NamedTuple
 
-from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.access import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, SrosError, UsageError
 from sros_tool.explain.answer import Answer, Evaluator, Part, Question, ask

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from enum import Enum, auto
 from typing import NamedTuple
 
-from sros_tool.dds.decision.answers import Outcome, OutcomeWord, ReasonWord
+from sros_tool.dds.decision.access import Outcome, OutcomeWord, ReasonWord
 from sros_tool.dds.decision.vendors import PRINCIPAL, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.distributions import SUPPORTED, Shipped

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
-from sros_tool.fleet.enclaves import MAX_ENCLAVES, group_of, path_for
-from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.fleet.robots import MAX_ENCLAVES, Fleet, Robot, group_of, path_for
 from sros_tool.names import check_enclave_name, check_namespace, expression_problem, is_expression
 from sros_tool.policy.document import PolicyFiles, read_policy
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Source, with_profiles

@@ -18,14 +18,8 @@ from typing import Any
 from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError, UnavailableError
 from sros_tool.files import read_toml
-from sros_tool.fleet.enclaves import (
-    MAX_PATTERNS,
-    pattern_problem,
-    robot_of,
-    router_of,
-    size_problem,
-)
 from sros_tool.fleet.robots import (
+    MAX_PATTERNS,
     MAX_ROBOTS,
     ROUTERS,
     Fleet,
@@ -35,8 +29,12 @@ from sros_tool.fleet.robots import (
     grace_problem,
     name_problem,
     namespace_problem,
+    pattern_problem,
     renewal_problem,
+    robot_of,
+    router_of,
     router_problem,
+    size_problem,
     user_problem,
 )
 from sros_tool.names import distribution_problem

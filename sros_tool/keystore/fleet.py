@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note, SrosError
-from sros_tool.fleet.enclaves import enclaves_of, robot_of, router_of, size_problem
-from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.fleet.robots import Fleet, Robot, enclaves_of, robot_of, router_of, size_problem
 from sros_tool.keystore.layout import FLEET, FLEET_ROOT, enclave_names, has_enclave
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import Keystore

@@ -20,8 +20,14 @@ from typing import Annotated, NamedTuple
 
 from sros_tool.dds.advisories import Advisory, known_vulnerabilities
 from sros_tool.errors import SrosError
-from sros_tool.fleet.enclaves import Unrecorded, enclaves_of, robot_of, unrecorded_enclaves
-from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.fleet.robots import (
+    Fleet,
+    Robot,
+    Unrecorded,
+    enclaves_of,
+    robot_of,
+    unrecorded_enclaves,
+)
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     CONFIRMED_FILES,

@@ -16,8 +16,7 @@ from typing import NamedTuple
 
 from cryptography import x509
 
-from sros_tool.dds.decision.access import Access, GovernedDomain
-from sros_tool.dds.decision.answers import Decision, Outcome, Refusal
+from sros_tool.dds.decision.access import Access, Decision, GovernedDomain, Outcome, Refusal
 from sros_tool.dds.decision.documents import (
     canonical_governance,
     canonical_permissions,

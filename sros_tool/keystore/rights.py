@@ -22,9 +22,8 @@ from cryptography import x509
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
-from sros_tool.fleet.enclaves import robot_of
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
-from sros_tool.fleet.robots import Fleet
+from sros_tool.fleet.robots import Fleet, robot_of
 from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import (
     PERMISSIONS_CA_FILE,

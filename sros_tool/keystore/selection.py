@@ -12,13 +12,13 @@ from shlex import quote
 from typing import NamedTuple
 
 from sros_tool.errors import InvalidNameError, KeystoreError, Note, SrosError
-from sros_tool.fleet.enclaves import (
+from sros_tool.fleet.robots import (
+    Fleet,
     Unrecorded,
     folders_of_robots,
     robot_of,
     unrecorded_enclaves,
 )
-from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, load_fleet, words_for
 from sros_tool.keystore.layout import (
     FLEET,

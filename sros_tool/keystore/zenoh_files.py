@@ -2,7 +2,7 @@
 
 Zenoh itself verifies nothing, so each configuration must be identical to the document in the
 signed message next to it, and state the rights of the enclave's signed permissions.
-`sros_tool.keystore.issuing.zenoh` writes them.
+`sros_tool.keystore.lifecycle.change` writes them.
 """
 
 from __future__ import annotations

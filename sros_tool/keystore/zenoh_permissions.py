@@ -18,8 +18,7 @@ from string import ascii_letters, digits
 from typing import NamedTuple
 
 from sros_tool.automata import Automaton, Letters, NameSet
-from sros_tool.dds.decision.access import GrantedAccess, choose_grant
-from sros_tool.dds.decision.answers import AccessVerb, Refusal
+from sros_tool.dds.decision.access import AccessVerb, GrantedAccess, Refusal, choose_grant
 from sros_tool.dds.decision.documents import canonical_permissions, read_permissions_as
 from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.vendors import MEASURED, DocumentReader, Style, Vendor, together

@@ -3,6 +3,9 @@
 The rules of each vendor are compared as sets of topics.  Each reported name is confirmed by that
 vendor's decision on it.  An empty result means that no name is added.
 
+A policy states no governance and, except for robots of a fleet, no domains; permissions state no
+governance.  The comparison assumes what a side does not state, and says so.
+
 This module reads no files.
 """
 
@@ -12,12 +15,12 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from itertools import islice, product
 from typing import Annotated, NamedTuple
 
 from sros_tool.automata import NameSet, SearchLimit
-from sros_tool.dds.decision.access import Access, GovernedDomain
-from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain
 from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.grants import (
     ComparisonCrash,
@@ -28,27 +31,31 @@ from sros_tool.dds.decision.grants import (
 from sros_tool.dds.decision.matching import ExpressionIndex, matches
 from sros_tool.dds.decision.vendors import MEASURED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import Governance
+from sros_tool.dds.governance import DomainRule, Governance
 from sros_tool.dds.permissions import Grant, Permissions
 from sros_tool.errors import DocumentError, Note
+from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.comparison import Effect, SettingChange
 from sros_tool.keystore.rights import SourceKind, by_domains
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.model import ALLOW, Source
 from sros_tool.policy.rights import KIND_OF, Right
-from sros_tool.proof.assumptions import assumptions, completed, domains_of_robots, left_out
 from sros_tool.proof.protection import (
     added_crossing,
     contradiction,
     less_protection,
+    limits_crossing,
     looser_router_rules,
+    states_routers,
+    strict_protection,
 )
-from sros_tool.proof.sources import AT, AccessSource
+from sros_tool.proof.sources import ALL_DOMAINS, AT, AccessSource
 from sros_tool.proof.worlds import ROS_TOPICS, domains_of, enforced_access, is_enforced
 from sros_tool.proof.zenoh_settings import unknown_settings
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded
-from sros_tool.translate import grant_rights
+from sros_tool.translate import governance_for, grant_rights
 from sros_tool.values import Words, shows
+from sros_tool.zenoh.configuration import Mode
 
 _VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 _ZENOH = "Zenoh"
@@ -239,7 +246,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     scope = None
     if base.scope is None or head.scope is None:
         scope = head.scope if base.scope is None else base.scope
-    before, after = completed(base, head), completed(head, base)
+    before, after = _completed(base, head), _completed(head, base)
     worlds = _worlds(before, after)
     added = tuple(_gains(before, after, worlds, scope, limit))
     lost = tuple(dict.fromkeys(_less(base, head, limit, rules=not added)))
@@ -265,8 +272,8 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         tuple(replace(change, effect=Effect.TIGHTER) for change in more),
         tuple(world.title for world in worlds),
         tuple(sorted({domain for world in worlds for domain in world.domains})),
-        assumptions(base, head),
-        left_out(base, head),
+        tuple(_assumed(base, head)),
+        tuple(_left_out(base, head)),
         unclear,
     )
 
@@ -371,7 +378,7 @@ def _zenoh_domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
     """
     domains: set[DomainSet] = set()
     for side, other in ((base, head), (head, base)):
-        domains.update(DomainSet.of((e, e)) for e in domains_of_robots(side, other).values())
+        domains.update(DomainSet.of((e, e)) for e in _domains_of_robots(side, other).values())
         if side.zenoh is None and side.kind != "policy":
             domains.update(domain_set.closed() for domain_set in _granted(side))
     return domains_of((*base.enforcers, *head.enforcers), domains) or (0,)
@@ -445,7 +452,7 @@ def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
 def _on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
     """Return a function for access on Zenoh: by the rules of a side, or else by its rights."""
     stated = {
-        id(side): _of_rights(side, domains_of_robots(side, other))
+        id(side): _of_rights(side, _domains_of_robots(side, other))
         for side, other in ((base, head), (head, base))
         if side.zenoh is None
     }
@@ -950,3 +957,177 @@ def _reached(edges: _Edges, start: str) -> dict[str, Hop]:
                 reached[there] = hop
                 row.append(there)
     return reached
+
+
+# ── what a side does not state ─────────────────────────────────────────────────────────────
+
+
+def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
+    """Return a side with the domains and access control that it does not state itself.
+
+    Enclaves of robots are for the domain of their robot.  A side without a governance gets access
+    control of everything, in its own domains and those of the other side.
+    """
+    domains = _domains_of_robots(side, other)
+    permissions = _certified_as(side, other)
+    if domains:
+        permissions = {
+            name: _for_domain(each, domains[name]) if name in domains else each
+            for name, each in permissions.items()
+        }
+    if side.governance:
+        return replace(side, permissions=permissions)
+    own = DomainSet.of(*((domain, domain) for domain in domains.values()))
+    if side.kind != "policy":
+        own = _certified_domains(side)
+    governance = _controlling(other.governance, own)
+    if governance is None:
+        known = DomainSet((*own.ranges, *_certified_domains(other).ranges)).closed()
+        open_ended = {"policy"} >= {side.kind, other.kind}
+        governance = governance_for(strict_protection(), ALL_DOMAINS if open_ended else known)
+    return replace(side, permissions=permissions, governance=governance)
+
+
+def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permissions]:
+    """Return the permissions of a side; those of a policy get the subjects of the other side.
+
+    If the other side is a keystore with unique subjects, enclaves that only the policy has get a
+    unique subject, too.
+    """
+    if side.kind != "policy" or other.kind == "policy":
+        return side.permissions
+    unique = other.later is not None and other.later.unique_subject
+    found = {}
+    for name, permissions in side.permissions.items():
+        subject = other.subject_of(name)
+        if not subject and unique:
+            subject = f"CN={name},OU={sha256(name.encode()).hexdigest()}"
+        grants = permissions.grants
+        if subject:
+            grants = tuple(grant._replace(subject=subject) for grant in grants)
+        found[name] = Permissions(grants)
+    return found
+
+
+def _domains_of_robots(side: AccessSource, other: AccessSource) -> dict[str, int]:
+    """Map enclaves to the ROS domain of their robot, if the fleet states one."""
+    robots = side.fleet or other.fleet
+    if side.kind != "policy" or robots is None:
+        return {}
+    robots_of = ((name, robot_of(robots, name)) for name in side.permissions)
+    return {
+        name: robot.domain
+        for name, robot in robots_of
+        if robot is not None and robot.domain is not None
+    }
+
+
+def _for_domain(permissions: Permissions, domain: int) -> Permissions:
+    only = DomainSet.of((domain, domain))
+    return Permissions(
+        tuple(
+            grant._replace(rules=tuple(rule._replace(domains=only) for rule in grant.rules))
+            for grant in permissions.grants
+        )
+    )
+
+
+def _certified_domains(side: AccessSource) -> DomainSet:
+    """Return the domains for which the permissions have rules; empty for a policy.
+
+    A policy fits any domain.
+    """
+    if side.kind == "policy":
+        return DomainSet(())
+    return DomainSet(
+        tuple(
+            part
+            for permissions in side.permissions.values()
+            for grant in permissions.grants
+            for rule in grant.rules
+            for part in rule.domains.ranges
+        )
+    ).closed()
+
+
+def _controlling(governance: Governance | None, more: DomainSet) -> Governance | None:
+    """Return a governance with access control of everything, also for the domains ``more``."""
+    if governance is None:
+        return None
+    strict = governance_for(strict_protection(), more).domain_access_rules[0]
+
+    def controlling(rule: DomainRule) -> DomainRule:
+        topics = tuple(
+            replace(topic_rule, enable_read_access_control=True, enable_write_access_control=True)
+            for topic_rule in rule.topic_access_rules
+        )
+        if not any(topic.topic_expression == "*" for topic in topics):
+            topics += strict.topic_access_rules
+        return replace(
+            rule,
+            allow_unauthenticated_participants=False,
+            enable_join_access_control=True,
+            topic_access_rules=topics,
+        )
+
+    rules = tuple(map(controlling, governance.domain_access_rules))
+    missing = [domain for domain in more if domain not in governance.domains().closed()]
+    if missing:
+        rules += (replace(strict, domains=DomainSet.of(*((domain, domain) for domain in missing))),)
+    return Governance(rules)
+
+
+def _assumed(base: AccessSource, head: AccessSource) -> Iterator[str]:
+    """Yield, as clauses, what is assumed about a side that does not state everything."""
+    if "zenoh" not in (base.kind, head.kind):
+        if base.governance is None and head.governance is None:
+            yield "both are signed with the same governance, which controls all access"
+        elif base.governance is None:
+            yield (
+                "BASE is signed with access control of everything, and with encryption unless it "
+                "demands another protection"
+            )
+        elif head.governance is None:
+            yield (
+                "HEAD is signed with access control of everything, and protects no less than BASE"
+            )
+    for name, side, other in (("BASE", base, "HEAD"), ("HEAD", head, "BASE")):
+        against = head if side is base else base
+        if side.kind != "policy" or against.kind == "policy":
+            continue
+        if _domains_of_robots(side, against).keys() < side.permissions.keys():
+            whose = "its enclaves without a robot" if side.fleet else "it"
+            yield f"{name} names no domains: for {whose}, the domains of {other} count"
+        if against.zenoh is not None:
+            yield f"{name} has the Zenoh settings that sros writes"
+
+
+def _left_out(base: AccessSource, head: AccessSource) -> Iterator[str]:
+    """Yield the parts that are not compared on purpose, in words."""
+    yield "dates"
+    sides = (("BASE", base), ("HEAD", head))
+    if "zenoh" in (base.kind, head.kind):
+        if {base.kind, head.kind} != {"zenoh"}:
+            yield "what DDS permits"
+    else:
+        yield "partitions other than the default one"
+    if {base.kind, head.kind} & {"keystore", "enclave"}:
+        yield "who holds which key"
+    if any(
+        file.document.mode is Mode.CLIENT for _, side in sides for file in side.zenoh_files.values()
+    ):
+        yield "what clients of Zenoh let their router do"
+    for name, side in sides:
+        other = head if side is base else base
+        if side.trusts is not None and other.trusts is None:
+            yield f"the CAs and revocation lists of {name}"
+        if side.later is not None and other.later is None:
+            yield f"what {name} gives to enclaves that are created later"
+        if limits_crossing(side) and not states_routers(other):
+            yield f"what {name} lets cross between Zenoh routers"
+        if side.zenoh_files and not other.zenoh_files:
+            yield f"where the Zenoh processes of {name} listen and connect"
+        if side.scope is not None and other.scope is None:
+            yield f"enclaves that {name} does not have"
+    if base.protections is not None and head.governance is None and head.kind != "policy":
+        yield "the protection of messages, of which HEAD says nothing"

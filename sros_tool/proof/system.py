@@ -15,8 +15,7 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.automata import NameSet
-from sros_tool.dds.decision.access import Access, GovernedDomain
-from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain
 from sros_tool.dds.decision.grants import also_fitting
 from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import MEASURED, Style, Vendor

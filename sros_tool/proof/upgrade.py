@@ -39,8 +39,7 @@ from sros_tool.checks.upgrade import (
     ZENOH,
 )
 from sros_tool.dds.advisories import Advisory, known_vulnerabilities
-from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import Outcome
+from sros_tool.dds.decision.access import Access, Outcome
 from sros_tool.dds.decision.grants import also_fitting
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet

@@ -18,8 +18,7 @@ from string import ascii_letters, digits
 from types import MappingProxyType
 
 from sros_tool.automata import Automaton, Letters, NameSet, SearchLimit
-from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.access import Access, AccessVerb
 from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet

@@ -21,9 +21,8 @@ from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import policies_dir
-from sros_tool.fleet.enclaves import robot_of
 from sros_tool.fleet.expansion import FleetPolicy
-from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.fleet.robots import Fleet, Robot, robot_of
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
 from sros_tool.keystore.fleet import load_fleet

@@ -36,7 +36,7 @@ from sros_tool.keystore.delivery.release import (
 )
 from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer, read_present
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.transaction import recovery
+from sros_tool.keystore.transaction import transaction
 from sros_tool.pki.crl import load_crl
 from tests.agent.published import DAY, ROLES, Home, Thief
 from tests.support.harness import policy_text, snapshot, sros
@@ -366,9 +366,9 @@ def test_many_files_that_nothing_names(publisher: Home, monkeypatch: pytest.Monk
 
 
 def test_two_at_once(publisher: Home, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recovery, "_LOCK_SECONDS", 0.0)
+    monkeypatch.setattr(transaction, "_LOCK_SECONDS", 0.0)
     with Folder(publisher.pub) as folder:
-        lock = recovery.KeystoreLock(folder).acquire()
+        lock = transaction.KeystoreLock(folder).acquire()
         try:
             with pytest.raises(KeystoreError, match="is busy"):
                 publisher.publish()

@@ -5,8 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime, tzinfo
 from functools import lru_cache
 
-from sros_tool.dds.decision.access import Access, GovernedDomain
-from sros_tool.dds.decision.answers import Refusal
+from sros_tool.dds.decision.access import Access, GovernedDomain, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.vendors import Vendor, VendorTraits
 from sros_tool.dds.governance import Governance

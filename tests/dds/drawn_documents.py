@@ -17,8 +17,7 @@ from zoneinfo import ZoneInfo
 
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import AccessVerb, Refusal
+from sros_tool.dds.decision.access import Access, AccessVerb, Refusal
 from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import NOW, access_of
 from tests.dds.drawn_words import (

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import AccessVerb, Outcome
+from sros_tool.dds.decision.access import Access, AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import (
     NOW,

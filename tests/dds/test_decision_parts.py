@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision.access import holds_for
-from sros_tool.dds.decision.answers import Outcome, Refusal
+from sros_tool.dds.decision.access import Outcome, Refusal, holds_for
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.grants import read_moment, same_subject
 from sros_tool.dds.decision.vendors import Moments, OpenRange, Subjects, Vendor

@@ -10,8 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 
-from sros_tool.dds.decision.access import Access, GovernedDomain
-from sros_tool.dds.decision.answers import _REASONS, Decision, Outcome, Refusal
+from sros_tool.dds.decision.access import (
+    _REASONS,
+    Access,
+    Decision,
+    GovernedDomain,
+    Outcome,
+    Refusal,
+)
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet

@@ -12,7 +12,7 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from sros_tool.dds.decision.answers import AccessVerb, Outcome, Refusal
+from sros_tool.dds.decision.access import AccessVerb, Outcome, Refusal
 from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import (
     NOW,

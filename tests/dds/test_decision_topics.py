@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from sros_tool.dds.decision.answers import AccessVerb, Refusal
+from sros_tool.dds.decision.access import AccessVerb, Refusal
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from tests.dds.drawn_documents import documents
 from tests.support.children import LONG

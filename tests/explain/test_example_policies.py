@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision.answers import Outcome
+from sros_tool.dds.decision.access import Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.answer import Evaluator, Question, ask

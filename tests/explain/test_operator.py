@@ -11,7 +11,7 @@ from functools import cache
 
 import pytest
 
-from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.access import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.answer import Evaluator, Part, Question

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import sros_tool.dds.decision as decision
-from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.access import AccessVerb
 from sros_tool.errors import UsageError
 from sros_tool.explain.answer import TYPES, WORDS, ask
 from sros_tool.explain.explanation import _BY_REASON, remedy

@@ -40,7 +40,7 @@ from sros_tool.keystore.fleet import recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import key_on_robot
 from sros_tool.keystore.reader import Keystore, read_certificate
-from sros_tool.keystore.transaction import recovery
+from sros_tool.keystore.transaction import transaction
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
 from sros_tool.pki.crl import load_crl
@@ -175,7 +175,7 @@ def test_messages_are_kept_once_each(home: Home) -> None:
 
 def test_two_at_once(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody keeps an earlier message, or signs again, while another process takes them in."""
-    monkeypatch.setattr(recovery, "_LOCK_SECONDS", 0.0)
+    monkeypatch.setattr(transaction, "_LOCK_SECONDS", 0.0)
     (home.folder / "said").write_bytes(render_confirmation(home.said("r1", NOW, sequence=None)))
     home.send("r1")
     kept = keep

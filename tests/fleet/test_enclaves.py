@@ -6,9 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from sros_tool.fleet import enclaves
-from sros_tool.fleet.enclaves import _candidates, enclaves_of, robot_of
-from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.fleet import robots
+from sros_tool.fleet.robots import Fleet, Robot, _candidates, enclaves_of, robot_of
 
 ROBOTS = (
     Robot("r1", "/r1", groups=("carriers",)),
@@ -58,15 +57,17 @@ def test_other_enclaves_are_of_no_robot(path: str) -> None:
 def test_the_robot_of_one_enclave_among_many_patterns_is_found_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    robots = [Robot(f"r{i}", f"/r{i}") for i in range(1000)]
-    many = Fleet.of(robots, enclaves=[f"/{{robot}}/node{i}" for i in range(1000)])
+    many = Fleet.of(
+        [Robot(f"r{i}", f"/r{i}") for i in range(1000)],
+        enclaves=[f"/{{robot}}/node{i}" for i in range(1000)],
+    )
     tried = []
 
-    def counted(fleet: Fleet, pattern: enclaves._Pattern, enclave: str) -> Iterator[Robot]:
+    def counted(fleet: Fleet, pattern: robots._Pattern, enclave: str) -> Iterator[Robot]:
         tried.append(pattern)
         return _candidates(fleet, pattern, enclave)
 
-    monkeypatch.setattr(enclaves, "_candidates", counted)
+    monkeypatch.setattr(robots, "_candidates", counted)
     for i in range(1000):
         found = robot_of(many, f"/r{i}/node{999 - i}")
         assert found and found.name == f"r{i}"

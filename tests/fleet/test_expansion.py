@@ -11,10 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sros_tool.errors import PolicyError, SrosError
-from sros_tool.fleet.enclaves import enclaves_of, robot_of
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.fleet_file import parse_fleet, render_fleet
-from sros_tool.fleet.robots import Fleet, Robot, name_problem, namespace_problem
+from sros_tool.fleet.robots import (
+    Fleet,
+    Robot,
+    enclaves_of,
+    name_problem,
+    namespace_problem,
+    robot_of,
+)
 from sros_tool.names import is_expression
 from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.model import Policy

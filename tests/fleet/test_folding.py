@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.fleet.enclaves import folded
-from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.fleet.robots import Fleet, Robot, folded
 from tests.support.harness import policy_text, publish, sros
 
 FLEET = Fleet.of(

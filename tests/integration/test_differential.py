@@ -21,7 +21,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision.answers import AccessVerb, Outcome, Refusal
+from sros_tool.dds.decision.access import AccessVerb, Outcome, Refusal
 from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, MEASURED, Vendor, VendorTraits
 from sros_tool.dds.governance import render_governance
 from sros_tool.dds.permissions import Permissions, render_permissions

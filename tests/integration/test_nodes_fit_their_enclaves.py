@@ -19,8 +19,7 @@ from typing import Any
 
 import pytest
 
-from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import AccessVerb, Outcome
+from sros_tool.dds.decision.access import Access, AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY, Backend, conditions

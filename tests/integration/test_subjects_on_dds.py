@@ -14,7 +14,7 @@ from cryptography import x509
 from cryptography.x509.name import _ASN1Type
 from cryptography.x509.oid import NameOID
 
-from sros_tool.dds.decision.answers import AccessVerb, Outcome, Refusal
+from sros_tool.dds.decision.access import AccessVerb, Outcome, Refusal
 from sros_tool.dds.decision.vendors import MEASURED, Subjects, Vendor
 from sros_tool.pki.certificates import subject_text
 from tests.dds.decision_documents import access_of, allow, grant, permissions, publish, subscribe

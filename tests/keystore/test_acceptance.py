@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 
-from sros_tool.dds.decision.answers import Outcome
+from sros_tool.dds.decision.access import Outcome
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.explain.answer import Evaluator, ask
 from sros_tool.keystore.participant import JoinContext, load_enclave

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from sros_tool.fleet import enclaves
+from sros_tool.fleet import robots
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.fleet import left_enclaves
 from sros_tool.keystore.layout import list_enclaves
@@ -68,7 +68,7 @@ def test_no_enclave_belongs_to_two_robots(made: Path) -> None:
 
 def test_paths_of_earlier_policies_count(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is written can be read again."""
-    monkeypatch.setattr(enclaves, "MAX_PATTERNS", 1)
+    monkeypatch.setattr(robots, "MAX_PATTERNS", 1)
     before = snapshot(made / "ks")
     ended = generate(made, "/{robot}/other")
     assert (ended.status, "2 paths with a placeholder" in ended.err) == (2, True), ended
@@ -80,14 +80,14 @@ def test_enclaves_that_are_left_are_found_in_one_pass(
 ) -> None:
     """Not every name is compared with every path."""
     looked = 0
-    candidates = enclaves._candidates
+    candidates = robots._candidates
 
     def counted(*arguments: Any) -> Iterator[Robot]:
         nonlocal looked
         looked += 1
         return candidates(*arguments)
 
-    monkeypatch.setattr(enclaves, "_candidates", counted)
+    monkeypatch.setattr(robots, "_candidates", counted)
     paths = [f"/e{number}/{{robot}}" for number in range(30)]
     before = Fleet.of([Robot("a", "/a"), Robot("b", "/b")], enclaves=["/{robot}", *paths])
     assert not list(left_enclaves(made / "ks", before, before))

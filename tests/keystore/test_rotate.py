@@ -554,7 +554,7 @@ def test_death_at_every_step(stage: RotationStage | None, tmp_path: Path) -> Non
 
 
 def shape_after_tidy(root: Path) -> tuple[object, ...]:
-    from sros_tool.keystore.transaction.recovery import tidy
+    from sros_tool.keystore.transaction.transaction import tidy
 
     tidy(root)
     return shape(root)

@@ -37,9 +37,9 @@ from sros_tool.keystore.lifecycle.create import (
 )
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction import recovery
-from sros_tool.keystore.transaction import recovery as locking
 from sros_tool.keystore.transaction import stage as stage_of
+from sros_tool.keystore.transaction import transaction
+from sros_tool.keystore.transaction import transaction as locking
 from sros_tool.keystore.transaction.stage import Change, Changes
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.policy.document import read_policy
@@ -782,7 +782,7 @@ def test_a_stage_of_an_unknown_format_is_refused_and_not_touched(
     before = snapshot(keystore)
     for verb in (
         lambda: create_enclaves(keystore, ["/new"], now=NOW),
-        lambda: recovery.tidy(keystore),
+        lambda: transaction.tidy(keystore),
     ):
         with pytest.raises(KeystoreError, match=r"this version of sros.*version of sros that"):
             verb()

@@ -11,8 +11,7 @@ from random import Random
 
 import pytest
 
-from sros_tool.dds.decision.access import Access, GovernedDomain
-from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain
 from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.dds.domains import DomainRange, DomainSet
 from sros_tool.dds.governance import parse_governance

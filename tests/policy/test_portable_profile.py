@@ -10,8 +10,7 @@ from datetime import UTC, datetime, timedelta, timezone
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.access import Access, AccessVerb
 from sros_tool.dds.decision.vendors import MEASURED
 from sros_tool.dds.governance import render_governance
 from sros_tool.dds.permissions import Permissions, render_permissions

@@ -16,7 +16,7 @@ from random import Random
 
 import pytest
 
-from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.access import AccessVerb
 from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import MEASURED, Style
 from sros_tool.errors import DocumentError, UsageError

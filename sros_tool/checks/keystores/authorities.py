@@ -372,7 +372,7 @@ robots.
 
 
 def _left_enclaves(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]:
-    from sros_tool.fleet.enclaves import left_robot_of
+    from sros_tool.fleet.robots import left_robot_of
 
     robots: dict[str, list[str]] = {}
     for name in keystore.names:

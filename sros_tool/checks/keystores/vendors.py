@@ -16,8 +16,7 @@ from sros_tool.checks.keystores.enclaves import fault_remedy, grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave
 from sros_tool.checks.keystores.topic_names import NO_ROS_NAME, has_foreign_letters, is_for_ros
 from sros_tool.checks.kind import ERROR, WARNING, Cause, Finding, FindingKind, some_names
-from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import AccessVerb, Outcome
+from sros_tool.dds.decision.access import Access, AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import MEASURED, Vendor, together
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant

@@ -7,7 +7,7 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import TypeVar
 
-from sros_tool.dds.decision.answers import Refusal
+from sros_tool.dds.decision.access import Refusal
 from sros_tool.dds.decision.vendors import DocumentReader, Vendor
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import (

@@ -12,7 +12,7 @@ from enum import Enum, auto
 
 from lxml import etree
 
-from sros_tool.dds.decision.answers import Outcome, Refusal
+from sros_tool.dds.decision.access import Outcome, Refusal
 from sros_tool.dds.decision.vendors import VendorTraits
 from sros_tool.dds.governance import (
     DomainRule,

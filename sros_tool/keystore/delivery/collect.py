@@ -25,8 +25,7 @@ from cryptography import x509
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
-from sros_tool.fleet.enclaves import enclaves_of, robot_of
-from sros_tool.fleet.robots import RENEWAL_ALLOWED, Fleet, Robot
+from sros_tool.fleet.robots import RENEWAL_ALLOWED, Fleet, Robot, enclaves_of, robot_of
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     MAX_BYTES,

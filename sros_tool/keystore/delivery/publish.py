@@ -69,7 +69,7 @@ from sros_tool.keystore.lifecycle.revocation_list import Forgotten
 from sros_tool.keystore.lifecycle.revoke import restore_revocations, restored_note
 from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.transaction.recovery import KeystoreLock
+from sros_tool.keystore.transaction.transaction import KeystoreLock
 from sros_tool.parallel import map_slices, tick
 from sros_tool.pki.certificates import load_certificates
 from sros_tool.pki.crl import lists_as_revoked, read_list

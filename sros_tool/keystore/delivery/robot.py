@@ -56,9 +56,8 @@ from sros_tool.keystore.reader import (
     read_certificate,
     weaknesses,
 )
-from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
-from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.transaction.transaction import Transaction, tidy
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime

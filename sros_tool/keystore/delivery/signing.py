@@ -17,8 +17,8 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import name_notes
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
 from sros_tool.files import staged_file
-from sros_tool.fleet.enclaves import robot_of
 from sros_tool.fleet.expansion import FleetPolicy
+from sros_tool.fleet.robots import robot_of
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.archive import pack
 from sros_tool.keystore.delivery.robot import RequestAnswer, check_answer, seal
@@ -54,7 +54,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import document_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
-from sros_tool.keystore.lifecycle.governed import refuse_less_protected
+from sros_tool.keystore.lifecycle.create import refuse_less_protected
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
     earlier_permissions,

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from cryptography import x509
 
-from sros_tool.dds.decision.answers import Decision
+from sros_tool.dds.decision.access import Decision
 from sros_tool.dds.decision.vendors import MEASURED, Vendor, together, words_of
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import render_permissions

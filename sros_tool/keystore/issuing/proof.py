@@ -26,8 +26,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 
-from sros_tool.dds.decision.access import Access, GovernedDomain
-from sros_tool.dds.decision.answers import AccessVerb, Outcome
+from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain, Outcome
 from sros_tool.dds.decision.matching import ExpressionIndex
 from sros_tool.dds.decision.matching import matches as dds_matches
 from sros_tool.dds.decision.vendors import Style, Vendor

@@ -3,14 +3,17 @@
 The order is the same for every verb: lock and recover, open the keystore once, note files that were
 edited by hand, determine the new state, prove, sign and stage it, update Zenoh configurations,
 write the ledger, check that vendors accept the enclaves, and put everything in place at once.  A
-verb determines the new state; this module does the rest.
+verb determines the new state; this module does the rest.  As it updates Zenoh configurations in the
+same transaction, DDS and Zenoh enforce the same rights at any moment.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from functools import cached_property
 from pathlib import Path
 from shlex import quote
@@ -22,7 +25,7 @@ from cryptography import x509
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
-from sros_tool.errors import KeystoreError, Note
+from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import (
     checked_fleet,
@@ -36,43 +39,51 @@ from sros_tool.keystore.issuing.enclave import EnclaveWriter
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import EnclaveTokens
 from sros_tool.keystore.known_keys import KnownKeys
-from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, check_keystore
-from sros_tool.keystore.ledger import Entry, Ledger, append
+from sros_tool.keystore.layout import (
+    GOVERNANCE_P7S,
+    IDENTITY,
+    PERMISSIONS,
+    PERMISSIONS_FILE,
+    ROLES,
+    check_keystore,
+)
+from sros_tool.keystore.ledger import Entry, Ledger, append, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights, Superseded
 from sros_tool.keystore.outcomes import KeptZenoh
 from sros_tool.keystore.reader import Keystore, check_domain
 from sros_tool.keystore.rights import RecordedRights, SignedRights
-from sros_tool.keystore.settings import edit_notes, edit_remedy, found_edits
+from sros_tool.keystore.settings import (
+    edit_notes,
+    edit_remedy,
+    found_edits,
+    present_settings,
+    write_settings,
+)
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
-from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.keystore.transaction.transaction import Transaction, tidy
+from sros_tool.keystore.zenoh_files import (
+    NO_CHANGE,
+    Drift,
+    Drifted,
+    ZenohChange,
+    drifted,
+    signed_path,
+    stale_files,
+    zenoh_documents,
+)
+from sros_tool.pki.certificates import validity_of
 from sros_tool.pki.keys import PublicKey
 from sros_tool.pki.token import TokenUri
 from sros_tool.policy.model import Enclave
+from sros_tool.translate import protection_for
+from sros_tool.validity import iso, parse_iso, window
+from sros_tool.wording import counted
 from sros_tool.zenoh.configuration import ZenohNetwork, check_network
 
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
 
-
-from collections import Counter
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
-from datetime import timedelta
-
-from sros_tool.errors import SrosError
-from sros_tool.keystore.layout import (
-    GOVERNANCE_P7S,
-    PERMISSIONS_FILE,
-    ROLES,
-)
-from sros_tool.keystore.ledger import certificate_entry, document_entry
-from sros_tool.keystore.settings import present_settings, write_settings
-from sros_tool.pki.certificates import validity_of
-from sros_tool.translate import protection_for
-from sros_tool.validity import iso, parse_iso, window
-from sros_tool.wording import counted
 
 Result = TypeVar("Result", bound="Changed")
 _NOTED = timedelta(days=1)
@@ -408,10 +419,9 @@ class KeystoreChange:
         """
         if self.template.zenoh is None:
             return
-        from sros_tool.keystore.issuing.zenoh import keep_zenoh
         from sros_tool.keystore.zenoh_files import ZenohChange
 
-        self.zenoh = keep_zenoh(
+        self.zenoh = _keep_zenoh(
             self.transaction,
             keystore=self.keystore,
             network=self.template.zenoh,
@@ -603,3 +613,132 @@ def _settings_of_ros2(
     present = present_settings(keystore)
     if protection_for(present.governance):  # else settings would say another protection
         yield write_settings(transaction, present.settings, now)
+
+
+def _keep_zenoh(
+    transaction: Transaction,
+    *,
+    keystore: Keystore,
+    network: ZenohNetwork,
+    domains: DomainSet,
+    authority: x509.Certificate,
+    signer: Callable[[], Authority],
+    now: datetime,
+    change: ZenohChange = NO_CHANGE,
+) -> KeptZenoh:
+    """Stage the Zenoh configurations that the keystore needs after a change.
+
+    Args:
+        transaction: the transaction, before its commit.
+        keystore: the keystore, as it was opened for the change.
+        network: the Zenoh network of the keystore's settings.
+        domains: the ROS domains of the keystore's governance.
+        authority: the permissions CA that signed what the keystore has.
+        signer: returns the permissions CA; called only if a configuration has to be signed.
+        now: the current time.
+        change: what the transaction changes.
+
+    Raises:
+        PolicyError: an enclave's rights cannot be stated to Zenoh.
+        KeystoreError: the enclave of the router is missing.
+    """
+    existing = transaction.enclaves
+    wanted = zenoh_documents(keystore, network, domains, authority, now, change, existing=existing)
+    drifts = drifted(keystore, wanted, authority, change.gone)
+    for drift in drifts:
+        if drift.kind is Drift.STALE:
+            _remove(transaction, drift.path)
+    changed = [drift for drift in drifts if drift.kind is not Drift.STALE]
+    written = _stage(transaction, wanted.files, changed, signer()) if changed else {}
+    names = tuple(wanted.enclaves.values())
+    return KeptZenoh(
+        {name: path for path, name in wanted.enclaves.items()},
+        wanted.nodes,
+        {name: why.rstrip(".") for name, why in wanted.left_out.items()},
+        written,
+        tuple(sorted({drift.enclave for drift in drifts if drift.kind is not Drift.UNSIGNED})),
+        (
+            *_left_out_notes(wanted.left_out),
+            *_revoked_names(wanted.ledger, names, now, change.replaced),
+        ),
+    )
+
+
+def _stage(
+    transaction: Transaction,
+    files: Mapping[str, bytes],
+    changed: Sequence[Drifted],
+    authority: Authority,
+) -> dict[str, bytes]:
+    """Stage changed configurations and their signed documents on all cores; map them to content."""
+
+    def stage(part: Sequence[Drifted]) -> list[bytes]:
+        documents = [files[drift.path] for drift in part]
+        messages = [b""] * len(part)
+        if not transaction.dry_run:
+            messages = authority.sign_all(documents, "a Zenoh configuration")
+        for drift, document, message in zip(part, documents, messages, strict=True):
+            if drift.kind is not Drift.UNSIGNED:
+                transaction.write(drift.path, document)
+            transaction.write(signed_path(drift.path), message)
+        return messages
+
+    written: dict[str, bytes] = {}
+    for part, signed in transaction.on_all_cores(changed, stage, alone=authority.on_token):
+        for drift, message in zip(part, signed, strict=True):
+            if drift.kind is not Drift.UNSIGNED:
+                written[drift.path] = files[drift.path]
+            written[signed_path(drift.path)] = message
+    return written
+
+
+def remove_zenoh(transaction: Transaction) -> tuple[str, ...]:
+    """Stage the removal of all configurations of a keystore; return their enclaves."""
+    stale = list(stale_files(transaction.root, (), transaction.enclaves))
+    for drift in stale:
+        _remove(transaction, drift.path)
+    return tuple(dict.fromkeys(drift.enclave for drift in stale))
+
+
+def _remove(transaction: Transaction, path: str) -> None:
+    for file in (path, signed_path(path)):
+        if (transaction.root / file).is_file():
+            transaction.remove(file)
+
+
+# ── notes ──────────────────────────────────────────────────────────────────────────────────
+
+
+def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
+    for name, why in left_out.items():
+        yield Note(
+            "zenoh.left-out",
+            f"{name} gets no configuration for Zenoh, and all others deny it everything there: "
+            f"{why}.".replace("..", "."),
+        )
+
+
+def _revoked_names(
+    ledger: Ledger, names: Sequence[str], now: datetime, replaced: Collection[str]
+) -> Iterable[Note]:
+    """Yield a note on enclave names that revoked certificates also have, until these expire."""
+    entries = ledger.entries
+    revoked = {entry.serial for entry in entries if entry.what == "revocation"}
+    again = sorted(
+        {
+            entry.enclave
+            for entry in entries
+            if entry.what == "certificate"
+            and entry.serial in revoked
+            and entry.enclave in names
+            and entry.not_after >= iso(now)
+        }
+        | {*replaced}
+    )
+    if again:
+        yield Note(
+            "zenoh.revoked-name",
+            f"a revoked certificate of {', '.join(again)} has not expired: Zenoh has no revocation "
+            "list, so anyone who has the certificate gets the rights of that enclave. Give the "
+            "enclave another name, or replace the identity CA with `sros rotate_ca`.",
+        )

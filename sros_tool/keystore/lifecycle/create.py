@@ -1,4 +1,7 @@
-"""Creation of keystores and enclaves: CAs, governance, settings, keys and permissions."""
+"""Creation of keystores and enclaves: CAs, governance, settings, keys and permissions.
+
+A policy can demand a stricter governance than the keystore has.
+"""
 
 from __future__ import annotations
 
@@ -12,45 +15,55 @@ from types import MappingProxyType
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.errors import KeystoreError, Note, PolicyError, UsageError
+from sros_tool.dds.governance import Governance, parse_governance, render_governance
+from sros_tool.errors import KeystoreError, Note, PolicyError, UsageError, check_meaning
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet
+from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
 from sros_tool.keystore.fleet import (
     EnclaveDomains,
     left_enclaves,
     load_fleet,
+    publish_command,
     refuse_stale_domains,
 )
 from sros_tool.keystore.issuing.acceptance import imported_notes
-from sros_tool.keystore.issuing.authority import create_authorities
+from sros_tool.keystore.issuing.authority import create_authorities, write_copies
 from sros_tool.keystore.issuing.enclave import stated_enclave
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import token_places
 from sros_tool.keystore.layout import (
     ENCLAVES,
+    GOVERNANCE_FILE,
+    GOVERNANCE_P7S,
+    GOVERNANCE_XML,
     PRIVATE,
     PUBLIC,
+    SETTINGS,
+    enclave_path,
     is_keystore,
+    key_on_robot,
     keystore_around,
     refuse_earlier,
     similar_keystores,
 )
-from sros_tool.keystore.ledger import certificate_entry
+from sros_tool.keystore.ledger import certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.enclaves import write_enclaves
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights
-from sros_tool.keystore.protection import with_stated
+from sros_tool.keystore.protection import less_protected, with_stated
 from sros_tool.keystore.reader import Keystore, check_domain
 from sros_tool.keystore.selection import no_such_enclave
-from sros_tool.keystore.settings import with_places, write_settings
+from sros_tool.keystore.settings import edit_remedy, found_edits, with_places, write_settings
 from sros_tool.keystore.template import Template, template_names
-from sros_tool.keystore.transaction.recovery import tidy
+from sros_tool.keystore.transaction.transaction import tidy
 from sros_tool.names import check_enclave_name
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.parallel import Progress
-from sros_tool.policy.model import Enclave, Policy, StatedProtection, stated_protections
+from sros_tool.policy.model import Enclave, Level, Policy, StatedProtection, stated_protections
 from sros_tool.translate import governance_for
 from sros_tool.validity import window
+from sros_tool.wording import first_few
 from sros_tool.zenoh.configuration import check_network
 
 _NONE_IMPORTED: Mapping[str, bytes] = MappingProxyType({})
@@ -416,16 +429,13 @@ def _begin(
         refuse_stale_domains(root, EnclaveDomains(change.domains, before), recorded, stated)
         change.notes += left_enclaves(root, before, recorded) if before else ()
     if protections:
-        from sros_tool.keystore.lifecycle.governed import raise_protection
-
-        raise_protection(change, protections)
+        _raise_protection(change, protections)
 
 
 def _write_keystore(
     change: KeystoreChange, template: Template, domains: DomainSet, imported: Mapping[str, bytes]
 ) -> None:
     """Stage a new keystore: its CAs, its governance and its settings."""
-    from sros_tool.keystore.lifecycle.governed import write_governance
 
     _check_free(change.root)  # another process may have created it meanwhile
     if template.zenoh:
@@ -507,3 +517,153 @@ def _check_typo(root: Path) -> None:
             "The name may be a typo, so no second keystore is created.",
             f"Name '{similar}', or run `sros create_keystore {quote(str(root))}` first.",
         )
+
+
+_SHOWN = 5
+
+
+def write_governance(
+    change: KeystoreChange, governance: Governance, *, names: Sequence[str]
+) -> None:
+    """Sign, stage and record the governance of a keystore that is made from settings.
+
+    Enclaves in ``names`` that have a copy of the document instead of a link get the new one, too.
+    """
+    document, what = render_governance(governance), "the governance document"
+    check_meaning(parse_governance(document), governance, what)
+    message = change.permissions.sign(document, what)
+    change.transaction.write(GOVERNANCE_XML, document)
+    change.transaction.write(GOVERNANCE_P7S, message)
+    # The governance of the keystore itself is in the folder of the enclave /.
+    below = [name for name in names if name != "/"]
+    write_copies(change.transaction, below, GOVERNANCE_FILE, message)
+    change.entries.append(document_entry(change.now, "governance", message))
+
+
+def _raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection]) -> None:
+    """Stage a governance and settings with more protection, if policies demand more.
+
+    ``stated`` are the statements of policies about the protection of names.
+
+    Raises:
+        PolicyError: the statements contradict each other, or the settings.
+        KeystoreError: the keystore has no settings that can state it, or its files were edited by
+            hand.
+    """
+    root, template, governance = change.root, change.template, change.governance
+    protection = with_stated(template.protection, stated)
+    less = [demanded for demanded, _ in less_protected(governance, stated)]
+    if not less:
+        return
+    demand = f"{less[0].source} demands that {less[0]} has protect={less[0].word!r}"
+    if not (root / SETTINGS).exists():
+        raise KeystoreError(
+            f"{demand}, and keystore '{root}' has no settings for that",
+            f"A keystore of ros2/sros2 has no {SETTINGS}.",
+            f"Give it settings first: `sros update_keystore {quote(str(root))} --template "
+            "NAME|FILE --dry-run` shows what they would change.",
+        )
+    if edits := found_edits(change.keystore, governance):
+        raise KeystoreError(
+            f"{demand}, and files of keystore '{root}' were edited by hand: "
+            f"{'; '.join(edits.clauses())}",
+            "It is unclear which governance to start from.",
+            f"First apply or undo the edit: {edit_remedy(root)}",
+        )
+    change.template = replace(template, protection=protection)
+    after = governance_for(protection, governance.domains().closed())
+    write_governance(change, after, names=change.names)
+    change.entries.append(write_settings(change.transaction, change.template, change.now))
+    demanded = [f"{name} {name.word} ({name.source})" for name in less]
+    changes = compare_governance(governance, after)
+    text = (
+        f"The governance of the keystore changes, because policies demand it: "
+        f"{first_few(demanded, _SHOWN)}. "
+        f"{'; '.join(dict.fromkeys(change.meaning for change in changes[:_SHOWN]))}."
+    )
+    change.restart = change.names
+    change.remarks += (
+        Note("keystore.governance-by-policy", text),
+        restart_note(mismatch(governance, after)),
+        exports_note(root, change.names),
+        Note(
+            "keystore.earlier-governance",
+            "The signature of the former governance stays valid: anyone who can change the files "
+            "of a robot can put it back there, until the CA that signed it is replaced (`sros "
+            "rotate_ca --help`).",
+        ),
+        *_zenoh_notes(template),
+    )
+
+
+def refuse_less_protected(
+    root: Path, governance: Governance, stated: Sequence[StatedProtection]
+) -> None:
+    """Raise `KeystoreError` if a policy demands more protection than the governance gives.
+
+    Used when requests are signed, because all robots would need a changed governance.
+    """
+    for name, level in less_protected(governance, stated):
+        kinds = "data=ENCRYPT" if name.level is Level.ENCRYPT else "metadata=SIGN"
+        raise KeystoreError(
+            f"{name.source} demands that {name} has protect={name.word!r}, and keystore '{root}' "
+            f"protects it with {level}",
+            "Its governance has to change first, and with it the files of all enclaves.",
+            f"Run `sros update_keystore {quote(str(root))} --rule "
+            f"{quote(f'{name} {kinds}')} --dry-run`, and then without --dry-run.",
+        )
+
+
+def _zenoh_notes(template: Template) -> tuple[Note, ...]:
+    """Return a note on protection by Zenoh, if the keystore has a Zenoh network."""
+    if template.zenoh is None:
+        return ()
+    text = (
+        "Zenoh has no protection of single names: its links are TLS, so all names are encrypted "
+        "on each link, and each router reads what it passes on."
+    )
+    return (Note("keystore.protection-on-zenoh", text),)
+
+
+def restart_note(disturbed: Mismatch, *, revoked: bool = False) -> Note:
+    """Return a note on the processes to restart and their order; vendors agree (measured)."""
+    return Note("keystore.restart", _restart_text(disturbed, revoked=revoked))
+
+
+def _restart_text(disturbed: Mismatch, *, revoked: bool) -> str:
+    if revoked and not disturbed.everything:
+        return (
+            "All vendors: restart all processes together; restarted processes refuse the revoked "
+            "certificates of other processes. Until then, running processes communicate as before."
+        )
+    if disturbed:
+        which, what = "all processes", "do not communicate"
+        if not disturbed.everything:
+            which = "the processes that use these names"
+            what += f" on {', '.join(disturbed.names)}, but do on everything else"
+        return (
+            f"Cyclone DDS and Fast DDS: restart {which} together; processes before and after the "
+            f"restart {what}. Until then, running processes communicate as before."
+        )
+    return (
+        "All vendors: restart the processes one by one, at any time; processes before and after "
+        "the restart communicate. Until its restart, a process keeps its former files."
+    )
+
+
+def exports_note(root: Path, names: Sequence[str]) -> Note:
+    """Return a note that robots need new files, with the commands that deliver them."""
+    if published := publish_command(root):
+        text = (
+            f"Robots have the former files: publish the new ones ({published}); if nodes run from "
+            "an export, export them again."
+        )
+        return Note("keystore.export-again", text)
+    shown = quote(str(root))
+    text = "Robots have the former files: export the new ones (`sros distribute_key "
+    text += f"{shown} ENCLAVE TARGET --force`)"
+    remote = [name for name in names if key_on_robot(enclave_path(root, name))]
+    if remote:
+        text += f"; for {', '.join(remote)}, answer the request again (`sros sign_request "
+        text += f"{shown} REQUEST --renew`)"
+    return Note("keystore.export-again", f"{text}.")

@@ -22,7 +22,7 @@ from cryptography import x509
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
-from sros_tool.fleet.enclaves import robot_of
+from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.fleet import checked_fleet, load_fleet
 from sros_tool.keystore.fleet_status import State, fleet_status
 from sros_tool.keystore.issuing.authority import (

@@ -44,7 +44,6 @@ from sros_tool.keystore.issuing.enclave import (
     default_rights,
 )
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.issuing.zenoh import remove_zenoh
 from sros_tool.keystore.layout import (
     GOVERNANCE_XML,
     PERMISSIONS,
@@ -59,10 +58,15 @@ from sros_tool.keystore.layout import (
     waits_for_answer,
 )
 from sros_tool.keystore.ledger import Entry
-from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
-from sros_tool.keystore.lifecycle.create import Creation, creation
+from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange, remove_zenoh
+from sros_tool.keystore.lifecycle.create import (
+    Creation,
+    creation,
+    exports_note,
+    restart_note,
+    write_governance,
+)
 from sros_tool.keystore.lifecycle.enclaves import write_enclaves
-from sros_tool.keystore.lifecycle.governed import exports_note, restart_note, write_governance
 from sros_tool.keystore.lifecycle.renew import checked_rights
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,

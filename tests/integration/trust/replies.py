@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from sros_tool.dds.decision.answers import Outcome
+from sros_tool.dds.decision.access import Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain.answer import Evaluator
 from sros_tool.explain.answer import ask as question
