@@ -64,9 +64,9 @@ from sros_tool.keystore.lifecycle.create import (
     creation,
     exports_note,
     restart_note,
+    write_enclaves,
     write_governance,
 )
-from sros_tool.keystore.lifecycle.enclaves import write_enclaves
 from sros_tool.keystore.lifecycle.renew import checked_rights
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
