@@ -591,23 +591,30 @@ def _unanswered(lost: Iterable[Right], rights: Iterable[Right]) -> list[Right]:
 
     For example, a right to subscribe to a topic that no enclave may publish any more.
     """
-    had: dict[str, Names] = {}
-    has: dict[str, Names] = {}
-    for names, some in ((had, lost), (has, rights)):
-        stated: dict[str, set[str]] = defaultdict(set)
-        for right in some:
-            if right.qualifier is not DENY:
-                stated[right.right].add(right.name)
-        names |= {right: Names(sorted(stated[right])) for right in _OFFERING.values()}
-    return sorted(
+    had = _allowed_names(lost)
+    waiting = [
         right
         for right in rights
-        if (offering := _OFFERING.get(right.right))
+        if (offering := _OFFERING.get(right.right)) in had
         and right.qualifier is not DENY
         and not is_expression(right.name)
         and had[offering].meets(right.name)
-        and not has[offering].meets(right.name)
+    ]
+    has = _allowed_names(rights) if waiting else {}
+    return sorted(
+        right
+        for right in waiting
+        if (offering := _OFFERING[right.right]) not in has or not has[offering].meets(right.name)
     )
+
+
+def _allowed_names(rights: Iterable[Right]) -> dict[str, Names]:
+    """Map publish, subscribe and so on to the names for which a right allows it."""
+    stated: dict[str, set[str]] = defaultdict(set)
+    for right in rights:
+        if right.qualifier is not DENY:
+            stated[right.right].add(right.name)
+    return {word: Names(sorted(names)) for word, names in stated.items()}
 
 
 _OFFERING = {"subscribe": "publish", "request": "reply", "call": "execute"}
