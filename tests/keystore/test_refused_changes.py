@@ -278,6 +278,18 @@ def test_what_is_staged_is_evaluated(
         assert note.text.startswith(f"{MEASURED[0].title} refuses {stopped} from now on")
 
 
+def test_an_enclave_that_was_broken_before_hides_no_other_one(sound: Path, tmp_path: Path) -> None:
+    """Enclaves of the same kind are evaluated by one of them: by one that starts today."""
+    root, other = tmp_path / "ks", tmp_path / "other"
+    shutil.copytree(sound, root, symlinks=True)
+    create_keystore(other, template=load_template("production"), now=now())
+    shutil.copy(enclave_path(root, "/b") / "permissions.p7s", enclave_path(root, "/a"))
+    with Transaction(root) as transaction:
+        _break_governance(transaction, other)
+        with pytest.raises(KeystoreError, match="start in /a, /b, /b/c of"):
+            refuse_stopping(transaction, now())
+
+
 def test_a_revoked_enclave_that_is_put_back_keeps_nobody_from_signing_a_list(
     sound: Path, tmp_path: Path
 ) -> None:

@@ -173,12 +173,13 @@ def _stopped_enclaves(
     for (_, own, _), names in _kinds(files, now).items():
         for tried, name in enumerate(names, 1):
             before, after = files.before(name), files.after(name)
-            accepted = set(MEASURED) - refusals(name, before, now).keys() if before else set()
-            if accepted or not before or tried == _MOST_BROKEN:
+            refused = refusals(name, after, now) if after else {}
+            is_last = tried == min(len(names), _MOST_BROKEN)
+            # Who accepts it today matters if somebody refuses it, or to try the next enclave.
+            asked = before and (refused or not is_last)
+            accepted = set(MEASURED) - refusals(name, before, now).keys() if asked else set()
+            if accepted or not before or is_last:
                 break
-        if not after:
-            continue
-        refused = refusals(name, after, now)
         if not before:
             all_new = {CERTIFICATE_FILE, PERMISSIONS_FILE} <= own
             accepted = set(MEASURED) if all_new and len(refused) == len(MEASURED) else set()
