@@ -453,22 +453,32 @@ def installed_dds(top: Path = Path("/")) -> tuple[MappedLibrary, ...]:
 
     Environment variables are not used: in a login by ssh they do not name the folder of ROS.
     """
-    files = {
-        (file.resolve(), product)
-        for folder in _LIBRARY_FOLDERS
-        for name, product in _PRODUCTS.items()
-        for file in top.glob(f"{folder}/lib{name.decode()}.so*")
-        if file.is_file()
-    }
+    found = (
+        (folder / name, _PRODUCTS[match[1].encode()])
+        for pattern in _LIBRARY_FOLDERS
+        for folder in top.glob(pattern)
+        for name in _names_in(folder)
+        if (match := _LIBRARY_FILE.match(name))
+    )
+    files = {(file.resolve(), product) for file, product in found if file.is_file()}
     return tuple(
         MappedLibrary(product, _version(str(file)), str(file)) for file, product in sorted(files)
     )
+
+
+def _names_in(folder: Path) -> list[str]:
+    """Return the names of the files of a folder; none if it cannot be read, or is a file."""
+    try:
+        return os.listdir(folder)
+    except OSError:
+        return []
 
 
 _LIBRARY_FOLDERS = (
     *("opt/ros/*/lib", "opt/ros/*/lib/*-linux-gnu*"),
     *("usr/lib", "usr/lib/*-linux-gnu*", "usr/local/lib"),
 )
+_LIBRARY_FILE = re.compile(rf"lib({'|'.join(map(re.escape, map(bytes.decode, _PRODUCTS)))})\.so")
 
 
 class ProcessOrigin(NamedTuple):
