@@ -26,7 +26,7 @@ settings.register_profile(
     "sros",
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
-    max_examples=1000 if LONG else 10,
+    max_examples=1000 if LONG else 5,
 )
 settings.load_profile("sros")
 

@@ -348,7 +348,7 @@ def includes(tmp_path: Path) -> Path:
     "case",
     [
         pytest.param(case, marks=sometimes(case)) if case == "includes of one file" else case
-        for case in POLICIES
+        for case in some([*POLICIES], 30)
     ],
 )
 def test_policy(case: str, keystore: Path, includes: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import os
 import shutil
 import stat
 import tarfile
+from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -41,6 +42,7 @@ from sros_tool.pki.crl import load_crl
 from tests.agent.published import DAY, ROLES, Home, Thief
 from tests.support.harness import policy_text, snapshot, sros
 from tests.support.harness import publish as allow_publish
+from tests.support.long_form import few_steps
 
 
 def archives(publisher: Home) -> dict[str, bytes]:
@@ -263,37 +265,37 @@ def test_a_kill_at_any_write_leaves_whole_metadata(
 ) -> None:
     """New releases and new keys of three roles: robots get the old release, or the new one."""
     put = publishing._put
-    writes = 0
-    for kill in range(100):
-        home = made_publisher.copy(tmp_path / f"at{kill}")
+
+    def publish_killed(at: int) -> int:
+        """Publish, killed ``at`` a write, and again; return the number of writes before."""
+        home = made_publisher.copy(tmp_path / f"at{at}")
         home.run("renew", "ks", "/r1/base")
-        robot, count = home.robot(), iter(range(100))
+        robot, writes = home.robot(), 0
         old = robot.gets()
 
-        def killed(
-            folder: Folder, path: str, data: bytes, count: object = count, kill: int = kill
-        ) -> None:
-            if next(count) == kill:  # type: ignore[call-overload]
+        def killed(folder: Folder, path: str, data: bytes) -> None:
+            nonlocal writes
+            if writes == at:
                 raise _Killed
             put(folder, path, data)
+            writes += 1
 
-        with monkeypatch.context() as patched:
+        with monkeypatch.context() as patched, suppress(_Killed):
             patched.setattr(publishing, "_put", killed)
-            try:
-                home.publish(rotate=("timestamp", "snapshot", "targets", "root"))
-                writes = kill
-            except _Killed:
-                pass
-        then = robot.gets()
+            home.publish(rotate=("timestamp", "snapshot", "targets", "root"))
+        then, written = robot.gets(), writes
         assert home.robot().gets() == then
         assert then == old or then.number > old.number
         home.publish()
         assert not [*(home.root / "private").glob("*before*")]
         assert robot.gets() == home.robot().gets() != old
         shutil.rmtree(home.folder)
-        if writes:
-            break
-    assert writes >= 6
+        return written
+
+    whole = publish_killed(at=100)
+    assert whole >= 6
+    for at in few_steps(range(whole)):
+        assert publish_killed(at) == at
 
 
 def test_a_kill_after_the_keystore_changed_keeps_the_number(

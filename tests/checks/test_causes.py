@@ -20,6 +20,7 @@ from sros_tool.pki.keys import key_pem
 from tests.checks.bench import Bench, name_of, new_key
 from tests.checks.keystore_cases import IS_CA
 from tests.support.harness import sros
+from tests.support.long_form import some
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 PERMISSIONS = "enclaves/base/permissions.p7s"
@@ -122,7 +123,7 @@ def _(bench: Bench) -> None:
     bench.trust("permissions", later)
 
 
-@pytest.mark.parametrize("text", CAUSES)
+@pytest.mark.parametrize("text", some([*CAUSES], 5))
 def test_the_cause_is_said(text: str, bench: Bench) -> None:
     finding, work = CAUSES[text]
     assert not any(

@@ -90,7 +90,7 @@ def at(moment: datetime, monkeypatch: pytest.MonkeyPatch) -> None:
 NAMED = [each for each in CASES if "`sros " in all_kinds()[each].remedy and each not in ELSEWHERE]
 
 
-@pytest.mark.parametrize("kind", some(NAMED, 20))
+@pytest.mark.parametrize("kind", some(NAMED, 8))
 def test_no_remedy_names_a_command_that_refuses(
     kind: str, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,7 +124,7 @@ SHOWN_ONLY = {"portable.document-size"}
 """The findings whose commands show what a person may change, and write nothing."""
 
 
-@pytest.mark.parametrize("case", POLICIES, ids=lambda case: case.id)
+@pytest.mark.parametrize("case", some(POLICIES, 3), ids=lambda case: case.id)
 def test_the_remedy_of_a_policy_can_be_carried_out(case: policy_cases.Case, tmp_path: Path) -> None:
     written, observed, output = (tmp_path / f"{each}.xml" for each in ("robot", "seen", "narrow"))
 
@@ -193,7 +193,7 @@ def variables(verb: str, output: str) -> Iterator[tuple[str, str]]:
         yield name, "".join(shlex.split(value)) if verb == "env" else value
 
 
-@pytest.mark.parametrize("name", some(STARTED, 8))
+@pytest.mark.parametrize("name", some(STARTED, 4))
 def test_what_starts_with_the_variables_of_a_remedy_is_mended(
     name: str, robot: tuple[Bench, RuntimeState], tmp_path: Path
 ) -> None:
@@ -219,7 +219,7 @@ def test_what_starts_with_the_variables_of_a_remedy_is_mended(
             assert kind not in {each.id for each in found_in(again)}, words
 
 
-@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("name", some(OTHERS, 3))
 def test_no_remedy_of_the_runtime_names_a_command_that_refuses(
     name: str, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,7 +27,7 @@ def fnmatch(expression: str, name: str) -> bool:
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="Fast DDS asks the C library")
-@settings(max_examples=5000 if LONG else 200)
+@settings(max_examples=5000 if LONG else 60)
 @given(expressions, names)
 @example("rt/[^a-c]", "rt/x")
 @example("[[:digit:]]", "1")
@@ -49,7 +49,7 @@ def cyclone() -> ctypes.CDLL:
     return library
 
 
-@settings(max_examples=5000 if LONG else 200)
+@settings(max_examples=5000 if LONG else 60)
 @given(expressions, names)
 @example("rt/[ab]-x", "rt/q")
 @example("[ab]", "]")

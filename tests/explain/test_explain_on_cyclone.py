@@ -19,6 +19,7 @@ from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from tests.integration.cyclone_rights import refusals
 from tests.support.harness import sros
+from tests.support.long_form import some
 
 pytestmark = pytest.mark.dds
 
@@ -46,7 +47,7 @@ QUESTIONS = {
 }
 
 
-@pytest.mark.parametrize("policy", QUESTIONS)
+@pytest.mark.parametrize("policy", some([*QUESTIONS], 2))
 def test_cyclone_does_as_told(policy: str, tmp_path: Path) -> None:
     keystore = tmp_path / "ks"
     file = policies_dir() / f"{policy}.xml"

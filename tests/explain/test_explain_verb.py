@@ -190,7 +190,7 @@ def test_parts_of_a_service_are_told(tmp_path: Path) -> None:
     assert "part      subscribe its replies (rr/addReply): denied" in found.out
 
 
-@pytest.mark.parametrize("breakage", BREAKAGES)
+@pytest.mark.parametrize("breakage", some([*BREAKAGES], 8))
 def test_what_cannot_load_is_denied_everything(breakage: str, keystore: Path) -> None:
     BREAKAGES[breakage](Enclave(keystore))
     verbs = [("publish", "/chatter"), ("join",)]

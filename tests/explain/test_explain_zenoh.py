@@ -20,6 +20,7 @@ from sros_tool.policy.rights import Rules, policy_rights, unfolded
 from tests.explain.zenoh_policies import NAMES, OTHER_END, WORD, drawn_policy
 from tests.support.children import LONG
 from tests.support.harness import Ended, policy_text, publish, sros
+from tests.support.long_form import some
 
 HERE = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", "TZ": "UTC"}
 POLICY = policy_text(
@@ -84,7 +85,7 @@ DENIED = [
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(("words", "reached"), ALLOWED)
+@pytest.mark.parametrize(("words", "reached"), some(ALLOWED, 4))
 def test_what_is_allowed_and_whom_it_reaches(
     made: Path, mode: str, words: str, reached: list[str]
 ) -> None:
@@ -96,7 +97,7 @@ def test_what_is_allowed_and_whom_it_reaches(
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("words", DENIED)
+@pytest.mark.parametrize("words", some(DENIED, 3))
 def test_what_is_denied_is_dropped_without_an_error(made: Path, mode: str, words: str) -> None:
     shown = explain(made / mode, *words.split(), "--vendor", "zenoh")
     assert shown.status == 1
@@ -362,7 +363,7 @@ def test_zenoh_is_asked_where_ros_uses_it(made: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("seed", range(12 if LONG else 2))
+@pytest.mark.parametrize("seed", range(12 if LONG else 1))
 def test_random_policies_are_answered_as_their_permissions_say(
     tmp_path: Path, mode: str, seed: int
 ) -> None:
@@ -403,7 +404,7 @@ def asked_in(root: Path) -> dict[tuple[str, str, str], tuple[tuple[Any, ...], An
     return found
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", some(MODES, 1))
 @pytest.mark.parametrize("seed", range(12 if LONG else 1))
 def test_files_of_other_rights_are_out_of_date_or_answer_the_same(
     tmp_path: Path, mode: str, seed: int

@@ -24,6 +24,7 @@ from sros_tool.fleet.robots import (
 from sros_tool.names import is_expression
 from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.model import Policy
+from tests.support.children import LONG
 
 FLEET = Fleet.of(
     [
@@ -192,7 +193,7 @@ TEMPLATES = st.sampled_from(
 )  # fmt: skip
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=1000 if LONG else 30, deadline=None)
 @given(
     robots=st.lists(st.tuples(NAMES, NAMESPACES), min_size=1, max_size=4, unique_by=lambda r: r[0]),
     names=st.lists(TEMPLATES, min_size=1, max_size=4, unique=True),

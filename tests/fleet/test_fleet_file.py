@@ -7,6 +7,7 @@ import pytest
 from sros_tool.errors import DocumentError
 from sros_tool.fleet.fleet_file import parse_fleet, render_fleet
 from sros_tool.fleet.robots import Fleet, Robot
+from tests.support.long_form import ONLY_LONG
 
 TEXT = """
 enclaves = ["/{robot}/base", "/fleet{namespace:carriers}/arm"]
@@ -162,7 +163,10 @@ def test_a_value_that_is_not_valid(line: str, problem: str) -> None:
         ('enclaves = ["/{robot:a}/{robot:b}"]\n[robots.r]', "different groups"),
         ('enclaves = ["{robot}"]\n[robots.r]', "does not start with '/'"),
         ('enclaves = ["/{robot}*"]\n[robots.r]', "wildcard"),
-        ("[robots]\n" + "".join(f"r{i} = {{}}\n" for i in range(100_001)), "more than 100000"),
+        pytest.param(
+            "[robots]\n" + "".join(f"r{i} = {{}}\n" for i in range(100_001)), "more than 100000",
+            marks=ONLY_LONG,
+        ),
     ],
 )  # fmt: skip
 def test_a_file_that_is_not_valid(text: str, problem: str) -> None:

@@ -12,7 +12,7 @@ import pytest
 from sros_tool.errors import SrosError
 from sros_tool.fleet.fleet_file import inventory, parse_fleet, read_fleet, script_inventory
 from sros_tool.fleet.robots import Fleet
-from tests.support.long_form import sometimes
+from tests.support.long_form import ONLY_LONG, sometimes
 
 HOSTS = """
 all:
@@ -116,7 +116,7 @@ DIAMONDS = {f"g{i}": {"children": [f"g{i + 1}", f"h{i + 1}"]} for i in range(30)
          "hosts: {r: }}", "gets sros_domain from two groups"),
         ("h.json", '{"a": {"children": ["b"]}, "b": {"children": ["a"]}, "all": {"children": '
          '["a"]}}', "in itself"),
-        ("h.json", json.dumps(DIAMONDS), "more than 200000"),
+        pytest.param("h.json", json.dumps(DIAMONDS), "more than 200000", marks=ONLY_LONG),
         ("h.yml", "all: {}", "no robot"),
         ("hosts", "[carriers]\nr1 ansible_host=10.0.0.1\n", "ansible-inventory -i"),
         ("hosts.ini", "r1\nr2\n", "ansible-inventory -i"),

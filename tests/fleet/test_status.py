@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from sros_tool.cli import fleet as fleet_verbs
 from sros_tool.cli.fleet import ComparedFleet, _facts, _joined, _runs
 from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
@@ -115,6 +116,12 @@ class Field:
         """Return when what an enclave has was issued."""
         entries = Keystore(self.root).ledger.entries
         return [each.time for each in entries if (each.what, each.enclave) == (what, enclave)]
+
+
+@pytest.fixture(autouse=True)
+def no_look_at_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What DDS a robot has, each confirmation here says itself."""
+    monkeypatch.setattr(fleet_verbs, "_dds_here", lambda _: SOUND_DDS)
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from tests.fuzz import runner
 from tests.fuzz.corpus import Corpus, make_corpus
 from tests.fuzz.readers import READERS, Place, Reader
 from tests.support.children import LONG
+from tests.support.long_form import some
 
 COUNT = 20_000 if LONG else 500
 
@@ -21,7 +22,7 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Corpus:
     return make_corpus(tmp_path_factory.mktemp("corpus"))
 
 
-@pytest.mark.parametrize("name", runner.WEIGHTS)
+@pytest.mark.parametrize("name", some([*runner.WEIGHTS], 10))
 def test_fuzz(name: str, corpus: Corpus) -> None:
     count = runner.shares(COUNT, list(runner.WEIGHTS))[name]
     findings = runner.try_range(name, corpus, range(count), "short", lambda _: None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -62,13 +63,18 @@ Install = Callable[[str], None]
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
     """Make a script the program of the CA service; it logs what it is asked for."""
-    programs = tmp_path / "bin"
+    return installs(tmp_path, monkeypatch)
+
+
+def installs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
+    """Return a function that makes a script the program of the CA service."""
+    programs = folder / "bin"
     programs.mkdir()
     monkeypatch.setenv("PATH", f"{programs}:/usr/bin:/bin")
 
     def install(script: str) -> None:
         program = programs / "sros-issuer-test"
-        log = f'echo "$SROS_ENCLAVE $SROS_SUBJECT $SROS_NOT_AFTER" >>{tmp_path}/asked\n'
+        log = f'echo "$SROS_ENCLAVE $SROS_SUBJECT $SROS_NOT_AFTER" >>{folder}/asked\n'
         program.write_text(f"#!/bin/sh\nset -e\n{log}{script}\n")
         program.chmod(0o755)
 
@@ -86,15 +92,25 @@ def office(tmp_path: Path, days: int = 30) -> str:
     )
 
 
+@pytest.fixture(scope="module")
+def made_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the keystore ``site`` and what the CA service was asked; only to be copied."""
+    folder = tmp_path_factory.mktemp("service")
+    with pytest.MonkeyPatch.context() as patched:
+        installs(folder, patched)(office(folder))
+        root = folder / "site"
+        create_keystore(
+            root, template=TEMPLATE, now=now(), keyring=SERVICE, imported={"identity": pem(CA)}
+        )
+        create_enclaves(root, ["/talker", "/listener"], now=now())
+    return folder
+
+
 @pytest.fixture
-def site(tmp_path: Path, install: Install) -> Path:
+def site(made_site: Path, tmp_path: Path, install: Install) -> Path:
     install(office(tmp_path))
-    root = tmp_path / "site"
-    create_keystore(
-        root, template=TEMPLATE, now=now(), keyring=SERVICE, imported={"identity": pem(CA)}
-    )
-    create_enclaves(root, ["/talker", "/listener"], now=now())
-    return root
+    shutil.copy(made_site / "asked", tmp_path)
+    return Path(shutil.copytree(made_site / "site", tmp_path / "site", symlinks=True))
 
 
 def test_the_service_issues_and_the_permissions_ca_signs(

@@ -19,6 +19,7 @@ from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.rotation import rotation_status
 from sros_tool.keystore.reader import Keystore, open_enclave
 from tests.support.harness import certificate, check_enclave_whole, remains, snapshot, sros
+from tests.support.long_form import some
 from tests.support.made_by_ros2 import make
 
 NOW = datetime.now(UTC).replace(microsecond=0)
@@ -101,7 +102,7 @@ def open_to_others(root: Path) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("words", WRITING, ids=" ".join)
+@pytest.mark.parametrize("words", some(WRITING, 3), ids=" ".join)
 def test_writing_closes_the_keys_to_other_users_and_says_so(
     words: tuple[str, ...], root: Path
 ) -> None:

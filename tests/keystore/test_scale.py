@@ -1,6 +1,6 @@
-"""A keystore of very many enclaves: 10,000 in the long form of the tests, 210 otherwise.
+"""A keystore of very many enclaves: 10,000 in the long form of the tests, 45 otherwise.
 
-Those are enough that all cores share the work.  What must not grow with the keystore is counted in
+In the long form, all cores share the work.  What must not grow with the keystore is counted in
 folders that are read, not in seconds.
 """
 
@@ -22,7 +22,7 @@ from tests.support.children import LONG
 from tests.support.harness import sros
 
 ROBOTS = 100 if LONG else 3
-EACH = 100 if LONG else 40
+EACH = 100 if LONG else 15
 MANY = ROBOTS * EACH
 
 

@@ -31,21 +31,37 @@ from sros_tool.pki.keys import generate_key, load_key
 from tests.keystore.test_ledger_index import check_answers, is_indexed
 from tests.keystore.test_transaction import DIED, in_child
 from tests.support.harness import check_whole, remains, snapshot, sros
-from tests.support.long_form import some
+from tests.support.long_form import few_steps, some
 
 NOW = datetime.now(UTC) + timedelta(hours=1)
 CHECK = ("check", "keystore", "--fail-on", "error", "--exclude", "enclave.node-cannot-start")
 
 
-@pytest.fixture
-def root(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A keystore whose ledger has two sealed parts; the first one has all but a renewal."""
+def index_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have also a short ledger indexed, and never one that is not long yet sealed."""
     monkeypatch.setattr(ledger_module, "_INDEXED_FROM", 1)
     monkeypatch.setattr(ledger_module, "_LINES_PER_LOOKUP", 0)
-    for sealed_from in (1, 1 << 30, 1, 1 << 30):
-        monkeypatch.setattr(ledger_module, "_SEALED_FROM", sealed_from)
-        renew(keystore, ["/a"], now=NOW)
-    return keystore
+    monkeypatch.setattr(ledger_module, "_SEALED_FROM", 1 << 30)
+
+
+@pytest.fixture(scope="module")
+def sealed(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A keystore whose ledger has two sealed parts; the first one has all but a renewal."""
+    root = tmp_path_factory.mktemp("sealed") / "ks"
+    shutil.copytree(made_keystore, root, symlinks=True)
+    with pytest.MonkeyPatch.context() as patched:
+        index_all(patched)
+        for sealed_from in (1, 1 << 30, 1, 1 << 30):
+            patched.setattr(ledger_module, "_SEALED_FROM", sealed_from)
+            renew(root, ["/a"], now=NOW)
+    return root
+
+
+@pytest.fixture
+def root(sealed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of ``sealed``, to be changed."""
+    index_all(monkeypatch)
+    return Path(shutil.copytree(sealed, tmp_path / "ks", symlinks=True))
 
 
 def parts(root: Path) -> list[str]:
@@ -190,7 +206,7 @@ def test_death_at_every_step_of_sealing(
     assert status == 0
     assert len(parts(work)) == 4
     done = set()
-    for step in steps:
+    for step in few_steps(steps):
         shutil.rmtree(work)
         shutil.copytree(root, work, symlinks=True)
         assert in_child(lambda: change(work), step)[0] in (DIED, 0)

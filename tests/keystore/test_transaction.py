@@ -366,7 +366,7 @@ WHOLE = ("generate_artifacts", "create_keystore")
 
 
 @pytest.mark.parametrize(
-    "name", [*WHOLE, *some([name for name in SCENARIOS if name not in WHOLE], 3)]
+    "name", [*WHOLE, *some([name for name in SCENARIOS if name not in WHOLE], 1)]
 )
 def test_death_at_every_step(name: str, stage: Stage) -> None:
     scenario = SCENARIOS[name]
@@ -387,7 +387,7 @@ def test_death_at_every_step(name: str, stage: Stage) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", some(["generate_artifacts", "generate_artifacts, empty root", "revoke"], 2)
+    "name", some(["generate_artifacts", "generate_artifacts, empty root", "revoke"], 1)
 )
 def test_death_while_recovering_from_death(name: str, stage: Stage) -> None:
     scenario = SCENARIOS[name]
@@ -407,7 +407,7 @@ def test_death_while_recovering_from_death(name: str, stage: Stage) -> None:
         shutil.rmtree(stopped)
 
 
-@pytest.mark.parametrize("name", some([*SCENARIOS], 2))
+@pytest.mark.parametrize("name", some([*SCENARIOS], 1))
 def test_no_space_at_every_step(name: str, stage: Stage) -> None:
     """An error leaves everything as it was, byte by byte; or else the verb succeeds."""
     scenario = SCENARIOS[name]
@@ -445,7 +445,7 @@ def cannot_exchange(monkeypatch: pytest.MonkeyPatch, *, hard_links: bool) -> lis
     ("name", "hard_links"),
     some(
         [(n, link) for n in ("create_permission", "completion", "links") for link in (True, False)],
-        2,
+        1,
     ),
 )
 def test_death_without_exchange(
@@ -486,7 +486,7 @@ def test_concurrent_additions_all_count(keystore: Path) -> None:
     assert all((keystore / enclave_folder(name) / "permissions.p7s").is_file() for name in names)
 
 
-@pytest.mark.parametrize("root", ["missing", "empty", "deep/er"])
+@pytest.mark.parametrize("root", some(["missing", "empty", "deep/er"], 1))
 def test_only_one_of_many_makes_the_keystore(root: str, tmp_path: Path) -> None:
     """generate_artifacts, too, makes no second CA in a keystore that another one just made."""
     target = tmp_path / root

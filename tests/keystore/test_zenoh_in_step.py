@@ -19,6 +19,7 @@ from sros_tool.keystore.zenoh_permissions import rights_in_domain
 from sros_tool.pki import smime
 from sros_tool.zenoh.configuration import ZenohNetwork
 from tests.support.harness import policy_text, publish, snapshot, sros
+from tests.support.long_form import some
 
 FIRST = policy_text({"/a": publish("/x"), "/b": publish("/y")})
 MORE = policy_text({"/a": publish("/x", "/z")})
@@ -61,18 +62,25 @@ ALL = ["/a", "/b", "/router"]
 
 @pytest.mark.parametrize(
     ("words", "client", "peer"),
-    [
-        (("generate_artifacts", "-k", "{}", "-p", "more.xml"), ["/a", "/router"], ALL),
-        (("generate_artifacts", "-k", "{}", "-p", "first.xml"), [], []),
-        (("generate_artifacts", "-k", "{}", "-p", "new.xml"), ["/router"], ALL),
-        (("create_enclave", "{}", "/c"), ["/router"], ALL),
-        (("create_permission", "{}", "/a", "more.xml"), ["/a", "/router"], ALL),
-        (("renew", "{}", "/a"), [], []),
-        (("renew", "{}", "/a", "--new-key"), [], []),
-        (("update_keystore", "{}", "--set", "zenoh.endpoints=localhost:7449"), ALL, ALL),
-        (("update_keystore", "{}", "--set", "zenoh.listen=[::]:7447"), ["/router"], ["/router"]),
-        (("zenoh", "{}"), [], []),
-    ],
+    some(
+        [
+            (("generate_artifacts", "-k", "{}", "-p", "more.xml"), ["/a", "/router"], ALL),
+            (("generate_artifacts", "-k", "{}", "-p", "first.xml"), [], []),
+            (("generate_artifacts", "-k", "{}", "-p", "new.xml"), ["/router"], ALL),
+            (("create_enclave", "{}", "/c"), ["/router"], ALL),
+            (("create_permission", "{}", "/a", "more.xml"), ["/a", "/router"], ALL),
+            (("renew", "{}", "/a"), [], []),
+            (("renew", "{}", "/a", "--new-key"), [], []),
+            (("update_keystore", "{}", "--set", "zenoh.endpoints=localhost:7449"), ALL, ALL),
+            (
+                ("update_keystore", "{}", "--set", "zenoh.listen=[::]:7447"),
+                ["/router"],
+                ["/router"],
+            ),
+            (("zenoh", "{}"), [], []),
+        ],
+        4,
+    ),
 )
 def test_the_files_follow_and_exactly_what_changed_is_restarted(
     words: tuple[str, ...], client: list[str], peer: list[str], folder: Path

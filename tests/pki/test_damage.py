@@ -61,7 +61,7 @@ def damaged(data: bytes, dice: random.Random) -> bytes:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", some(FILES, 4))
+@pytest.mark.parametrize("name", some(FILES, 2))
 def test_damage(name: str, keystore: Path) -> None:
     dice = random.Random(name)
     path, now = keystore / name, datetime.now(UTC)

@@ -20,6 +20,7 @@ from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
 from tests.policy.earlier_policies import EARLIER, FRAGMENTS, PRESENT, policies
 from tests.support.harness import sros
+from tests.support.long_form import some
 
 Topics = dict[str, set[tuple[str, str, str]]]
 """Each enclave's DDS topics, with ALLOW or DENY and publish or subscribe."""
@@ -99,7 +100,9 @@ def _signed_by_sros(policy: Policy, window: Window) -> Topics:
     return found
 
 
-@pytest.mark.parametrize(("name", "text"), [*policies(EARLIER)], ids=lambda value: str(value)[:30])
+@pytest.mark.parametrize(
+    ("name", "text"), some([*policies(EARLIER)], 12), ids=lambda value: str(value)[:30]
+)
 def test_an_earlier_policy_is_recognised_and_keeps_its_rights(
     name: str, text: str, tmp_path: Path, any_time: Window
 ) -> None:

@@ -45,9 +45,11 @@ from tests.proof.drawn_sides import (
 from tests.proof.drawn_sides import write as write_side
 from tests.support.children import LONG
 from tests.support.harness import policy_text, publish, sros
+from tests.support.long_form import SEED as DRAWN
+from tests.support.long_form import some
 
-PAIRS = int(os.environ.get("SROS_PAIRS", "5000" if LONG else "12"))
-SEED = int(os.environ.get("SROS_PAIRS_SEED", "1"))
+PAIRS = int(os.environ.get("SROS_PAIRS", "5000" if LONG else "5"))
+SEED = os.environ.get("SROS_PAIRS_SEED", "1" if LONG else DRAWN)
 
 
 Used = tuple[AccessVerb, str]
@@ -93,7 +95,8 @@ def test_random_pairs_against_single_questions(tmp_path: Path, part: int) -> Non
         seen.update(check_pair(tmp_path / str(number), base, head, f"{SEED}.{number}"))
         shutil.rmtree(tmp_path / str(number))
     print(sorted(seen.items()))
-    assert min(seen[each] for each in ("gain", "none", "less")) > PAIRS // parts // 20
+    if LONG:
+        assert min(seen[each] for each in ("gain", "none", "less")) > PAIRS // parts // 20
 
 
 def check_pair(folder: Path, base: Drawn, head: Drawn, name: str) -> Counter[str]:
@@ -320,7 +323,7 @@ LOOSER = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", LOOSER)
+@pytest.mark.parametrize("kind", some([*LOOSER], 3))
 def test_a_policy_alone_means_a_strict_governance(made: Path, kind: str) -> None:
     keystore = made / f"looser-{kind}"
     shutil.copytree(made / "ks", keystore)
@@ -580,17 +583,35 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     ("base", "head", "status", "said"),
-    [
-        ("seven", "eight", 1, "+ /r1/base publish topic /r1/status  (fleet.xml:3); in domain 8\n"),
-        ("seven", "any", 1, "+ /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n"),
-        ("any", "seven", 0, "- /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n"),
-        ("seven", "seven", 0, ""),
-        ("ks", "seven", 0, ""),
-        ("seven", "ks", 0, ""),
-        ("ks", "any", 1, "+ /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n"),
-        ("ks", "eight", 1, "+ /desk subscribe topic /r1/status  (fleet.xml:5); in domain 8\n"),
-        ("any", "ks", 0, "- /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n"),
-    ],
+    some(
+        [
+            (
+                "seven",
+                "eight",
+                1,
+                "+ /r1/base publish topic /r1/status  (fleet.xml:3); in domain 8\n",
+            ),
+            (
+                "seven",
+                "any",
+                1,
+                "+ /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n",
+            ),
+            (
+                "any",
+                "seven",
+                0,
+                "- /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n",
+            ),
+            ("seven", "seven", 0, ""),
+            ("ks", "seven", 0, ""),
+            ("seven", "ks", 0, ""),
+            ("ks", "any", 1, "+ /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n"),
+            ("ks", "eight", 1, "+ /desk subscribe topic /r1/status  (fleet.xml:5); in domain 8\n"),
+            ("any", "ks", 0, "- /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n"),
+        ],
+        4,
+    ),
 )
 def test_the_domains_of_robots_are_compared(
     fleet: Path, base: str, head: str, status: int, said: str

@@ -224,7 +224,7 @@ def changed(
     return changes
 
 
-@pytest.mark.parametrize("name", PLANTED)
+@pytest.mark.parametrize("name", some([*PLANTED], 6))
 def test_an_update_changes_what_was_planted(name: str, bench: Bench) -> None:
     plant, wanted = PLANTED[name]
     plant(bench)

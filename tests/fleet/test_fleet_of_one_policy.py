@@ -1,4 +1,6 @@
-"""Fifty robots from one policy and one fleet file: three commands, and the rights written by hand.
+"""A fleet from one policy and one fleet file: three commands, and the rights written by hand.
+
+Fifty robots in the long form of the tests, sixteen otherwise.
 
 The policy that is compared with is made by this file's own text, with the names filled in.
 """
@@ -18,10 +20,13 @@ from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
+from tests.support.children import LONG
 from tests.support.harness import snapshot, sros, topics_of
 
-ROBOTS = sorted(f"r{number}" for number in range(1, 51))
+ROBOTS = sorted(f"r{number}" for number in range(1, 51 if LONG else 17))
 CARRIERS = [name for name in ROBOTS if int(name[1:]) % 2]
+COUNT = len(ROBOTS) + len(CARRIERS) + 1
+"""The enclaves: one of each robot, one of each carrier, and the dispatcher."""
 POLICY = """<policy version="0.2.0"><enclaves>
 <enclave path="/{robot}/base"><profiles><profile ns="{namespace}" node="base">
 <topics publish="ALLOW"><topic>odom</topic><topic>/fleet/{robot}/state</topic></topics>
@@ -101,7 +106,7 @@ def test_the_rights_of_each_robot_are_those_written_by_hand(made: Path) -> None:
     (made / "hand.xml").write_text(written_by_hand())
     hand = read_policy(made / "hand.xml")
     assert sorted(each.path for each in hand.enclaves) == list(enclave_names(made / "ks"))
-    assert len(hand.enclaves) == 50 + 25 + 1
+    assert len(hand.enclaves) == COUNT
     sros("diff_policy", "hand.xml", "ks", cwd=made).ok()
     assert topics_of(made / "ks/enclaves/r7/base") == {
         "ros_discovery_info",
@@ -220,20 +225,20 @@ def test_the_rights_of_every_node_are_not_next_to_the_policy(made: Path, tmp_pat
 def test_findings_that_are_the_same_for_many_robots_are_said_once(made: Path) -> None:
     fleet = FLEET
     folded = sros("check", "robot.xml", *fleet, cwd=made).out
-    assert "76 nodes lack the common part" in folded
+    assert f"{COUNT} nodes lack the common part" in folded
     ended = sros("check", "robot.xml", *fleet, "--exclude", "policy.no-parameter-events", cwd=made)
     lines = ended.out.splitlines()
     rosout = [at for at, each in enumerate(lines) if each.endswith("[policy.no-rosout]")]
     assert len(rosout) == 3, "base, lift and the dispatcher"
     said = [lines[at + 3] if at + 3 < len(lines) else "" for at in rosout]
     assert [each.strip().partition(":")[0] for each in said if "the same" in each] == [
-        "the same for 49 more robots",
-        "the same for 24 more robots",
+        f"the same for {len(ROBOTS) - 1} more robots",
+        f"the same for {len(CARRIERS) - 1} more robots",
     ]
     counted = json.loads(sros("check", "robot.xml", *fleet, "--json", cwd=made).out)
-    assert f"{counted['counts']['error'] - 76} errors" in ended.err
+    assert f"{counted['counts']['error'] - COUNT} errors" in ended.err
     ids = [each["id"] for each in counted["findings"]]
-    assert ids.count("policy.no-rosout") == 76
+    assert ids.count("policy.no-rosout") == COUNT
 
 
 def test_what_differs_in_the_robot_is_said_once(made: Path, tmp_path: Path) -> None:
@@ -244,7 +249,7 @@ def test_what_differs_in_the_robot_is_said_once(made: Path, tmp_path: Path) -> N
     ended = sros("check", "robot.xml", "--fleet", "fleet.toml", cwd=folder)
     _, _, said = ended.out.partition("[policy.name-misspelt]")
     assert said and "policy.name-misspelt" not in said
-    assert "    the same for 49 more robots: r" in said
+    assert f"    the same for {len(ROBOTS) - 1} more robots: r" in said
     more = "<topic>odom</topic><topic>grip/force</topic>"
     policy.write_text(POLICY.replace("<topic>odom</topic>", more))
     again = sros("generate_artifacts", "-k", "ks", "-p", "robot.xml", *FLEET, cwd=folder).ok()
@@ -275,7 +280,7 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     assert "/hall/r9/base/cmd" not in str(permissions(folder / "ks", "/dispatcher"))
     assert "/hall/r11/base/cmd" in str(permissions(folder / "ks", "/dispatcher"))
     fleet = load_fleet(Keystore(folder / "ks"))
-    assert fleet and "r9" not in fleet.robots and len(fleet.robots) == 48
+    assert fleet and "r9" not in fleet.robots and len(fleet.robots) == len(ROBOTS) - 2
     words = ("--include", "keystore.left-enclaves", "--severity", "note", "--json")
     found = json.loads(sros("check", "ks", *words, cwd=folder).out)["findings"]
     assert [each["text"] for each in found] == ["r9: /r9/base, /r9/lift"]
