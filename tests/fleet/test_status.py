@@ -67,7 +67,9 @@ class Field:
 
     def confirm(self, robot: str, **changed: object) -> Ended:
         """Confirm what a robot has, with a sound DDS and with ``changed`` values."""
-        said = json.loads(self.run("fleet", "report", robot, "--robot", robot).out)
+        with pytest.MonkeyPatch.context() as patched:  # it is replaced below
+            patched.setattr(fleet_verbs, "_dds_here", lambda _: SOUND_DDS)
+            said = json.loads(self.run("fleet", "report", robot, "--robot", robot).out)
         (self.folder / "said.json").write_text(json.dumps(said | {"dds": DDS} | changed))
         return self.run("fleet", "confirm", "ks", "said.json", "--robot", robot)
 
@@ -116,12 +118,6 @@ class Field:
         """Return when what an enclave has was issued."""
         entries = Keystore(self.root).ledger.entries
         return [each.time for each in entries if (each.what, each.enclave) == (what, enclave)]
-
-
-@pytest.fixture(autouse=True)
-def no_look_at_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What DDS a robot has, each confirmation here says itself."""
-    monkeypatch.setattr(fleet_verbs, "_dds_here", lambda _: SOUND_DDS)
 
 
 @pytest.fixture(scope="module")
