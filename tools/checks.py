@@ -17,9 +17,6 @@ from xml.etree import ElementTree
 from tools.record import PYTHON, read_record
 from tools.steps import CHECKOUT, VENV, SetupError, log_tail, say, succeeds
 
-_NOTHING_COLLECTED = 5
-"""pytest's exit status when a selection matches no test."""
-
 _PLUGINS = "_hypothesis_pytestplugin"
 
 LONG = "--long"
@@ -30,9 +27,6 @@ OLDEST = "--oldest"
 
 OLDEST_PACKAGES = ("click==8.1.6", "cryptography==41.0.7", "lxml==5.2.1")
 """The packages of Ubuntu 24.04, which ROS 2 Jazzy and Kilted have."""
-
-WITH_DDS = ("tests/integration", "tests/explain")
-"""The folders with tests that start DDS processes; see `modules_with_dds`."""
 
 FORKED = ("-p", "tools.forked_tests", "--processes")
 """pytest's arguments before a number of processes."""
@@ -50,9 +44,8 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     With the oldest packages only the tests run: ruff and mypy check against the newest.
 
     Ruff and mypy run beside the tests; their output is shown after that of the tests.  Without
-    ``arguments``, so do the tests that start DDS processes, with one process more than there are
-    cores: each has a separate network and often waits.  With ``arguments``, pytest runs once, with
-    these arguments.
+    ``arguments``, the tests run in more processes than there are cores: those that start DDS
+    processes often wait.  With ``arguments``, pytest runs in one process, with these arguments.
     """
     started = time.monotonic()
     if LONG in arguments:
@@ -74,26 +67,11 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     if arguments:
         steps = lint | {"pytest": ["-m", "pytest", *arguments]}
         return _conclude(_run_together(steps, "pytest", env), Counter(), started)
-    cores = len(os.sched_getaffinity(0))
-    parts = {
-        "tests": ["-m", "not dds", *FORKED, str(cores)],
-        "tests on a real DDS": ["-m", "dds", *FORKED, str(cores + 1), *modules_with_dds()],
-    }
-    reports = {name: VENV / f"{name.replace(' ', '-')}.xml" for name in parts}
-    for report in reports.values():
-        report.unlink(missing_ok=True)
-    steps = lint | {
-        name: ["-m", "pytest", *words, f"--junit-xml={reports[name]}"]
-        for name, words in parts.items()
-    }
-    results = _run_together(steps, "tests", env)
-    for name in parts:
-        if results[name] == _NOTHING_COLLECTED:
-            results[name] = 0
-    counts: Counter[str] = Counter()
-    for report in reports.values():
-        counts += count(report)
-    return _conclude(results, counts, started)
+    report = VENV / "tests.xml"
+    report.unlink(missing_ok=True)
+    processes = 2 * len(os.sched_getaffinity(0)) + 1
+    steps = lint | {"tests": ["-m", "pytest", *FORKED, str(processes), f"--junit-xml={report}"]}
+    return _conclude(_run_together(steps, "tests", env), count(report), started)
 
 
 def _with_oldest_packages(env: Mapping[str, str]) -> dict[str, str]:
@@ -124,16 +102,6 @@ def _run_together(
             begun[name] = running.enter_context(step)
         ended = {name: begun[name].end() for name in reversed(order)}
     return {name: ended[name] for name in steps}
-
-
-def modules_with_dds() -> list[str]:
-    """Return the paths of the modules that have tests on a real DDS: only these are imported."""
-    paths = [path for folder in WITH_DDS for path in (CHECKOUT / folder).glob("**/test_*.py")]
-    return [
-        str(path.relative_to(CHECKOUT))
-        for path in sorted(paths)
-        if "pytest.mark.dds" in path.read_text(encoding="utf-8")
-    ]
 
 
 def _conclude(results: Mapping[str, int], counts: Counter[str], started: float) -> int:
