@@ -9,7 +9,6 @@ import json
 import os
 import random
 import socket
-import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -44,7 +43,7 @@ from tests.integration.vendor_oracle import (
     with_patience,
 )
 from tests.proof.test_against_brute_force import ENCLAVES, draw_policy, draw_requirement
-from tests.support.children import LONG, run
+from tests.support.children import LONG
 from tests.support.harness import policy_text, sros
 
 COUNT = int(os.environ.get("SROS_WITNESSES", "200" if LONG else "12"))
@@ -142,15 +141,13 @@ def test_zenoh_does_what_a_witness_says(tmp_path: Path) -> None:
         control = json.loads(written.render())["access_control"]
         of = worlds.setdefault(json.dumps(control), {"access_control": control, "uses": []})
         of["uses"].append([use.enclave, use.writes, use.topic, allowed])
-    done = run(
-        [sys.executable, "-P", Path(__file__).with_name("zenoh_witnesses.py"), keystore],
-        said=json.dumps(list(worlds.values())),
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        patience=3600.0,
-    )
+    from tests.integration.zenoh_witnesses import observe
+    from tests.integration.zenoh_world import observed_apart
+
+    observed = observed_apart(lambda: [observe(keystore, each) for each in worlds.values()])
     wrong = [
         use
-        for of, happened in zip(worlds.values(), json.loads(done.stdout), strict=True)
+        for of, happened in zip(worlds.values(), observed, strict=True)
         for use, found in zip(of["uses"], happened, strict=True)
         if found is not use[3]
     ]

@@ -5,23 +5,18 @@ The verbs are real, the sessions too; a process keeps the files that it read whe
 
 from __future__ import annotations
 
-import json
-import os
 import socket
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.support.children import run
 from tests.support.harness import policy_text, publish, sros
 from tests.support.long_form import some
 
 pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
 
 pytestmark = pytest.mark.zenoh
-LIFE = Path(__file__).with_name("zenoh_life.py")
 POLICY = policy_text(
     {
         "/talker": publish("/chatter", "/more"),
@@ -41,11 +36,10 @@ def play(what: str, folder: Path, mode: str) -> Any:
     sros("create_keystore", folder / "ks", "--template", "production").ok()
     sros("generate_artifacts", "-k", folder / "ks", "-p", folder / "policy.xml").ok()
     sros("zenoh", folder / "ks", "--endpoint", endpoint, "--mode", mode).ok()
-    done = run(
-        [sys.executable, "-P", LIFE, what, folder / "ks"],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-    )
-    return json.loads(done.stdout)
+    from tests.integration.zenoh_life import PLAYS
+    from tests.integration.zenoh_world import observed_apart
+
+    return observed_apart(lambda: PLAYS[what](folder / "ks"))
 
 
 @MODES

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import json
-import os
 import re
 import socket
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.support.children import run
 from tests.support.harness import policy_text, publish, sros, subscribe
 
 pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
 
 pytestmark = pytest.mark.zenoh
-WORLD = Path(__file__).with_name("zenoh_world.py")
-
 
 POLICY = policy_text(
     {
@@ -56,11 +50,9 @@ def play(what: str, folder: Path, mode: str = "peer") -> Any:
         endpoint = f"localhost:{free.getsockname()[1]}"
     for name in ("ks", "foreign"):
         sros("zenoh", folder / name, "--endpoint", endpoint, "--mode", mode).ok()
-    done = run(
-        [sys.executable, "-P", WORLD, what, folder / "ks", folder / "foreign"],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-    )
-    return json.loads(done.stdout)
+    from tests.integration.zenoh_world import PLAYS, observed_apart
+
+    return observed_apart(lambda: PLAYS[what](folder / "ks", folder / "foreign"))
 
 
 @pytest.mark.parametrize("mode", ["peer", "client"])

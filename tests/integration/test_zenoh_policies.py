@@ -7,10 +7,7 @@ Besides the names of a policy, its wildcards stand for some names that they matc
 
 from __future__ import annotations
 
-import json
-import os
 import socket
-import sys
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,13 +19,12 @@ from sros_tool.names import is_expression
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import RIGHTS
 from sros_tool.policy.rights import KIND_OF, Rules, policy_rights, unfolded
-from tests.support.children import LONG, run
+from tests.support.children import LONG
 from tests.support.harness import policy_text, publish, sros
 
 pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
 
 pytestmark = pytest.mark.zenoh
-MATRIX = Path(__file__).with_name("zenoh_matrix.py")
 KINDS = ("topics", "services")
 ROBOT = "mobile_robot.xml"
 SHIPPED = sorted(each.name for each in policies_dir().glob("*.xml"))
@@ -85,15 +81,13 @@ def keystore_of(folder: Path, policies: list[Path], *, mode: str) -> Path:
     return root
 
 
-def tried(keystore: Path, policies: list[Path], folder: Path, *more: str) -> Any:
+def tried(keystore: Path, policies: list[Path], *, enforced: bool = True) -> Any:
     """Return what was observed on sessions with the files of a keystore."""
-    (folder / "matrix.json").write_text(json.dumps(matrix_of(policies)))
-    done = run(
-        [sys.executable, "-P", MATRIX, keystore, folder / "matrix.json", *more],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        patience=3600,
-    )
-    return json.loads(done.stdout)
+    from tests.integration import zenoh_matrix as live
+    from tests.integration.zenoh_world import observed_apart
+
+    matrix = live.read_matrix(matrix_of(policies))
+    return observed_apart(lambda: live.observed(keystore, matrix, enforced=enforced))
 
 
 SMALL = "talker_listener.xml"
@@ -113,7 +107,7 @@ def test_every_allowed_pair_communicates_and_no_other_one(
         sros("distribute_key", keystore, "--all", tmp_path / "elsewhere").ok()
         keystore.rename(tmp_path / "gone")
         keystore = tmp_path / "elsewhere"
-    observed = tried(keystore, policies, tmp_path)
+    observed = tried(keystore, policies)
     print(file, mode, "exported" if exported else "", observed["allowed"], "of", observed["tried"])
     assert observed["up"]
     assert observed["different"] == {}
@@ -123,5 +117,5 @@ def test_every_allowed_pair_communicates_and_no_other_one(
 def test_without_rules_others_communicate_too(tmp_path: Path) -> None:
     (tmp_path / "witness.xml").write_text(WITNESS)
     policies = [policies_dir() / "talker_listener.xml", tmp_path / "witness.xml"]
-    observed = tried(keystore_of(tmp_path, policies, mode="client"), policies, tmp_path, "open")
+    observed = tried(keystore_of(tmp_path, policies, mode="client"), policies, enforced=False)
     assert all(observed["different"][what]["too much"] for what in ("heard", "executed", "replied"))

@@ -1,17 +1,12 @@
 """Random access control in every process of a Zenoh network: what arrives, and what sros says.
 
-    python -P tests/integration/zenoh_deliveries.py KEYSTORE TALKER LISTENER SEED COUNT
-
-TALKER and LISTENER are the modes of the sessions of two enclaves. Prints as JSON in which of the
-COUNT cases real sessions and `sros_tool.zenoh.delivery` differ. Usually in a network of its own.
+For a process of its own, as all that opens sessions (`zenoh_world.observed_apart`).
 """
 
 from __future__ import annotations
 
 import json
-import os
 import random
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass
@@ -22,7 +17,6 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from sros_tool.runtime.netns import enter_isolation, try_isolation
 from sros_tool.zenoh.access import Enforcement, Flow, Message
 from sros_tool.zenoh.configuration import Mode
 from sros_tool.zenoh.delivery import ZenohProcess, call, publication, route, token
@@ -243,13 +237,3 @@ def play(
     time.sleep(2 * PAUSE)
     until(lambda: all(said[kind] <= seen[kind] for kind in KINDS), again)
     time.sleep(2 * PAUSE)
-
-
-if __name__ == "__main__":
-    if try_isolation().isolated:
-        enter_isolation()
-    folder, one, other, seed, count = sys.argv[1:]
-    chosen = {ROUTER: Mode.ROUTER, TALKER: Mode(one), LISTENER: Mode(other)}
-    observed = compared(Path(folder), chosen, int(seed), int(count))
-    print(json.dumps(observed), flush=True)
-    os._exit(0)  # threads of a session that hangs would keep the process

@@ -1,23 +1,15 @@
-"""What a real router lets through by random rules, next to what sros says of them.
-
-    python -P tests/integration/zenoh_enforcement.py KEYSTORE PORT WORLDS
-
-Prints the differences as JSON.  The process enters a network of its own where it may.
-"""
+"""What a real router lets through by random rules, next to what sros says of them."""
 
 from __future__ import annotations
 
 import json
-import os
 import random
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from sros_tool.runtime.netns import enter_isolation, try_isolation
 from sros_tool.zenoh.access import Message, Remote
 from sros_tool.zenoh.document import parse_configuration
 from tests.integration.zenoh_world import MESSAGES, PAUSE, drawn_rule, observed_cases
@@ -179,17 +171,9 @@ def world(keystore: Path, port: int, draw: random.Random, default: str) -> dict[
     }
 
 
-def main() -> None:
-    keystore, port, worlds = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-    if try_isolation().isolated:
-        enter_isolation()
-    found = []
-    for number in range(worlds):
-        default = ("deny", "allow")[number % 2]
-        found.append(world(keystore, port, random.Random(number), default))
-    print(json.dumps(found), flush=True)
-    os._exit(0)  # threads of a session that hangs would keep the process
-
-
-if __name__ == "__main__":
-    main()
+def worlds(keystore: Path, port: int, count: int) -> list[dict[str, Any]]:
+    """Return what was observed in so many worlds, and where sros says something else."""
+    return [
+        world(keystore, port, random.Random(number), ("deny", "allow")[number % 2])
+        for number in range(count)
+    ]

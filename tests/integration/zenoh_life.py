@@ -1,16 +1,9 @@
-"""Running Zenoh sessions while their keystore changes; started as a process of its own.
-
-    python -P tests/integration/zenoh_life.py PLAY KEYSTORE
-
-Prints what was observed as JSON. The process enters a network of its own where it may.
-"""
+"""Running Zenoh sessions while their keystore changes, in a process and a network of their own."""
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +11,6 @@ from typing import Any
 
 import zenoh
 
-from sros_tool.runtime.netns import enter_isolation, try_isolation
 from tests.integration.zenoh_world import PAUSE, World, key, text, until
 from tests.support.harness import policy_text, sros, subscribe
 
@@ -160,10 +152,3 @@ def rotation(keystore: Path) -> dict[str, Any]:
 PLAYS: dict[str, Callable[[Path], Any]] = {
     each.__name__: each for each in (rights, renewal, revocation, rotation)
 }
-
-if __name__ == "__main__":
-    if try_isolation().isolated:
-        enter_isolation()
-    observed = PLAYS[sys.argv[1]](Path(sys.argv[2]))
-    print(json.dumps(observed), flush=True)
-    os._exit(0)  # threads of a session that hangs would keep the process

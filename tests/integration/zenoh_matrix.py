@@ -1,10 +1,7 @@
 """Every enclave of a policy tries every name in every direction, on real Zenoh sessions.
 
-    python -P tests/integration/zenoh_matrix.py KEYSTORE MATRIX [open]
-
-MATRIX is a JSON file: the names of topics and services, and which of them each enclave may publish,
-subscribe, request and reply. With "open" nobody enforces anything. Prints what was observed
-otherwise, as JSON, and how much was tried.
+A matrix has the names of topics and services, and which of them each enclave may publish,
+subscribe, request and reply.
 
 Each enclave has two sessions: one with the written file, which uses all that it may, and one that
 obeys no rules, and tries everything. The second one shows that the others enforce; so no pair of
@@ -14,8 +11,6 @@ two such sessions counts in peer mode.
 from __future__ import annotations
 
 import json
-import os
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,7 +20,6 @@ from typing import Any
 
 import zenoh
 
-from sros_tool.runtime.netns import enter_isolation, try_isolation
 from sros_tool.translate_zenoh.graph import example_token
 from tests.integration.zenoh_world import key, text, tokens_of, until, world
 from tests.support.children import PATIENCE
@@ -261,20 +255,10 @@ def observed(keystore: Path, matrix: Matrix, *, enforced: bool) -> dict[str, Any
     }
 
 
-def read_matrix(file: Path) -> Matrix:
-    """Return the matrix of a file."""
-    document = json.loads(file.read_text())
+def read_matrix(document: dict[str, Any]) -> Matrix:
+    """Return the matrix of a document."""
     rights = {
         enclave: {right: frozenset(names) for right, names in of.items()}
         for enclave, of in document["rights"].items()
     }
     return Matrix(tuple(document["topics"]), tuple(document["services"]), rights)
-
-
-if __name__ == "__main__":
-    if try_isolation().isolated:
-        enter_isolation()
-    of = read_matrix(Path(sys.argv[2]))
-    result = observed(Path(sys.argv[1]), of, enforced="open" not in sys.argv[3:])
-    print(json.dumps(result), flush=True)
-    os._exit(0)  # threads of a session that hangs would keep the process

@@ -1,25 +1,18 @@
 """Ask real Zenoh, past a router with given rules, who may write and read what.
 
-    python -P tests/integration/zenoh_witnesses.py KEYSTORE
-
-Reads a JSON list of worlds from standard input: {"access_control", "uses": [[enclave, writes,
-topic, allowed]...]}.  Prints for each world whether each use happened.  The enclave /probe is at
-the other end; its rights have to be all.  What is not allowed is tried until /twin, which has all
-rights, too, has done the same.
+A world is {"access_control", "uses": [[enclave, writes, topic, allowed]...]}.  The enclave /probe
+is at the other end; its rights have to be all.  What is not allowed is tried until /twin, which has
+all rights, too, has done the same.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from sros_tool.runtime.netns import enter_isolation, try_isolation
 from tests.integration.zenoh_world import PAUSE, key, replies, serve, text, until, world
 
 _ENDS = {"rt": "", "rq": "Request", "rr": "Reply"}
@@ -98,11 +91,3 @@ def observe(keystore: Path, given: dict[str, Any]) -> list[bool]:
         at.open("/router", "router.json5", rules=True, access_control=given["access_control"])
         who = {each: at.open(each) for each in sorted(enclaves | {"/probe", "/twin"})}
         return [happens(who, *use) for use in given["uses"]]
-
-
-if __name__ == "__main__":
-    worlds = json.load(sys.stdin)
-    if try_isolation().isolated:
-        enter_isolation()
-    print(json.dumps([observe(Path(sys.argv[1]), each) for each in worlds]), flush=True)
-    os._exit(0)  # threads of a session that hangs would keep the process

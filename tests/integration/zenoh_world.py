@@ -1,17 +1,10 @@
-"""Zenoh sessions that speak as nodes of rmw_zenoh do; started as a process of its own.
-
-    python -P tests/integration/zenoh_world.py PLAY KEYSTORE FOREIGN
-
-Prints what was observed as JSON. The process enters a network of its own where it may.
-"""
+"""Zenoh sessions that speak as nodes of rmw_zenoh do, in a process and a network of their own."""
 
 from __future__ import annotations
 
 import contextlib
 import json
-import os
 import random
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -21,10 +14,9 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from sros_tool.runtime.netns import enter_isolation, try_isolation
 from sros_tool.zenoh.access import AccessControl, AccessRule, Flow, Message, RemoteRights
 from sros_tool.zenoh.configuration import Configuration, Mode
-from tests.support.children import LONG
+from tests.support.children import LONG, apart
 
 TYPE = "std_msgs::msg::dds_::String_/RIHS01_" + "0" * 64
 BUFFERS = ("_buf_cpu", "_buf/0a1b")
@@ -550,9 +542,9 @@ PLAYS: dict[str, Callable[[Path, Path], Any]] = {
 }
 
 
-if __name__ == "__main__":
-    if try_isolation().isolated:
-        enter_isolation()
-    observed = PLAYS[sys.argv[1]](Path(sys.argv[2]), Path(sys.argv[3]))
-    print(json.dumps(observed), flush=True)
-    os._exit(0)  # threads of a session that hangs would keep the process
+def observed_apart(look: Callable[[], object]) -> Any:
+    """Return, as JSON has it, what a function observes in a process and a network of its own.
+
+    Threads of a session that hangs end with the process.
+    """
+    return json.loads(apart(lambda: json.dumps(look()), patience=3600))
