@@ -16,8 +16,10 @@ from typing import Any
 
 from sros_tool.names import NODE_SERVICES, dds_names, expand
 from sros_tool.runtime.netns import end_with_parent
-from tests.integration.ros_nodes.run_nodes import Nodes
+from tests.integration.ros_nodes.run_nodes import Nodes, load_types
 from tests.support.children import importing
+
+load_types()
 
 Process = list[dict[str, Any]] | dict[str, Any]
 PATIENCE_S = 240.0

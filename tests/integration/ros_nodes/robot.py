@@ -18,9 +18,11 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-from tests.integration.ros_nodes.run_nodes import Nodes
+from tests.integration.ros_nodes.run_nodes import Nodes, load_types
 from tests.support.children import wait_for
 from tests.support.harness import Ended, Running
+
+load_types()
 
 OBSERVER = b"sros_tool.graph.observation"
 OF_THE_VERBS = (

@@ -17,17 +17,30 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import Log
+from rcl_interfaces import srv
+from rcl_interfaces.msg import Log, ParameterEvent
 from rclpy.action import ActionClient, ActionServer
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
+from rclpy.type_support import check_for_type_support
 from std_msgs.msg import String
 from test_msgs.action import Fibonacci
 from test_msgs.srv import BasicTypes
+from type_description_interfaces.srv import GetTypeDescription
 
 from tests.support.children import Forked
+
+
+def load_types() -> None:
+    """Load the types that nodes use, which takes most of the time in which a node is made.
+
+    The processes that are forked after this have them.
+    """
+    services = (getattr(srv, name) for name in vars(srv) if name[0].isupper())
+    for each in (Log, ParameterEvent, String, *services, GetTypeDescription, BasicTypes, Fibonacci):
+        check_for_type_support(each)
 
 
 def make_node(spec: dict[str, Any]) -> Any:
