@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import lru_cache
 from hashlib import sha1
@@ -68,8 +69,22 @@ def form_of(folders: Sequence[Path], now: datetime, made: datetime | None = None
     Moments are told by their distance from ``made``, if the enclaves were made then and signed
     until ``now``, and else from ``now``.
     """
-    contents = [(name, _content(folder / name)) for folder in folders for name in FILES]
-    writer = _Writer(made or now, now)
+    contents = tuple((name, _content(folder / name)) for folder in folders for name in FILES)
+    if made is None:
+        return _form(contents, now, now)
+    known = _FORMS.get((contents, made))
+    if known is None:
+        known = _FORMS[contents, made] = _form(contents, made, now)
+    return known
+
+
+_Contents = tuple[tuple[str, bytes | str], ...]
+_FORMS: dict[tuple[_Contents, datetime], str] = {}
+"""The forms of enclaves that several vendors are asked about."""
+
+
+def _form(contents: _Contents, made: datetime, now: datetime) -> str:
+    writer = _Writer(made, now)
     for _, content in contents:
         if isinstance(content, bytes):
             writer.learn(content)
@@ -110,31 +125,15 @@ class _Writer:
     def learn(self, content: bytes) -> None:
         """Count the keys in a file, public and private."""
         for _, _, data in _blobs(content):
-            private = _private_key(data)
-            if private is not None:
-                info = private.public_key().public_bytes(
-                    Encoding.DER, PublicFormat.SubjectPublicKeyInfo
-                )
-                self._learn_key(der.first(info))
-            else:
-                _walk(der.first(data), self._learn_key)
-
-    def _learn_key(self, value: der.Value) -> None:
-        """Count a value if it is a SubjectPublicKeyInfo."""
-        if value.tag != der.SEQUENCE or value.whole in self._keys:
-            return
-        parts = _children(value)
-        if [part.tag for part in parts] != [der.SEQUENCE, der.BIT_STRING]:
-            return
-        try:
-            key: Any = load_der_public_key(value.whole)
-        except (ValueError, UnsupportedAlgorithm):
-            return
-        self._keys[value.whole] = key
-        size = getattr(key, "key_size", "")
-        name = f"{parts[0].content.hex()} {size} {len(self._keys)}"
-        self._names[value.whole] = f"<key {name}>"
-        self._names[sha1(parts[1].content[1:]).digest()] = f"<identifier of {name}>"
+            for info, key in _keys_in(data):
+                if info in self._keys:
+                    continue
+                self._keys[info] = key
+                algorithm, bits = _children(der.first(info))
+                size = getattr(key, "key_size", "")
+                name = f"{algorithm.content.hex()} {size} {len(self._keys)}"
+                self._names[info] = f"<key {name}>"
+                self._names[sha1(bits.content[1:]).digest()] = f"<identifier of {name}>"
 
     # ── files ──────────────────────────────────────────────────────────────────────────────
 
@@ -259,8 +258,13 @@ def _decoded(data: bytes) -> str:
     return data.decode("utf-8", "backslashreplace")
 
 
-def _blobs(content: bytes) -> Iterator[tuple[tuple[int, int], str, bytes]]:
-    """Yield where DER stands in base64, how its lines are written, and the DER."""
+# What several enclaves have, such as the certificate of their CA, is read once.
+
+
+@lru_cache(1000)
+def _blobs(content: bytes) -> list[tuple[tuple[int, int], str, bytes]]:
+    """Return where DER stands in base64, how its lines are written, and the DER."""
+    blobs = []
     for found in _BASE64.finditer(content):
         lines = found[0].splitlines()
         end = b"\r\n" if found[0].endswith(b"\r\n") else b"\n"
@@ -272,7 +276,29 @@ def _blobs(content: bytes) -> Iterator[tuple[tuple[int, int], str, bytes]]:
         written = (canonical[at : at + width] + end for at in range(0, len(canonical), width))
         if b"".join(written) == found[0] and data[:1] == b"\x30" and _is_whole(data):
             kind = f"width {width if len(lines) > 1 else 'of a line'}, {end!r}"
-            yield found.span(), kind, data
+            blobs.append((found.span(), kind, data))
+    return blobs
+
+
+@lru_cache(1000)
+def _keys_in(data: bytes) -> list[tuple[bytes, Any]]:
+    """Return the public keys in an encoded value, with that of a private key, and their infos."""
+    found: list[tuple[bytes, Any]] = []
+
+    def look(value: der.Value) -> None:
+        parts = _children(value) if value.tag == der.SEQUENCE else []
+        if [part.tag for part in parts] != [der.SEQUENCE, der.BIT_STRING]:
+            return
+        with suppress(ValueError, UnsupportedAlgorithm):
+            found.append((value.whole, load_der_public_key(value.whole)))
+
+    private = _private_key(data)
+    if private is None:
+        _walk(der.first(data), look)
+    else:
+        encoding = Encoding.DER, PublicFormat.SubjectPublicKeyInfo
+        look(der.first(private.public_key().public_bytes(*encoding)))
+    return found
 
 
 def _is_whole(data: bytes) -> bool:
@@ -283,8 +309,13 @@ def _is_whole(data: bytes) -> bool:
 
 
 def _children(value: der.Value) -> list[der.Value]:
+    return _parsed(value.content) if value.tag & 0x20 else []
+
+
+@lru_cache(20_000)
+def _parsed(content: bytes) -> list[der.Value]:
     try:
-        return der.children(value.content) if value.tag & 0x20 else []
+        return der.children(content)
     except PkiError:
         return []
 
