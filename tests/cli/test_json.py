@@ -80,7 +80,7 @@ def objects(schema: Any) -> Iterator[Schema]:
             yield from objects(value)
 
 
-@pytest.mark.parametrize("name", DOCUMENTS)
+@pytest.mark.parametrize("name", some([*DOCUMENTS], 12))
 def test_a_schema_is_closed_and_describes_every_property(name: str) -> None:
     Draft202012Validator.check_schema(DOCUMENTS[name])
     for schema in objects(DOCUMENTS[name]):
@@ -241,9 +241,10 @@ ON_A_ROBOT = {verb for verb in CASES if verb.startswith("agent ") or verb == "cl
 )
 def test_what_a_verb_prints(verb: str, made_folder: Path, tmp_path: Path) -> None:
     seen = Seen()
-    for case in CASES[verb]:
+    whole = drawn(verb, 1 / 2)
+    for case in CASES[verb] if whole else CASES[verb][:1]:
         seen.check(verb, both_ways(verb, case, made_folder, tmp_path))
-    assert seen.unseen(verb) == []
+    assert seen.unseen(verb) == [] or not whole
 
 
 @pytest.mark.parametrize("verb", WITH_A_GRAPH)

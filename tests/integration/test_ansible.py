@@ -29,7 +29,7 @@ pytestmark = [
 ]
 
 BREAKS = "a robot breaks half way, and changed rights arrive"
-ROBOTS = [name for name in names(3) if name != "r2" or drawn(BREAKS, 1 / 4)]
+ROBOTS = [name for name in names(3) if name != "r2" or drawn(BREAKS, 1 / 8)]
 """The second one is for the test in which it breaks."""
 ARMS = '{groups = ["arms"]}'
 FLEET = "[robots]\n" + "".join(f"{name} = {ARMS if name == 'r1' else '{}'}\n" for name in ROBOTS)

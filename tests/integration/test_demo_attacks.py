@@ -25,7 +25,7 @@ from tests.integration.test_demo_run import processes_with, start
 from tests.integration.weak_keystores import WEAKNESSES, make_weak
 from tests.support.children import LONG, PATIENCE
 from tests.support.harness import Running, snapshot, sros
-from tests.support.long_form import ONLY_LONG, some
+from tests.support.long_form import ONLY_LONG, some, sometimes
 
 pytestmark = pytest.mark.dds
 
@@ -100,13 +100,16 @@ def test_every_attack_ends_as_expected(
 
 
 OFTEN = ("subjects that others contain", "files open to all users")
-"""What test_demo_user_keystore.py does not show in a robot's keystore; one is drawn."""
+"""What test_demo_user_keystore.py does not show in a robot's keystore."""
 
 
 @needs_isolation
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(each, marks=[] if each in some(OFTEN, 1) else ONLY_LONG) for each in WEAKNESSES],
+    [
+        pytest.param(each, marks=sometimes(each) if each in OFTEN else ONLY_LONG)
+        for each in WEAKNESSES
+    ],
 )
 def test_a_weakness_makes_its_rows_fail_and_no_others(
     backend: Backend, name: str, tmp_path: Path

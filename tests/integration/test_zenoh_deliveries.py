@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import os
 import random
 import socket
-import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -16,15 +12,15 @@ from sros_tool.cli.common import now
 from sros_tool.explain.answer import ask
 from sros_tool.explain.zenoh import ZenohEvaluator
 from sros_tool.keystore.reader import Keystore
+from sros_tool.zenoh.configuration import Mode
 from tests.explain.zenoh_policies import NAMES, OTHER_END, WORD, drawn_policy
-from tests.support.children import LONG, run
+from tests.support.children import LONG
 from tests.support.harness import policy_text, publish, sros
+from tests.support.long_form import some
 
 pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
 
 pytestmark = pytest.mark.zenoh
-DELIVERIES = Path(__file__).with_name("zenoh_deliveries.py")
-MATRIX = Path(__file__).with_name("zenoh_matrix.py")
 POLICY = policy_text({"/talker": publish("/chatter"), "/listener": publish("/chatter")})
 
 
@@ -46,27 +42,26 @@ def keystore(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_keystore(tmp_path_factory.mktemp("zenoh"), POLICY, "peer")
 
 
-def play(script: Path, *words: object) -> Any:
-    """Return what a process with a world of real sessions observed."""
-    done = run(
-        [sys.executable, "-P", script, *words],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        patience=3600,
-    )
-    return json.loads(done.stdout)
-
-
-MIXED = [("client", "peer"), ("peer", "client")]
+MIXED = [("client", "peer"), ("peer", "client")] if LONG else []
 
 
 @pytest.mark.parametrize(
-    ("talker", "listener"), [("client", "client"), ("peer", "peer"), *(MIXED if LONG else [])]
+    ("talker", "listener"), [*some([("client", "client"), ("peer", "peer")], 1), *MIXED]
 )
 @pytest.mark.parametrize("seed", range(1, 6) if LONG else [1])
 def test_what_arrives_is_what_the_engine_says(
     keystore: Path, talker: str, listener: str, seed: int
 ) -> None:
-    observed = play(DELIVERIES, keystore, talker, listener, seed, 250 if LONG else 80)
+    from tests.integration import zenoh_deliveries as live
+    from tests.integration.zenoh_world import observed_apart
+
+    modes = {
+        live.ROUTER: Mode.ROUTER,
+        live.TALKER: Mode(talker),
+        live.LISTENER: Mode(listener),
+    }
+    count = 250 if LONG else 80
+    observed = observed_apart(lambda: live.compared(keystore, modes, seed, count))
     assert not any(observed["different"].values()), observed["different"]
     # Both sides were up, and each kind of delivery was both allowed and dropped.
     assert min(observed["arrived"].values()) >= 5, observed["arrived"]
@@ -92,9 +87,11 @@ def test_what_explain_answers_is_what_happens(tmp_path: Path, mode: str, seed: i
         for enclave in evaluator.names
         if enclave != "/router"
     }
-    matrix = {"topics": NAMES, "services": NAMES, "rights": answers}
-    (tmp_path / "matrix.json").write_text(json.dumps(matrix))
-    observed = play(MATRIX, keystore, tmp_path / "matrix.json")
+    from tests.integration import zenoh_matrix as live
+    from tests.integration.zenoh_world import observed_apart
+
+    matrix = live.read_matrix({"topics": NAMES, "services": NAMES, "rights": answers})
+    observed = observed_apart(lambda: live.observed(keystore, matrix, enforced=True))
     assert observed["up"]
     assert observed["different"] == {}
     assert observed["allowed"]["heard"] > 0

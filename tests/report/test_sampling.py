@@ -13,6 +13,10 @@ from sros_tool.report.picture import Picture
 from sros_tool.report.sources import Drawing, draw
 from tests.report.pictures import group
 from tests.support.harness import Ended, made_once, policy_text, sros
+from tests.support.long_form import some
+
+UNREAD = {"/a4/base", "/a4/nav"}
+"""Enclaves of which nothing is read as long as their robot is like the others."""
 
 
 def publishes(*names: str) -> str:
@@ -57,20 +61,20 @@ def large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return made_once(tmp_path / "ks", make)
 
 
-def both(keystore: Path) -> tuple[tuple[Picture, Folding], tuple[Picture, Folding]]:
-    """Return the picture of all enclaves, and of a sample."""
-    now = datetime.now(UTC)
-    whole, sample = (draw(Drawing([keystore], now, UTC, sampled=each)) for each in (False, True))
-    return whole, sample
+def drawing(keystore: Path, *, sampled: bool) -> tuple[Picture, Folding]:
+    """Return the picture of all enclaves, or of a sample."""
+    return draw(Drawing([keystore], datetime.now(UTC), UTC, sampled=sampled))
 
 
 def test_a_sample_draws_what_all_enclaves_draw(large: Path) -> None:
-    (all_of_them, whole), (some, sample) = both(large)
+    all_of_them, whole = drawing(large, sampled=False)
+    part_of_them, sample = drawing(large, sampled=True)
     assert not all_of_them.unread
-    read = {enclave.path for enclave in some.enclaves}
+    read = {enclave.path for enclave in part_of_them.enclaves}
     assert len(read) < len(all_of_them.enclaves) - 10
     assert {"/b3/arm", *(f"/d{n}/peer" for n in range(1, 7)), "/a2/nav"} <= read
-    assert {units.like: units.members for units in some.unread} == {
+    assert not UNREAD & read
+    assert {units.like: units.members for units in part_of_them.unread} == {
         "a1": ("a3", "a4", "a5"),
         "b1": ("b2", "b4", "b5"),
         "c1": ("c2",),
@@ -90,22 +94,26 @@ def cards(folding: Folding) -> set[tuple[str, str, str]]:
 
 @pytest.mark.parametrize(
     ("enclave", "more"),
-    [
-        ("/a4/nav", {"/a4/nav": publishes("/a4/loud")}),
-        ("/a4/base", {"/dispatcher": subscribes("/a4/odom")}),
-        ("/a4/nav", {"/a4/extra": publishes("/a4/loud")}),
-        ("/a4/nav", {"/a4/nav": group("topics", "publish", "/a4/x", qualifier="DENY")}),
-    ],
+    some(
+        [
+            ("/a4/nav", {"/a4/nav": publishes("/a4/loud")}),
+            ("/a4/base", {"/dispatcher": subscribes("/a4/odom")}),
+            ("/a4/nav", {"/a4/extra": publishes("/a4/loud")}),
+            ("/a4/nav", {"/a4/nav": group("topics", "publish", "/a4/x", qualifier="DENY")}),
+        ],
+        2,
+    ),
 )
 def test_a_unit_of_which_anything_differs_is_read(
     large: Path, enclave: str, more: dict[str, str]
 ) -> None:
-    assert enclave not in {each.path for each in both(large)[1][0].enclaves}
+    assert enclave in UNREAD
     policy = large.with_name("more.xml")
     policy.write_text(policy_text({p: t + families().get(p, "") for p, t in more.items()}))
     sros("generate_artifacts", "-k", large, "-p", policy).ok()
-    (_, whole), (some, sample) = both(large)
-    assert enclave in {each.path for each in some.enclaves}
+    _, whole = drawing(large, sampled=False)
+    part_of_them, sample = drawing(large, sampled=True)
+    assert enclave in {each.path for each in part_of_them.enclaves}
     assert (sample.equal, sample.picture.edges) == (whole.equal, whole.picture.edges)
 
 
@@ -113,9 +121,9 @@ def test_a_unit_of_which_anything_differs_is_read(
 def test_a_unit_whose_files_are_broken(large: Path, file: str) -> None:
     """Permissions are compared; of the rest, nothing is known and that is said."""
     (large / "enclaves/a4/nav" / file).write_bytes(b"x")
-    some, _ = both(large)[1]
-    assert ("/a4/nav" in {each.path for each in some.enclaves}) == (file == "permissions.p7s")
-    assert any("signatures, certificates" in line for line in some.headlines)
+    picture, _ = drawing(large, sampled=True)
+    assert ("/a4/nav" in {each.path for each in picture.enclaves}) == (file == "permissions.p7s")
+    assert any("signatures, certificates" in line for line in picture.headlines)
 
 
 def test_the_verb_says_what_was_only_compared(large: Path) -> None:
@@ -137,10 +145,11 @@ def test_the_verb_says_what_was_only_compared(large: Path) -> None:
 
 def test_what_is_asked_for_is_read(large: Path) -> None:
     """Values for programs, and questions that go beyond what is drawn."""
+    said: dict[str, Ended] = {}
     for more in (("--json",), ("--focus", "/a1/odom")):
-        ended: Ended = sros("view", large, *more).ok()
+        said[more[0]] = ended = sros("view", large, *more).ok()
         assert "were only compared" not in ended.out + ended.err
-    assert '"/a4/nav"' in sros("view", large, "--json").ok().out
+    assert '"/a4/nav"' in said["--json"].out
     refused = sros("view", large, "--robot", "a9")
     assert refused.status == 2 and "has no enclaves of a robot 'a9'" in refused.err
     assert "It has a1, a2, a3, a4, a5 and" in refused.err

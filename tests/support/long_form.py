@@ -41,6 +41,6 @@ def few_steps(steps: Sequence[int]) -> Sequence[int]:
     return list(steps) if LONG else [steps[0], *some(steps[1:-1], 1), *steps[1:][-1:]]
 
 
-def sometimes(name: str, part: float = 1 / 4) -> pytest.MarkDecorator:
+def sometimes(name: str, part: float = 1 / 8) -> pytest.MarkDecorator:
     """Mark a test that a ``part`` of the short runs has, and the long form always."""
     return pytest.mark.skipif(not drawn(name, part), reason=f"not drawn by SROS_SEED={SEED}")
