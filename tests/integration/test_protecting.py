@@ -8,10 +8,12 @@ import pytest
 
 from benchmarks.protecting import Effort, measure_protection
 from tests.integration.enforcing import BACKENDS, enforcing_backend
+from tests.support.long_form import sometimes
 
 pytestmark = pytest.mark.dds
 
 
+@sometimes("what protection costs")
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_each_kind_is_measured_by_the_same_program(backend: str, tmp_path: Path) -> None:
     enforcing_backend(backend)
