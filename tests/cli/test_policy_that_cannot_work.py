@@ -182,7 +182,7 @@ def test_a_keystore_is_checked_with_its_policy_and_without(tmp_path: Path) -> No
     for strict in ((), ("--strict",)):
         alone = sros("check", "ks", *strict, cwd=tmp_path)
         assert alone.status == 1
-        assert "6 enclaves in which no ordinary node" in alone.out
+        assert "6 enclaves in which no ordinary ROS 2 node" in alone.out
         assert "`sros generate_artifacts -k ks -p POLICY_FILE`" in alone.out
         assert len(alone.out.splitlines()) <= 10
         both = sros("check", "ks", "--policy", "robot.xml", *strict, cwd=tmp_path)

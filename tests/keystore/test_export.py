@@ -255,7 +255,7 @@ def test_a_copy_of_the_whole_keystore_has_ca_keys(fleet: Path) -> None:
     keys = [each for each in findings if each.id == "keystore.home-or-robot"]
     (said,) = keys
     assert "private/identity_ca.key.pem, private/permissions_ca.key.pem" in said.text
-    assert said.remedy.startswith("Where the keystore belongs, keep the keys, and run")
+    assert said.remedy.startswith("Where the keystore belongs, keep them, and run")
     # The enclave whose key is on its robot is no finding at home.
     assert [each.name for each in arrival.enclaves if each.key_on_robot] == [BORN]
     assert not [each for each in findings if each not in keys]
@@ -287,7 +287,7 @@ def test_an_export_that_looks_like_home_is_found_with_its_ca_key(
     verified = {each.id for each in verify_arrival(robot, now=NOW).findings}
     checked = {each.id: each.remedy for each in keystore_findings(Keystore(robot), now=NOW)}
     assert "keystore.home-or-robot" in verified & set(checked)
-    assert "keep the keys" in checked["keystore.home-or-robot"]
+    assert "keep them" in checked["keystore.home-or-robot"]
 
 
 def test_no_remedy_for_a_ca_key_may_lose_it(fleet: Path, tmp_path: Path) -> None:
