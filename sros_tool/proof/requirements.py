@@ -30,6 +30,7 @@ from sros_tool.files import read_toml
 from sros_tool.names import expression_problem, is_expression
 from sros_tool.policy.model import RIGHTS, Level, Source
 from sros_tool.policy.patterns import covers, overlap
+from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.values import shows
 from sros_tool.wording import first_few
@@ -375,7 +376,7 @@ class _Table:
         """Return a list of absolute names, perhaps with wildcards."""
         names = self.texts(key, least=least)
         for name in names:
-            problem = expression_problem(name)
+            problem = _placeholder_problem(name) or expression_problem(name)
             if not problem and name[0] not in "/*":
                 problem = "It is not absolute: it does not begin with '/' or '*'."
             if not problem and name == "/":
@@ -389,7 +390,7 @@ class _Table:
         enclaves = self.texts(key)
         for enclave in enclaves:
             name = enclave.removeprefix(EXCEPT)
-            problem = "" if name == "/" else expression_problem(name)
+            problem = "" if name == "/" else _placeholder_problem(name) or expression_problem(name)
             if not problem and name[0] not in "/*?[":
                 problem = "An enclave begins with '/'."
             if problem:
@@ -412,6 +413,13 @@ class _Table:
     def error(self, key: str, what: str, why: str) -> DocumentError:
         place = Source(self.source.file, self.lines.get(key, self.source.line))
         return DocumentError(f"{place}: {what}", why)
+
+
+def _placeholder_problem(name: str) -> str:
+    """Return why a name with a placeholder is refused, as a sentence, or ""."""
+    if not has_placeholder(name):
+        return ""
+    return "Requirements have no placeholders: write a table for each robot, or a wildcard."
 
 
 def _only(table: _Table) -> Only:

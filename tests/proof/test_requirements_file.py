@@ -146,6 +146,8 @@ WRONG = {
     '[[nobody]]\npublish = ["~/x"]': "'~/x' is not valid in publish",
     '[[nobody]]\npublish = ["/x y"]': "'/x y' is not valid in publish",
     '[[nobody]]\npublish = ["/[^a]"]': "'/[^a]' is not valid in publish",
+    '[[nobody]]\npublish = ["/{robot}/x"]': "Requirements have no placeholders",
+    '[[widest]]\npublish = []\nenclaves = ["/{robot}/x"]': "Requirements have no placeholders",
     f"{NOBODY}why = 1": "r.toml:3: why has 1, which is not a text",
     f'{NOBODY}why = ""': "r.toml:3: why has '', which is not a text",
     f'{NOBODY}name = "{"n" * 501}"': "r.toml:3: name has",

@@ -406,7 +406,8 @@ def _unknown_names(inbox: Path, fleet: Fleet) -> Iterator[Note]:
         yield Note(
             "fleet.unknown-in-inbox",
             f"{counted(len(unknown), 'name')} in '{inbox}' {verb} not in the fleet, and {verb} not "
-            f"read: {first_few(unknown, _SHOWN)}.",
+            f"read: {first_few(unknown, _SHOWN)}. If a robot left the fleet, delete its messages "
+            "there.",
         )
 
 
@@ -525,7 +526,7 @@ class _Verifier:
         if issued is None:
             raise _RefusedError(
                 "its certificate is not in the ledger of the keystore, though its identity CA "
-                "issued it: `sros fleet status` says what to do"
+                "issued it: the keystore may be older than its robots"
             )
         owner = robot_of(self._fleet, issued.enclave)
         if owner != robot:
