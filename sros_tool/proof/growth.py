@@ -11,12 +11,13 @@ This module reads no files.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from hashlib import sha256
-from itertools import islice, product
+from itertools import chain, islice, product, takewhile
 from typing import Annotated, NamedTuple
 
 from sros_tool.automata import NameSet, SearchLimit
@@ -39,6 +40,7 @@ from sros_tool.keystore.comparison import Effect, SettingChange
 from sros_tool.keystore.rights import SourceKind, by_domains
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.model import ALLOW, Source
+from sros_tool.policy.patterns import literal_prefix
 from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.protection import (
     added_crossing,
@@ -731,6 +733,8 @@ class _Stated:
         earlier = old.rights if old.zenoh is None else old.rights | old.zenoh
         self._allowed = _by_enclave(right for right in rights if right.qualifier is ALLOW)
         self._denied = _by_enclave(right for right in earlier if right.qualifier is not ALLOW)
+        topics = {topic for right in rights for side in right.topics for topic in side}
+        self._exact = sorted(topic for topic in topics if not is_expression(topic))
 
     def gains(
         self,
@@ -798,14 +802,23 @@ class _Stated:
     def _example(
         self, names: NameSet, key: tuple[str, AccessVerb, str], world: _World, limit: SearchLimit
     ) -> str | None:
-        """Return an example name; if possible, the same example as in another world."""
-        for topic in self._examples[key]:
+        """Return an example name; if possible, the same as in another world, or a stated name."""
+        for topic in chain(self._examples[key], self._meant(key[2])):
             if topic in names and (world.longest is None or len(topic.encode()) <= world.longest):
+                self._examples[key] += [topic] if topic not in self._examples[key] else []
                 return topic
         example = _example(names, key[2], world, limit)
         if example is not None:
             self._examples[key].append(example)
         return example
+
+    def _meant(self, expression: str) -> Iterator[str]:
+        """Yield some exact topics of the new rights that begin as the expression does."""
+        prefix = literal_prefix(expression)
+        if prefix != expression:
+            first = bisect_left(self._exact, prefix)
+            near = islice(self._exact, first, first + _MOST_NEAR)
+            yield from takewhile(lambda topic: topic.startswith(prefix), near)
 
     def _gain(
         self,
@@ -836,6 +849,9 @@ class _Stated:
             (domain,),
         )
 
+
+_MOST_NEAR = 100
+"""Largest number of stated topics that are tried as an example."""
 
 _Sources = dict[str, dict[Right, Source]]
 """Cache: for each enclave, the file and line that states each right."""

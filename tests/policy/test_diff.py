@@ -103,3 +103,11 @@ def test_a_right_without_its_other_side_is_named(tmp_path: Path) -> None:
     assert [line for line in renamed.out.splitlines() if line.startswith("!")] == [lost]
     assert renamed.status == 1
     assert "!" not in sros("diff_policy", "a.xml", "c.xml", cwd=tmp_path).out
+
+
+def test_an_example_is_a_name_of_the_policy(tmp_path: Path) -> None:
+    driven = {"/b": subscribe("/f1/cmd_vel", "/f12/scan")}
+    (tmp_path / "a.xml").write_text(policy_text(driven))
+    (tmp_path / "b.xml").write_text(policy_text(driven | {"/a": publish("/f*/cmd_vel")}))
+    ended = sros("diff_policy", "--no-new-access", "a.xml", "b.xml", cwd=tmp_path)
+    assert "/a publish topic /f*/cmd_vel" in ended.out and "such as /f1/cmd_vel" in ended.out
