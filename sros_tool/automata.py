@@ -570,7 +570,7 @@ class NameSet:
     def stated(self) -> Iterator[str]:
         """Yield the exact names in this set, the shortest first; not the names of wildcards."""
         exact = {name for leaf in _leaves(self._node) for name in leaf.exact}
-        return (name for name in sorted(exact, key=_length) if name in self)
+        return (name for name in sorted(exact, key=_shortest_first) if name in self)
 
     def example(
         self, limit: SearchLimit | None = None, *, longest: int | None = None
@@ -590,7 +590,9 @@ class NameSet:
         best: str | None = None
         for search in _searches(self._node, limit):
             found = search.shortest(limit, longest)
-            if found is not None and (best is None or _length(found) < _length(best)):
+            if found is not None and (
+                best is None or _shortest_first(found) < _shortest_first(best)
+            ):
                 best = found
         return best
 
@@ -669,7 +671,7 @@ def _roughness(around: Surroundings) -> tuple[int, int]:
     return -told, -len(around.exact)
 
 
-def _length(name: str) -> tuple[int, str]:
+def _shortest_first(name: str) -> tuple[int, str]:
     return len(name.encode(errors="surrogatepass")), name
 
 

@@ -171,7 +171,7 @@ class ClosedProcess(NamedTuple):
         return f"cd {shlex.quote(self.folder)} && {shlex.join(self.launch or self.command)}"
 
     def secured_command(self, folder: Path, of_launch: str = "") -> str:
-        """Return the shell command that starts the process, its launch or all containers secured.
+        """Return the shell command that starts the process, its launch or containers with security.
 
         ``folder`` is that of the closed robot, and ``of_launch`` the enclave of the node that its
         `ros2 launch` has.
@@ -273,13 +273,13 @@ class Proof(NamedTuple):
     claim: str
     """What has to hold."""
     holds: bool | None
-    """Whether it holds; null if it could not be asked."""
+    """Whether the claim holds; null if it could not be tested."""
     reason: str
-    """What was seen, or why it could not be asked."""
+    """What was seen, or why the claim could not be tested."""
 
     @property
     def fails(self) -> bool:
-        """Whether it was asked, and does not hold."""
+        """Whether the claim was tested, and does not hold."""
         return self.holds is False
 
 
@@ -794,7 +794,7 @@ class OpenRobot:
         ).variables
 
     def _write_starts(self, observed: ObservedProcesses) -> list[FileChange]:
-        """Write how each process is started secured; return what changed."""
+        """Write the files that start each process with security; return what changed."""
         folder = self.folder.absolute()
         variables = {
             process.enclave: self._variables(process.enclave, process.rmw)

@@ -106,7 +106,7 @@ def _is_private(group: int, trusted: frozenset[int]) -> bool:
 
 
 def user_name(user: int) -> str:
-    """Return the name of a user in words, or the number of a user without a name."""
+    """Return text such as ``user alice``, or ``user 1000`` for a user without a name."""
     try:
         return f"user {pwd.getpwuid(user).pw_name}"
     except KeyError:

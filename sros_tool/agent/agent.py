@@ -236,7 +236,10 @@ class _Round:
         return self._machine.clock()
 
     def _proven_moment(self) -> datetime | None:
-        """Return a moment that has passed, by what was verified or else by the certificates."""
+        """Return a time that is certainly past, or None.
+
+        It is the latest time that was verified, else the earliest start of a certificate.
+        """
         if self._state.latest:
             return self._state.latest
         begins = []

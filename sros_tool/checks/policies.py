@@ -202,7 +202,7 @@ NO_COUNTERPART = FindingKind(
     "No enclave of the policy, in any ROS domain, may publish this subscribed topic, or serve this "
     "called service or action. The name may have a typing error, or the other side is in another "
     "policy.",
-    "sros: the policy as a whole.",
+    "sros: compares the rights of all enclaves in the policy.",
     "Compare the names on both sides, after remapping.",
 )
 MISSPELT = FindingKind(
@@ -212,7 +212,7 @@ MISSPELT = FindingKind(
     "Neither of the two names has a counterpart, so the nodes do not communicate: one of them may "
     "have a typing error, lack a namespace, or be of another kind, such as a service where an "
     "action is called.",
-    "sros: the policy as a whole.",
+    "sros: compares the rights of all enclaves in the policy.",
     "Write the same name, of the same kind, on both sides, as the nodes have it after remapping.",
 )
 MISTAKEN_SIDE = FindingKind(
@@ -221,7 +221,7 @@ MISTAKEN_SIDE = FindingKind(
     "a service or action with request and reply, or call and execute, mistaken for each other",
     "A node offers (reply, execute) the services and actions under its own name, and other nodes "
     "use them (request, call). Nobody has the opposite right, so no call succeeds.",
-    "sros: the policy as a whole.",
+    "sros: compares the rights of all enclaves in the policy.",
     'Write reply="ALLOW" (action: execute) at the node that offers the service, and '
     'request="ALLOW" (action: call) at the nodes that use it.',
 )
@@ -754,7 +754,7 @@ def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
         )
         size = _signed_bytes(enclave)
         for finding in outside_findings(permissions, size, enclave.path, source.file, source.line):
-            yield _at_denial(finding, checked) if finding.kind is DENY_BLOCKS else finding
+            yield _located_at_denial(finding, checked) if finding.kind is DENY_BLOCKS else finding
         if len(enclave.profiles) > 1:
             text = f"it has {len(enclave.profiles)} <profiles>"
             yield SEVERAL_PROFILES.found(enclave.path, text, source.file, source.line)
@@ -765,7 +765,7 @@ def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
         yield ENCLAVE_NAMES.found(pairs[0][0], text, checked.policy.file, line)
 
 
-def _at_denial(found: Finding, checked: _CheckedPolicy) -> Finding:
+def _located_at_denial(found: Finding, checked: _CheckedPolicy) -> Finding:
     """Return the finding with the file and line of the first denial in its enclave."""
     denials = (s for s in checked.statements if s.right.enclave == found.subject and not s.allows)
     source = next(denials).source

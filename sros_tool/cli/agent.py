@@ -128,9 +128,9 @@ def _init(
 ) -> None:
     """Set up the agent of the security folder FOLDER: FOLDER/.agent/agent.toml.
 
-    FOLDER is where `sros import` or a play installs this robot's enclaves. The agent runs as its
-    owner. Compare the printed SHA-256 of the root metadata with the SHA-256 that `sros fleet
-    publish` printed.
+    FOLDER is where `sros import` or a play installs this robot's enclaves. The agent runs as the
+    owner of FOLDER. Compare the printed SHA-256 of the root metadata with the SHA-256 that
+    `sros fleet publish` printed.
 
     Example:
       $ sros agent init /etc/sros/keystore --robot r1 --root root.json \\

@@ -59,7 +59,9 @@ def _run(words: Sequence[str], live: bool) -> tuple[int, str, str]:
 @click.option(
     "--domain", "domain_text", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or 0]"
 )
-@click.option("--apply", "applies", is_flag=True, help="Restart the robot's systemd units secured.")
+@click.option(
+    "--apply", "applies", is_flag=True, help="Restart the robot's systemd units with security."
+)
 @click.option("--proof", "proves", is_flag=True, help="Prove that the robot is closed.")
 @click.option("--undo", "undoes", is_flag=True, help="Restart these units open again.")
 @click.option(
@@ -84,7 +86,7 @@ def close(
 
     Watches the robot on DDS or Zenoh, and writes into FOLDER its policy, requirements that hold
     now, a production keystore with an enclave for each process, an export of the enclaves without
-    CA keys, and the files that start each process secured. Each step is a command, which is
+    CA keys, and the files that start each process with security. Each step is a command, which is
     printed. Existing files are kept: edit policy.xml and requirements.toml, and run it again.
 
     Nothing is closed before --apply, which restarts the processes that are systemd units, and
@@ -149,7 +151,7 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
     echo(f"who may do what, without what every node needs (all of it: {robot.page}):")
     for line in access_lines(read_policy(robot.policy), robot.folder):
         echo(f"  {line}")
-    echo(f"how each process is restarted secured (all of it: {robot.start}):")
+    echo(f"how to restart each process with security (all of it: {robot.start}):")
     for process in closed.observed.processes:
         how = "by its launch, by hand" if process.launch else "by hand"
         how = "by Docker Compose, by hand" if process.container else how

@@ -541,8 +541,8 @@ def _status(
     missing; or unknown (never issued by this keystore). Processes use new files only after a
     restart: confirmations by the Ansible collection and `sros agent` say which restarts are due,
     confirmations by `sros fleet report` do not. A robot without a recent confirmation is offline.
-    Whatever files a robot has, it is named if it claims a release that was never published. Robots
-    with the same state share a line. The last line counts known vulnerabilities of the robots' DDS,
+    A robot that claims a release that was never published is always named. Robots with the same
+    state share a line. The last line counts known vulnerabilities of the robots' DDS,
     by the advisories of sros; --robot and --advisories name them.
 
     The revocation list is in force on a robot that has it and says that no restart is due. Robots

@@ -35,11 +35,11 @@ from sros_tool.graph.learn import (
     Learned,
     RightsFound,
     enclave_per_node,
-    fold,
     is_tool,
     is_tool_name,
     learn,
     listed,
+    rights_of_endpoints,
 )
 from sros_tool.graph.observation import (
     PUBLISH,
@@ -470,7 +470,7 @@ _OF_EVERY_NODE = ("/rosout", "/parameter_events")
 def _only_observes(node: ObservedNode) -> bool:
     """Return whether a node has only its own services and its log, as every node has."""
     own = expand("~/", node.ns, node.name)
-    folded = fold(node.endpoints)
+    folded = rights_of_endpoints(node.endpoints)
     return not (folded.halves or folded.foreign) and all(
         right.name in _OF_EVERY_NODE or right.name.startswith(own) for right in folded.rights
     )
@@ -539,7 +539,7 @@ def _denied_to(node: ObservedNode, enclave: str, evaluator: Evaluator) -> Iterat
 
 def _rights_of(node: ObservedNode, enclave: str) -> Iterator[tuple[Right, tuple[Endpoint, ...]]]:
     """Yield the rights that a node uses, each with the endpoints that it needs."""
-    folded = fold(node.endpoints)
+    folded = rights_of_endpoints(node.endpoints)
     for right in folded.rights:
         yield Right(enclave, ALLOW, right.right, right.name), _endpoints(right.right, right.name)
     for endpoint in folded.halves | folded.foreign:

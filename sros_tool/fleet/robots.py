@@ -381,7 +381,7 @@ def _folders(fleet: Fleet) -> Mapping[str, frozenset[str]]:
 
 
 def _begin(path: Parts) -> Parts:
-    """Return the parts of a path to the end of its folder with the first placeholder."""
+    """Return a path up to and including the first folder whose name has a placeholder."""
     begin: list[str | Placeholder] = []
     inside = False
     for part in path:

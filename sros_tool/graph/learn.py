@@ -198,7 +198,9 @@ def _rights_of(node: ObservedNode, notes: _Notes) -> list[tuple[_Place, frozense
         notes.add("changing-name", f"{node.fqn} as {name}")
     if len(enclaves) > 1:
         notes.add("ambiguous", f"{node.fqn} in {' or '.join(enclaves)}")
-    folded = fold(endpoint for endpoint in node.endpoints if _is_plain(endpoint, node, notes))
+    folded = rights_of_endpoints(
+        endpoint for endpoint in node.endpoints if _is_plain(endpoint, node, notes)
+    )
     for half in folded.halves:
         notes.add("half-service", f"{node.fqn} {half.topic}")
     for foreign in folded.foreign:
@@ -260,7 +262,7 @@ class Folded(NamedTuple):
 _ANY_DOMAIN = DomainSet.of((0, 0))
 
 
-def fold(endpoints: Iterable[Endpoint]) -> Folded:
+def rights_of_endpoints(endpoints: Iterable[Endpoint]) -> Folded:
     """Return the ROS rights that a node needs for these DDS endpoints.
 
     The topics of a service or an action become one right if all of them are there.

@@ -429,7 +429,7 @@ class LedgerFile:
     def _reading(self, having: bytes, terms: _Terms | None = None) -> _Reading:
         """Return the ledger; chained lines without the text ``having`` are verified, not parsed.
 
-        ``terms`` are the same for the index; None for what no index finds.
+        ``terms`` are the field values by which the index finds these lines; None if it cannot.
         """
         if having not in self._readings:
             self._readings[having] = self._compared(having, terms)

@@ -480,7 +480,7 @@ def _identifies(identifier: x509.AuthorityKeyIdentifier, authority: x509.Certifi
 
 
 class _Content:
-    """A revocation list with a hash, as a key of caches: the enclaves of a keystore share lists."""
+    """A hashable revocation list: the key of caches, because enclaves have the same list."""
 
     def __init__(self, crl: x509.CertificateRevocationList) -> None:
         self.crl = crl

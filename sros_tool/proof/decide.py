@@ -159,7 +159,7 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
         case NothingBut():
             witness = _more_than(requirement, world, limit)
         case NotBoth():
-            witness = _both(requirement, world, limit)
+            witness = _with_both(requirement, world, limit)
         case Protected():
             witness = _unprotected(requirement, world, limit)
         case Apart():
@@ -232,7 +232,7 @@ def _parts_of(right: str) -> tuple[_Part, ...]:
 
 
 @lru_cache(maxsize=16)
-def _doing(right: str) -> tuple[_Part, ...]:
+def _sufficient_parts(right: str) -> tuple[_Part, ...]:
     """Return the DDS topics of a right; access to one of them is enough to do a part of it."""
     return tuple(part for part in _parts_of(right) if part.writes or right == "subscribe")
 
@@ -241,7 +241,7 @@ def _each(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
     """Yield the DDS topics of some rights, each with its right."""
     for right, names in rights:
         for name in names:
-            for part in _doing(right):
+            for part in _sufficient_parts(right):
                 yield right, part, part.topics(name)
 
 
@@ -365,7 +365,7 @@ def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness 
     for right, names in requirement.rights:
         for expression in names:
             holders: dict[str, list[tuple[_Part, TopicUser]]] = {}
-            for part in _doing(right):
+            for part in _sufficient_parts(right):
                 for met in world.side(part.writes).meeting(part.topics(expression), limit):
                     holders.setdefault(met.enclave, []).append((part, met))
             if len(holders) <= most:
@@ -441,7 +441,7 @@ def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness 
     enclaves = [enclave for enclave in world.enclaves if _match(requirement.enclaves, enclave)]
     uses: dict[str, Use] = {}
     for right, names in requirement.rights:
-        for part in _doing(right):
+        for part in _sufficient_parts(right):
             side, every = world.side(part.writes), part.topics("*")
             within = NameSet.union(part.topics(name).every() for name in names)
             for enclave in enclaves:
@@ -482,7 +482,7 @@ def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Wit
     return _first_of(uses.values())
 
 
-def _both(requirement: NotBoth, world: World, limit: SearchLimit) -> Witness | None:
+def _with_both(requirement: NotBoth, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with an enclave that has rights of both sets: its shortest use of each."""
     sides = [
         _first_uses(rights, world, limit) for rights in (requirement.first, requirement.second)
@@ -578,17 +578,19 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
             )
             for right, names in sides:
                 for name in names:
-                    if not _anybody(world, _doing(right), name, limit):
+                    if not _anybody(world, _sufficient_parts(right), name, limit):
                         yield f"no enclave may {right} {_named(right, name)}"
         case Nobody():
             for right, names in requirement.rights:
                 other = OTHER_SIDE[right]
                 for name in names:
-                    if not _anybody(world, (*_doing(other), *_doing(right)), name, limit):
+                    if not _anybody(
+                        world, (*_sufficient_parts(other), *_sufficient_parts(right)), name, limit
+                    ):
                         yield f"no enclave may use {_named(right, name)}"
         case Protected():
             for kind, name in requirement.names:
-                parts = [part for right in RIGHTS[kind] for part in _doing(right)]
+                parts = [part for right in RIGHTS[kind] for part in _sufficient_parts(right)]
                 if not _anybody(world, parts, name, limit):
                     yield f"no enclave may use {kind.removesuffix('s')} {name}"
 

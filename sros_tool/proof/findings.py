@@ -41,9 +41,9 @@ from sros_tool.proof.worlds import World
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A use in a witness, with the right that states it, or None.
+    """A use in a witness, with the place of the right that states it, or None.
 
-    ``lender`` is the enclave whose permissions the use is by, if it is another enclave; else "".
+    ``lender`` is another enclave whose permissions allow the use, or "" if it needs no other.
     """
 
     use: Use

@@ -182,7 +182,7 @@ def _changes(
                 address = f"{endpoint.protocol}/{endpoint.address}"[:80]
                 yield f"{key}/endpoints", "without", f"with {address}", what
     if protocols := _more_protocols(before.protocols, after.protocols):
-        meaning = "it takes connections of these protocols"
+        meaning = "it accepts connections over these protocols"
         yield "transport/link/protocols", "without", f"with {protocols}", meaning
     for path in sorted({*before.settings, *after.settings}):
         values = before.settings.get(path), after.settings.get(path)

@@ -354,7 +354,7 @@ def _agent(folder: str, *, user: str, sros: str, writable: Sequence[str] = ()) -
         _check_program(sros),
     )
     places = " ".join((root, *(f"-{_check_path(place, 'the inbox')}" for place in writable)))
-    what = f"Keep the enclaves in {root} as they are published"
+    what = f"Keep the enclaves in {root} up to date"
     # It asks the kernel whether the clock is set; without capabilities it cannot set it anyway.
     closed = _CLOSED.replace("ProtectClock=yes\n", "")
     service = f"""\

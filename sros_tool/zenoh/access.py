@@ -336,12 +336,12 @@ class RightsBetween:
                         continue
                     if both := keys.common(others):
                         same = (place[0], messages, True)
-                        shared[same] = _sorted(shared.get(same, ()), both)
+                        shared[same] = _added_keys(shared.get(same, ()), both)
             for place, rule, _ in (
                 *(rule_of_peer for rule_of_peer in theirs if not rule_of_peer.rule.allows),
                 *denied,
             ):
-                shared[place] = _sorted(shared.get(place, ()), rule.key_expressions)
+                shared[place] = _added_keys(shared.get(place, ()), rule.key_expressions)
             rules = (
                 AccessRule(flow, messages, keys, allows)
                 for (flow, messages, allows), keys in shared.items()
@@ -373,7 +373,7 @@ def _shared(one: _Place, other: _Place) -> tuple[Message, ...]:
     return tuple(message for message in one[1] if message in other[1])
 
 
-def _sorted(some: tuple[str, ...], others: tuple[str, ...]) -> tuple[str, ...]:
+def _added_keys(some: tuple[str, ...], others: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(sorted({*some, *others})) if some else others
 
 

@@ -157,9 +157,10 @@ def _around(chunks: Chunks) -> tuple[Chunks, Chunks]:
 
 
 def _parts(wide: Chunks, denied: Iterable[Chunks]) -> Iterator[Chunks]:
-    """Split ``wide`` so that its ``**`` meets no fixed beginning or end of a denied expression.
+    """Split ``wide`` so that its ``**`` overlaps no fixed start or end of a denied expression.
 
-    Then a denied expression can be compared from its start, and after that from its end.
+    A denied expression can then be compared chunk by chunk, first from its start, then from its
+    end.
     """
     if ANY_CHUNKS not in wide:
         yield wide

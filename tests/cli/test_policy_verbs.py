@@ -320,7 +320,9 @@ def test_a_node_that_was_observed_in_an_enclave_of_its_own(folder: Path) -> None
     (folder / "seen.xml").write_text(whole.format(enclave.format("/arm/driver", "/pose")))
     ended = sros("minimize_policy", "own.xml", "--observed", "seen.xml").ok()
     assert "publish topic /*  covered publish topic /pose" in ended.out
-    assert "/arm/driver was observed, and counts for /robot/arm." in ended.err
+    assert (
+        "The rights observed in /arm/driver count for /robot/arm, which has this node." in ended.err
+    )
     sros("view", "own.xml", "--observed", "seen.xml", "-o", "use.html").ok()
     assert "/arm/driver" not in {
         found["path"]

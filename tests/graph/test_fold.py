@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.graph.learn import NodeRight, fold
+from sros_tool.graph.learn import NodeRight, rights_of_endpoints
 from sros_tool.graph.observation import Endpoint
 from tests.graph.graphs import endpoints
 
@@ -29,7 +29,7 @@ from tests.graph.graphs import endpoints
     ids=", ".join,
 )
 def test_folding_undoes_the_translation(said: list[str]) -> None:
-    folded = fold(endpoints("/", "n", said))
+    folded = rights_of_endpoints(endpoints("/", "n", said))
     assert {f"{each.right} {each.name}" for each in folded.rights} == set(said)
     assert not folded.halves
     assert not folded.foreign
@@ -37,7 +37,7 @@ def test_folding_undoes_the_translation(said: list[str]) -> None:
 
 def test_a_partial_action_stays_its_parts() -> None:
     whole = endpoints("/", "n", ["execute /fib"])
-    folded = fold(whole - {Endpoint("rt/fib/_action/status", "publish")})
+    folded = rights_of_endpoints(whole - {Endpoint("rt/fib/_action/status", "publish")})
     assert folded.rights == {
         NodeRight("publish", "/fib/_action/feedback"),
         NodeRight("reply", "/fib/_action/cancel_goal"),
@@ -48,7 +48,7 @@ def test_a_partial_action_stays_its_parts() -> None:
 
 def test_halves_and_foreign_topics_are_no_rights() -> None:
     half, foreign = Endpoint("rq/addRequest", "publish"), Endpoint("Square", "subscribe")
-    folded = fold([half, foreign])
+    folded = rights_of_endpoints([half, foreign])
     assert folded.rights == frozenset()
     assert folded.halves == {half}
     assert folded.foreign == {foreign}

@@ -82,8 +82,8 @@ class Evaluated(NamedTuple):
 class PublishedRobot(NamedTuple):
     """What was published last for a robot, and what it was made from.
 
-    ``content`` is the SHA-256 of the list of its files, ``files`` a digest of the state of these
-    files in the keystore (inode, size and times), which show that a robot is unchanged.
+    ``content`` is the SHA-256 of the list of its files.  ``files`` is a digest of the inodes, sizes
+    and times of these files in the keystore: if it is the same, nothing changed for the robot.
     """
 
     release: PublishedRelease

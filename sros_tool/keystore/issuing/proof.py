@@ -142,7 +142,10 @@ class Disagreement:
 
 
 def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None:
-    """Raise `KeystoreError` unless ``permissions`` decide as ``policy`` does on all ``domains``."""
+    """Raise `KeystoreError` unless ``permissions`` allow exactly what ``policy`` allows.
+
+    This must hold on all ``domains``.
+    """
     stated = stated_expressions(policy)
     wildcards = {expression for expression in stated.all() if is_expression(expression)}
     signed = signed_expressions(permissions, domains)

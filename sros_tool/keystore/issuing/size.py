@@ -109,7 +109,7 @@ class MinimizedEnclave(NamedTuple):
 
 
 class PolicyMinimization(NamedTuple):
-    """The rights of a policy that were observed in use."""
+    """A policy reduced to the rights that were observed in use."""
 
     policy: Path
     """POLICY, as given on the command line."""
@@ -165,7 +165,10 @@ def minimized_policy(
             right._replace(enclave=homes.get(right.enclave, right.enclave)) for right in used
         )
         notes += [
-            Note("minimize.enclave-of-node", f"{path} was observed, and counts for {home}.")
+            Note(
+                "minimize.enclave-of-node",
+                f"The rights observed in {path} count for {home}, which has this node.",
+            )
             for path, home in sorted(homes.items())
         ]
     stated = absolute(policy)

@@ -174,7 +174,7 @@ class Transaction:
 
     @cached_property
     def enclaves(self) -> tuple[str, ...]:
-        """The sorted names of the enclaves before the change, for who changes all of them.
+        """The sorted names of the enclaves before the change, for verbs that change all of them.
 
         Raises:
             KeystoreError: this user cannot read all files of all enclaves.
