@@ -35,7 +35,7 @@ from sros_tool.enclave_environment import loadable_environment
 from sros_tool.errors import DocumentError, SrosError, UnavailableError, UsageError
 from sros_tool.explain.audit import DeniedRight, audit, audited_enclaves
 from sros_tool.files import policies_dir, remove_file, replace_file
-from sros_tool.folders import Folder, make_folders
+from sros_tool.folders import Folder, make_folders, remove_folders
 from sros_tool.graph.learn import common_parts, is_tool, stable_name
 from sros_tool.graph.observation import (
     PUBLISH,
@@ -689,6 +689,7 @@ class OpenRobot:
         self._shell.say(f"$ {step.command}")
         status, output, messages = self._shell.run(step.words, bool(step.into))
         if watches and status:
+            remove_folders([self.folder])  # if this run made it
             raise UnavailableError(
                 "there is no robot to close: no node was observed",
                 "",

@@ -588,6 +588,7 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     assert not (robot.folder / "robot").exists()
     robot.more, robot.nodes = (), ()
     assert "no node was observed" in robot.close(status=2).err
+    assert not (robot.folder / "robot").exists()
     robot.nodes = (TALKER, LISTENER)
     robot.close()
     assert "was watched in domain 0, not 7" in robot.close("--domain", "7", status=2).err
