@@ -130,7 +130,7 @@ PLANTED: dict[str, tuple[Callable[[Bench], object], set[tuple[str, str, str]]]] 
     ),
     "the same inside of wildcards": (
         lambda b: b.permissions(denied(subscribe="rt/st?t*"), (STATUS, "<topic>rt/s*s</topic>")),
-        {("opens", CYCLONE, "/base: publish topic /ststs")},
+        {("opens", CYCLONE, "/base: publish topic /status")},
     ),
     "a name with a hyphen": (
         lambda b: b.permissions((STATUS, "<topic>rt/a-b</topic>")),
