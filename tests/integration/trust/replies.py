@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest.mock import patch
 
 from sros_tool.dds.decision.access import Outcome
 from sros_tool.dds.decision.vendors import Vendor
@@ -158,6 +159,7 @@ def ask(
     )
 
 
+@patch.dict(os.environ)  # what names the tokens goes with the comparison
 def compare(
     vendor: Vendor,
     cases: Sequence[Case],
