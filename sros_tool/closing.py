@@ -53,7 +53,8 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.participant import JoinContext
-from sros_tool.keystore.reader import FilesReadOnce, open_enclave
+from sros_tool.keystore.reader import FilesReadOnce, Keystore, open_enclave
+from sros_tool.keystore.selection import revocation_of
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import RIGHTS, Policy
@@ -82,7 +83,7 @@ from sros_tool.runtime.processes import (
 )
 from sros_tool.runtime.rmw import RMW, chosen_vendor
 from sros_tool.runtime.units import unit_changes, unit_instance, unit_words, write_units
-from sros_tool.runtime.variables import ENABLE, ENCLAVE, domain_of
+from sros_tool.runtime.variables import ENABLE, ENCLAVE, KEYSTORE, domain_of
 from sros_tool.values import DryRun, FileChange, FileChanges, Words, as_plain, shows
 from sros_tool.wording import counted, first_few
 from sros_tool.xml import read_bytes
@@ -620,7 +621,7 @@ class OpenRobot:
             return closing._replace(problems=problems)
         if self.observed and len(closing.observed.processes) > len(self.observed.processes):
             self._write_processes(closing.observed)
-        changes = [*self._write_starts(closing.observed), *self._remove_left_enclaves()]
+        changes = [*self._write_starts(closing.observed), *self._remove_revoked_enclaves()]
         denied = self._denied()
         newly = [right for right in denied if right not in denied_before]
         problems += self._problems(closing.observed, partial=partial)
@@ -684,12 +685,14 @@ class OpenRobot:
             SrosError: the robot cannot be watched.
         """
         watches = step.into == self.seen
+        made: list[Path] = []
         if watches:
             self._check_open()
+            made = make_folders(self.folder)
         self._shell.say(f"$ {step.command}")
         status, output, messages = self._shell.run(step.words, bool(step.into))
         if watches and status:
-            remove_folders([self.folder])  # if this run made it
+            remove_folders(made)
             raise UnavailableError(
                 "there is no robot to close: no node was observed",
                 "",
@@ -709,7 +712,7 @@ class OpenRobot:
         return "done", self._keep_processes(output) if watches else ""
 
     def _check_open(self) -> None:
-        """Make the folder; raise `SrosError` if the robot cannot be watched as an open one."""
+        """Raise `SrosError` if the robot cannot be watched as an open one."""
         named = self._shell.environment
         if named.get(ENABLE) == "true":
             raise UsageError(
@@ -732,7 +735,6 @@ class OpenRobot:
                     "",
                     f"Run `export {RMW}={RMW_ZENOH}`, and this command again.",
                 )
-        make_folders(self.folder)
 
     def _is_neighbour(self, process: Process) -> bool:
         return _is_in_domain(process, self.domain)
@@ -830,25 +832,37 @@ class OpenRobot:
         changes = unit_changes(self.start, files, force=True)
         write_units(self.start, files, changes)
         written = [FileChange(action, str(self.start / path)) for path, action in changes.items()]
-        left = [path for path in self.start.glob("*.env") if path.name not in files]
+        kept = {self.start / path for path in files}
+        keystore = f"{KEYSTORE}={self.export.absolute()}\n".encode()
+        left = [
+            path
+            for path in sorted({*self.start.glob("*.env")} - kept)
+            if keystore in read_bytes(path, "environment file")  # written here, for another enclave
+        ]
         for path in left:
             remove_file(path)
+            self._shell.say(f"removed {path}: no process of the policy is in its enclave any more")
         return [*written, *(FileChange("remove", str(path)) for path in left)]
 
-    def _remove_left_enclaves(self) -> list[FileChange]:
-        """Remove from the export the enclaves that keystore and policy do not have any more."""
-        left = {*list_enclaves(self.export)} - {*list_enclaves(self.keystore)}
+    def _enclaves_left(self) -> list[str]:
+        """Return the enclaves of the export that the keystore does not have any more."""
+        return sorted({*list_enclaves(self.export)} - {*list_enclaves(self.keystore)})
+
+    def _remove_revoked_enclaves(self) -> list[FileChange]:
+        """Remove from the export the enclaves that the keystore revoked."""
+        keystore = Keystore(self.keystore)
+        revoked = [name for name in self._enclaves_left() if revocation_of(keystore, name)]
         with Folder(self.export) as export:
-            for inside in map(enclave_folder, left):
+            for inside in map(enclave_folder, revoked):
                 for entry in (f"{inside}/{name}" for name in export.names(inside)):
                     if not stat.S_ISDIR(export.mode(entry)):
                         export.unlink(entry)
-            for name in sorted(left, reverse=True):  # inner ones first
-                if not export.names(enclave_folder(name)):
-                    export.rmdir(enclave_folder(name))
-        paths = [enclave_path(self.export, name) for name in sorted(left)]
+            for inside in sorted(map(enclave_folder, revoked), reverse=True):  # inner ones first
+                if not export.names(inside):
+                    export.rmdir(inside)
+        paths = [enclave_path(self.export, name) for name in revoked]
         for path in paths:
-            self._shell.say(f"removed {path}: its enclave is not in the keystore any more")
+            self._shell.say(f"removed {path}: its enclave was revoked")
         return [FileChange("remove", str(path)) for path in paths]
 
     def _mark(self) -> str:
@@ -878,6 +892,9 @@ class OpenRobot:
             if name not in (_OBSERVER, _ROUTER) and not policy.enclave(name):
                 revoke = f"sros revoke {shlex.quote(str(self.keystore))} {name}"
                 yield f"the policy does not have {name}, and the keystore does: {revoke}"
+        for name in self._enclaves_left():
+            remove = f"rm -r {shlex.quote(str(enclave_path(self.export, name)))}"
+            yield f"the export has {name}, and the keystore does not, nor revoked it: {remove}"
         owner, export = self.export.stat().st_uid, self.export.absolute()
         users = sorted({process.user for process in observed.processes})
         for user in users:

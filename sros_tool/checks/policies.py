@@ -57,6 +57,7 @@ from sros_tool.policy.document import COMMON, IncludedFile, Includer, read_polic
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
+    OFFERING_SIDE,
     RIGHTS,
     Enclave,
     Policy,
@@ -241,8 +242,7 @@ _DIGIT_FIRST = re.compile(r"/(?:[0-9]|\[[0-9-]+\])")
 _DDS_PREFIX = re.compile(r"/?(?:rt|rq|rr|rs)/")
 _GLOBAL_TOPICS = ("/rosout", "/parameter_events", "/clock", "/tf", "/tf_static", "/diagnostics")
 _ALL = re.compile(r"/?[*?]*\*[*?]*\Z")
-_OTHER_SIDE = {"subscribe": "publish", "request": "reply", "call": "execute"}
-_ASKING_SIDE = {offering: asking for asking, offering in _OTHER_SIDE.items()}
+_ASKING_SIDE = {offering: asking for asking, offering in OFFERING_SIDE.items()}
 
 
 def _check_names(checked: _CheckedPolicy) -> Iterator[Finding]:
@@ -290,7 +290,7 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
             offered[statement.name].append(statement)
     near = NearNames(offered)
     for statement in checked.statements:
-        other = _OTHER_SIDE.get(statement.right.right)
+        other = OFFERING_SIDE.get(statement.right.right)
         if not other or not is_alone(statement, other):
             continue
         if statement.right.kind != "topics" and statement.is_private:

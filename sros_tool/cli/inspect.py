@@ -119,9 +119,11 @@ def inspect(
 
 def _enclave_of(root: Path, name: str) -> Path:
     """Return the folder of an enclave of a keystore."""
+    from sros_tool.keystore.layout import check_keystore
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.selection import no_such_enclave
 
+    check_keystore(root)
     keystore = Keystore(root)
     names = keystore.names
     if name not in names:

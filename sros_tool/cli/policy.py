@@ -193,8 +193,8 @@ def diff_policy(
     Zenoh configurations such as router.json5. Permissions and Zenoh rules are shown in ROS
     terms; the signature of permissions is verified if the permissions CA is next to them. "!" is a
     right of B whose other side only A has. If A or B covers only some enclaves, only these are
-    compared. Lines that differ only in the robot of a
-    fleet are shown as one. For two policies, the protection that they demand is compared, too.
+    compared. Lines that differ only in the robot of a fleet are shown as one. For two policies, the
+    protection that they demand is compared, too.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
 

@@ -43,7 +43,13 @@ from sros_tool.names import is_expression
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import DENY, Policy, StatedProtection, stated_protections
+from sros_tool.policy.model import (
+    DENY,
+    OFFERING_SIDE,
+    Policy,
+    StatedProtection,
+    stated_protections,
+)
 from sros_tool.policy.patterns import Names
 from sros_tool.policy.rights import Right, RightsDifference, Rules, compare, policy_rights
 from sros_tool.translate import grant_rights
@@ -581,44 +587,49 @@ def compare_sources(first: RightsSource, second: RightsSource) -> SourcesDiffere
     if first.scope is None or second.scope is None:
         scope = second.scope if first.scope is None else first.scope
     difference = compare(first.rights, second.rights, scope)
-    unanswered = () if scope else _unanswered(difference.only_first, second.rights)
+    unanswered = _unanswered(first.rights, second.rights, difference) if scope is None else ()
     protections = _protection_differences(first, second)
     return SourcesDifference(scope, difference, protections, unanswered)
 
 
-def _unanswered(lost: Iterable[Right], rights: Iterable[Right]) -> list[Right]:
-    """Return the ``rights`` to an exact name whose other side only rights that were ``lost`` allow.
+def _unanswered(
+    first: Collection[Right], second: Collection[Right], difference: RightsDifference
+) -> list[Right]:
+    """Return the rights of ``second`` to use a name that only in ``first`` an enclave offers.
 
-    For example, a right to subscribe to a topic that no enclave may publish any more.
+    For example, a right to subscribe to a topic that no enclave may publish any more, because the
+    right to publish it is gone or denied.  Names with wildcards are left out.
     """
-    had = _allowed_names(lost)
-    waiting = [
+    taken = [right for right in difference.only_first if right.qualifier is not DENY]
+    taken += (right for right in difference.only_second if right.qualifier is DENY)
+    names_of: dict[str, set[str]] = defaultdict(set)
+    for right in taken:
+        names_of[right.right].add(right.name)
+    touched = {word: Names(sorted(names)) for word, names in names_of.items()}
+    asked = [
         right
-        for right in rights
-        if (offering := _OFFERING.get(right.right)) in had
+        for right in second
+        if (offering := OFFERING_SIDE.get(right.right)) in touched
         and right.qualifier is not DENY
         and not is_expression(right.name)
-        and had[offering].meets(right.name)
+        and touched[offering].meets(right.name)
     ]
-    has = _allowed_names(rights) if waiting else {}
-    return sorted(
-        right
-        for right in waiting
-        if (offering := _OFFERING[right.right]) not in has or not has[offering].meets(right.name)
-    )
+    if not asked:
+        return []
+    names = {(OFFERING_SIDE[right.right], right.name) for right in asked}
+    before, after = _offered(first, names), _offered(second, names)
+    lost = before - after
+    return sorted(right for right in asked if (OFFERING_SIDE[right.right], right.name) in lost)
 
 
-def _allowed_names(rights: Iterable[Right]) -> dict[str, Names]:
-    """Map publish, subscribe and so on to the names for which a right allows it."""
-    stated: dict[str, set[str]] = defaultdict(set)
-    for right in rights:
-        if right.qualifier is not DENY:
-            stated[right.right].add(right.name)
-    return {word: Names(sorted(names)) for word, names in stated.items()}
-
-
-_OFFERING = {"subscribe": "publish", "request": "reply", "call": "execute"}
-"""Right to use a name → the right to offer it."""
+def _offered(rights: Iterable[Right], names: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
+    """Return those of the pairs of a right and a name that some enclave is allowed."""
+    rules, enclaves = Rules(rights), {right.enclave for right in rights}
+    return {
+        (word, name)
+        for word, name in names
+        if any(rules.allow(enclave, word, name) for enclave in enclaves)
+    }
 
 
 def _protection_differences(

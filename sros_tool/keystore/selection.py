@@ -221,7 +221,7 @@ def no_such_enclave(
     Without ``may_create`` it does not advise to create the enclave.
     """
     root = keystore.root
-    if revocation := _revocation(keystore, name):
+    if revocation := revocation_of(keystore, name):
         return _was_revoked(root, revocation)
     what = f"enclave {name} does not exist in keystore '{root}'"
     names = sorted(there)
@@ -248,7 +248,7 @@ def no_such_enclave(
     return KeystoreError(what, why, f"If it is not a typo, create it with {create}.")
 
 
-def _revocation(keystore: Keystore, name: str) -> Entry | None:
+def revocation_of(keystore: Keystore, name: str) -> Entry | None:
     """Return the ledger entry of an enclave's revocation; None if it has a later certificate."""
     try:
         entries = keystore.ledger_with("enclave", name).entries

@@ -24,6 +24,8 @@ RIGHTS: dict[str, tuple[str, str]] = {
 """The two rights that a group of each kind (topics, services, actions) allows or denies."""
 OTHER_SIDE = {one: other for pair in RIGHTS.values() for one, other in (pair, pair[::-1])}
 """Maps a right to the right that the peer needs, such as publish to subscribe."""
+OFFERING_SIDE = {"subscribe": "publish", "request": "reply", "call": "execute"}
+"""Maps a right to use a name to the right to offer it."""
 
 
 class Qualifier(StrEnum):

@@ -306,24 +306,21 @@ def _enclaves(
 
 
 def _domains_of(sources: Sequence[PictureSource]) -> dict[str, str]:
-    """Map enclaves to their ROS domains as text, by the last source that says them.
+    """Map enclaves to the ROS domains of their rights in any source, as text.
 
     The text is "" for an enclave with a right that holds in every domain.
     """
-    domains: dict[str, str] = {}
-    for source in sources:
-        of_source: dict[str, list[tuple[int, int]]] = defaultdict(list)
-        everywhere: set[str] = set()
-        for some, rights in source.in_domains.items():
-            enclaves = {right.enclave for right in rights}
-            if some is None:
-                everywhere |= enclaves
-                continue
-            for enclave in enclaves:
-                of_source[enclave] += ((part.first or 0, part.last or 0) for part in some.ranges)
-        domains |= {name: str(DomainSet.of(*of_source[name])) for name in of_source}
-        domains |= dict.fromkeys(everywhere, "")
-    return domains
+    ranges: dict[str, list[tuple[int, int]]] = defaultdict(list)
+    everywhere: set[str] = set()
+    for domains, rights in (item for source in sources for item in source.in_domains.items()):
+        enclaves = {right.enclave for right in rights}
+        if domains is None:
+            everywhere |= enclaves
+            continue
+        for enclave in enclaves:
+            ranges[enclave] += ((part.first or 0, part.last or 0) for part in domains.ranges)
+    known = {enclave: str(DomainSet.of(*some)) for enclave, some in ranges.items()}
+    return known | dict.fromkeys(everywhere, "")
 
 
 def group_of(enclave: str, hosts: Mapping[str, str]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -227,6 +228,9 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert "36 endpoints as before, but for 1 right that the policy denies now\n" in said
 
 
+LOST = "robot/export/enclaves/lost"
+
+
 def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     robot.units = UNITS
     robot.close()
@@ -235,8 +239,19 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     head, _, _ = before.partition('    <enclave path="/listener">')
     policy.write_text(head + enclave + after)
     revoke = "sros revoke robot/keystore /listener"
+    mine = robot.folder / "robot/start/mine.env"
+    mine.write_text("A=1\n")
+    first = robot.close("--apply", status=1)
+    assert f"the policy does not have /listener, and the keystore does: {revoke}\n" in first.out
+    assert "removed robot/start/listener.env: no process " in first.err and mine.exists()
+    # An enclave that the keystore lost, and did not revoke, keeps its key.
+    shutil.copytree(robot.folder / "robot/export/enclaves/talker", robot.folder / LOST)
     said = robot.close("--apply", status=1).out
-    assert f"the policy does not have /listener, and the keystore does: {revoke}\n" in said
+    assert (
+        f"the export has /lost, and the keystore does not, nor revoked it: rm -r {LOST}\n" in said
+    )
+    assert (robot.folder / LOST / "key.pem").exists()
+    shutil.rmtree(robot.folder / LOST)
     assert robot.restarts == []
     sros(*revoke.split()[1:], cwd=robot.folder).ok()
     robot.remaining = (TALKER,)
@@ -244,8 +259,7 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     assert left.exists() and not (robot.folder / "robot/start/listener.env").exists()
     ended = robot.close("--apply", status=1)
     assert not left.exists()
-    removed = "removed robot/export/enclaves/listener: its enclave is not in the keystore any more"
-    assert f"{removed}\n" in ended.err
+    assert "removed robot/export/enclaves/listener: its enclave was revoked\n" in ended.err
     assert robot.restarts == ["daemon-reload", "restart talker.service"]
     assert "no: every process runs in its enclave: process 4712 (run): in domain 0" in ended.out
     assert "yes: everything that talked still talks: 1 node with 18 endpoints" in ended.out
@@ -589,6 +603,9 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     robot.more, robot.nodes = (), ()
     assert "no node was observed" in robot.close(status=2).err
     assert not (robot.folder / "robot").exists()
+    (robot.folder / "robot").mkdir()  # by somebody else: it stays
+    robot.close(status=2)
+    assert (robot.folder / "robot").exists()
     robot.nodes = (TALKER, LISTENER)
     robot.close()
     assert "was watched in domain 0, not 7" in robot.close("--domain", "7", status=2).err

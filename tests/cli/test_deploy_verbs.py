@@ -177,6 +177,8 @@ def test_from_the_request_to_a_running_process(keystore: Path, tmp_path: Path) -
     assert f"{NAME}  key on its robot, expires" in sros("inspect", keystore).ok().out
     folder = sros("inspect", tmp_path / "robot" / FOLDER).ok().out
     assert sros("inspect", tmp_path / "robot", NAME).ok().out == folder
+    no_keystore = sros("inspect", tmp_path / "robot" / FOLDER, NAME)
+    assert no_keystore.status == 2 and "is not a valid keystore" in no_keystore.err
     missing = sros("inspect", keystore, f"{NAME}s")
     assert missing.status == 2 and f"Perhaps you mean {NAME}." in missing.err
     ended = sros("distribute_key", keystore, NAME, tmp_path / "out")

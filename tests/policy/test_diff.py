@@ -103,6 +103,10 @@ def test_a_right_without_its_other_side_is_named(tmp_path: Path) -> None:
     assert [line for line in renamed.out.splitlines() if line.startswith("!")] == [lost]
     assert renamed.status == 1
     assert "!" not in sros("diff_policy", "a.xml", "c.xml", cwd=tmp_path).out
+    denial = '<topics publish="DENY"><topic>/x</topic></topics>'
+    (tmp_path / "d.xml").write_text(policy_text({"/a": publish("/x") + denial, **reader}))
+    assert f"\n{lost}\n" in sros("diff_policy", "a.xml", "d.xml", cwd=tmp_path).out
+    assert "!" not in sros("diff_policy", "d.xml", "b.xml", cwd=tmp_path).out
 
 
 def test_an_example_is_a_name_of_the_policy(tmp_path: Path) -> None:
