@@ -635,7 +635,7 @@ def check_requirements(
         template: The keystore template, by name or file, whose protection a policy gets. Without
             it, the default template is assumed where the policy states no protection, and a finding
             reports this.
-        vendor: The only DDS vendor to decide for, or "zenoh"; every measured one and Zenoh by
+        vendor: The only DDS vendor to decide for, or "zenoh"; every tested one and Zenoh by
             default.
         distribution: The ROS 2 distribution, such as "lyrical", whose DDS decides; without
             ``vendor``, all that it ships.

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Vendor
 from sros_tool.errors import Note, UsageError
 from sros_tool.names import DISTRIBUTIONS, distribution_problem
 from sros_tool.wording import enumerated
@@ -22,7 +22,7 @@ class Shipped(NamedTuple):
     """A DDS that a distribution ships.
 
     ``latest`` is its latest version; ``vendor`` has the rules that sros decides by, which are those
-    of another release if this one was not measured.
+    of another release if this one was not tested.
     """
 
     product: str
@@ -41,15 +41,13 @@ class Shipped(NamedTuple):
         return f"{self.product} {_minor(self.latest)}"
 
     @property
-    def measured(self) -> bool:
-        """Whether sros decides by rules that were measured on this release."""
+    def tested(self) -> bool:
+        """Whether sros decides by rules that were tested with this release."""
         return _minor(self.vendor.release) == _minor(self.latest)
 
     def __str__(self) -> str:
         """Return text such as ``Fast DDS 3.6, assumed to decide as Fast DDS 2.14``."""
-        return self.release + (
-            "" if self.measured else f", assumed to decide as {self.vendor.title}"
-        )
+        return self.release + ("" if self.tested else f", assumed to decide as {self.vendor.title}")
 
 
 class Distribution(NamedTuple):
@@ -108,9 +106,9 @@ class Distribution(NamedTuple):
         if self.stands_for:
             parts.append(f"which is assumed to be like {self.name.capitalize()}")
         parts += (
-            f"whose {shipped.release} was not measured"
+            f"whose {shipped.release} was not tested"
             for shipped in self.shipped
-            if shipped.vendor is vendor and not shipped.measured
+            if shipped.vendor is vendor and not shipped.tested
         )
         return ", ".join(parts)
 
@@ -210,9 +208,9 @@ def unknown_distribution(environment: Mapping[str, str]) -> list[Note]:
 
 
 def _decided_as(product: str, version: str) -> Vendor:
-    """Return the measured vendor for a version: of the same release, or the latest before it."""
+    """Return the tested vendor for a version: of the same release, or the latest before it."""
     vendors = sorted(
-        (vendor for vendor in MEASURED if vendor.traits.product == product),
+        (vendor for vendor in TESTED if vendor.traits.product == product),
         key=lambda vendor: _numbers(vendor.release),
     )
     release = _numbers(_minor(version))

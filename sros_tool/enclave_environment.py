@@ -216,11 +216,11 @@ def _check_joining(
         KeystoreError: each of these vendors refuses the enclave, and none of its own faults says
             why.
     """
-    from sros_tool.dds.decision.vendors import MEASURED
+    from sros_tool.dds.decision.vendors import TESTED
     from sros_tool.faults import Fault
     from sros_tool.keystore.participant import evaluated
 
-    vendors = (vendor,) if vendor else MEASURED
+    vendors = (vendor,) if vendor else TESTED
     evaluation = evaluated(
         name, folder, state, at=context.at, domain=context.domain, vendors=vendors
     )

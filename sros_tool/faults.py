@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import Enum
 
 _RCL = "rcl 9 (security.c) and the RMWs of ROS 2 Jazzy."
-_MEASURED = "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured."
+_TESTED = "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested."
 _CLOCK_BEHIND = "Often the clock of the robot is behind."
 
 _RESTORE = "Restore {path} from a backup."
@@ -57,7 +57,7 @@ class Fault(Enum):
     """A fault of an enclave's files that keeps a process from running in it.
 
     ``id`` is stable, for programs.  ``title`` is a clause.  ``why`` (how DDS reacts), ``source``
-    (where the reaction is specified or was measured) and ``remedy`` (what to do) are sentences.
+    (where the reaction is specified or was tested) and ``remedy`` (what to do) are sentences.
     ``{root}``, ``{enclave}`` and ``{path}`` in a remedy stand for the keystore, the enclave and the
     file.
     """
@@ -120,21 +120,21 @@ class Fault(Enum):
         "certificate-expired",
         "the certificate of an enclave has expired",
         "Fast DDS refuses it with an empty reason, Cyclone DDS with code 200.",
-        _MEASURED,
+        _TESTED,
         _RENEW,
     )
     CERTIFICATE_NOT_YET_VALID = (
         "certificate-not-yet-valid",
         "the certificate of an enclave is not valid yet",
         f"Fast DDS refuses it with an empty reason. {_CLOCK_BEHIND}",
-        _MEASURED,
+        _TESTED,
         _CLOCK,
     )
     CERTIFICATE_ISSUER = (
         "certificate-issuer",
         "a certificate that another CA issued",
         "The node itself refuses it; Fast DDS with an empty reason.",
-        "DDS-Security 1.1, 9.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+        "DDS-Security 1.1, 9.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
         REPLACE,
     )
     CA_EXPIRED = (
@@ -142,21 +142,21 @@ class Fault(Enum):
         "a CA that an enclave trusts has expired",
         "Nothing that it issued or signed is accepted any more (Fast DDS: Error '10' verifying "
         "CA certificate), but Cyclone DDS 11 still accepts documents of a permissions CA.",
-        _MEASURED,
+        _TESTED,
         _AUTHORITY,
     )
     CA_NOT_YET_VALID = (
         "ca-not-yet-valid",
         "a CA that an enclave trusts is not valid yet",
         f"Nothing that it issued or signed is accepted. {_CLOCK_BEHIND}",
-        _MEASURED,
+        _TESTED,
         "Set the clock of this host.",
     )
     KEY_MALFORMED = (
         "key-malformed",
         "a private key that cannot be read",
         'Fast DDS says "Error obtaining private key".',
-        _MEASURED,
+        _TESTED,
         _NEW_KEY,
     )
     KEY_ENCRYPTED = (
@@ -173,7 +173,7 @@ class Fault(Enum):
         "a private key that does not belong to the certificate",
         "With Fast DDS the node does not start; with Cyclone DDS it starts, and every peer aborts "
         "the handshake.",
-        'Fast DDS 2.14.5 ("Error verifying private key"), Cyclone DDS 0.10.2; measured.',
+        'Fast DDS 2.14.5 ("Error verifying private key"), Cyclone DDS 0.10.2; tested.',
         _NEW_KEY,
     )
     TOKEN_URI = (
@@ -196,14 +196,14 @@ class Fault(Enum):
         "crl-malformed",
         "a revocation list that cannot be read",
         "With Fast DDS the node does not start, and its log has an empty reason.",
-        "Fast DDS 2.6 to 3.6 (PKIDH.cpp); measured.",
+        "Fast DDS 2.6 to 3.6 (PKIDH.cpp); tested.",
         _CRL,
     )
     CRL_ISSUER = (
         "crl-issuer",
         "a revocation list of another CA",
         "No certificate can be verified with it, so every participant is refused.",
-        "RFC 5280, 6.3.3; Fast DDS 2.6 to 3.6; measured.",
+        "RFC 5280, 6.3.3; Fast DDS 2.6 to 3.6; tested.",
         _CRL,
     )
     CRL_USAGE = (
@@ -212,7 +212,7 @@ class Fault(Enum):
         "The keyUsage of the CA lacks cRLSign, so every vendor refuses the list, and every "
         "participant.",
         "RFC 5280, 4.2.1.3; OpenSSL 3 (x509_vfy.c); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; "
-        "measured.",
+        "tested.",
         "Replace the CA with one whose keyUsage has cRLSign. Until then, nodes start if you remove "
         "the list (`rm {path}`), but trust revoked enclaves again.",
     )
@@ -223,7 +223,7 @@ class Fault(Enum):
         "delta list, no list for one distribution point or for some certificates, and no list with "
         "an unknown critical extension.",
         "RFC 5280, 5.2; OpenSSL 3 (x_crl.c, x509_vfy.c); Fast DDS 2.9.1, Cyclone DDS 0.10.2; "
-        "measured.",
+        "tested.",
         _CRL,
     )
     CRL_NOT_YET_VALID = (
@@ -237,14 +237,14 @@ class Fault(Enum):
         "crl-expired",
         "a revocation list that has expired",
         "Every participant is refused, and Fast DDS does not report it.",
-        "RFC 5280, 5.1.2.5; Fast DDS 2.6 to 3.6; measured.",
+        "RFC 5280, 5.1.2.5; Fast DDS 2.6 to 3.6; tested.",
         _CRL,
     )
     REVOKED = (
         "revoked",
         "an enclave whose certificate is revoked",
         "Every participant with this crl.pem refuses the enclave; Fast DDS does not report it.",
-        "RFC 5280, 5; Fast DDS 2.6 to 3.6; measured.",
+        "RFC 5280, 5; Fast DDS 2.6 to 3.6; tested.",
         "This is intended after a revocation. If not, give the enclave a new key and certificate: "
         "`sros renew {root} {enclave} --new-key`.",
     )
@@ -252,7 +252,7 @@ class Fault(Enum):
         "not-signed",
         "a document that is not signed",
         'Fast DDS says "Input data has not PKCS7 S/MIME format".',
-        "DDS-Security 1.1, 9.4.1.1; measured.",
+        "DDS-Security 1.1, 9.4.1.1; tested.",
         _SIGN,
         {"governance.p7s": _GOVERNANCE},
     )
@@ -272,7 +272,7 @@ class Fault(Enum):
         "Cyclone DDS 0.10 and Fast DDS 2.9.1 accept every signer whose certificate the "
         "permissions CA issued. If that CA also issues identities, each enclave can sign rights "
         "for itself: someone with the signer's key signed this document.",
-        "CVE-2023-24011; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+        "CVE-2023-24011; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
         "Unless you signed it on purpose, treat the signer's key as stolen: `sros revoke {root} "
         "{enclave}`. If one CA is for both, use separate CAs for identities and documents, as "
         "keystore.one-authority says.",
@@ -297,7 +297,7 @@ class Fault(Enum):
         "governance that does not name the domain",
         'The node dies with "Not found topic access rule for topic ros_discovery_info" (Fast '
         'DDS) or "Could not find domain in governance" (Cyclone DDS, code 141).',
-        "DDS-Security 1.1, 9.4.1.2; measured.",
+        "DDS-Security 1.1, 9.4.1.2; tested.",
         "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env {root} {enclave} --domain ID` "
         "prints the variables. To add a domain, name all domains in `sros update_keystore {root} "
         "--domain IDS --allow-looser`.",
@@ -307,14 +307,14 @@ class Fault(Enum):
         "permissions that have expired",
         'Fast DDS says "Not found the identity subject name in permissions file", Cyclone DDS '
         "code 147.",
-        _MEASURED,
+        _TESTED,
         _RENEW,
     )
     PERMISSIONS_NOT_YET_VALID = (
         "permissions-not-yet-valid",
         "permissions that are not valid yet",
         f'Fast DDS says "Not found the identity subject name in permissions file". {_CLOCK_BEHIND}',
-        _MEASURED,
+        _TESTED,
         _CLOCK,
     )
     PERMISSIONS_SUBJECT = (
@@ -331,7 +331,7 @@ class Fault(Enum):
         "permissions that allow nothing in the domain",
         "With Fast DDS the node starts, and every peer refuses it; with Cyclone DDS it does not "
         "start.",
-        "DDS-Security 1.1, 9.4.1.3; measured.",
+        "DDS-Security 1.1, 9.4.1.3; tested.",
         f"Set ROS_DOMAIN_ID to a domain that the permissions name, or add this domain. {_SIGN}",
     )
     CERTIFICATE_FILE = (
@@ -339,7 +339,7 @@ class Fault(Enum):
         "a file of certificates that a vendor cannot read",
         "Fast DDS reads the whole CA file, and refuses it if any part is damaged; Cyclone DDS "
         "reads only the first certificate, and does not read 'TRUSTED CERTIFICATE'.",
-        "OpenSSL 3.0 (pem_info.c); Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+        "OpenSSL 3.0 (pem_info.c); Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
         "Keep only the certificates in the file, as '-----BEGIN CERTIFICATE-----'.",
     )
     CA_CRASH = (
@@ -347,7 +347,7 @@ class Fault(Enum):
         "a CA file that crashes a vendor",
         "If the first certificate of a CA file is not signed with SHA-256, Fast DDS (except 2.9.1) "
         "frees its memory and then uses it.",
-        "Fast DDS 2.6 to 3.6 (FileProvider.cpp); measured.",
+        "Fast DDS 2.6 to 3.6 (FileProvider.cpp); tested.",
         "Put a CA that is signed with SHA-256 first in the file.",
     )
     CERTIFICATE_CRASH = (
@@ -355,7 +355,7 @@ class Fault(Enum):
         "a certificate that crashes a vendor",
         "Fast DDS crashes on a certificate with an empty subject: its own, or a peer's that is not "
         "verified yet.",
-        "Fast DDS 2.6 to 3.6 (PKIDH.cpp); measured.",
+        "Fast DDS 2.6 to 3.6 (PKIDH.cpp); tested.",
         "Issue a certificate with the common name of the enclave.",
     )
     CERTIFICATE_LASTS = (
@@ -363,21 +363,21 @@ class Fault(Enum):
         "a certificate that expires more than 292 years from now",
         "Fast DDS 2.6 and 3.2 set a timer for its expiry, whose nanoseconds overflow: the node is "
         "refused as if the certificate had expired, or crashes.",
-        "Fast DDS 2.6.12 and 3.2.5 (PKIDH.cpp, arm_identity_expiry); measured.",
+        "Fast DDS 2.6.12 and 3.2.5 (PKIDH.cpp, arm_identity_expiry); tested.",
         "Issue a certificate for a shorter time: `sros renew {root} {enclave}`.",
     )
     CA_CHAIN = (
         "ca-chain",
         "a CA certificate that a vendor refuses",
         "Fast DDS (except 2.9.1) also verifies the CA certificate, by the strict rules of OpenSSL.",
-        "RFC 5280, 6.1; Fast DDS 2.6 to 3.6 (FileProvider.cpp); measured.",
+        "RFC 5280, 6.1; Fast DDS 2.6 to 3.6 (FileProvider.cpp); tested.",
         "Use a self-signed CA with keyCertSign, first in its file.",
     )
     SIGNATURE_HASH = (
         "signature-hash",
         "a certificate that is not signed with SHA-256",
         "Fast DDS refuses other digests, and RSA-PSS, in a CA and in an enclave's certificate.",
-        "Fast DDS 2.6 to 3.6 (PKIDH.cpp); measured.",
+        "Fast DDS 2.6 to 3.6 (PKIDH.cpp); tested.",
         "Issue the certificate again with SHA-256, which every vendor accepts.",
     )
     KEY_ALGORITHM = (
@@ -385,7 +385,7 @@ class Fault(Enum):
         "a key that not every vendor accepts",
         "Cyclone DDS accepts only EC prime256v1 and RSA of exactly 2048 bits; with Ed25519, the "
         "handshake of Fast DDS fails.",
-        "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10 and 11.0, Fast DDS 2.6 to 3.6; measured.",
+        "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10 and 11.0, Fast DDS 2.6 to 3.6; tested.",
         "Use EC prime256v1 keys, which every vendor accepts.",
     )
     KEY_ON_TOKEN = (
@@ -394,7 +394,7 @@ class Fault(Enum):
         "Only rmw_fastrtps of ROS 2 Jazzy and later reads key.p11; without key.pem, no node "
         "of another RMW, or of ROS 2 Humble or Iron, starts.",
         "rmw_fastrtps_shared_cpp 8.4 (participant.cpp), rmw_cyclonedds 2.2 and rmw_connextdds 0.22 "
-        "(they ask rmw_dds_common for files alone); Fast DDS 2.9.1, measured.",
+        "(they ask rmw_dds_common for files alone); Fast DDS 2.9.1, tested.",
         "Use rmw_fastrtps_cpp, or a key in a file.",
     )
     DOCUMENT_SIZE = (
@@ -402,7 +402,7 @@ class Fault(Enum):
         "permissions that are too large for a handshake",
         "The node starts, and the handshake with its peers never finishes, if the permissions and "
         "the certificate do not fit into one message of 64 KB.",
-        "Fast DDS 2.9.1; measured.",
+        "Fast DDS 2.9.1; tested.",
         "Make the permissions smaller, with wildcards, or split the enclave.",
     )
 

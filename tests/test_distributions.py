@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Vendor
 from sros_tool.distributions import SUPPORTED, find_distribution
 from sros_tool.errors import UsageError
 from sros_tool.names import DISTRIBUTIONS
 
 
-def test_each_release_has_its_own_rules_or_is_called_not_measured() -> None:
+def test_each_release_has_its_own_rules_or_is_called_not_tested() -> None:
     for known in SUPPORTED:
         assert find_distribution(known.name) is known and not known.assumption
         assert known.zenoh.distribution == known.title
         for shipped in known.shipped:
-            assert shipped.vendor in MEASURED
+            assert shipped.vendor in TESTED
             assert shipped.vendor.traits.product == shipped.product
-            own = [each for each in MEASURED if shipped.vendor.title.startswith(shipped.release)]
-            assert shipped.measured is bool(own)
-            assert ("not measured" in known.why(shipped.vendor)) is not shipped.measured
+            own = [each for each in TESTED if shipped.vendor.title.startswith(shipped.release)]
+            assert shipped.tested is bool(own)
+            assert ("not tested" in known.why(shipped.vendor)) is not shipped.tested
     assert find_distribution("lyrical").vendors[1] is Vendor.CYCLONE_11
     assert find_distribution("jazzy").vendors == (Vendor.FAST, Vendor.CYCLONE)
 

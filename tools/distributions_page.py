@@ -8,7 +8,7 @@ from dataclasses import fields
 from enum import Enum
 
 from sros_tool.checks.upgrade import ALL
-from sros_tool.dds.decision.vendors import MEASURED, VendorTraits, together
+from sros_tool.dds.decision.vendors import TESTED, VendorTraits, together
 from sros_tool.distributions import SUPPORTED, Shipped
 from sros_tool.names import has_type_descriptions
 from sros_tool.zenoh.releases import version_text
@@ -16,7 +16,7 @@ from tools.json_schemas import docstrings_of_fields
 from tools.page_parts import MADE, cell, table_text
 from tools.steps import CHECKOUT
 
-_NAMES = ("title", "product", "measured")
+_NAMES = ("title", "product", "tested")
 """The traits that are no rules."""
 
 _RELEASES = re.compile(r" \((?:Fast DDS|Cyclone|\d)[^)]*\)(?=\.$)")
@@ -39,9 +39,9 @@ def distributions_page() -> str:
         MADE,
         shipped,
         "The versions are the latest as of November 2026; sros assumes that patches of a release "
-        "decide alike. For a release that is *not measured*, sros uses the rules of another "
+        "decide alike. For a release that is *not tested*, sros uses the rules of another "
         "release, and does not see how the two differ.",
-        "The rules in which two measured releases differ:",
+        "The rules in which two tested releases differ:",
         table_text("rule", "where it holds", rows=_rules()),
         "What an update changes is reported as:",
         table_text("finding", "severity", "what it says", rows=_findings()),
@@ -66,15 +66,15 @@ def _shipped() -> Iterator[tuple[str, ...]]:
 
 def _release(shipped: Shipped) -> str:
     text = f"{shipped.product} {shipped.latest}"
-    if shipped.measured:
+    if shipped.tested:
         return text
-    return f"{text}, *not measured*: decided as {shipped.vendor.title}"
+    return f"{text}, *not tested*: decided as {shipped.vendor.title}"
 
 
 def _rules() -> Iterator[tuple[str, ...]]:
     texts = docstrings_of_fields(VendorTraits)
     for field in fields(VendorTraits):
-        values = [getattr(vendor.traits, field.name) for vendor in MEASURED]
+        values = [getattr(vendor.traits, field.name) for vendor in TESTED]
         if field.name in _NAMES or len(set(values)) == 1:
             continue
         own = next((type(value).__doc__ for value in values if isinstance(value, Enum)), "")
@@ -85,9 +85,7 @@ def _rules() -> Iterator[tuple[str, ...]]:
 def _where(values: Sequence[object]) -> Iterator[str]:
     """Yield the releases that have each of a trait's values, in words."""
     for value in dict.fromkeys(values):
-        titles = [
-            vendor.title for vendor, own in zip(MEASURED, values, strict=True) if own == value
-        ]
+        titles = [vendor.title for vendor, own in zip(TESTED, values, strict=True) if own == value]
         releases = ", ".join(together(titles))
         if value is True:
             yield releases

@@ -180,7 +180,7 @@ DOMAIN_NOT_GOVERNED = FindingKind(
     "the keystore does not cover this domain",
     'No node starts: Fast DDS says "Not found topic access rule for topic ros_discovery_info", '
     'Cyclone DDS "Could not find domain in governance".',
-    "DDS-Security 1.1, 9.4.1.2; measured.",
+    "DDS-Security 1.1, 9.4.1.2; tested.",
     Fault.GOVERNANCE_DOMAIN.remedy.format(root="KEYSTORE", enclave="ENCLAVE"),
 )
 CA_KEY_HERE = FindingKind(
@@ -329,7 +329,7 @@ def value_text(environment: Mapping[str, str], name: str) -> str:
     return f"{name} is not set" if value is None else f"{name} is {value!r}"
 
 
-_SOURCE = "rmw_zenoh_cpp (zenoh_config.cpp); Zenoh 1.10.2, measured."
+_SOURCE = "rmw_zenoh_cpp (zenoh_config.cpp); Zenoh 1.10.2, tested."
 OWN_CONFIGURATION = (
     "`sros zenoh KEYSTORE` writes the configuration of each enclave, where the CA keys are; `sros "
     "env KEYSTORE ENCLAVE` and `sros run KEYSTORE ENCLAVE -- COMMAND...` set the variables of an "
@@ -368,7 +368,7 @@ TOO_OLD = FindingKind(
     "an rmw_zenoh that is too old for the files that sros writes",
     "No session opens in an enclave: an earlier rmw_zenoh does not read ZENOH_CONFIG_OVERRIDE, and "
     "its Zenoh does not accept all settings.",
-    "Changelogs of rmw_zenoh_cpp; Zenoh wheels, measured.",
+    "Changelogs of rmw_zenoh_cpp; Zenoh wheels, tested.",
     "Install a later version of the same distribution.",
 )
 OVERRIDDEN = FindingKind(
@@ -385,7 +385,7 @@ NO_CERTIFICATE = FindingKind(
     ERROR,
     "a Zenoh configuration with TLS, but without the paths of certificates and keys",
     "No session opens with it, and no router starts.",
-    "Zenoh 1.10.2, measured.",
+    "Zenoh 1.10.2, tested.",
     f"Name the paths in ZENOH_CONFIG_OVERRIDE. {OWN_CONFIGURATION}",
 )
 PROCESS_OPEN = FindingKind(

@@ -614,7 +614,7 @@ DOCUMENT_SIZE = FindingKind(
     "exceed one message of 64 KB, Fast DDS 2.6 and 2.9 never finish the handshake, or abort; later "
     "releases and Cyclone DDS accept them.",
     "ros2/sros2 issue 228; Fast DDS 2.6.12, 2.9.1 (SecurityManager.cpp), 2.14.5, 3.2.5 and "
-    "3.6.2, Cyclone DDS 0.10.2; measured.",
+    "3.6.2, Cyclone DDS 0.10.2; tested.",
     "Remove rights that are never used, or use wildcards (`sros minimize_policy POLICY --observed "
     "OBSERVED` shows both), or split the enclave.",
     vendors=tuple(vendor for vendor in FAST_DDS if vendor.traits.largest_document),
@@ -625,7 +625,7 @@ LONG_NAME = FindingKind(
     "a topic whose name is too long for Fast DDS",
     "If the DDS topic name has 252 bytes or more (with prefix and suffix), Fast DDS creates the "
     "endpoint and never matches it; Cyclone DDS matches it.",
-    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Use shorter namespaces and names.",
     vendors=FAST_DDS,
 )
@@ -635,7 +635,7 @@ DENY_BLOCKS = FindingKind(
     "a topic that is denied in one direction and allowed in the other",
     "Cyclone DDS 0.10 does not create a topic of which one direction is denied; Fast DDS and "
     "Cyclone DDS 11 create it.",
-    "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c), Fast DDS 2.6 to 3.6; measured.",
+    "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c), Fast DDS 2.6 to 3.6; tested.",
     "Remove the denial: everything that no rule allows is denied anyway.",
     vendors=(Vendor.CYCLONE,),
 )
@@ -644,7 +644,7 @@ CHARACTER_SET = FindingKind(
     NOTE,
     "a [set] of characters in a name",
     "Vendors read plain sets alike, but only * and ? are part of the portable profile.",
-    "Fast DDS 2.6 to 3.6 (fnmatch), Cyclone DDS 0.10 and 11.0 (its own matching); measured.",
+    "Fast DDS 2.6 to 3.6 (fnmatch), Cyclone DDS 0.10 and 11.0 (its own matching); tested.",
     "Use * or ?, or write the names out.",
 )
 ENCLAVE_NAMES = FindingKind(

@@ -106,7 +106,7 @@ PROCESS_LOCAL_TIME = FindingKind(
     "a process whose permissions Fast DDS refuses in its time zone",
     'Fast DDS reads their dates in the local time of the process, and says "Not found the '
     'identity subject name in permissions file".',
-    "Fast DDS 2.6 to 3.6 (mktime); measured.",
+    "Fast DDS 2.6 to 3.6 (mktime); tested.",
     "Run `sros renew KEYSTORE ENCLAVE`, or start the process with TZ=UTC.",
     vendors=FAST_DDS,
 )
@@ -429,7 +429,7 @@ MIXED_VENDORS = FindingKind(
     "secured processes on different RMWs",
     "In these versions, secured nodes on different DDS vendors do not communicate, and do not "
     "report it.",
-    "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; tested.",
     "Use the same RMW for all secured nodes that communicate.",
 )
 
@@ -447,7 +447,7 @@ PROCESS_OTHER_KEYSTORE = FindingKind(
     WARNING,
     "a secured process among processes of another keystore",
     "They trust other CAs, so they do not communicate, and do not report it.",
-    "DDS-Security 1.1, 8.3.2.8; Fast DDS 2.14.5 and Cyclone DDS 0.10.2, measured.",
+    "DDS-Security 1.1, 8.3.2.8; Fast DDS 2.14.5 and Cyclone DDS 0.10.2, tested.",
     "Start all processes of a domain with one keystore, or give each keystore its own domain.",
 )
 ZENOH_UNREAD = FindingKind(
@@ -456,7 +456,7 @@ ZENOH_UNREAD = FindingKind(
     "a Zenoh process whose configuration sros cannot read",
     "Zenoh reads forms that sros does not, such as YAML, and a process without an RMW chooses its "
     "configuration itself. sros does not know whether the process enforces anything.",
-    "Zenoh 1.10.2, measured.",
+    "Zenoh 1.10.2, tested.",
     "Write the configuration as JSON5 objects, or start the process with the configuration of its "
     f"enclave. {OWN_CONFIGURATION}",
 )

@@ -94,7 +94,7 @@ VULNERABILITIES = FindingKind(
 NOT_MEASURED = FindingKind(
     "distribution.not-measured",
     NOTE,
-    "a DDS that was not measured",
+    "a release of a DDS that sros was not tested with",
     "sros decides by the rules of another release of this product, so it does not see differences "
     "between the two releases.",
     _ENGINE,

@@ -24,7 +24,7 @@ from sros_tool.zenoh.document import (
 )
 from sros_tool.zenoh.key_expressions import includes, intersects, widest
 
-_MEASURED = "Zenoh 1.10.2, measured."
+_TESTED = "Zenoh 1.10.2, tested."
 _BY_SROS = "Let `sros zenoh` write the files: rules for each enclave, by its name."
 
 MALFORMED = FindingKind(
@@ -32,7 +32,7 @@ MALFORMED = FindingKind(
     ERROR,
     "a configuration that Zenoh does not accept",
     "No session opens with it, and no router starts.",
-    "Zenoh 1.10.2 (commons/zenoh-config), measured.",
+    "Zenoh 1.10.2 (commons/zenoh-config), tested.",
     "Correct the file.",
 )
 UNREAD = FindingKind(
@@ -41,7 +41,7 @@ UNREAD = FindingKind(
     "a configuration that Zenoh may accept, and sros does not read",
     "Zenoh also reads YAML, TOML, and lists in place of objects, whose meaning depends on its "
     "version. So sros does not know whether the configuration enforces anything.",
-    "Zenoh 1.10.2 (commons/zenoh-config), measured.",
+    "Zenoh 1.10.2 (commons/zenoh-config), tested.",
     "Write it as JSON5 objects into a file whose name ends with .json5.",
 )
 UNKNOWN_SETTING = FindingKind(
@@ -50,7 +50,7 @@ UNKNOWN_SETTING = FindingKind(
     "a setting that Zenoh does not have",
     "Zenoh refuses the whole file, so that no session opens and no router starts. The name is "
     "misspelt, or of another version.",
-    "Zenoh 1.10.2 (commons/zenoh-config), measured.",
+    "Zenoh 1.10.2 (commons/zenoh-config), tested.",
     "Correct the name, or remove the setting.",
 )
 ROUTER_WITHOUT_RULES = FindingKind(
@@ -59,7 +59,7 @@ ROUTER_WITHOUT_RULES = FindingKind(
     "a router without access control",
     "It forwards everything between all connected processes: anyone with a certificate of the CA "
     "can publish, hear, call and serve everything.",
-    _MEASURED,
+    _TESTED,
     _BY_SROS,
 )
 SESSION_WITHOUT_RULES = FindingKind(
@@ -69,7 +69,7 @@ SESSION_WITHOUT_RULES = FindingKind(
     "Anyone who impersonates the router, or in mode peer connects to the session directly, can "
     "read everything that it publishes and send it anything. The rules of the real router do not "
     "apply.",
-    _MEASURED,
+    _TESTED,
     _BY_SROS,
 )
 DEFAULT_ALLOW = FindingKind(
@@ -78,7 +78,7 @@ DEFAULT_ALLOW = FindingKind(
     "access control that allows what no rule denies",
     "A query or a put with a wildcard gets past a denial, and a process that matches two subjects "
     "is denied only what both subjects deny.",
-    _MEASURED,
+    _TESTED,
     'Write "default_permission": "deny", and rules that allow.',
 )
 NOTHING_ALLOWED = FindingKind(
@@ -87,7 +87,7 @@ NOTHING_ALLOWED = FindingKind(
     "access control under which no message passes",
     "No policy gives a subject a rule, and the default is to deny: sessions open, and Zenoh drops "
     "everything without a log line.",
-    _MEASURED,
+    _TESTED,
     _BY_SROS,
 )
 EVERYBODY = FindingKind(
@@ -97,7 +97,7 @@ EVERYBODY = FindingKind(
     "A subject matches any value of a property that it does not state. Interfaces and protocols "
     "are not identities, and a process chooses its own zid. So the rules apply to everyone who "
     "gets a connection.",
-    "Zenoh 1.9 (authorization.rs); measured with 1.10.2.",
+    "Zenoh 1.9 (authorization.rs); tested with 1.10.2.",
     'Name each enclave by "cert_common_names".',
 )
 SELF_LIMITING = FindingKind(
@@ -107,7 +107,7 @@ SELF_LIMITING = FindingKind(
     "No rule names another process: the rules say what this process may do, and only this process "
     "itself obeys them. Any other process with a certificate of the CA publishes to it, and reads "
     "from it.",
-    "zenoh_security_tools writes such files; Zenoh 1.10.2, measured.",
+    "zenoh_security_tools writes such files; Zenoh 1.10.2, tested.",
     _BY_SROS,
 )
 DENY_IN_WILDCARD = FindingKind(
@@ -117,7 +117,7 @@ DENY_IN_WILDCARD = FindingKind(
     "A rule applies to a message only if it covers the whole key expression of the message. A "
     "put, a query or a subscription with a wildcard is wider than the denial, so it is allowed, "
     "and reaches the denied names.",
-    "Zenoh 1.5.1, 1.6.2 and 1.10.2, measured.",
+    "Zenoh 1.5.1, 1.6.2 and 1.10.2, tested.",
     "Allow the intended names, and remove the denial.",
 )
 DENY_OVERRULED = FindingKind(
@@ -125,7 +125,7 @@ DENY_OVERRULED = FindingKind(
     ERROR,
     "a denial without effect, because another subject of the access control allows the name",
     "If a process matches two subjects, one of them is enough to allow a message.",
-    "Zenoh 1.6.2 and 1.10.2, measured.",
+    "Zenoh 1.6.2 and 1.10.2, tested.",
     "Use one subject for each name, and rules that allow.",
 )
 OVERLAPPING = FindingKind(
@@ -134,7 +134,7 @@ OVERLAPPING = FindingKind(
     "subjects that match the same process",
     "Such a process has the rights of both subjects; up to Zenoh 1.5.1, the rights of one of them, "
     "by chance.",
-    "Zenoh 1.5.1 (issue 2137 of zenoh) and 1.10.2, measured.",
+    "Zenoh 1.5.1 (issue 2137 of zenoh) and 1.10.2, tested.",
     "Use one subject for each name.",
 )
 UNUSED = FindingKind(
@@ -151,7 +151,7 @@ PLAIN_ENDPOINT = FindingKind(
     "an endpoint without TLS",
     "Messages there are neither encrypted nor authenticated: everybody on the network reads it, "
     "and gets a connection without a certificate.",
-    _MEASURED,
+    _TESTED,
     "Write tls/HOST:PORT.",
 )
 ENDPOINT_REFUSED = FindingKind(
@@ -159,7 +159,7 @@ ENDPOINT_REFUSED = FindingKind(
     ERROR,
     "an endpoint of a protocol that the configuration excludes",
     "Zenoh does not start if it has to listen at the endpoint, and never connects to it.",
-    _MEASURED,
+    _TESTED,
     "Change the endpoint, or transport/link/protocols.",
 )
 PROTOCOLS_OPEN = FindingKind(
@@ -168,7 +168,7 @@ PROTOCOLS_OPEN = FindingKind(
     "protocols without encryption are not excluded",
     "Zenoh also uses an endpoint tcp/... that is added (for instance by ZENOH_CONFIG_OVERRIDE) or "
     "that another process names.",
-    _MEASURED,
+    _TESTED,
     'Write "protocols": ["tls"] in transport/link.',
 )
 NO_MUTUAL_TLS = FindingKind(
@@ -176,7 +176,7 @@ NO_MUTUAL_TLS = FindingKind(
     ERROR,
     "a listener that asks for no certificate",
     "Everybody gets a connection, without a name that a rule could require.",
-    _MEASURED,
+    _TESTED,
     'Write "enable_mtls": true in transport/link/tls.',
 )
 NAME_NOT_VERIFIED = FindingKind(
@@ -195,7 +195,7 @@ EXPIRED_STAYS = FindingKind(
     WARNING,
     "a connection outlives its certificate",
     "A process keeps its connection after its certificate has expired, for as long as it runs.",
-    _MEASURED,
+    _TESTED,
     'Write "close_link_on_expiration": true in transport/link/tls.',
 )
 SHARED_MEMORY = FindingKind(
@@ -204,7 +204,7 @@ SHARED_MEMORY = FindingKind(
     "shared memory between the processes of a host",
     "Messages of more than 3 KB lie there unencrypted, even with TLS, and stay there after both "
     "processes have ended.",
-    _MEASURED,
+    _TESTED,
     'Write "enabled": false in transport/shared_memory; Zenoh\'s default is true.',
 )
 MULTICAST = FindingKind(
@@ -213,7 +213,7 @@ MULTICAST = FindingKind(
     "multicast scouting",
     "Everybody on the network learns, without a certificate, of each process and its endpoints, "
     "and can answer a session that looks for a router.",
-    _MEASURED,
+    _TESTED,
     'Write "enabled": false in scouting/multicast; Zenoh\'s default is true.',
 )
 ADMIN_SPACE = FindingKind(
@@ -222,7 +222,7 @@ ADMIN_SPACE = FindingKind(
     "Zenoh's admin space",
     "Anyone who can read it sees sessions, connections and the configuration; anyone who can "
     "write to it can change them.",
-    _MEASURED,
+    _TESTED,
     'Write "enabled": false in adminspace.',
 )
 

@@ -50,7 +50,7 @@ from sros_tool.cli.common import (
     taken_secrets,
     verb,
 )
-from sros_tool.dds.decision.vendors import MEASURED
+from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines, visible, visible_json
 from sros_tool.values import file_change, shows, versioned
@@ -80,7 +80,7 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
     return [kind_id for kind_id in all_kinds() if kind_id.startswith(incomplete)]
 
 
-_VENDORS = (*(vendor.value for vendor in MEASURED), _ZENOH)
+_VENDORS = (*(vendor.value for vendor in TESTED), _ZENOH)
 
 
 @verb("check")

@@ -99,7 +99,7 @@ def dry_run_option(function: Decorated) -> Decorated:
 
 
 class _MeasuredVendors(click.Choice):  # type: ignore[type-arg]  # generic from click 8.2 on
-    """An option type: measured DDS vendors and products, imported only when the option is used."""
+    """An option type: tested DDS vendors and products, imported only when the option is used."""
 
     def __init__(self) -> None:
         self.case_sensitive = True
@@ -107,9 +107,9 @@ class _MeasuredVendors(click.Choice):  # type: ignore[type-arg]  # generic from 
     def __getattr__(self, name: str) -> tuple[str, ...]:
         if name != "choices":
             raise AttributeError(name)
-        from sros_tool.dds.decision.vendors import MEASURED, WHOLE_PRODUCTS
+        from sros_tool.dds.decision.vendors import TESTED, WHOLE_PRODUCTS
 
-        self.choices = (*WHOLE_PRODUCTS, *(vendor.value for vendor in MEASURED))
+        self.choices = (*WHOLE_PRODUCTS, *(vendor.value for vendor in TESTED))
         return self.choices
 
 

@@ -25,7 +25,7 @@ MAX_SIGNED_BYTES = 60 * 1024
 """Size limit, in bytes, of signed permissions: with more, Fast DDS 2.6 and 2.9 may not finish.
 
 A message of the handshake must fit into one UDP datagram of 64 KB, with the certificate, the
-signature and the participant's data.  Measured on Fast DDS 2.9.1 with one network interface:
+signature and the participant's data.  Tested with Fast DDS 2.9.1 on one network interface:
 63,129 bytes work and 63,189 do not for an EC certificate of 0.6 KB; for an RSA certificate of
 0.9 KB, 62,579 and 62,854.  The rest is room for longer certificates and more interfaces.
 """

@@ -110,7 +110,7 @@ class Backend:
         """The seconds for which peers still know a secured node that has ended.
 
         Cyclone DDS 11 announces its end only unencrypted, which peers do not believe: they keep the
-        participant until its lease expires (measured).
+        participant until its lease expires (tested).
         """
         return 10.0 if self.dds.startswith("Cyclone DDS 11.") else 0.0
 

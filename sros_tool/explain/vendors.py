@@ -75,8 +75,8 @@ class DistributionAnswer(NamedTuple):
 
     @property
     def measured(self) -> bool:
-        """Whether the decision is by rules that were measured on this release."""
-        return self.shipped.measured
+        """Whether the decision is by rules that were tested with this release."""
+        return self.shipped.tested
 
     @property
     def decided_as(self) -> Vendor:
@@ -185,12 +185,12 @@ def explain_on_dds(
             for shipped in distribution.shipped
         ]
         return Comparison(what, None, by_distribution, beside, answer.allowed, notes)
-    measured = [
+    tested = [
         answer if v is vendor else Evaluator(v, enclave, context).answer(question)
         for v in PRINCIPAL
     ]
-    if len({each.outcome for each in measured}) > 1:
-        notes = (*notes, Note("explain.vendors-differ", f"{_vendor_differences(measured)}."))
+    if len({each.outcome for each in tested}) > 1:
+        notes = (*notes, Note("explain.vendors-differ", f"{_vendor_differences(tested)}."))
     return VendorExplanation(what, answer, why, beside, notes)
 
 

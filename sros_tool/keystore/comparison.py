@@ -254,7 +254,7 @@ def _text(value: bool | ProtectionKind) -> str:
 class Mismatch:
     """Communication that fails between a process with the old governance and one with the new.
 
-    Measured on Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5, which agree: two participants whose
+    Tested with Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5, which agree: two participants whose
     domain rules differ in a protection kind do not communicate at all; two whose rules for a topic
     differ do not communicate on that topic.  Differences in join access control, unauthenticated
     participants and domains do no harm.  ``everything`` says that no communication works; ``names``

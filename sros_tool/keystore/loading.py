@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import dsa, ec, rsa
 from cryptography.x509.oid import SignatureAlgorithmOID
 
 from sros_tool.dds.decision.vendors import (
-    MEASURED,
+    TESTED,
     Hashes,
     Keys,
     Signers,
@@ -298,12 +298,12 @@ def _authority_fault(
 
 
 def authority_refusals(role: str, certificates: Certificates, at: datetime) -> dict[Vendor, str]:
-    """Map each measured vendor that refuses the certificates or documents of a CA to the reason.
+    """Map each tested vendor that refuses the certificates or documents of a CA to the reason.
 
     ``certificates`` are all certificates of the CA file, the issuing CA first.
     """
     refusals = {}
-    for vendor in MEASURED:
+    for vendor in TESTED:
         traits = vendor.traits
         fault = _authority_fault(traits, certificates, at)
         if fault:
@@ -333,7 +333,7 @@ def refusals_text(refusals: Mapping[Vendor, str]) -> str:
         clauses.append(
             f"{' and '.join(titles)} {verb} the certificates or documents of this CA: {text}"
         )
-    accepts = together(vendor.title for vendor in MEASURED if vendor not in refusals)
+    accepts = together(vendor.title for vendor in TESTED if vendor not in refusals)
     if accepts:
         verb = "accepts" if len(accepts) == 1 else "accept"
         clauses.append(f"{' and '.join(accepts)} {verb} it")

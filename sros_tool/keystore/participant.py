@@ -28,7 +28,7 @@ from sros_tool.dds.decision.documents import (
 from sros_tool.dds.decision.vendors import (
     CYCLONE_DDS,
     FAST_DDS,
-    MEASURED,
+    TESTED,
     Vendor,
     VendorTraits,
     together,
@@ -421,7 +421,7 @@ def evaluated(
     at: datetime,
     domain: int | None = None,
     zone: tzinfo = UTC,
-    vendors: Sequence[Vendor] = MEASURED,
+    vendors: Sequence[Vendor] = TESTED,
 ) -> EvaluatedEnclave:
     """Return an opened enclave as ``vendors`` load it at the time ``at``.
 

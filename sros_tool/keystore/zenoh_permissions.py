@@ -21,7 +21,7 @@ from sros_tool.automata import Automaton, Letters, NameSet
 from sros_tool.dds.decision.access import AccessVerb, GrantedAccess, Refusal, choose_grant
 from sros_tool.dds.decision.documents import canonical_permissions, read_permissions_as
 from sros_tool.dds.decision.expressions import names_of
-from sros_tool.dds.decision.vendors import MEASURED, DocumentReader, Style, Vendor, together
+from sros_tool.dds.decision.vendors import TESTED, DocumentReader, Style, Vendor, together
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, parse_permissions
 from sros_tool.errors import DocumentError, PolicyError
@@ -32,7 +32,7 @@ from sros_tool.policy.rights import Right, parts
 from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh.rights import StatedRight
 
-_VENDORS = (*MEASURED, Vendor.CONNEXT)
+_VENDORS = (*TESTED, Vendor.CONNEXT)
 """The vendors of ROS 2, whose decisions have to be the same; Connext stands for the standard."""
 _VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 _REMEDY = "State the rights of the enclave in a policy, with `sros create_permission`."

@@ -1,6 +1,6 @@
 """Distinguished names: reading and comparing them as OpenSSL does (RFC 5280, 7.1; x_name.c).
 
-``object_names.txt`` has all names of objects of OpenSSL 3.0, which the measured DDS vendors use.
+``object_names.txt`` has all names of objects of OpenSSL 3.0, which the tested DDS vendors use.
 """
 
 from __future__ import annotations

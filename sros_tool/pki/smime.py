@@ -274,7 +274,7 @@ class SignedDocument(NamedTuple):
         """Verify that ``authority`` signed this document, and that it is the only signer.
 
         Stricter than Cyclone DDS 0.10.2 and Fast DDS 2.9.1, which accept any signer with a chain to
-        the authority (the CVE-2023-24011 class; both measured).
+        the authority (the CVE-2023-24011 class; both tested).
 
         Raises:
             PkiError: another certificate signed it, too, its signature does not match its content,

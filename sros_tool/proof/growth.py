@@ -30,7 +30,7 @@ from sros_tool.dds.decision.grants import (
     same_subject,
 )
 from sros_tool.dds.decision.matching import ExpressionIndex, matches
-from sros_tool.dds.decision.vendors import MEASURED, Style, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance
 from sros_tool.dds.permissions import Grant, Permissions
@@ -300,7 +300,7 @@ def _not_compared(base: AccessSource, head: AccessSource) -> Iterator[str]:
     yield from unknown_settings(base.zenoh_files, head.zenoh_files)
     if "zenoh" in (base.kind, head.kind):
         return
-    for side, vendor in product((base, head), MEASURED):
+    for side, vendor in product((base, head), TESTED):
         for name, certified in side.certified.items():
             if name in side.permissions and not _fits(vendor, side, name, certified.subject):
                 yield (
@@ -357,7 +357,7 @@ def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
     worlds = []
     if "zenoh" not in (base.kind, head.kind):
         domains = _domains(base, head)
-        for vendor in MEASURED:
+        for vendor in TESTED:
             lenders = _lenders(vendor, base, head)
             access = _of_vendor(vendor, lenders)
             traits = vendor.traits

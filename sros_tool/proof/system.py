@@ -18,7 +18,7 @@ from sros_tool.automata import NameSet
 from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain
 from sros_tool.dds.decision.grants import also_fitting
 from sros_tool.dds.decision.matching import matches
-from sros_tool.dds.decision.vendors import MEASURED, Style, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
 from sros_tool.dds.permissions import Grant
@@ -77,8 +77,8 @@ from sros_tool.zenoh.access import AccessControl, Enforcement
 
 _ZENOH = "zenoh"
 """Name of the Zenoh world."""
-WORLDS = (*(vendor.value for vendor in MEASURED), _ZENOH)
-"""The worlds that are decided: the measured vendors, and Zenoh."""
+WORLDS = (*(vendor.value for vendor in TESTED), _ZENOH)
+"""The worlds that are decided: the tested vendors, and Zenoh."""
 _PLANNED = timedelta(days=365)
 """The assumed validity of permissions that are not signed yet."""
 _OF_EVERY_NODE = ((True, ROS_DISCOVERY_TOPIC), (False, ROS_DISCOVERY_TOPIC))
@@ -183,7 +183,7 @@ def policy_system(
         for enclave in policy.enclaves
     }
     worlds = []
-    for vendor in MEASURED:
+    for vendor in TESTED:
         if not only or vendor.value in only:
             governed = GovernedDomain(vendor, governance, domain)
             access = {
@@ -400,7 +400,7 @@ def _keystore_system(
     granting = {name: [each.subject for each in grant] for name, grant in grants.items()}
     moments = {name: (at, *_later(name, grants.get(name, ()), at)) for name in names}
     worlds = []
-    for vendor, number in product(MEASURED, domains):
+    for vendor, number in product(TESTED, domains):
         if only and vendor.value not in only:
             continue
         title = vendor.title if len(domains) == 1 else f"{vendor.title} in domain {number}"

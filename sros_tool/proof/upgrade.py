@@ -272,7 +272,7 @@ def _upgrade(
         if distribution.assumption:
             yield NOT_MEASURED.found(f"ROS 2 {distribution.title}", distribution.assumption)
     for old, new in _products(before, after, vendor):
-        yield from _not_measured(old, new)
+        yield from _not_tested(old, new)
         for change in changes(files, old, new):
             kind = _KINDS[change.kind]
             yield kind.found(change.enclave, change.text, change.file, remedy=change.remedy)
@@ -499,9 +499,9 @@ def _refusal(
     return DecisionChange(kind, name, text, files.place(name, cause.file), remedy)
 
 
-def _not_measured(before: Shipped, after: Shipped) -> Iterator[Finding]:
+def _not_tested(before: Shipped, after: Shipped) -> Iterator[Finding]:
     for shipped in dict.fromkeys((before, after)):
-        if not shipped.measured:
+        if not shipped.tested:
             same = before.vendor is after.vendor
             blind = ", so that no difference between both can be seen" if same else ""
             text = f"{shipped}{blind}"

@@ -330,7 +330,7 @@ def _text(path: Path) -> str:
     """Return a path as a JSON string.
 
     Zenoh puts paths behind "#" into the text of an endpoint, in which ";" and "?" also have a
-    meaning (measured with 1.10.2).
+    meaning (tested with 1.10.2).
     """
     text = str(path)
     if set(text) & set(";?") or any("\ud800" <= letter <= "\udfff" for letter in text):

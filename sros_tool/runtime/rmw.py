@@ -157,7 +157,7 @@ def vendor_here(
     The vendor is that of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS, in the
     release that $ROS_DISTRO ships.  With ``distribution``, its release counts instead, and
     installed RMWs do not.  The text also warns if the RMW was built without DDS Security, or if the
-    release was not measured.
+    release was not tested.
     """
     named = environment.get(RMW, "")
     rmw, why = "", ""

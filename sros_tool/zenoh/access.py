@@ -1,7 +1,7 @@
 """Zenoh access control: rules for remote processes, and what they decide.
 
 `AccessControl` is what sros writes: its subjects are certificates, and its default is to deny.  A
-denial inside a wider permission stops neither queries nor puts with a wildcard key (measured with
+denial inside a wider permission stops neither queries nor puts with a wildcard key (tested with
 1.10.2).  It does stop graph tokens, because nobody reads them as wildcards.  `Enforcement` is what
 any configuration may state. Sources: zenoh.io "Access Control"; zenoh 1.9, access_control.rs and
 authorization.rs; compared with the wheel 1.10.2.

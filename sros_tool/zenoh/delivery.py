@@ -2,7 +2,7 @@
 
 On a link, both processes enforce their rules: the sender by egress rules, the receiver by ingress
 rules.  A process drops a denied message without an error.  Which messages a delivery needs, and on
-which links, was measured with zenoh 1.10.2, by denying one message after another.  A test compares
+which links, was tested with zenoh 1.10.2, by denying one message after another.  A test compares
 the result on random rules (``tests/integration/test_zenoh_deliveries.py``).
 """
 

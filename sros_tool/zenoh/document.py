@@ -66,7 +66,7 @@ _LINK_PROTOCOLS = frozenset(
 _AS_YAML = (".yaml", ".yml")
 _AS_TOML = (".toml",)
 ENDINGS = (".json5", ".json", *_AS_YAML, *_AS_TOML)
-"""Endings of the file names that Zenoh reads (1.10.2, measured)."""
+"""Endings of the file names that Zenoh reads (1.10.2, tested)."""
 _OTHER_IN_YAML = re.compile(r"\\u|[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff]")
 """Characters and escapes that YAML reads differently from JSON, or refuses."""
 _MOST_MEANT = 1_000_000

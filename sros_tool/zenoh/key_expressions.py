@@ -2,7 +2,7 @@
 
 A key expression has chunks, with "/" between them.  ``*`` stands for one chunk, ``**`` for any
 number of them, ``$*`` for any part of a chunk.  No wildcard matches a chunk that begins with ``@``.
-Source: zenoh.io "Key Expressions"; measured with the wheel 1.10.2.
+Source: zenoh.io "Key Expressions"; tested with the wheel 1.10.2.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import pytest
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.keystores.topic_names import ros_name_problem
 from sros_tool.checks.kind import NOTE, Finding
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Vendor
 from sros_tool.keystore.reader import Keystore
 from tests.checks.bench import Bench, name_of
 from tests.checks.keystore_cases import (
@@ -252,5 +252,5 @@ def test_strangers_are_those_of_the_vendor(
     assert found.id == f"governance.{kind}"
     said = text.format(Vendor(vendor).title)
     assert found.text.startswith(f"allow_unauthenticated_participants is true: {said}")
-    others = {each.title for each in MEASURED} - {Vendor(vendor).title}
+    others = {each.title for each in TESTED} - {Vendor(vendor).title}
     assert not any(each in found.text for each in others)

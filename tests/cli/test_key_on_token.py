@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision.vendors import CYCLONE_DDS, MEASURED
+from sros_tool.dds.decision.vendors import CYCLONE_DDS, TESTED
 from sros_tool.errors import PkiError, UsageError
 from sros_tool.keystore.layout import has_enclave, list_enclaves
 from sros_tool.keystore.participant import load_enclave
@@ -221,7 +221,7 @@ def test_no_process_of_another_rmw_starts(rmw: str, root: Path) -> None:
 
 def test_each_vendor_is_asked_whether_it_uses_the_key(root: Path) -> None:
     enclave = load_enclave("/arm", root / "enclaves/arm", at=datetime.now(UTC))
-    refusing = {each for each in MEASURED if enclave.problems(each.traits)}
+    refusing = {each for each in TESTED if enclave.problems(each.traits)}
     assert refusing == {*CYCLONE_DDS}
     explained = sros("explain", root, "/arm", "join", "--all-vendors")
     assert "key.p11" in explained.out, explained

@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 
 from sros_tool.dds.decision.access import AccessVerb, Refusal
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Vendor
 from tests.dds.drawn_documents import documents
 from tests.support.children import LONG
 from tests.support.long_form import some
@@ -19,7 +19,7 @@ TOPICS = (
 VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 
 
-@pytest.mark.parametrize("vendor", some([*MEASURED, Vendor.STANDARD], 2))
+@pytest.mark.parametrize("vendor", some([*TESTED, Vendor.STANDARD], 2))
 def test_a_topic_is_in_the_set_if_it_is_allowed(vendor: Vendor) -> None:
     seen: Counter[bool] = Counter()
     for case in documents(11, 4000 if LONG else 250):

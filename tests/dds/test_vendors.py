@@ -2,18 +2,18 @@
 
 import pytest
 
-from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, MEASURED, PRINCIPAL, Vendor
+from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, PRINCIPAL, TESTED, Vendor
 
 
 def test_the_measured_vendors() -> None:
-    assert MEASURED == FAST_DDS + CYCLONE_DDS
+    assert TESTED == FAST_DDS + CYCLONE_DDS
     assert PRINCIPAL == (Vendor.FAST, Vendor.CYCLONE)
     assert {each.release for each in FAST_DDS} == {"2.6", "2.9.1", "2.14", "3.2", "3.6"}
     assert CYCLONE_DDS == (Vendor.CYCLONE, Vendor.CYCLONE_11)
 
 
-@pytest.mark.parametrize("vendor", [each for each in Vendor if each not in MEASURED])
-def test_vendors_that_were_not_measured_decide_by_the_standard(vendor: Vendor) -> None:
+@pytest.mark.parametrize("vendor", [each for each in Vendor if each not in TESTED])
+def test_vendors_that_were_not_tested_decide_by_the_standard(vendor: Vendor) -> None:
     names = {"title", "product", "reads_tokens"}  # what its RMW reads is known from its source
     for name in set(type(vendor.traits).__slots__) - names:
         assert getattr(vendor.traits, name) == getattr(Vendor.STANDARD.traits, name)

@@ -22,7 +22,7 @@ from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
 from sros_tool.dds.decision.access import AccessVerb, Outcome, Refusal
-from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, MEASURED, Vendor, VendorTraits
+from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, TESTED, Vendor, VendorTraits
 from sros_tool.dds.governance import render_governance
 from sros_tool.dds.permissions import Permissions, render_permissions
 from sros_tool.keystore.template import load_template, template_names
@@ -80,7 +80,7 @@ def test_every_row_of_what_is_known(vendor: Vendor, workshop: Workshop) -> None:
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("vendor", MEASURED)
+@pytest.mark.parametrize("vendor", TESTED)
 def test_the_engine_says_what_the_rows_say(vendor: Vendor) -> None:
     """Where only one Fast DDS is at hand, what another was seen to do stands in the rows."""
     assert not list(contradictions(vendor))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision.vendors import MEASURED, Signers, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Signers, Vendor
 from sros_tool.errors import PkiError
 from sros_tool.keystore.participant import load_enclave
 from sros_tool.pki import smime
@@ -105,7 +105,7 @@ def test_what_the_vendors_take(vendor: str, workshop: Workshop, enclaves: dict[s
 @pytest.mark.parametrize("name", FORMS)
 def test_sros_explains_what_the_vendors_do(name: str, enclaves: dict[str, Path]) -> None:
     material = load_enclave("/t", enclaves[name], at=datetime.now(UTC))
-    taken = {vendor: takes(vendor, name) for vendor in MEASURED}
+    taken = {vendor: takes(vendor, name) for vendor in TESTED}
     found = {vendor: not material.problems(vendor.traits) for vendor in taken}
     assert found == taken
 

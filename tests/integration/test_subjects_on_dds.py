@@ -15,7 +15,7 @@ from cryptography.x509.name import _ASN1Type
 from cryptography.x509.oid import NameOID
 
 from sros_tool.dds.decision.access import AccessVerb, Outcome, Refusal
-from sros_tool.dds.decision.vendors import MEASURED, Subjects, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Subjects, Vendor
 from sros_tool.pki.certificates import subject_text
 from tests.dds.decision_documents import access_of, allow, grant, permissions, publish, subscribe
 from tests.dds.signer_rows import NOW, REFUSED, YES, Made, write_enclave
@@ -134,7 +134,7 @@ def test_every_row(asked: str, tmp_path: Path) -> None:
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("vendor", MEASURED)
+@pytest.mark.parametrize("vendor", TESTED)
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
 def test_the_engine_says_what_the_rows_say(row: Row, vendor: Vendor) -> None:
     access = access_of(

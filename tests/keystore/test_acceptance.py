@@ -8,7 +8,7 @@ import pytest
 from cryptography import x509
 
 from sros_tool.dds.decision.access import Outcome
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Vendor
 from sros_tool.explain.answer import Evaluator, ask
 from sros_tool.keystore.participant import JoinContext, load_enclave
 from tests.dds.decision_documents import allow, governance, grant, permissions, publish, subscribe
@@ -38,7 +38,7 @@ def test_each_vendor(row: Row, tmp_path: Path) -> None:
     granted = permissions(grant(allow(publish("*"), subscribe("*"))))
     write_enclave(row, tmp_path / "t", "CN=/t", governance(), granted)
     material = load_enclave("/t", tmp_path / "t", at=NOW)
-    for vendor in MEASURED:
+    for vendor in TESTED:
         answer = row.answer(vendor)
         problems = [str(each) for each in material.problems(vendor.traits)]
         assert (not problems) == (answer == YES), (vendor, problems)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from sros_tool.dds.decision.vendors import MEASURED, Signers, Vendor, together
+from sros_tool.dds.decision.vendors import TESTED, Signers, Vendor, together
 from sros_tool.errors import UsageError
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem
@@ -148,7 +148,7 @@ def test_a_ca_that_some_vendors_refuse_gets_a_note(
     assert "note [" not in sros("create_keystore", tmp_path / "plain", *plain).ok().err
 
 
-LATER = {vendor for vendor in MEASURED if vendor.traits.signers is Signers.LISTED}
+LATER = {vendor for vendor in TESTED if vendor.traits.signers is Signers.LISTED}
 """The vendors that do not ask what the permissions CA may sign."""
 
 
@@ -157,7 +157,7 @@ LATER = {vendor for vendor in MEASURED if vendor.traits.signers is Signers.LISTE
     [
         ("only certifies", "lacks digitalSignature", LATER),
         ("for serverAuth", "lacks emailProtection", LATER),
-        ("may sign", "", {*MEASURED}),
+        ("may sign", "", {*TESTED}),
     ],
 )
 def test_vendors_that_refuse_a_permissions_ca_are_named(
@@ -180,17 +180,17 @@ def test_vendors_that_refuse_a_permissions_ca_are_named(
         return
     assert ("portable.ca-purpose" in ended.err) == bool(words)
     sros("create_enclave", root, "/a").ok()
-    for vendor in MEASURED:
+    for vendor in TESTED:
         asked = sros("explain", root, "/a", "join", "--vendor", vendor)
         assert asked.status == (0 if vendor in takes else 1), asked
         checked = sros("check", root, "--vendor", vendor, "--include", "portable.ca-purpose")
         assert checked.status == (0 if vendor in takes else 1), checked
 
 
-ALL = {*MEASURED}
-STRICT = {vendor for vendor in MEASURED if vendor.traits.verifies_authorities}
+ALL = {*TESTED}
+STRICT = {vendor for vendor in TESTED if vendor.traits.verifies_authorities}
 """The vendors that verify a CA file when they load it."""
-(STRICT_TITLE,) = together(vendor.title for vendor in MEASURED if vendor in STRICT)
+(STRICT_TITLE,) = together(vendor.title for vendor in TESTED if vendor in STRICT)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision.vendors import MEASURED, Vendor, together
+from sros_tool.dds.decision.vendors import TESTED, Vendor, together
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.issuing.acceptance import refusals, refuse_stopping
 from sros_tool.keystore.layout import CRL, enclave_path, list_enclaves
@@ -31,7 +31,7 @@ CA, SIGNS = "basicConstraints=critical,CA:TRUE", "keyCertSign,digitalSignature"
 PSS = ("-sigopt", "rsa_padding_mode:pss", "-sigopt", "rsa_pss_saltlen:-1")
 RSA = ("-newkey", "rsa:2048")
 EC = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1")
-ALL = tuple(vendor.value for vendor in MEASURED)
+ALL = tuple(vendor.value for vendor in TESTED)
 
 
 def now() -> datetime:
@@ -118,7 +118,7 @@ def test_a_list_that_every_vendor_refuses_is_not_signed(
     ended = sros(*(word.format(corporate) for word in words))
     assert ended.status == 2, ended
     assert "no node could start in /a, /b" in ended.err
-    titles = enumerated(together(vendor.title for vendor in MEASURED))
+    titles = enumerated(together(vendor.title for vendor in TESTED))
     assert f"{titles} refuse their files" in ended.err
     assert "cRLSign" in ended.err and "Nothing was changed." in ended.err
     remedy = f"sros rotate_ca {corporate} --identity --identity-key URI --finish"
@@ -170,7 +170,7 @@ def test_the_user_may_name_the_vendors_on_which_nodes_stop(corporate: Path) -> N
     assert "Cyclone DDS 11.0 refuses their files" in ended.err and "Fast DDS 2.14" not in ended.err
     said = sros("revoke", corporate, "/lost", *allowed).ok().err
     assert "Cyclone DDS 11.0 refuses /a, /b from now on" in said
-    assert refused_by(corporate, "/a") == set(MEASURED)
+    assert refused_by(corporate, "/a") == set(TESTED)
     # Nothing that runs today stops any more, so the list can be signed again.
     sros("crl", corporate, "--refresh").ok()
 
@@ -274,8 +274,8 @@ def test_what_is_staged_is_evaluated(
         with pytest.raises(KeystoreError) as refusal:
             refuse_stopping(transaction, now())
         assert f"start in {stopped} of" in refusal.value.what
-        (note, *_) = refuse_stopping(transaction, now(), allowed=MEASURED)
-        assert note.text.startswith(f"{MEASURED[0].title} refuses {stopped} from now on")
+        (note, *_) = refuse_stopping(transaction, now(), allowed=TESTED)
+        assert note.text.startswith(f"{TESTED[0].title} refuses {stopped} from now on")
 
 
 def test_an_enclave_that_was_broken_before_hides_no_other_one(sound: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from random import Random
 import pytest
 
 from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Vendor
 from sros_tool.dds.domains import DomainRange, DomainSet
 from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
@@ -35,7 +35,7 @@ from tests.support.children import LONG
 
 ZERO = DomainSet.of((0, 0))
 TYPE = "std_msgs::msg::dds_::String_/RIHS01_00"
-VENDORS = (*MEASURED, Vendor.CONNEXT)
+VENDORS = (*TESTED, Vendor.CONNEXT)
 USES = {
     "publish": (Flow.INGRESS, Message.PUT), "subscribe": (Flow.EGRESS, Message.PUT),
     "request": (Flow.INGRESS, Message.QUERY), "reply": (Flow.EGRESS, Message.QUERY),

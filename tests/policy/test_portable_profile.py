@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sros_tool.dds.decision.access import Access, AccessVerb
-from sros_tool.dds.decision.vendors import MEASURED
+from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.dds.governance import render_governance
 from sros_tool.dds.permissions import Permissions, render_permissions
 from sros_tool.keystore.template import load_template, template_names
@@ -39,7 +39,7 @@ def test_vendors_agree(permissions: Permissions, template: str, zone: int) -> No
             at=NOW,
             zone=timezone(timedelta(hours=zone)),
         )
-        for vendor in MEASURED
+        for vendor in TESTED
     ]
     for direction, topic in sorted(EVERYTHING):
         said = {

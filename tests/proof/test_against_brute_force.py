@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from itertools import permutations
 
-from sros_tool.dds.decision.vendors import MEASURED
+from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.names import dds_names, expand
 from sros_tool.policy.model import (
     ALLOW,
@@ -189,7 +189,7 @@ def test_every_decision_is_that_of_brute_force() -> None:
                     if old in broken and new not in broken:
                         different.append(f"{number}, {world.title}: {new} does not imply {old}")
     assert different == []
-    assert len({title for title, _, _ in seen}) == len(MEASURED) + 1  # and Zenoh
+    assert len({title for title, _, _ in seen}) == len(TESTED) + 1  # and Zenoh
     if LONG:
         assert min(seen.values()) > COUNT / 1000
         assert implied > COUNT / 100

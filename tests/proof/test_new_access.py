@@ -18,7 +18,7 @@ import pytest
 
 from sros_tool.dds.decision.access import AccessVerb
 from sros_tool.dds.decision.matching import matches
-from sros_tool.dds.decision.vendors import MEASURED, Style
+from sros_tool.dds.decision.vendors import TESTED, Style
 from sros_tool.errors import DocumentError, UsageError
 from sros_tool.fleet.fleet_file import read_fleet
 from sros_tool.names import DdsNames, dds_names
@@ -75,7 +75,7 @@ USES = tuple(product(VERBS, TOPICS))
 def questions(base: Drawn, head: Drawn) -> Iterator[tuple[str, Style, Decide]]:
     """Yield title, style and decision of each world in which a pair is compared."""
     if "zenoh" not in (base.kind, head.kind):
-        for vendor in MEASURED:
+        for vendor in TESTED:
             yield vendor.title, vendor.traits.style, partial(Side.dds, vendor=vendor)
     if base.zenoh or head.zenoh:
         yield "Zenoh", Style.FNMATCH, Side.on_zenoh

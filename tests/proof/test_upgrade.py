@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives import hashes
 from sros_tool.checks.targets import Circumstances
 from sros_tool.cli.common import now
 from sros_tool.dds.advisories import parse_advisories
-from sros_tool.dds.decision.vendors import MEASURED
+from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.distributions import SUPPORTED, Distribution, Shipped, find_distribution
 from sros_tool.errors import DocumentError
 from sros_tool.files import policies_dir
@@ -38,7 +38,7 @@ from tests.support.long_form import some
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
-# Releases that were measured and differ, whatever the distributions ship.
+# Releases that were tested and differ, whatever the distributions ship.
 BEFORE = find_distribution("jazzy")._replace(fast="2.9.1", cyclone="0.10.5")
 AFTER = find_distribution("lyrical")._replace(fast="2.14.5", cyclone="11.0.1")
 ALLOW, DISCOVERY, STATUS = (
@@ -235,7 +235,7 @@ def test_an_update_changes_what_was_planted(name: str, bench: Bench) -> None:
 
 
 def test_an_update_changes_nothing_of_shipped_policies(tmp_path: Path) -> None:
-    """For all ROS names, all measured vendors decide alike on the form that sros writes."""
+    """For all ROS names, all tested vendors decide alike on the form that sros writes."""
     root = tmp_path / "ks"
     sros("create_keystore", root, "--template", "production").ok()
     policies = [word for file in sorted(policies_dir().glob("*.xml")) for word in ("-p", file)]
@@ -243,7 +243,7 @@ def test_an_update_changes_nothing_of_shipped_policies(tmp_path: Path) -> None:
     keystore = Keystore(root)
     assert len(keystore.names) > 20
     first, *others = (
-        Shipped(vendor.traits.product, vendor.release, vendor, SUPPORTED[0]) for vendor in MEASURED
+        Shipped(vendor.traits.product, vendor.release, vendor, SUPPORTED[0]) for vendor in TESTED
     )
     files = signed_files(keystore, at=now())
     # Many wildcards take long, unless both vendors have the same style of them.
@@ -296,7 +296,7 @@ def test_an_update_mends_and_brings_known_vulnerabilities(bench: Bench) -> None:
 
 
 def test_what_an_update_cannot_show_is_said(bench: Bench) -> None:
-    """A release that was not measured, and the versions of rmw_zenoh that the files need."""
+    """A release that was not tested, and the versions of rmw_zenoh that the files need."""
     with_zenoh(bench)
     unknown = AFTER._replace(fast="99.1.0")
     found = check_upgrade(bench.root, unknown, Circumstances(bench.now), present=BEFORE).findings

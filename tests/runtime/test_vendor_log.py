@@ -1,4 +1,4 @@
-"""What the vendors say, as measured and as in their sources."""
+"""What the vendors say, as tested and as in their sources."""
 
 from __future__ import annotations
 

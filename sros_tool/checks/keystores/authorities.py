@@ -74,7 +74,7 @@ INTERMEDIATE = FindingKind(
     "verifies a chain of identity CAs; 2.14 requires keyUsage and key identifiers in each CA. For "
     "an intermediate permissions CA, Fast DDS 2.14 requires keyUsage, and 2.9 requires a purpose "
     "that allows signing documents.",
-    "Fast DDS 2.6 to 3.6 (FileProvider.cpp), Cyclone DDS 0.10 and 11.0; measured.",
+    "Fast DDS 2.6 to 3.6 (FileProvider.cpp), Cyclone DDS 0.10 and 11.0; tested.",
     "Use a separate root CA for robots, unless all of them run a Fast DDS that accepts this CA.",
 )
 CA_PURPOSE = FindingKind(
@@ -86,7 +86,7 @@ CA_PURPOSE = FindingKind(
     "extendedKeyUsage, if present, emailProtection. Fast DDS 2.14 and Cyclone DDS 11 check "
     "neither.",
     "RFC 8550, 4.4.2; Fast DDS 2.9.1 and 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2 and 11.0.1; "
-    "measured.",
+    "tested.",
     "Replace it with `sros rotate_ca KEYSTORE`, or issue its certificate again with "
     "digitalSignature.",
     vendors=(Vendor.FAST_2_9, Vendor.CYCLONE),
@@ -97,7 +97,7 @@ KEY_ALGORITHM = FindingKind(
     "a key that not every vendor accepts",
     "Cyclone DDS accepts only EC prime256v1 and RSA of exactly 2048 bits. Fast DDS also accepts "
     "larger keys of both kinds, but not Ed25519, which fails in its handshake.",
-    "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10 and 11.0, Fast DDS 2.6 to 3.6; measured.",
+    "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10 and 11.0, Fast DDS 2.6 to 3.6; tested.",
     "Use EC prime256v1, as sros does.",
 )
 SIGNATURE_HASH = FindingKind(
@@ -105,7 +105,7 @@ SIGNATURE_HASH = FindingKind(
     WARNING,
     "a certificate that is not signed with SHA-256",
     "Fast DDS refuses SHA-384 in a CA and in an enclave's certificate; Cyclone DDS accepts it.",
-    "Fast DDS 2.6 to 3.6 (PKIDH.cpp), Cyclone DDS 0.10 and 11.0; measured.",
+    "Fast DDS 2.6 to 3.6 (PKIDH.cpp), Cyclone DDS 0.10 and 11.0; tested.",
     "Issue the certificate again with SHA-256, as sros does.",
     vendors=FAST_DDS,
 )
@@ -133,7 +133,7 @@ def _authority_findings(
         yield INTERMEDIATE.found(subject, f"{name} is issued by {issuer}. {refused}", file)
     elif role == PERMISSIONS and (fault := next(purpose_faults(chain[:1]), "")):
         yield CA_PURPOSE.found(subject, fault, file)
-    signs_documents = role == PERMISSIONS  # no vendor asks for small keys then (measured)
+    signs_documents = role == PERMISSIONS  # no vendor asks for small keys then (tested)
     for finding in key_findings(certificate, subject, file, what=f"{name} has"):
         if finding.kind is not KEY_ALGORITHM or not signs_documents:
             yield finding
@@ -326,7 +326,7 @@ CRL_EXPIRES_SOON = FindingKind(
     ERROR,
     "a revocation list that expires soon, or has expired",
     "Once it has expired, DDS refuses every participant.",
-    "RFC 5280, 5.1.2.5; Fast DDS 2.6 to 3.6; measured.",
+    "RFC 5280, 5.1.2.5; Fast DDS 2.6 to 3.6; tested.",
     "Run `sros crl KEYSTORE --refresh`.",
 )
 CRL_ISSUER = FindingKind(

@@ -22,7 +22,7 @@ from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import (
     CYCLONE_DDS,
     FAST_DDS,
-    MEASURED,
+    TESTED,
     Moments,
     Vendor,
     together,
@@ -48,7 +48,7 @@ SEVERAL_GRANTS = FindingKind(
     "Fast DDS uses the subject's first grant that is valid now. Cyclone DDS uses the subject's "
     "first grant, valid or not, and also accepts a grant whose subject only contains the subject "
     "of the certificate.",
-    "Fast DDS 2.6 to 3.6 (Permissions.cpp), Cyclone DDS 0.10 and 11.0; measured.",
+    "Fast DDS 2.6 to 3.6 (Permissions.cpp), Cyclone DDS 0.10 and 11.0; tested.",
     "Write one document with one grant for each enclave.",
 )
 DEFAULT_ALLOW = FindingKind(
@@ -56,7 +56,7 @@ DEFAULT_ALLOW = FindingKind(
     WARNING,
     "a grant that allows by default",
     "Fast DDS ignores <default>, and denies; Cyclone DDS allows everything that no rule names.",
-    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Write <default>DENY</default>, and an allow rule for the intended topics.",
 )
 ALLOW_RULES = FindingKind(
@@ -65,7 +65,7 @@ ALLOW_RULES = FindingKind(
     "several allow rules in one grant",
     "Fast DDS decides by the first rule whose topic matches, and denies if the partitions of this "
     "rule do not match; Cyclone DDS goes on to a rule in which topic and partitions match.",
-    "Fast DDS 2.6 to 3.6 (Permissions.cpp), Cyclone DDS 0.10 and 11.0; measured.",
+    "Fast DDS 2.6 to 3.6 (Permissions.cpp), Cyclone DDS 0.10 and 11.0; tested.",
     "Put all topics into one allow rule.",
     vendors=FAST_DDS,
 )
@@ -76,7 +76,7 @@ PARTITIONS = FindingKind(
     "Fast DDS ignores partitions in deny rules, and denies if an allow rule matches the topic but "
     "not the partition; Cyclone DDS goes on to the next rule. ROS 2 uses only the default "
     "partition.",
-    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Leave partitions out.",
 )
 DEFAULT_FIRST = FindingKind(
@@ -85,7 +85,7 @@ DEFAULT_FIRST = FindingKind(
     "rules after the <default> of a grant",
     "Fast DDS ends a grant at its <default>, and ignores the rules that follow; Cyclone DDS reads "
     "them.",
-    "omg_shared_ca_permissions.xsd; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    "omg_shared_ca_permissions.xsd; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Put <default> behind the rules.",
     vendors=FAST_DDS,
 )
@@ -95,7 +95,7 @@ DOMAIN_RANGE = FindingKind(
     "a range of domains that vendors read differently",
     "Fast DDS and Cyclone DDS read a range without <max> as a single domain. Cyclone DDS crashes "
     "on a range without <min>, and refuses domains above 230.",
-    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Write <id>, or <min> and <max> up to 230.",
 )
 GRANT_NAME = FindingKind(
@@ -103,7 +103,7 @@ GRANT_NAME = FindingKind(
     WARNING,
     "a grant without a name",
     "Fast DDS refuses the document; Cyclone DDS accepts it.",
-    "omg_shared_ca_permissions.xsd; Fast DDS 2.6 to 3.6; measured.",
+    "omg_shared_ca_permissions.xsd; Fast DDS 2.6 to 3.6; tested.",
     'Write <grant name="...">.',
     vendors=FAST_DDS,
 )
@@ -114,7 +114,7 @@ SUBJECT = FindingKind(
     "Cyclone DDS splits subjects at commas, slashes and vertical bars, and compares characters "
     "beyond ASCII in their escaped form; Fast DDS 2.6 and 2.9 treat spaces around = as part of the "
     "name.",
-    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Write it in the form of RFC 4514, CN=/name, without , | and quotes in the name.",
 )
 TIME_FORMAT = FindingKind(
@@ -124,7 +124,7 @@ TIME_FORMAT = FindingKind(
     "Fast DDS ignores the UTC offset and reads local time; Cyclone DDS refuses dates without a "
     "time, and years from 2263 on.",
     "DDS-Security 1.1, 9.4.1.3.2.2; Fast DDS 2.6 to 3.6 (mktime), Cyclone DDS 0.10 and 11.0; "
-    "measured.",
+    "tested.",
     "Sign the permissions again: all with renew --all, or those of one enclave with `sros "
     "create_permission KEYSTORE ENCLAVE POLICY_FILE`. In documents that sros does not sign, write "
     "CCYY-MM-DDThh:mm:ssZ.",
@@ -135,7 +135,7 @@ TIME_WINDOW = FindingKind(
     "a validity that in some time zones begins too late or expires too early",
     "Fast DDS reads the dates of permissions in the host's local time: they begin up to 12 hours "
     "late in the west, and expire up to 14 hours early in the east.",
-    "Fast DDS 2.6 to 3.6 (mktime); measured in Los Angeles and Tokyo.",
+    "Fast DDS 2.6 to 3.6 (mktime); tested in Los Angeles and Tokyo.",
     "Sign permissions with a not_before at least 14 hours in the past, as sros does, and renew "
     "them in time.",
     vendors=FAST_DDS,
@@ -146,7 +146,7 @@ LOCAL_TIME = FindingKind(
     "permissions that Fast DDS refuses in the time zone of this host",
     'Fast DDS reads their dates in local time, and says "Not found the identity subject name in '
     'permissions file".',
-    "Fast DDS 2.6 to 3.6 (mktime); measured.",
+    "Fast DDS 2.6 to 3.6 (mktime); tested.",
     "Run `sros renew KEYSTORE ENCLAVE`, or let the host run in UTC.",
     vendors=FAST_DDS,
 )
@@ -156,7 +156,7 @@ CHARACTER_CLASS = FindingKind(
     "a [class] of characters that vendors read differently",
     "Cyclone DDS reads [^...] and [[:class:]] as plain characters; Fast DDS supports negation and "
     "classes.",
-    "Fast DDS 2.6 to 3.6 (fnmatch), Cyclone DDS 0.10 and 11.0; measured.",
+    "Fast DDS 2.6 to 3.6 (fnmatch), Cyclone DDS 0.10 and 11.0; tested.",
     "Use * or ?, or write the names out.",
 )
 BLANKS = FindingKind(
@@ -165,7 +165,7 @@ BLANKS = FindingKind(
     "spaces or line ends around the name of a topic",
     "Fast DDS takes them for a part of the name, so the rule matches no topic of a node; Cyclone "
     "DDS strips them.",
-    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Write the name alone between the tags: <topic>rt/chatter</topic>.",
     vendors=FAST_DDS,
 )
@@ -174,7 +174,7 @@ EMPTY_TOPIC = FindingKind(
     ERROR,
     "a <topic> without text",
     "Cyclone DDS crashes when it evaluates the rule; Fast DDS refuses the document.",
-    "Cyclone DDS 0.10.2 (a fault in create_topic), Fast DDS 2.9.1; measured.",
+    "Cyclone DDS 0.10.2 (a fault in create_topic), Fast DDS 2.9.1; tested.",
     "Remove the empty <topic>.",
 )
 NO_EFFECT = FindingKind(
@@ -182,7 +182,7 @@ NO_EFFECT = FindingKind(
     ERROR,
     "a deny rule after an allow rule for the same topic",
     "The first rule that matches decides, so the denial has no effect.",
-    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Put deny rules first, as sros does.",
 )
 UNREACHABLE = FindingKind(
@@ -190,7 +190,7 @@ UNREACHABLE = FindingKind(
     WARNING,
     "a rule that never decides, because an earlier rule matches first",
     "The first rule that matches decides, so this rule never decides on these topics.",
-    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Remove the topic, or put the narrower rule first.",
 )
 DOMAINS = FindingKind(
@@ -198,7 +198,7 @@ DOMAINS = FindingKind(
     WARNING,
     "permissions and governance for different domains",
     "In a domain that only one of them names, no node of the enclave can communicate.",
-    "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; measured.",
+    "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; tested.",
     "Sign both for the same domains: `sros create_permission` uses the domains of the governance, "
     "or the robot's domain in the fleet file.",
 )
@@ -208,7 +208,7 @@ FEWER_DOMAINS = FindingKind(
     "permissions for fewer domains than the governance",
     "In the other domains no node of the enclave can communicate. This is intended if a fleet file "
     "gives the robot a domain.",
-    "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; measured.",
+    "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; tested.",
     "Nothing to do if the robot is in this domain.",
 )
 
@@ -462,7 +462,7 @@ UNAUTHENTICATED = FindingKind(
     "Cyclone DDS, every topic without protection, even with access control. If RTPS messages are "
     "protected too, Fast DDS refuses the document; only Fast DDS 2.9 ignores the attribute.",
     f"{_GOVERNANCE} (allow_unauthenticated_participants); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS "
-    "0.10 and 11.0; measured.",
+    "0.10 and 11.0; tested.",
     "Run `sros update_keystore KEYSTORE --set "
     "protection.allow_unauthenticated_participants=false`.",
 )
@@ -506,7 +506,7 @@ SIGNED_PAYLOAD = FindingKind(
     "topics whose messages Fast DDS loses",
     "If the payload is only signed, Fast DDS leaves its padding out of the signature: the reader "
     "rejects every message whose serialized length is not a multiple of four.",
-    "Fast DDS 2.14.5, measured; fixed in its source in August 2026 (pull request 6498).",
+    "Fast DDS 2.14.5, tested; fixed in its source in August 2026 (pull request 6498).",
     "Sign the submessage, with the payload in it (data NONE, metadata SIGN), or encrypt (data "
     "ENCRYPT).",
 )
@@ -540,7 +540,7 @@ NO_TOPIC_RULE = FindingKind(
     "topics without a topic rule",
     "If no topic rule matches, the endpoint cannot be created; without a rule for "
     "ros_discovery_info no ROS 2 node starts.",
-    f"{_GOVERNANCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    f"{_GOVERNANCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Add a rule for * at the end.",
 )
 NO_OTHER_TOPIC_RULE = FindingKind(
@@ -548,7 +548,7 @@ NO_OTHER_TOPIC_RULE = FindingKind(
     NOTE,
     "topic rules for ROS names only",
     "A program that uses DDS without ROS can create no endpoint.",
-    f"{_GOVERNANCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    f"{_GOVERNANCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Nothing to do if all programs are ROS 2 nodes. Otherwise add a rule for * at the end.",
 )
 UNREACHABLE_TOPIC_RULE = FindingKind(
@@ -564,7 +564,7 @@ GOVERNANCE_DOMAIN_RANGE = FindingKind(
     ERROR,
     "a range of domains that vendors read differently",
     "Cyclone DDS refuses a range without <min>, and domains above 230; Fast DDS accepts them.",
-    "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Write <id>, or <min> and <max> up to 230.",
 )
 GOVERNANCE_OPEN_RANGE = FindingKind(
@@ -573,7 +573,7 @@ GOVERNANCE_OPEN_RANGE = FindingKind(
     "a range of domains without an end, which counts as one domain",
     "Fast DDS and Cyclone DDS read a range without <max> as the domain <min> alone; by the "
     "standard, the range has no end.",
-    "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; measured.",
+    "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Write <id>, or <min> and <max> up to 230.",
 )
 DIFFERS = FindingKind(
@@ -676,7 +676,7 @@ def _unauthenticated(rule: DomainRule, asked: Sequence[Vendor]) -> tuple[Finding
     """Return the kind and the text of the finding about participants without a certificate."""
     kind = UNAUTHENTICATED_KEPT_OUT
     clauses: dict[str, list[str]] = {}
-    for vendor in asked or MEASURED:
+    for vendor in asked or TESTED:
         if vendor.traits.ignores_unauthenticated:
             clause = "they are refused all the same"
         elif rule.rtps_protection_kind is ProtectionKind.NONE:

@@ -154,7 +154,7 @@ NOT_UNIQUE = FindingKind(
     "a subject without the unique part that the keystore adds",
     "The keystore adds a unique part to every subject, so that neither permissions of another "
     "enclave nor earlier permissions match it. This certificate is older, or was issued elsewhere.",
-    "Cyclone DDS 0.10.2 (subsets of subjects); ros2/sros2 issue 275; measured on both vendors.",
+    "Cyclone DDS 0.10.2 (subsets of subjects); ros2/sros2 issue 275; tested with both vendors.",
     "Run `sros renew KEYSTORE ENCLAVE`.",
 )
 LONG_PERMISSIONS = FindingKind(
@@ -232,7 +232,7 @@ PIN_FILE = FindingKind(
     "a PIN file that other users can read, or that Fast DDS cannot read",
     "Anyone who can read the file can use the key while the token is there; a node that cannot "
     "read the file does not start.",
-    "RFC 7512, 2.4 and 4; libp11 0.4.12 (eng_parse.c), measured.",
+    "RFC 7512, 2.4 and 4; libp11 0.4.12 (eng_parse.c), tested.",
     "Write the PIN alone into the file, with mode 0600, for the user that runs the node.",
 )
 

@@ -52,7 +52,7 @@ from sros_tool.checks.keystores.vendors import (
 )
 from sros_tool.checks.keystores.zenoh_files import check_network, check_own_zenoh
 from sros_tool.checks.kind import WARNING, Cause, Finding, some_names
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
@@ -201,7 +201,7 @@ def _stated(keystore: CheckedKeystore, names: Sequence[str]) -> dict[str, tuple[
 def _vendors_of(distributions: Sequence[Distribution]) -> tuple[Vendor, ...]:
     """Return the vendors that decide for some distributions, in the order of all vendors."""
     shipped = {vendor for each in distributions for vendor in each.vendors}
-    return tuple(vendor for vendor in MEASURED if vendor in shipped)
+    return tuple(vendor for vendor in TESTED if vendor in shipped)
 
 
 def _enclave_findings(

@@ -13,7 +13,7 @@ from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.patterns import overlap
 from sros_tool.wording import first_few
 
-_MAPPING = 'ROS 2 design "Topic and Service name mapping to DDS"; rmw_dds_common; measured.'
+_MAPPING = 'ROS 2 design "Topic and Service name mapping to DDS"; rmw_dds_common; tested.'
 
 NO_ROS_NAME = FindingKind(
     "permissions.no-ros-name",
@@ -43,7 +43,7 @@ RELAY_ONLY = FindingKind(
     WARNING,
     "topics that only <relay> allows",
     "No RMW relays data: a node publishes and subscribes, and both are denied.",
-    "DDS-Security 1.1, 9.4.1.3.2.3; measured.",
+    "DDS-Security 1.1, 9.4.1.3.2.3; tested.",
     "Write the topics into <publish> or <subscribe>.",
 )
 CAPITALS = FindingKind(

@@ -17,7 +17,7 @@ from sros_tool.checks.keystores.opened import CheckedEnclave
 from sros_tool.checks.keystores.topic_names import NO_ROS_NAME, has_foreign_letters, is_for_ros
 from sros_tool.checks.kind import ERROR, WARNING, Cause, Finding, FindingKind, some_names
 from sros_tool.dds.decision.access import Access, AccessVerb, Outcome
-from sros_tool.dds.decision.vendors import MEASURED, Vendor, together
+from sros_tool.dds.decision.vendors import TESTED, Vendor, together
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.distributions import Distribution, shipped_title
@@ -129,7 +129,7 @@ def asked_vendors(words: Sequence[str]) -> tuple[Vendor, ...]:
     Only vendors are returned whose real library was tried.  ``zenoh`` is no DDS vendor, so that
     ``("zenoh",)`` gives no vendor.
     """
-    return tuple(vendor for vendor in MEASURED if not words or vendor.value in words)
+    return tuple(vendor for vendor in TESTED if not words or vendor.value in words)
 
 
 class EnclaveEvaluation(NamedTuple):

@@ -1,8 +1,8 @@
 """The vendors of DDS Security, and how their decisions differ, as data.
 
 The decisions of Fast DDS 2.6.12, 2.9.1, 2.14.5, 2.14.6, 3.2.5 and 3.6.2 and Cyclone DDS 0.10.2,
-0.10.5 and 11.0.1 were measured on the real libraries; Fast DDS 2.14.5 and 2.14.6 decide alike, and
-so do Cyclone DDS 0.10.2 and 0.10.5.  Vendors that were never measured, such as OpenDDS and Connext,
+0.10.5 and 11.0.1 were tested with the real libraries; Fast DDS 2.14.5 and 2.14.6 decide alike, and
+so do Cyclone DDS 0.10.2 and 0.10.5.  Vendors that were never tested, such as OpenDDS and Connext,
 are assumed to follow the standard, as their manuals say.
 """
 
@@ -131,7 +131,7 @@ class VendorTraits:
     """The name and version, for messages."""
     product: str = ""
     """The name without a version, which all releases of the product share."""
-    measured: bool = False
+    tested: bool = False
     """Whether this data was compared with the decisions of the real library."""
     reader: DocumentReader = DocumentReader.STANDARD
     style: Style = Style.FNMATCH
@@ -148,7 +148,7 @@ class VendorTraits:
     """Running participants lose each other when the certificate of one expires.
 
     Since Fast DDS 2.6.12 and 3.2.5 (CVE-2025-67108); in 2.14.6 and 3.6.2 they stay connected (all
-    measured).
+    tested).
     """
     expiry_overflows: bool = False
     """A certificate that expires more than 292 years from now counts as expired.
@@ -195,7 +195,7 @@ class VendorTraits:
     shares_open_topics: bool = False
     """A participant still exchanges data on unprotected topics with peers that refuse it.
 
-    Access control in the direction of the participant prevents this (measured).
+    Access control in the direction of the participant prevents this (tested).
     """
     ignores_unauthenticated: bool = False
     """Participants without identity are refused even if governance allows them (2.9)."""
@@ -229,7 +229,7 @@ _STANDARD = VendorTraits("DDS-Security 1.1")
 _FAST_2_14 = VendorTraits(
     "Fast DDS 2.14",
     product="Fast DDS",
-    measured=True,
+    tested=True,
     reader=DocumentReader.FAST,
     governance_both_ways=True,
     subjects=Subjects.ANY_ORDER,
@@ -259,7 +259,7 @@ _FAST_2_14 = VendorTraits(
 _CYCLONE_0_10 = VendorTraits(
     "Cyclone DDS 0.10",
     product="Cyclone DDS",
-    measured=True,
+    tested=True,
     reader=DocumentReader.CYCLONE,
     style=Style.CYCLONE,
     trims_texts=True,
@@ -363,20 +363,20 @@ class Vendor(StrEnum):
 
     @property
     def release(self) -> str:
-        """The version in the title, such as ``2.14``; only for measured vendors."""
+        """The version in the title, such as ``2.14``; only for tested vendors."""
         return self.title.removeprefix(self.traits.product).strip()
 
     @property
     def documented_only(self) -> bool:
-        """Whether the vendor was never measured, and is taken to follow the standard."""
-        return not self.traits.measured and self is not Vendor.STANDARD
+        """Whether the vendor was never tested, and is taken to follow the standard."""
+        return not self.traits.tested and self is not Vendor.STANDARD
 
 
-MEASURED = tuple(vendor for vendor in Vendor if vendor.traits.measured)
+TESTED = tuple(vendor for vendor in Vendor if vendor.traits.tested)
 """The vendors whose decisions were compared with the real library."""
 
-PRINCIPAL = tuple({vendor.traits.product: vendor for vendor in reversed(MEASURED)}.values())[::-1]
-"""For each measured product, the release that is meant if an option names no version."""
+PRINCIPAL = tuple({vendor.traits.product: vendor for vendor in reversed(TESTED)}.values())[::-1]
+"""For each tested product, the release that is meant if an option names no version."""
 
 
 def _releases(product: str) -> tuple[Vendor, ...]:
@@ -392,11 +392,11 @@ CYCLONE_DDS = _releases("Cyclone DDS")
 
 WHOLE_PRODUCTS = {
     f"all-{vendor.value}": tuple(
-        each for each in MEASURED if each.traits.product == vendor.traits.product
+        each for each in TESTED if each.traits.product == vendor.traits.product
     )
     for vendor in PRINCIPAL
 }
-"""Words for all measured releases of a product, such as ``all-fastdds``."""
+"""Words for all tested releases of a product, such as ``all-fastdds``."""
 
 
 def words_of(vendors: Iterable[Vendor]) -> list[str]:
@@ -413,10 +413,10 @@ def words_of(vendors: Iterable[Vendor]) -> list[str]:
 def together(titles: Iterable[str]) -> list[str]:
     """Return titles of vendors, with the releases of one product joined into one title.
 
-    All measured releases become the name of the product, and some of them a title such as ``Fast
+    All tested releases become the name of the product, and some of them a title such as ``Fast
     DDS 2.14/3.6``.  Other texts, such as ``Zenoh``, stay as they are.
     """
-    of_title = {vendor.title: vendor for vendor in MEASURED}
+    of_title = {vendor.title: vendor for vendor in TESTED}
     releases: dict[str, list[Vendor]] = {}
     for title in titles:
         vendor = of_title.get(title)
@@ -429,7 +429,7 @@ def together(titles: Iterable[str]) -> list[str]:
 
 
 def _measured(product: str) -> set[Vendor]:
-    return {vendor for vendor in MEASURED if vendor.traits.product == product}
+    return {vendor for vendor in TESTED if vendor.traits.product == product}
 
 
 def _releases_text(vendors: Iterable[Vendor]) -> str:

@@ -1,7 +1,7 @@
 """Acceptance of enclaves by DDS vendors, before a transaction puts new files in place.
 
 Every verb that changes trust calls `refuse_stopping` before it commits.  It evaluates each changed
-enclave as every measured vendor would load it, before and after the change.  If a vendor accepts an
+enclave as every tested vendor would load it, before and after the change.  If a vendor accepts an
 enclave before and would refuse it after, its nodes would stop at their next start, so the change is
 refused.
 
@@ -21,7 +21,7 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.dds.decision.access import Decision
-from sros_tool.dds.decision.vendors import MEASURED, Vendor, together, words_of
+from sros_tool.dds.decision.vendors import TESTED, Vendor, together, words_of
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import render_permissions
 from sros_tool.errors import KeystoreError, Note, SrosError
@@ -177,13 +177,13 @@ def _stopped_enclaves(
             is_last = tried == min(len(names), _MOST_BROKEN)
             # Who accepts it today matters if somebody refuses it, or to try the next enclave.
             asked = before and (refused or not is_last)
-            accepted = set(MEASURED) - refusals(name, before, now).keys() if asked else set()
+            accepted = set(TESTED) - refusals(name, before, now).keys() if asked else set()
             if accepted or not before or is_last:
                 break
         if not before:
             all_new = {CERTIFICATE_FILE, PERMISSIONS_FILE} <= own
-            accepted = set(MEASURED) if all_new and len(refused) == len(MEASURED) else set()
-        stopping = [vendor for vendor in MEASURED if vendor in accepted and vendor in refused]
+            accepted = set(TESTED) if all_new and len(refused) == len(TESTED) else set()
+        stopping = [vendor for vendor in TESTED if vendor in accepted and vendor in refused]
         revoked = [name for name in names if stopping and files.was_revoked(name)]
         put_back += revoked
         if others := [name for name in names if name not in revoked]:
@@ -197,7 +197,7 @@ def _stopped_enclaves(
 
 
 def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
-    """Map each measured vendor that refuses an enclave with these files to the reason.
+    """Map each tested vendor that refuses an enclave with these files to the reason.
 
     ``files`` has the content of the files by name.  The private key is assumed to belong to the
     certificate.
@@ -213,7 +213,7 @@ def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
     domains = enclave.joined_domains
     domain = next(iter(domains), 0) if domains else 0
     reasons = {}
-    for vendor in MEASURED:
+    for vendor in TESTED:
         participant = VendorParticipant(vendor, enclave, JoinContext(domain, now))
         decision = participant.join()
         faults = {problem.fault for problem in participant.problems}
@@ -239,7 +239,7 @@ def _would_stop(root: Path, refused: Mapping[Vendor, _Refusals], remedy: str) ->
     )
 
 
-_READ_SEVERAL = tuple(vendor for vendor in MEASURED if not vendor.traits.reads_first_authority)
+_READ_SEVERAL = tuple(vendor for vendor in TESTED if not vendor.traits.reads_first_authority)
 
 
 def _authority_without_list(files: _FilesOfChange) -> x509.Certificate | None:
@@ -313,7 +313,7 @@ def imported_notes(
     """
     files = _example(transaction, template, authorities, domains, now)
     refused = refusals(_EXAMPLE, files, now)
-    if len(refused) == len(MEASURED):
+    if len(refused) == len(TESTED):
         raise KeystoreError(
             f"no DDS vendor would accept an enclave of keystore '{transaction.root}'",
             f"{_clauses(refused, 'it')}. Nothing was written.",
@@ -322,7 +322,7 @@ def imported_notes(
     known = " ".join(note.text for note in authorities.notes)
     notes = []
     if new := {vendor: why for vendor, why in refused.items() if vendor.title not in known}:
-        others = together(vendor.title for vendor in MEASURED if vendor not in refused)
+        others = together(vendor.title for vendor in TESTED if vendor not in refused)
         verb = "accepts" if len(others) == 1 else "accept"
         text = (
             f"{_clauses(new, 'the enclaves of this keystore')}; {enumerated(others)} {verb} them."

@@ -16,7 +16,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
-from sros_tool.dds.decision.vendors import MEASURED, Vendor
+from sros_tool.dds.decision.vendors import TESTED, Vendor
 from sros_tool.errors import KeystoreError, Note, PkiError, UsageError, check_meaning
 from sros_tool.keystore.issuing.ca_service import CaService
 from sros_tool.keystore.issuing.keyring import Keyring, check_imported_keys, check_places
@@ -337,7 +337,7 @@ def check_imported(
     for authority in chain:
         _check_ca(authority, role, now)
     refusals = authority_refusals(role, tuple(chain), now)
-    if len(refusals) == len(MEASURED):
+    if len(refusals) == len(TESTED):
         raise PkiError(
             f"{subject_text(own[0].subject)} cannot be the {role} CA: no DDS vendor accepts it",
             f"{refusals_text(refusals)}.",

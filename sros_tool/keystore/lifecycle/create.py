@@ -664,7 +664,7 @@ def _zenoh_notes(template: Template) -> tuple[Note, ...]:
 
 
 def restart_note(disturbed: Mismatch, *, revoked: bool = False) -> Note:
-    """Return a note on the processes to restart and their order; vendors agree (measured)."""
+    """Return a note on the processes to restart and their order; vendors agree (tested)."""
     return Note("keystore.restart", _restart_text(disturbed, revoked=revoked))
 
 

@@ -3,7 +3,7 @@
 ``crl.pem`` in every enclave is the list of the issuing identity CA.  During a rotation there is a
 second identity CA, whose list is in the file of the identity CAs.  Fast DDS 2.9.1 trusts both CAs
 and reads lists in that file, but reads only one list in ``crl.pem``; Cyclone DDS 0.10.2 trusts only
-the issuing CA (all measured).
+the issuing CA (all tested).
 """
 
 from __future__ import annotations

@@ -324,7 +324,7 @@ def renew_identity_ca(
 
     If a CA service is the identity CA, it has ``issued`` the certificate (PEM).
 
-    Nothing else changes: on Cyclone DDS 0.10.2 and Fast DDS 2.9.1 (measured), the certificates that
+    Nothing else changes: on Cyclone DDS 0.10.2 and Fast DDS 2.9.1 (tested), the certificates that
     the CA issued have a valid chain to its old and to its new certificate.  A permissions CA cannot
     be renewed this way: DDS accepts its documents only with the certificate that they embed.
 
@@ -433,7 +433,7 @@ class _Rotator:
 
         If revocations require a revocation list of the new identity CA, and enclaves lack it, only
         the list is distributed, and the stage stays DISTRIBUTE: as soon as a list exists, Fast DDS
-        2.9.1 refuses every enclave of a CA without a list (measured).
+        2.9.1 refuses every enclave of a CA without a list (tested).
         """
         if self._rotation.stage is RotationStage.REISSUE:
             self._retire()
@@ -845,7 +845,7 @@ def _make_successor(
             "A new CA needs a new key.",
             f"Name another place with --{roles[0]}-key.",
         )
-    # Fast DDS 2.9.1 refuses peers whose permissions CA has another name (measured).
+    # Fast DDS 2.9.1 refuses peers whose permissions CA has another name (tested).
     name = old[0].subject
     if PERMISSIONS not in roles:
         name = common_name(f"{template.authority_name} identity CA {secrets.token_hex(4)}")

@@ -303,7 +303,7 @@ def crls_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
     """Return whether OpenSSL may take the revocation list of one CA for the list of the other.
 
     OpenSSL finds a list by name and key identifier.  If both CAs have the same name and the old CA
-    has no identifier, Fast DDS 2.9.1 uses the wrong list and no process starts (measured).
+    has no identifier, Fast DDS 2.9.1 uses the wrong list and no process starts (tested).
     """
     return old.subject == new.subject and not _has_identifier(old)
 
@@ -319,7 +319,7 @@ def _has_identifier(certificate: x509.Certificate) -> bool:
 def _fast_dds_hindrance(keystore: Keystore, files: Sequence[str]) -> str:
     """Return a sentence on why Fast DDS cannot trust the old and the new CA at once; "" if it can.
 
-    Fast DDS 2.9.1 (measured) distinguishes two CAs of the same name by their key identifiers, and
+    Fast DDS 2.9.1 (tested) distinguishes two CAs of the same name by their key identifiers, and
     refuses a peer whose permissions CA has another name or key algorithm.
     """
     for file in files:
