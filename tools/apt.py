@@ -72,7 +72,7 @@ FOR_TESTS: tuple[tuple[str, str, Callable[[], bool]], ...] = (
     ("openssh-server", "robots that Ansible reaches", Path("/usr/sbin/sshd").exists),
     ("openssh-client", "the way there", _command("ssh")),
     ("libfaketime", "a robot with a wrong clock", _library("faketime/libfaketime.so.1")),
-    ("nginx-light", "a web server between robots and home", Path("/usr/sbin/nginx").exists),
+    ("nginx-light", "a web server from which robots fetch", Path("/usr/sbin/nginx").exists),
     ("golang-cfssl", "a CA service that issues certificates", _command("cfssl")),
     ("zsh", "a shell that evaluates what env prints", _command("zsh")),
     ("fish", "another shell that does", _command("fish")),

@@ -1,4 +1,4 @@
-"""A round of a robot's agent: fetch, install, restart, look, and send what it finds to home.
+"""A round of a robot's agent: fetch, install, restart, look, and send what it finds.
 
 Each part that fails is a problem of the round, and does not keep the other parts from their work:
 a robot whose source is away still confirms, and one whose inbox is away still installs.
@@ -81,7 +81,7 @@ _TOLERANCE = timedelta(minutes=2)
 _LOOK_SECONDS = 0.2
 _REPLACED_LIST = "replaced.crl.pem"
 _REPLACED_FOR = timedelta(days=30)
-"""How long the agent sends home a revocation list that a release replaced by a list that revokes
+"""How long the agent sends a revocation list that a release replaced by a list that revokes
 less.
 """
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -149,7 +149,7 @@ class _Round:
         self._problems: list[str] = []
         self._state = read_state(folder)
         self._is_in_step = False
-        """Whether home publishes what is here, so that it knows the revocation list."""
+        """Whether the last release has the files that are here, and so this revocation list."""
         self._began = time.clock_gettime(time.CLOCK_BOOTTIME)
 
     def run(self) -> Round:
@@ -487,7 +487,7 @@ class _Round:
             clock=clock,
             problems=_short(self._problems),
             requests=asked.requests,
-            crl=self._list_for_home(names),
+            crl=self._list_to_send(names),
         )
         message = self._signed(confirmation, (asked.signer,) if asked.signer else names)
         if not message:
@@ -508,8 +508,8 @@ class _Round:
             self._state = replace(self._state, sent=now)
         return arrived
 
-    def _list_for_home(self, names: Iterable[str]) -> str | None:
-        """Return the revocation list that home perhaps does not know any more; None if it does."""
+    def _list_to_send(self, names: Iterable[str]) -> str | None:
+        """Return a revocation list that the keystore may have lost; None if it has the list."""
         return self._replaced_list() if self._is_in_step else self._revocation_list(names)
 
     def _replaced_list(self) -> str | None:
@@ -524,8 +524,8 @@ class _Round:
     def _keep_replaced_list(self, text: str | None) -> None:
         """Keep the present revocation list, before a release may replace it by one that lacks some.
 
-        Home leaves out what has expired; but a home that was restored from a backup may have
-        forgotten it.
+        A release leaves out what has expired; but a keystore that was restored from a backup may
+        have lost it.
         """
         if text and not self._replaced_list():
             path = agent_folder(self._folder) / _REPLACED_LIST

@@ -52,7 +52,7 @@ class FetchProblem(StrEnum):
     UNREACHABLE = "unreachable"
     """The source does not answer, or lacks a file."""
     EXPIRED = "expired"
-    """The metadata expired: home publishes no more, somebody withholds it, or a clock is wrong."""
+    """The metadata expired: none is published, somebody withholds it, or a clock is wrong."""
     ROLLED_BACK = "rolled_back"
     """The metadata is older than what this robot has seen, or parts of it are."""
     NOT_SIGNED = "not_signed"

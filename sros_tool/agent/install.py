@@ -156,7 +156,7 @@ def install_release(
         tuple(name for name in changes if name in enclaves),
         tuple(name for name in removed if name in changes),
         kept,
-        # What is not valid yet proves nothing: the clock at home may have been ahead.
+        # What is not valid yet proves nothing: the clock of the keystore may have been ahead.
         _made_at(files for name, files in enclaves.items() if name not in kept),
     )
 

@@ -60,7 +60,7 @@ class AgentState:
     def next_sequence(self, now: datetime) -> int:
         """Return the sequence of the next message: higher than all before, also by the clock.
 
-        By the clock, so that a robot whose disk is restored goes on where home expects it.
+        By the clock, so that a robot whose disk is restored goes on where the keystore expects it.
         """
         return max(self.sequence, int(now.timestamp())) + 1
 

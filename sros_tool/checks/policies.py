@@ -201,20 +201,20 @@ NO_COUNTERPART = FindingKind(
     NOTE,
     "a name for which no enclave has the counterpart right",
     "No enclave of the policy, in any ROS domain, may publish this subscribed topic, or serve this "
-    "called service or action. The name may have a typing error, or the other side is in another "
+    "called service or action. The name may have a typing error, or its counterpart is in another "
     "policy.",
     "sros: compares the rights of all enclaves in the policy.",
-    "Compare the names on both sides, after remapping.",
+    "Compare the names that senders and receivers have after remapping.",
 )
 MISSPELT = FindingKind(
     "policy.name-misspelt",
     WARNING,
-    "a name that differs from that of the other side in spelling, namespace or kind",
+    "a name that differs from its likely counterpart in spelling, namespace or kind",
     "Neither of the two names has a counterpart, so the nodes do not communicate: one of them may "
     "have a typing error, lack a namespace, or be of another kind, such as a service where an "
     "action is called.",
     "sros: compares the rights of all enclaves in the policy.",
-    "Write the same name, of the same kind, on both sides, as the nodes have it after remapping.",
+    "Write the same name, of the same kind, in both places, as the nodes have it after remapping.",
 )
 MISTAKEN_SIDE = FindingKind(
     "policy.side-mistaken",

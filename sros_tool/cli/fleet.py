@@ -141,7 +141,7 @@ def _dds_here(moment: datetime) -> RobotDds:
     return robot_dds(ProcessTable().look(moment))
 
 
-# ── at home ────────────────────────────────────────────────────────────────────────────────
+# ── in the keystore ─────────────────────────────────────────────────────────────────────────
 
 
 @fleet.command("confirm")
@@ -670,7 +670,7 @@ def _facts(compared: ComparedFleet) -> Iterator[str]:
     status = compared.status
     command = (
         f"`sros fleet publish {quote(str(status.keystore))} {quote(status.folder or 'PUB')} "
-        "--restored`; docs/howto/home_is_lost.md says what else"
+        "--restored`; docs/howto/keystore_is_lost.md says what else"
     )
     if status.older:
         yield f"the keystore is older than its robots: {status.older}. Publish with {command}"
@@ -712,7 +712,7 @@ def _expiry_facts(compared: ComparedFleet) -> Iterator[str]:
     if kind == "crl":
         command = f"`sros crl {quote(str(root))} --refresh`, then "
     if not any("current" in robot.files.get(kind, ()) for robot in soon):
-        command = ""  # home has renewed them
+        command = ""  # the keystore has renewed them
     yield (
         f"first expiry on a robot: {end:%Y-%m-%d} ({first}, {_KINDS.get(kind, kind)}), within 30 "
         f"days on {counted(len(soon), 'robot')}: {command}{publish_command(root) or 'deliver'}"

@@ -168,7 +168,7 @@ class Confirmation:
     that is installed; 0 for none.  ``expiry`` and ``running`` map enclaves to when their files
     expire, and to what their processes have loaded.  ``problems`` are short sentences, and
     ``requests`` signing requests (PEM) for certificates that expire.  ``crl`` is the newest
-    revocation list (PEM) on the robot, if it is perhaps not what home published last: a keystore
+    revocation list (PEM) on the robot, if it is perhaps not what was published last: a keystore
     that was restored from a backup learns from it what it has revoked since.
     """
 
@@ -300,7 +300,7 @@ def _json(value: Mapping[str, Any]) -> bytes:
     return json.dumps(value, indent=1).encode() + b"\n"
 
 
-# ── at home ────────────────────────────────────────────────────────────────────────────────
+# ── in the keystore ─────────────────────────────────────────────────────────────────────────
 
 
 def parse_confirmation(data: bytes, what: str) -> Confirmation:

@@ -412,7 +412,7 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
     )
 
 
-# ── comparing a confirmation with the files at home ────────────────────────────────────────
+# ── comparing a confirmation with the keystore's files ────────────────────────────────────────
 
 
 class _Difference(NamedTuple):

@@ -1,4 +1,4 @@
-"""Messages of robots, taken in at home: verified, kept, and their requests for renewal signed.
+"""Messages of robots in an inbox: verify and keep them, and sign their requests for renewal.
 
 An inbox is a folder with ``<robot>/confirmation.p7s`` of each robot that fetches: its confirmation,
 signed with the key of one of its enclaves.  Whoever runs the web server or carries the folder can

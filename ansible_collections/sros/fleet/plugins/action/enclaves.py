@@ -1,4 +1,4 @@
-"""The part of the module enclaves that runs at home: export the enclaves of a robot."""
+"""The part of the module enclaves that runs on the keystore machine: export the enclaves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The part of the module reach that runs at home: take nothing else from the answer."""
+"""The part of module reach that runs on the keystore machine: use nothing else of the answer."""
 
 from __future__ import annotations
 

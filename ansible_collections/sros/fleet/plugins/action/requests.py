@@ -1,4 +1,4 @@
-"""The part of the module requests that runs at home: take nothing else from the answer."""
+"""The part of module requests that runs on the keystore machine: use nothing else of the answer."""
 
 from __future__ import annotations
 

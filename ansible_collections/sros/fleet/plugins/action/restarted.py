@@ -1,4 +1,4 @@
-"""The part of the module restarted that runs at home: take nothing else from the answer."""
+"""The part of module restarted for the keystore machine: use nothing else of the answer."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ description:
   - Returns the robots with enclaves for which the role did not get to its end, and the enclaves of
     no robot that no host got by its C(sros_patterns).
   - Also the enclaves that the inventory brings to the revoked robots besides their own.
-  - Only what is known at home counts, not what a robot answers.
+  - Only what is known on the keystore machine counts, not what a robot answers.
 options:
   _input:
     description: What C(sros list_enclaves --json) prints.

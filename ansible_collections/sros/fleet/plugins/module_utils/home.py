@@ -1,4 +1,4 @@
-"""Running sros at home, where the keystore is."""
+"""Running sros on the machine with the keystore."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def ask(command: list[str], said: bytes = b"") -> subprocess.CompletedProcess:
         )
     except OSError as error:
         raise RefusedError(
-            f"{command[0]} cannot be run at home: {error.strerror}. Install sros there (pip install"
-            " sros_tool), or name the program: sros_program."
+            f"{command[0]} cannot be run on the keystore machine: {error.strerror}. Install sros"
+            " there (pip install sros_tool), or name the program: sros_program."
         ) from error
 
 

@@ -110,7 +110,7 @@ def check_lists(before: Files, after: Files, spare: str) -> list[str]:
             raise RefusedError(
                 f"The revocation list for {name} is older than the one of this robot, which has the"
                 f" number {present.number}; the keystore has {number}. Revoked enclaves would be"
-                " trusted again. The keystore at home may come from a backup: copy crl.pem of"
+                " trusted again. The keystore may come from a backup: copy crl.pem of"
                 f" {name} on this robot to public/identity_ca.crl.pem there, run `sros revoke` for"
                 " each enclave that `sros crl` then shows, and deliver again. If the older list is"
                 " right, set allow_older_lists (sros_allow_older_lists)."

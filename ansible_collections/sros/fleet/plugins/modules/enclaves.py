@@ -9,8 +9,8 @@ DOCUMENTATION = r"""
 module: enclaves
 short_description: Install the enclaves of a robot from a keystore of sros
 description:
-  - At home, exports the enclaves of the robot with C(sros distribute_key), and installs them on
-    the robot, all of them or, if anything fails, none.
+  - Exports the enclaves of the robot on the keystore machine with C(sros distribute_key), and
+    installs them on the robot, all of them or, if anything fails, none.
   - The new files are verified next to the present ones, and only then take their place; who is
     interrupted in between ends it at the next run. Folders stay the same folders, so that units and
     containers that mounted them still have them.
@@ -25,7 +25,7 @@ description:
 options:
   keystore:
     description:
-      - The keystore at home. Without it nothing is installed, and the present enclaves are
+      - The keystore. Without it nothing is installed, and the present enclaves are
         verified.
     type: path
   robot:
@@ -39,7 +39,7 @@ options:
     elements: str
     default: []
   program:
-    description: The command that runs sros at home.
+    description: The command that runs sros on the keystore machine.
     type: list
     elements: str
     default: [sros]
@@ -69,14 +69,14 @@ options:
     elements: str
     default: [sros]
   longest_clock_difference:
-    description: Warn if the clocks at home and on the robot differ by more, in seconds.
+    description: Warn if the clocks of keystore machine and robot differ by more, in seconds.
     type: int
     default: 300
   archive:
-    description: Filled in by the action at home. The export (C(.tar.gz)) in base64.
+    description: Filled in by the action on the keystore machine. The export (C(.tar.gz)) in base64.
     type: str
   home_time:
-    description: Filled in by the action at home. Seconds since 1970 by its clock.
+    description: Filled in by the action on the keystore machine. Seconds since 1970 by its clock.
     type: float
 attributes:
   check_mode:
@@ -131,7 +131,7 @@ confirmation:
   type: dict
   returned: always
 remarks:
-  description: What is worth knowing, which the action at home shows as warnings.
+  description: What is worth knowing, which the action on the keystore machine shows as warnings.
   type: list
   elements: str
   returned: always
@@ -210,7 +210,7 @@ def _run(module: AnsibleModule, now: float) -> dict:
     asked = module.params
     place = Place(asked["dest"], asked["owner"])
     if asked["keystore"] and not asked["archive"]:
-        raise RefusedError("The action that exports the enclaves at home did not run.")
+        raise RefusedError("The action that exports the enclaves did not run.")
     if not asked["archive"]:
         return _look(place, asked, now)
     try:
@@ -279,8 +279,8 @@ def _after(before: Files, sent: Files) -> Files:
         if not any(each in sent for each in keys):
             if not any(each in before for each in keys):
                 raise RefusedError(
-                    f"The key of enclave {name} is neither at home nor on this robot. Make another"
-                    " one on the robot with the play sros.fleet.requests."
+                    f"The key of enclave {name} is neither on the keystore machine nor on this"
+                    " robot. Make another one on the robot with the play sros.fleet.requests."
                 )
             own = (*keys, folder_of(name) + "/" + REQUEST_FILE)
             after.update((each, before[each]) for each in own if each in before)

@@ -1,5 +1,5 @@
 #!/usr/bin/python
-"""Run a verb of sros on the keystore, at home."""
+"""Run a verb of sros on the keystore machine."""
 
 # SPDX-License-Identifier: Apache-2.0
 

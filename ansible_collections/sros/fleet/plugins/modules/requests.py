@@ -10,7 +10,7 @@ module: requests
 short_description: Make the keys of enclaves on their robot, with signing requests
 description:
   - Makes a key (EC P-256) for each enclave that has none, and a signing request for it. The key
-    never leaves the robot; C(sros sign_request) answers the request at home.
+    never leaves the robot; C(sros sign_request) answers the request on the keystore machine.
   - An enclave that has a key keeps it, and its request is returned again.
   - The robot needs OpenSSL (the program C(openssl)), not sros.
 options:

@@ -23,7 +23,7 @@ def check_facts(variables: Mapping[str, Any]) -> None:
 
     The plays of this collection take no facts from robots. But those of other plays, or of a cache,
     take the place of variables of the inventory unless ``inject_facts_as_vars`` is off: so a robot
-    could choose the command that runs at home, or whose keys it gets.
+    could choose the command that runs on the keystore machine, or whose keys it gets.
 
     Args:
         variables: the variables of a task, with the facts of its robot.
@@ -35,10 +35,10 @@ def check_facts(variables: Mapping[str, Any]) -> None:
         shown = harmless(", ".join(found), most=_MOST_SHOWN)
         raise RefusedError(
             f"This robot has facts that take the place of variables ({shown}): so it could choose"
-            " the commands that run at home, or get the keys of another. Nothing was done for it."
-            " Set inject_facts_as_vars = false in ansible.cfg, or delete the facts if they are"
-            " cached (ansible-playbook --flush-cache). If they are named as settings of sros, look"
-            " at the robot."
+            " the commands that run on the keystore machine, or get the keys of another robot."
+            " Nothing was done for it. Set inject_facts_as_vars = false in ansible.cfg, or delete"
+            " the facts if they are cached (ansible-playbook --flush-cache). If they are named as"
+            " settings of sros, look at the robot."
         )
 
 
@@ -59,7 +59,7 @@ def _replacing(variables: Mapping[str, Any]) -> list[str]:
 
 
 def _options() -> set[str]:
-    """Return the names of variables by which ssh, the shell and become are set at home.
+    """Return the names of variables by which ssh, the shell and become are set, where Ansible runs.
 
     Ansible takes only some of them out of the facts of a robot, which could choose by the others
     the path of the socket of ssh, or the program that copies files.

@@ -41,7 +41,7 @@ class RobotAction(ActionBase):  # type: ignore[misc]
         """Return the arguments of the module.
 
         Raises:
-            RefusedError: something at home is missing, or refused.
+            RefusedError: something on the keystore machine is missing, or refused.
         """
         return dict(self._task.args)
 
@@ -89,8 +89,8 @@ class RobotAction(ActionBase):  # type: ignore[misc]
     def _make_tmp_path(self, *words: Any, **options: Any) -> str:
         """Return the folder for a module, which a robot names where pipelining is off.
 
-        sftp at home reads it as a part of its commands: what is long becomes another command, and
-        one that begins with an exclamation mark is run at home.
+        sftp reads it as a part of its commands: what is long becomes another command, and one that
+        begins with an exclamation mark is run on the keystore machine.
         """
         made = str(super()._make_tmp_path(*words, **options))
         if not _FOLDER.fullmatch(made):
