@@ -535,7 +535,7 @@ class NameSet:
 
         Returns None if that would be all names.
         """
-        return _around(self._node, _roughness)
+        return _around(self._node, _longest_affixes_first)
 
     def __or__(self, other: NameSet) -> NameSet:
         return NameSet.union((self, other))
@@ -665,10 +665,10 @@ def _around(node: _Node, best: Callable[[Surroundings], tuple[int, int]]) -> Sur
     )
 
 
-def _roughness(around: Surroundings) -> tuple[int, int]:
+def _longest_affixes_first(around: Surroundings) -> tuple[int, int]:
     """Return a sort key for sets that puts long prefixes and suffixes first."""
-    told = min((len(a.prefix) + len(a.suffix) for a in around.automata), default=_LAST)
-    return -told, -len(around.exact)
+    known = min((len(a.prefix) + len(a.suffix) for a in around.automata), default=_LAST)
+    return -known, -len(around.exact)
 
 
 def _shortest_first(name: str) -> tuple[int, str]:
@@ -754,7 +754,7 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
         raise _too_many()
     exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
     everything = frozenset[Automaton]().union(*(leaf.everything for leaf in leaves))
-    around = _around(node, _width)
+    around = _around(node, _fewest_automata_first)
     for own in sorted(automata if around is None else around.automata, key=_order):
         met = frozenset(automaton for leaf in leaves for automaton in leaf.meeting(own))
         if others := len(met) // _OF_A_STEP:
@@ -768,15 +768,15 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
         yield _Search(_Not(_Some()) if isinstance(left, bool) else left, exact)
 
 
-def _width(around: Surroundings) -> tuple[int, int]:
+def _fewest_automata_first(around: Surroundings) -> tuple[int, int]:
     """Return a sort key that puts sets with few automata first.
 
     Small sets with an automaton without prefix and suffix come after other small sets.
     """
     if len(around.automata) > _FEW:
         return len(around.automata), 0
-    rough, _ = _roughness(around)
-    return len(around.automata) + (not rough) * _MOST_AUTOMATA, rough
+    affixes, _ = _longest_affixes_first(around)
+    return len(around.automata) + (not affixes) * _MOST_AUTOMATA, affixes
 
 
 def _needed(node: _Node) -> frozenset[Automaton]:

@@ -812,7 +812,7 @@ class OpenRobot:
             of_enclave = variables[process.enclave]
             if process.unit:
                 text = render_environment(of_enclave, "systemd")
-                if _needs_argument(process):
+                if _needs_enclave_argument(process):
                     words = (*process.command, ROS_ARGS, "--enclave", process.enclave)
                     text += f"ExecStart=\nExecStart={' '.join(unit_words(words))}\n"
                 files[f"units/{process.unit}.d/{_DROP_IN}"] = f"{self._mark()}[Service]\n{text}"
@@ -1190,7 +1190,7 @@ class OpenRobot:
         return status, json.loads(output)
 
 
-def _needs_argument(process: ClosedProcess) -> bool:
+def _needs_enclave_argument(process: ClosedProcess) -> bool:
     """Return whether the command has to name the enclave: on Zenoh others look at that alone."""
     is_node = bool(process.rmw) and process.enclave != _ROUTER
     return is_node and named_enclave(process.command) != process.enclave
@@ -1201,7 +1201,7 @@ def _as_its_unit_starts(process: ClosedProcess) -> ClosedProcess:
 
     Without the unit if it starts another command, such as a script.
     """
-    if not (process.unit and _needs_argument(process)):
+    if not (process.unit and _needs_enclave_argument(process)):
         return process
     asking = ["systemctl", "show", "--property=ExecStart", "--value", process.unit]
     try:

@@ -134,7 +134,7 @@ def install_release(
             try:
                 changes[name] = _change(opened, name, files, (new_keys or {}).get(name), now)
             except (SrosError, OSError) as error:
-                kept[name] = _clause(error)
+                kept[name] = _reason(error)
                 changes[name] = _list_alone(opened, name, files, now)
         removed = []
         for name in present:
@@ -144,7 +144,7 @@ def install_release(
                 changes[name] = _removal(opened, name)
                 removed.append(name)
             except (SrosError, OSError) as error:
-                kept[name] = _clause(error)
+                kept[name] = _reason(error)
         changes = {name: change for name, change in changes.items() if change}
         ran = [name for name in changes if name in enclaves and _had_certificate(opened, name)]
     if changes:
@@ -510,13 +510,13 @@ def _apply(folder: Path, changes: Mapping[str, _Change]) -> dict[str, str]:
             raise
         first = error
     if len(changes) == 1:
-        return {name: _clause(first) for name in changes}
+        return {name: _reason(first) for name in changes}
     failed = {}
     for name, change in changes.items():
         try:
             _commit(folder, [change])
         except (SrosError, OSError) as error:
-            failed[name] = _clause(error)
+            failed[name] = _reason(error)
     return failed
 
 
@@ -542,7 +542,7 @@ def _commit_lists(folder: Path, changes: Iterable[_Change]) -> None:
             _commit(folder, lists)
 
 
-def _clause(error: SrosError | OSError) -> str:
+def _reason(error: SrosError | OSError) -> str:
     """Return an error as a clause."""
     if isinstance(error, SrosError):
         return f"{error.what}: {error.clause}" if error.why else error.what

@@ -125,7 +125,7 @@ class HttpTransport(FetcherInterface):
         except (OSError, http.client.HTTPException) as error:
             if self.connection.is_cut_off:
                 raise SlowRetrievalError(f"{path} takes too long") from error
-            raise DownloadError(_clause(error)) from error
+            raise DownloadError(_reason(error)) from error
         finally:
             if response is None or not response.isclosed():
                 self.connection.end()
@@ -148,7 +148,7 @@ class HttpTransport(FetcherInterface):
         return self.connection.getresponse()
 
 
-def _clause(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     """Return why a server could not be asked, as a clause."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return f"its certificate is not valid: {error.verify_message}"

@@ -164,7 +164,7 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
         echo(f"  {process.enclave}: {pid if process.pid else 'not running as observed'}: {how}")
     export = shlex.quote(str(robot.export.absolute()))
     for name in closed.new:
-        echo(f"  {name}: new, start it by: sros run {export} {name} -- COMMAND")
+        echo(f"  {name}: new, start it with: sros run {export} {name} -- COMMAND")
     for right in closed.newly_denied:
         echo(f"used when sros watched, and denied now: {right}")
     if closed.newly_denied:
@@ -201,7 +201,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
     elif applies:
         for command, processes in closed.left_by_hand.items():
             stop = _together(processes)
-            echo(f"stop {stop}, and start it by:" if stop else "start again by:")
+            echo(f"stop {stop}, and start it with:" if stop else "start again with:")
             echo(f"  {command}")
         echo(f"next: these commands, and then sros close {folder} --proof", err=True)
     else:

@@ -192,7 +192,7 @@ def diff_policy(
     A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, or
     Zenoh configurations such as router.json5. Permissions and Zenoh rules are shown in ROS
     terms; the signature of permissions is verified if the permissions CA is next to them. "!" is a
-    right of B whose other side only A has. If A or B covers only some enclaves, only these are
+    right of B whose counterpart only A has. If A or B covers only some enclaves, only these are
     compared. Lines that differ only in the robot of a fleet are shown as one. For two policies, the
     protection that they demand is compared, too.
 
@@ -295,7 +295,7 @@ def rights_markdown(first: RightsSource, second: RightsSource) -> str:
 
 
 def unanswered_lines(compared: SourcesDifference) -> Iterator[str]:
-    """Yield a line for each right that the change leaves without the other side."""
+    """Yield a line for each right that the change leaves without a counterpart."""
     from sros_tool.policy.model import OTHER_SIDE
 
     for right in compared.unanswered:

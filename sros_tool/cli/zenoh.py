@@ -327,7 +327,7 @@ def _show_from(
                 "`sros zenoh --from` without -o shows what the rules allow. `sros generate_policy` "
                 "makes a policy from a running robot.",
             )
-        notes = tuple(_left_out(rights))
+        notes = tuple(_not_in_policy(rights))
         changes = file_change(output, existed=output.exists())
         saved = "" if dry_run else save(output, write_policy(policy))
     if as_json:
@@ -409,8 +409,8 @@ def _why_no_policy(subjects: Sequence[RightsBehindRules]) -> str:
     )
 
 
-def _left_out(subjects: Sequence[RightsBehindRules]) -> Iterator[Note]:
-    """Yield notes about what the rules allow or deny, and the policy does not state."""
+def _not_in_policy(subjects: Sequence[RightsBehindRules]) -> Iterator[Note]:
+    """Yield notes about what the rules allow or deny but the policy does not state."""
     from sros_tool.translate_zenoh.rights import enclave_of
 
     for rights in subjects:

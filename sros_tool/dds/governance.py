@@ -73,7 +73,9 @@ def _flag(term: str, *, protects: bool = True) -> dict[str, Any]:
     return {"term": term, "values": values, "open": not protects, "portable": protects}
 
 
-def _kind(term: str, values: tuple[ProtectionKind, ...] = tuple(ProtectionKind)) -> dict[str, Any]:
+def _protection_kind(
+    term: str, values: tuple[ProtectionKind, ...] = tuple(ProtectionKind)
+) -> dict[str, Any]:
     """Declare an attribute that is a protection kind."""
     kinds = {"open": ProtectionKind.NONE, "portable": ProtectionKind.ENCRYPT}
     return {"term": term, "values": values, **kinds}
@@ -93,9 +95,9 @@ class TopicRule:
     """Whether permissions decide who may read."""
     enable_write_access_control: bool = field(metadata=_flag("write_access_control"))
     """Whether permissions decide who may write."""
-    metadata_protection_kind: ProtectionKind = field(metadata=_kind("metadata"))
+    metadata_protection_kind: ProtectionKind = field(metadata=_protection_kind("metadata"))
     """Protection of submessages, as in DDS-Security 1.1."""
-    data_protection_kind: ProtectionKind = field(metadata=_kind("data", _DATA_KINDS))
+    data_protection_kind: ProtectionKind = field(metadata=_protection_kind("data", _DATA_KINDS))
     """Protection of the payload: ``NONE``, ``SIGN`` or ``ENCRYPT``."""
 
 
@@ -117,11 +119,11 @@ class DomainRule:
     """Whether participants without a certificate are let in."""
     enable_join_access_control: bool = field(metadata=_flag("join_access_control"))
     """Whether permissions decide who may join."""
-    discovery_protection_kind: ProtectionKind = field(metadata=_kind("discovery"))
+    discovery_protection_kind: ProtectionKind = field(metadata=_protection_kind("discovery"))
     """Protection of discovery, as in DDS-Security 1.1."""
-    liveliness_protection_kind: ProtectionKind = field(metadata=_kind("liveliness"))
+    liveliness_protection_kind: ProtectionKind = field(metadata=_protection_kind("liveliness"))
     """Protection of liveliness messages, as in DDS-Security 1.1."""
-    rtps_protection_kind: ProtectionKind = field(metadata=_kind("rtps"))
+    rtps_protection_kind: ProtectionKind = field(metadata=_protection_kind("rtps"))
     """Protection of whole RTPS messages, as in DDS-Security 1.1."""
     topic_access_rules: tuple[TopicRule, ...]
 

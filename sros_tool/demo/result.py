@@ -154,10 +154,10 @@ class RowResult:
 
     @property
     def untried(self) -> bool:
-        """Whether an attack that has to fail was not tried: it may succeed.
+        """Whether the row of an attack that has to fail was skipped, so that it may succeed.
 
-        Not counted are rows that prove nothing about a keystore (without the defence, or of an
-        attack that is known to succeed or was accepted), and rows that do not apply to it.
+        False for rows that prove nothing about a keystore (without the defence, or of an attack
+        that is known to succeed or was accepted), and for rows that do not apply to it.
         """
         if self.observed is not RowStatus.SKIPPED or not self.applies or self.removed:
             return False
@@ -902,6 +902,9 @@ def _attacks(attacks: Sequence[RowResult], removed: Sequence[RowResult]) -> list
 
 
 def _twin(row: RowResult) -> str:
+    """Return the result without the defence, such as ``heard with the right key``."""
+    if row.removed.startswith("the wrong "):  # the defence is a fault of the attacker's own files
+        return f"{row.observed} with the right {row.removed.removeprefix('the wrong ')}"
     return f"{row.observed} without {row.removed}"
 
 

@@ -194,7 +194,7 @@ class ZenohAnswer:
 
     @property
     def dropped(self) -> Check | None:
-        """The check that drops a message, or None; a check on data comes before all others."""
+        """The check that drops a message, or None; if several do, one on data."""
         return _first((check for check in self.checks if not check.allowed), self.enclave)
 
     @property
@@ -446,7 +446,7 @@ class ZenohEvaluator:
             if all(
                 delivery.arrives
                 for delivery in (
-                    self._between(own, _unrestricted(name, Mode.CLIENT), wanted)
+                    self._deliveries_between(own, _unrestricted(name, Mode.CLIENT), wanted)
                     if own.mode is Mode.CLIENT
                     else self._direct(own, _unrestricted(name, Mode.PEER), wanted)
                 )
@@ -640,16 +640,18 @@ class ZenohEvaluator:
                 continue
             assert own.process
             # What the others decide comes first: it needs no file of that enclave.
-            deliveries = self._between(own.process, _unrestricted(name, own.process.mode), wanted)
+            deliveries = self._deliveries_between(
+                own.process, _unrestricted(name, own.process.mode), wanted
+            )
             if not all(each.arrives for each in deliveries):
                 continue
             other = self._file(name, SESSION_FILE)
             if other.process:
-                deliveries = self._between(own.process, other.process, wanted)
+                deliveries = self._deliveries_between(own.process, other.process, wanted)
             if all(each.arrives for each in deliveries):
                 yield Reached(name, deliveries, other.problem)
 
-    def _between(
+    def _deliveries_between(
         self, own: ZenohProcess, other: ZenohProcess, wanted: Sequence[Right], key: str = ""
     ) -> tuple[Delivery, ...]:
         ends = [self._router_of(process.name).process for process in (own, other)]
@@ -675,7 +677,7 @@ class ZenohEvaluator:
                 each.enclave
                 for each in reached
                 if (other := self._file(each.enclave, SESSION_FILE).process)
-                and any(one.arrives for one in self._between(own, other, asked, wide))
+                and any(one.arrives for one in self._deliveries_between(own, other, asked, wide))
             ]
             yield DecidingWildcard(wide, tuple(enclaves))
 

@@ -559,7 +559,7 @@ class PolicyDifference(NamedTuple):
     protections: Sequence[DifferentProtection]
     """Protection that only one of two policies demands."""
     unanswered: Sequence[Right]
-    """Rights of B to subscribe, request or call, whose other side an enclave of A has, and no
+    """Rights of B to subscribe, request or call, whose counterpart an enclave of A has, and no
     enclave of B."""
 
 
@@ -750,7 +750,7 @@ class RecordedRights:
         return last[name].nodes if name in last else ""
 
     def latest(self, name: str, digest: str) -> Entry | None:
-        """Return the entry of permissions that are certainly the enclave's last, or None.
+        """Return the last ledger entry of an enclave; None unless it records these permissions.
 
         ``name`` and ``digest`` are as for `policy`.
         """

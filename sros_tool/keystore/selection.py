@@ -114,15 +114,15 @@ def select_to_revoke(
     chosen = dict.fromkeys(select_enclaves(keystore, names, patterns, every=every))
     unrecorded: dict[str, Unrecorded] = {}
     if fleet := checked_fleet(keystore) if robots else None:
-        near = _near_robots(keystore, fleet, robots)
-        unrecorded = unrecorded_enclaves(fleet, near, set(robots))
+        possible = _possible_enclaves(keystore, fleet, robots)
+        unrecorded = unrecorded_enclaves(fleet, possible, set(robots))
     chosen |= dict.fromkeys(_of_robots(keystore, robots, True, unrecorded))
     below = [name for each in unrecorded.values() for name in each.below]
     left = {name for each in unrecorded.values() for name in each.naming} - chosen.keys()
     return tuple(chosen), tuple(_unrecorded_notes(keystore.root, sorted(below), sorted(left)))
 
 
-def _near_robots(keystore: Keystore, fleet: Fleet, robots: Sequence[str]) -> Sequence[str]:
+def _possible_enclaves(keystore: Keystore, fleet: Fleet, robots: Sequence[str]) -> Sequence[str]:
     """Return all enclaves that could be those of ``robots``, and perhaps others.
 
     In a keystore with an index, these are the enclaves in the folders of the robots, and those that
@@ -132,10 +132,10 @@ def _near_robots(keystore: Keystore, fleet: Fleet, robots: Sequence[str]) -> Seq
     recorded = keystore.ledger_file.recorded_with(*robots, *folders)
     if recorded is None:
         return keystore.names
-    near = set(recorded)
+    possible = set(recorded)
     for folder in folders:
-        near.update((folder, *enclaves_below(keystore.root, folder)))
-    return sorted(name for name in near if has_enclave(keystore.root, name))
+        possible.update((folder, *enclaves_below(keystore.root, folder)))
+    return sorted(name for name in possible if has_enclave(keystore.root, name))
 
 
 def _unrecorded_notes(root: Path, below: list[str], left: list[str]) -> Iterator[Note]:

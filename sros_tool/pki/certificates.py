@@ -383,7 +383,8 @@ def same_key(certificate: x509.Certificate, key: PrivateKeyTypes) -> bool:
 def weakness(certificate: x509.Certificate) -> str:
     """Return the weak cryptography of a certificate as a clause, or "".
 
-    A hash under 256 bits is weak, because it signs what others chose: SHA-1, MD5.
+    A hash under 256 bits (SHA-1, MD5) is weak: others choose part of what a CA signs, so they could
+    look for two contents with the same hash.
     """
     key, digest = certificate.public_key(), certificate.signature_hash_algorithm
     if is_weak(key):

@@ -323,7 +323,8 @@ def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
         yield f"{subject_text(chain[0].subject)} has no basicConstraints, so it is not a CA"
     if len(chain) > 1:
         for certificate in filter(has_explicit_curve, chain):
-            yield f"the curve of the key of {subject_text(certificate.subject)} has no name"
+            name = subject_text(certificate.subject)
+            yield f"the key of {name} has a curve with explicit parameters"
     below = 0
     for place, certificate in enumerate(chain):
         constraints = extension(certificate, x509.BasicConstraints)

@@ -418,8 +418,8 @@ def _proven(path: Path, document: bytes, before: Policy, added: Sequence[Right])
 def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
     """Raise `PolicyError` unless ``merged`` protects names as ``additions`` require.
 
-    A name that the file already has is not edited: the author chooses which of its places states
-    the protection.
+    If the file already has a name, the merge does not change it: the author decides at which of the
+    name's places the protection is stated.
     """
     present = {(e.kind, e.name): e for e in stated_protections(merged.enclaves)}
     for protection in stated_protections(additions.enclaves):

@@ -479,7 +479,7 @@ def propose_wildcards(
         other = candidates.get(frozenset(found))
         # Of wildcards for the same names, the longest one allows least.
         if other is None or len(rule.name) > len(other.rule.name):
-            adds = tuple(sorted(_added(rule, foreign), key=order))
+            adds = tuple(sorted(_matching(rule, foreign), key=order))
             saves = sum(map(size, found)) - size(rule)
             names = tuple(sorted(found, key=order))
             candidates[frozenset(found)] = WildcardProposal(rule, names, adds, saves)
@@ -540,9 +540,10 @@ def _foreign(enclave: str, own: Rules, known: Iterable[Right]) -> dict[str, list
     }
 
 
-def _added(rule: Right, foreign: dict[str, list[str]]) -> Iterator[Right]:
+def _matching(rule: Right, names_by_right: dict[str, list[str]]) -> Iterator[Right]:
+    """Yield the rights to the names that a rule with a wildcard matches."""
     for part in parts(rule):
         match = compiled(part.name).match
-        for name in foreign[part.right]:
+        for name in names_by_right[part.right]:
             if match(name):
                 yield part._replace(name=name)

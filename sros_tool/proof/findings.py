@@ -43,12 +43,12 @@ from sros_tool.proof.worlds import World
 class Step:
     """A use in a witness, with the place of the right that states it, or None.
 
-    ``lender`` is another enclave whose permissions allow the use, or "" if it needs no other.
+    ``permissions_of`` is another enclave whose permissions allow the use; "" if none is needed.
     """
 
     use: Use
     place: Place | None
-    lender: str = ""
+    permissions_of: str = ""
 
     @property
     def source(self) -> Source | None:
@@ -61,7 +61,9 @@ class Step:
         shown = f"action {name}" if kind == "actions" else name
         text = f"{right or ('write' if self.use.writes else 'read')} {shown}"
         text += f" by {by}" if by else ""
-        return f"{text} with the permissions of {self.lender}" if self.lender else text
+        return (
+            f"{text} with the permissions of {self.permissions_of}" if self.permissions_of else text
+        )
 
     def drawn(self) -> tuple[str, str, str, str]:
         """Return right, kind and name as a policy states them, and the wildcard that allows them.
@@ -155,9 +157,9 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
 
 def _step(use: Use, world: World, system: System) -> Step:
     """Return a use with the right that allows it, which another enclave may have."""
-    lender = world.lender(use.enclave, use.writes, use.topic)
-    stating = replace(use, enclave=lender) if lender else use
-    return Step(use, system.places.find(stating), lender)
+    holder = world.whose_permissions(use.enclave, use.writes, use.topic)
+    stating = replace(use, enclave=holder) if holder else use
+    return Step(use, system.places.find(stating), holder)
 
 
 def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:

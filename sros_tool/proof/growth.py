@@ -260,7 +260,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         )
     sides: tuple[_Edges | None, ...] = ({}, {})
     if added and scope is None:
-        sides = tuple(_edges(source, _borrowed(source, worlds)) for source in (before, after))
+        sides = tuple(_edges(source, _fitting_pairs(source, worlds)) for source in (before, after))
     unknown = "only some enclaves are compared" if scope is not None else ""
     if None in sides:
         unknown = f"there are more than {_MOST_HOPS:,} hops between enclaves"
@@ -283,7 +283,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
 def _less(
     old: AccessSource, new: AccessSource, limit: SearchLimit, *, rules: bool
 ) -> Iterator[SettingChange]:
-    """Yield changes that make ``new`` protect less than ``old``, or let more names cross.
+    """Yield changes that make ``new`` protect less than ``old``, or let more names pass.
 
     With ``rules``, rules between Zenoh routers are compared, too, unless the settings state the
     cause: new rights would change these rules.
@@ -337,7 +337,7 @@ _NO_ACCESS = _Access(dict.fromkeys(_VERBS, NameSet()), lambda verb, topic: False
 
 _AccessOf = Callable[[AccessSource, str, int], _Access]
 """Function that returns the access of an enclave: from the side, the enclave and the domain."""
-_Lenders = Callable[[AccessSource, str], tuple[str, ...]]
+_FittingOthers = Callable[[AccessSource, str], tuple[str, ...]]
 """Function that returns the enclaves whose permissions also fit an enclave's certificate."""
 
 
@@ -349,7 +349,7 @@ class _World:
     style: Style
     domains: tuple[int, ...]
     access: _AccessOf
-    lenders: _Lenders = lambda side, enclave: ()
+    fitting_others: _FittingOthers = lambda side, enclave: ()
     longest: int | None = None
 
 
@@ -358,12 +358,17 @@ def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
     if "zenoh" not in (base.kind, head.kind):
         domains = _domains(base, head)
         for vendor in TESTED:
-            lenders = _lenders(vendor, base, head)
-            access = _of_vendor(vendor, lenders)
+            fitting_others = _fitting_others(vendor, base, head)
+            access = _of_vendor(vendor, fitting_others)
             traits = vendor.traits
             worlds.append(
                 _World(
-                    vendor.title, traits.style, domains, access, lenders, traits.longest_topic_name
+                    vendor.title,
+                    traits.style,
+                    domains,
+                    access,
+                    fitting_others,
+                    traits.longest_topic_name,
                 )
             )
     if base.zenoh is not None or head.zenoh is not None:
@@ -403,7 +408,7 @@ def _granted(side: AccessSource) -> set[DomainSet]:
     }
 
 
-def _lenders(vendor: Vendor, *sides: AccessSource) -> _Lenders:
+def _fitting_others(vendor: Vendor, *sides: AccessSource) -> _FittingOthers:
     by_side = {}
     for side in sides:
         granted = {
@@ -416,7 +421,7 @@ def _lenders(vendor: Vendor, *sides: AccessSource) -> _Lenders:
     return lambda side, enclave: by_side[id(side)].get(enclave, ())
 
 
-def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
+def _of_vendor(vendor: Vendor, fitting_others: _FittingOthers) -> _AccessOf:
     def access_by(
         side: AccessSource, governance: Governance, name: str, subject: str, at: int
     ) -> Access:
@@ -444,7 +449,7 @@ def _of_vendor(vendor: Vendor, lenders: _Lenders) -> _AccessOf:
         subject = side.subject_of(enclave)
         usable = [
             access_by(side, governance, name, subject, domain)
-            for name in (enclave, *lenders(side, enclave))
+            for name in (enclave, *fitting_others(side, enclave))
         ]
         return _joined(usable)
 
@@ -682,9 +687,9 @@ def _same(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> 
         return None not in (old.zenoh, new.zenoh) and old.enforcers == new.enforcers
     if old.governance != new.governance:
         return False
-    names = (enclave, *world.lenders(old, enclave))
+    names = (enclave, *world.fitting_others(old, enclave))
     return (
-        names == (enclave, *world.lenders(new, enclave))
+        names == (enclave, *world.fitting_others(new, enclave))
         and old.subject_of(enclave) == new.subject_of(enclave)
         and all(
             _same_grants(old.permissions.get(name), new.permissions.get(name)) for name in names
@@ -750,8 +755,15 @@ class _Stated:
         That is one `Gain` for each right of the policy that covers some of these topics, and one
         for the topics that no right covers.
         """
-        lenders = world.lenders(self._new, enclave)
-        key = enclave, lenders, verb, more, world.style, world.longest  # often in several domains
+        fitting_others = world.fitting_others(self._new, enclave)
+        key = (
+            enclave,
+            fitting_others,
+            verb,
+            more,
+            world.style,
+            world.longest,
+        )  # often in several domains
         if key not in self._found:
             self._found[key] = list(self._searched(enclave, verb, more, world, domain, limit))
         for gain in self._found[key]:
@@ -768,7 +780,7 @@ class _Stated:
     ) -> Iterator[Gain]:
         allowed = [
             (right, getattr(right.topics, verb))
-            for name in (enclave, *world.lenders(self._new, enclave))
+            for name in (enclave, *world.fitting_others(self._new, enclave))
             for right in self._allowed.get(name, ())
         ]
         denied = self._denials(enclave, verb, world.style)
@@ -911,35 +923,43 @@ def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach
             yield NewReach(source, target, tuple(path))
 
 
-def _borrowed(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tuple[str, str]]:
+def _fitting_pairs(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tuple[str, str]]:
     """Yield pairs of an enclave and another whose permissions it can also use in a world."""
     worlds = tuple(worlds)
     for enclave in side.permissions:
-        lenders = (lender for world in worlds for lender in world.lenders(side, enclave))
-        yield from ((enclave, lender) for lender in dict.fromkeys(lenders))
+        fitting_others = (
+            holder for world in worlds for holder in world.fitting_others(side, enclave)
+        )
+        yield from ((enclave, holder) for holder in dict.fromkeys(fitting_others))
 
 
-def _edges(side: AccessSource, borrowed: Iterable[tuple[str, str]]) -> _Edges | None:
+def _edges(side: AccessSource, fitting_pairs: Iterable[tuple[str, str]]) -> _Edges | None:
     """Return all hops between enclaves, or None if there are too many to follow.
 
     An enclave that uses the permissions of another one counts as a further enclave, to which its
     own denials do not apply.
     """
     rights = side.zenoh if side.kind == "zenoh" and side.zenoh is not None else side.rights
-    lent: dict[str, list[str]] = defaultdict(list)
+    names_by_holder: dict[str, list[str]] = defaultdict(list)
     real: dict[str, str] = {}
-    for enclave, lender in borrowed:
-        name = f"{enclave} by {lender}"
+    for enclave, holder in fitting_pairs:
+        name = f"{enclave} by {holder}"
         real[name] = enclave
-        lent[lender].append(name)
+        names_by_holder[holder].append(name)
     usable = {}
     left = _MOST_HOPS
     for domains, some in by_domains(rights, side.permissions, side.key_domains).items():
-        left -= sum(len(lent[right.enclave]) for right in some if right.enclave in lent)
+        left -= sum(
+            len(names_by_holder[right.enclave])
+            for right in some
+            if right.enclave in names_by_holder
+        )
         if left < 0:
             return None
         more = (
-            right._replace(enclave=name) for right in some for name in lent.get(right.enclave, ())
+            right._replace(enclave=name)
+            for right in some
+            for name in names_by_holder.get(right.enclave, ())
         )
         usable[domains] = some.union(more)
     network = Network(
@@ -1140,7 +1160,7 @@ def _left_out(base: AccessSource, head: AccessSource) -> Iterator[str]:
         if side.later is not None and other.later is None:
             yield f"what {name} gives to enclaves that are created later"
         if limits_crossing(side) and not states_routers(other):
-            yield f"what {name} lets cross between Zenoh routers"
+            yield f"what {name} lets pass between Zenoh routers"
         if side.zenoh_files and not other.zenoh_files:
             yield f"where the Zenoh processes of {name} listen and connect"
         if side.scope is not None and other.scope is None:

@@ -4,7 +4,7 @@ A side without a governance, such as a policy, stands for a strict governance, s
 looser governance protects less.  A policy never lowers the protection of a keystore.
 
 Two enclaves at the same Zenoh router exchange all that their rights allow.  At two routers they
-exchange only names that both routers let cross.  So more names pass if ``crossing`` gets wider, if
+exchange only names that both routers let pass.  So more names pass if ``crossing`` gets wider, if
 a router is removed, or if an enclave moves to the router of another one.
 
 This module reads no files.
@@ -320,13 +320,13 @@ _ALL = named("*")
 
 
 def limits_crossing(side: AccessSource) -> bool:
-    """Return whether the settings or the fleet of a side limit which names cross."""
+    """Return whether settings or fleet of a side limit what passes between Zenoh routers."""
     network = _network(side, side)
     return network is not None and _routers_limit_names(network)
 
 
 def states_routers(side: AccessSource) -> bool:
-    """Return whether settings or fleet of a side name the routers, and what crosses there."""
+    """Return whether settings or fleet of a side name the Zenoh routers, and what may pass."""
     return _network(side, side) is not None
 
 
@@ -377,7 +377,7 @@ def _moved(
                 yield SettingChange(
                     Effect.LOOSER,
                     f"router of {enclave}",
-                    f"{one}, where {crossing} crosses",
+                    f"{one}, which passes on {crossing}",
                     other,
                     f"{name} may pass between this enclave and enclaves that were at {there}",
                 )
@@ -418,11 +418,11 @@ def looser_router_rules(
 
 
 _Crossing = tuple[tuple[str, ...], ...]
-"""Lists of expressions; a name crosses if it matches an expression of every list."""
+"""Lists of expressions; a name may pass if it matches an expression of every list."""
 
 
 def _more(before: _Crossing, after: _Crossing, limit: SearchLimit) -> str:
-    """Return a name that crosses by ``after`` but not by ``before``; "" if there is none."""
+    """Return a name that may pass by ``after`` but not by ``before``; "" if there is none."""
     names = _names(after) - _names(before)
     return (names & _ABSOLUTE).example(limit) or names.example(limit) or ""
 

@@ -191,8 +191,10 @@ def policy_system(
                 for name, permissions in signed.items()
             }
             granted = {} if unique else {name: (subject,) for name, subject in subjects.items()}
-            lenders = also_fitting(vendor.traits, subjects, granted)
-            worlds.append(_dds_world(vendor, access, stated, demanded=demanded, lenders=lenders))
+            fitting_others = also_fitting(vendor.traits, subjects, granted)
+            worlds.append(
+                _dds_world(vendor, access, stated, demanded=demanded, fitting_others=fitting_others)
+            )
     left_out = None
     if not only or _ZENOH in only:
         try:
@@ -231,7 +233,7 @@ def _dds_world(
     title: str = "",
     idle: Collection[str] = (),
     demanded: Mapping[Level, NameSet] | None = None,
-    lenders: Mapping[str, Sequence[str]] | None = None,
+    fitting_others: Mapping[str, Sequence[str]] | None = None,
 ) -> World:
     """Return the world of a vendor.
 
@@ -242,7 +244,7 @@ def _dds_world(
         title: the title of the world; "" for the vendor's.
         idle: the enclaves without valid permissions.
         demanded: for each level, the topics for which a policy states it; None for a keystore.
-        lenders: for each enclave, the enclaves whose permissions it can present.
+        fitting_others: for each enclave, the enclaves whose permissions it can present.
     """
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
@@ -268,7 +270,7 @@ def _dds_world(
         demanded=None if demanded is None else NameSet.union(demanded.values()),
         needed=_OF_EVERY_NODE,
         idle=idle,
-        lenders=lenders or {},
+        fitting_others=fitting_others or {},
         longest=vendor.traits.longest_topic_name or LONGEST,
     )
 
@@ -422,8 +424,12 @@ def _keystore_system(
                 for loaded_enclave, moment in product(possible, moments[name])
             )
             access[name] = tuple(each for each in accesses if each is not None)
-        lenders = also_fitting(vendor.traits, subjects, granting)
-        worlds.append(_dds_world(vendor, access, stated, title=title, idle=idle, lenders=lenders))
+        fitting_others = also_fitting(vendor.traits, subjects, granting)
+        worlds.append(
+            _dds_world(
+                vendor, access, stated, title=title, idle=idle, fitting_others=fitting_others
+            )
+        )
     for first in range(0, len(worlds), len(domains)):
         _link_domains(worlds[first : first + len(domains)])  # those of one vendor
     if _ZENOH in only or (not only and has_zenoh_files(root, hidden=True)):

@@ -113,7 +113,7 @@ class DecidedFiles:
             return (self.domain,)
         return example_domains(enclave.state) if enclave.state else (0,)
 
-    def lenders(self, vendor: Vendor) -> Mapping[str, tuple[str, ...]]:
+    def fitting_others(self, vendor: Vendor) -> Mapping[str, tuple[str, ...]]:
         """Map each enclave to the other enclaves whose permissions fit its certificate."""
         if self.unique_subjects:
             return {}
@@ -388,14 +388,16 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
     if before.vendor is after.vendor:
         return
     by_vendors = AccessByVendors(files.source)
-    lenders = {each.vendor: files.lenders(each.vendor) for each in (before, after)}
+    fitting_others = {each.vendor: files.fitting_others(each.vendor) for each in (before, after)}
     for name, enclave in files.decided():
         numbers = files.domains(enclave)
         for number in numbers:
             context = JoinContext(number, files.at, files.zone)
             where = f"on domain {number}, " if len(numbers) > 1 else ""
             sides = [
-                _Decided(shipped, files, name, context, lenders[shipped.vendor].get(name, ()))
+                _Decided(
+                    shipped, files, name, context, fitting_others[shipped.vendor].get(name, ())
+                )
                 for shipped in (before, after)
             ]
             if found := list(_of_enclave(files, name, sides, number, where, by_vendors)):
@@ -406,7 +408,7 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
 class _Decided:
     """The decision of one release of DDS on an enclave: causes of a refusal, and access.
 
-    The access includes permissions of other enclaves (``lenders``) that fit the enclave's
+    The access includes permissions of other enclaves (``fitting_others``) that fit the enclave's
     certificate.
     """
 
@@ -416,21 +418,21 @@ class _Decided:
         files: DecidedFiles,
         name: str,
         context: JoinContext,
-        lenders: Sequence[str],
+        fitting_others: Sequence[str],
     ) -> None:
         own = files.enclaves[name]
         self.shipped = shipped
         participant = VendorParticipant(shipped.vendor, own, context)
         self.causes = participant.causes()
-        lent = (
+        presented = (
             own._replace(
-                permissions=files.enclaves[lender].permissions,
-                portable=files.enclaves[lender].portable,
+                permissions=files.enclaves[holder].permissions,
+                portable=files.enclaves[holder].portable,
                 state=None,
             )
-            for lender in lenders
+            for holder in fitting_others
         )
-        others = (VendorParticipant(shipped.vendor, each, context).access for each in lent)
+        others = (VendorParticipant(shipped.vendor, each, context).access for each in presented)
         usable = (participant.access, *others) if participant.access else ()
         self.access: tuple[Access, ...] = tuple(filter(None, usable))
 

@@ -152,7 +152,7 @@ class Side:
         topic is only known from an example.
         """
         stated: dict[str, list[str]] = {}
-        for topic in self.among(topics.expression, limit):
+        for topic in self.topics_matching(topics.expression, limit):
             for enclave in self.exact[topic]:
                 if topic in self.of[enclave]:
                     stated.setdefault(enclave, []).append(topic)
@@ -170,7 +170,7 @@ class Side:
             for each in sorted(wild.union(stated))
         ]
 
-    def among(self, expression: str, limit: SearchLimit) -> Sequence[str]:
+    def topics_matching(self, expression: str, limit: SearchLimit) -> Sequence[str]:
         """Return the exact topics in rights of all enclaves that match an expression."""
         if expression not in self._found:
             limit.spend(len(self._wild))
@@ -283,7 +283,7 @@ class World:
         demanded: NameSet | None = None,
         needed: Sequence[tuple[bool, str]] = (),
         idle: Collection[str] = (),
-        lenders: Mapping[str, Sequence[str]] = MappingProxyType({}),
+        fitting_others: Mapping[str, Sequence[str]] = MappingProxyType({}),
         longest: int = LONGEST,
         crossing: Crossing | None = None,
     ) -> None:
@@ -297,18 +297,18 @@ class World:
         protection of all others is assumed; None if nothing is assumed.  ``needed`` are topics that
         every node has to write (True) and read (False).  ``idle`` are enclaves in which no process
         starts with their files as they are: they may do what their rights give, but are able to do
-        nothing.  ``lenders`` maps an enclave to others whose permissions it can use as well.  These
-        count for what it may do, but not for what it must be able to do.  ``crossing`` is what
-        passes between several Zenoh routers; None if all enclaves reach each other.
+        nothing.  ``fitting_others`` maps an enclave to others whose permissions it can use as well.
+        These count for what it may do, but not for what it must be able to do.  ``crossing`` is
+        what passes between several Zenoh routers; None if all enclaves reach each other.
         """
         self.title = title
         self.confirm_own = confirm
-        self.lenders = lenders
+        self.fitting_others = fitting_others
         self.own = access
-        self.stated = {name: self._with_lent(name, stated) for name in stated}
+        self.stated = {name: self._with_fitting(name, stated) for name in stated}
         self.longest = longest
         self.enclaves = tuple(sorted(access))
-        self._access = {name: self._with_lent(name, access) for name in access}
+        self._access = {name: self._with_fitting(name, access) for name in access}
         self.needed = tuple(needed)
         self.idle = frozenset(idle)
         self.crossing = crossing
@@ -319,9 +319,11 @@ class World:
         self._readers_of: dict[str, list[str]] = {}
         self._shared: dict[tuple[str, str], str | None] = {}
 
-    def _with_lent(self, name: str, access: Mapping[str, TopicAccess]) -> TopicAccess:
+    def _with_fitting(self, name: str, access: Mapping[str, TopicAccess]) -> TopicAccess:
         every = [
-            access[lender] for lender in (name, *self.lenders.get(name, ())) if lender in access
+            access[holder]
+            for holder in (name, *self.fitting_others.get(name, ()))
+            if holder in access
         ]
         if len(every) == 1:
             return every[0]
@@ -330,17 +332,17 @@ class World:
 
     def confirm(self, enclave: str, writes: bool, topic: str) -> bool:
         """Return whether an enclave may write (or else read) a topic, as the engine decides."""
-        able = (enclave, *self.lenders.get(enclave, ()))
+        able = (enclave, *self.fitting_others.get(enclave, ()))
         return any(self.confirm_own(name, writes, topic) for name in able)
 
-    def lender(self, enclave: str, writes: bool, topic: str) -> str:
+    def whose_permissions(self, enclave: str, writes: bool, topic: str) -> str:
         """Return another enclave whose permissions let ``enclave`` use a topic.
 
         "" if the enclave's own permissions are enough, or no others fit.
         """
-        if enclave not in self.lenders or self.confirm_own(enclave, writes, topic):
+        if enclave not in self.fitting_others or self.confirm_own(enclave, writes, topic):
             return ""
-        others = self.lenders[enclave]
+        others = self.fitting_others[enclave]
         return next((each for each in others if self.confirm_own(each, writes, topic)), "")
 
     def gives_as(self, other: World) -> bool:
@@ -350,7 +352,7 @@ class World:
             and self.stated == other.stated
             and (self._weak, self.demanded) == (other._weak, other.demanded)
             and self.own == other.own
-            and self.lenders == other.lenders
+            and self.fitting_others == other.fitting_others
             and [world.own for world in self.elsewhere] == [world.own for world in other.elsewhere]
             and self.crossing is other.crossing is None
         )
@@ -381,7 +383,7 @@ class World:
         known = {
             topic
             for side in (self._writers, self._readers)
-            for topic in side.among(topics.expression, limit)
+            for topic in side.topics_matching(topics.expression, limit)
             if topic in names
         }
         valid = valid_topics(topics.begin, topics.end)

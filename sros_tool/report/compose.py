@@ -218,7 +218,7 @@ def _picture(
     governance = next(
         (source.governance for source in reversed(sources) if source.governance), None
     )
-    sides = _sides(edges)
+    sides = _senders_and_receivers(edges)
     said = next((source.protections for source in reversed(sources) if source.protections), ())
     demanded = _Demanded(() if governance else said)
     names = sorted({(edge.kind, edge.name) for edge in edges})
@@ -249,15 +249,15 @@ def _picture(
     )
 
 
-def _sides(edges: Iterable[Edge]) -> Mapping[tuple[str, str], list[bool]]:
+def _senders_and_receivers(edges: Iterable[Edge]) -> Mapping[tuple[str, str], list[bool]]:
     """Map kind and name to two flags: some enclave may send, some enclave may receive."""
-    sides: dict[tuple[str, str], list[bool]] = defaultdict(lambda: [False, False])
+    allowed: dict[tuple[str, str], list[bool]] = defaultdict(lambda: [False, False])
     for edge in edges:
         if edge.qualifier is ALLOW:
             # Who publishes feedback serves an action, who subscribes to it is a client of it.
             sends = edge.sends != (edge.kind == "actions" and edge.right in _ONE_WAY)
-            sides[edge.kind, edge.name][0 if sends else 1] = True
-    return sides
+            allowed[edge.kind, edge.name][0 if sends else 1] = True
+    return allowed
 
 
 def _lack(protection: Protection, sends: bool, receives: bool) -> Lack:

@@ -246,13 +246,16 @@ def _scene(
         everybody[edge.kind, edge.name].add(owner(edge.enclave))
     draft = _Draft(picture, edges, owner, members, everybody)
     scene = draft.placed(name, title) if placed else draft.scene(name, title)
-    shown = _real({(edge.kind, edge.name) for edge in edges}, drawn_as or {})
-    hidden = _real({(name.kind, name.name) for name in picture.names}, drawn_as or {}) - shown
+    shown = _count_real_names({(edge.kind, edge.name) for edge in edges}, drawn_as or {})
+    hidden = (
+        _count_real_names({(name.kind, name.name) for name in picture.names}, drawn_as or {})
+        - shown
+    )
     return replace(scene, hidden=hidden, shown=shown)
 
 
-def _real(names: Iterable[tuple[str, str]], drawn_as: DrawnAs) -> int:
-    """Return the number of distinct real names behind drawn names."""
+def _count_real_names(names: Iterable[tuple[str, str]], drawn_as: DrawnAs) -> int:
+    """Return the number of distinct real names that drawn names stand for."""
     return len(
         {(kind, real) for kind, name in names for real in drawn_as.get((kind, name), (name,))}
     )

@@ -107,7 +107,7 @@ def graph_rules(
     tokens = _Tokens(enclave, domain, known if known or offering else [_ANY_NODE])
     allowed, denied = tokens.of(rights)
     # A node of ``nodes`` stays, unless the denial is needed for others.
-    denied += tokens.of_every_kind(
+    denied += tokens.of_nodes_and_endpoints(
         [each for each in without if any(map(each.meets, left)) or not any(map(each.meets, nodes))]
     )
     everything = f"{GRAPH}/{domain}/{ANY_CHUNKS}"
@@ -158,7 +158,7 @@ class _Tokens:
             ]
         return tuple(allowed), tuple(denied)
 
-    def of_every_kind(self, nodes: Sequence[NodeName]) -> tuple[str, ...]:
+    def of_nodes_and_endpoints(self, nodes: Sequence[NodeName]) -> tuple[str, ...]:
         """Return key expressions for nodes, and for all endpoints that these nodes could have."""
         named = (
             # "$*" may stand for nothing: "/*" must not become the namespace "/", too.

@@ -118,8 +118,8 @@ def publication(way: Route, key: str, subscribed: str = "") -> Delivery:
     wanted = back[:-1] if "*" in key and way[1].mode is Mode.ROUTER else back
     return Delivery(
         (
-            *_crossing(wanted, Message.DECLARE_SUBSCRIBER, subscribed or key),
-            *_crossing(way, Message.PUT, key),
+            *_checks_on_route(wanted, Message.DECLARE_SUBSCRIBER, subscribed or key),
+            *_checks_on_route(way, Message.PUT, key),
         )
     )
 
@@ -135,10 +135,10 @@ def call(way: Route, key: str, served: str = "", replied: str = "") -> Delivery:
     offered = back[:-1] if way[1].mode is Mode.ROUTER else back
     return Delivery(
         (
-            *_crossing(offered, Message.DECLARE_QUERYABLE, served or key),
-            *_crossing(way, Message.QUERY, key),
+            *_checks_on_route(offered, Message.DECLARE_QUERYABLE, served or key),
+            *_checks_on_route(way, Message.QUERY, key),
         ),
-        tuple(_crossing(back, Message.REPLY, replied or key)),
+        tuple(_checks_on_route(back, Message.REPLY, replied or key)),
     )
 
 
@@ -153,13 +153,13 @@ def token(
     asking = way[:-3:-1] if way[-2].mode is Mode.ROUTER else ()
     return Delivery(
         (
-            *_crossing(asking, message, asked),
-            *_crossing(way, Message.LIVELINESS_TOKEN, key),
+            *_checks_on_route(asking, message, asked),
+            *_checks_on_route(way, Message.LIVELINESS_TOKEN, key),
         )
     )
 
 
-def _crossing(way: Sequence[ZenohProcess], message: Message, key: str) -> Iterator[Check]:
+def _checks_on_route(way: Sequence[ZenohProcess], message: Message, key: str) -> Iterator[Check]:
     """Yield the checks that a message has to pass on all links of a route."""
     for sender, receiver in pairwise(way):
         for enforcer, remote, flow in (

@@ -538,7 +538,7 @@ def _check_size(section: _Section, enforcement: Enforcement) -> None:
     if meant > _MOST_MEANT:
         raise UnreadConfigurationError(
             f"the access control of '{section.name}' is too large",
-            f"Its subjects and policies stand for {meant:.0e} rules; sros reads at most "
+            f"Its subjects and policies combine to {meant:.0e} rules; sros reads at most "
             f"{_MOST_MEANT:.0e}.",
         )
 

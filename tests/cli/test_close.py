@@ -317,7 +317,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     robot.close()
     ended = robot.close("--apply", status=1)
     assert robot.restarts == []
-    assert "stop process 4711, and start it by:\n  cd /opt && sros run " in ended.out
+    assert "stop process 4711, and start it with:\n  cd /opt && sros run " in ended.out
     assert ended.err.endswith("next: these commands, and then sros close robot --proof\n")
     assert (
         "no: every process runs in its enclave: no secured process of /listener, /talker; "
@@ -332,7 +332,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     assert "/talker: process 4711, known by its process id: closed\n" in ended.out
     assert "the robot runs closed, except for /listener (open), its files are valid" in ended.err
     assert "; next: start them by the commands in robot/start/commands.txt, and ask" in ended.err
-    assert "start it by" in (said := robot.close("--apply", status=1).out)
+    assert "start it with" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
     robot.by_hand = {"/talker", "/listener"}
     said = robot.close().err.splitlines()[-1]
@@ -386,7 +386,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     )
     (robot.folder / "robot/requirements.toml").unlink()
     ended = robot.close()
-    assert "  /late: new, start it by: sros run " in ended.out
+    assert "  /late: new, start it with: sros run " in ended.out
     assert "closed, except for /late (not running), its files" in ended.err
     export = robot.folder / "robot/export"
     environment = secured_environment(export, "/late", 0)
@@ -734,7 +734,7 @@ def test_containers_are_started_with_the_files_of_their_enclaves(robot: Robot) -
     assert services["listener"]["volumes"][0]["source"] == f"{place}/export/enclaves/listener"
     up = f"docker compose -f compose.yaml -f {place}/start/compose.yaml up -d"
     said = robot.close("--apply", status=1).out
-    assert f"stop the containers of /listener and /talker, and start it by:\n  {up}\n" in said
+    assert f"stop the containers of /listener and /talker, and start it with:\n  {up}\n" in said
     robot.by_hand = set(PID)
     assert robot.close("--undo", status=1).out == "restart it open: docker compose up -d\n"
 
@@ -805,7 +805,7 @@ def test_a_process_that_was_launched_is_launched_secured(tmp_path: Path, robot: 
         f"{place}/export {place}/policy.xml my_robot all.py 'a:=b c'\n"
     )
     said = robot.close("--apply", status=1).out
-    assert f"stop the launch of /listener and /talker, and start it by:\n  {command}" in said
+    assert f"stop the launch of /listener and /talker, and start it with:\n  {command}" in said
     assert f"\n# /listener, /talker\n{command}" in (place / "start/commands.txt").read_text()
     robot.by_hand = set(PID)
     undone = robot.close("--undo", status=1).out

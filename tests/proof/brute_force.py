@@ -80,15 +80,18 @@ class Finite:
     def lending(self) -> Finite:
         """The world of a vendor that takes the permissions of ``/a/b`` for those of ``/a``, too."""
 
-        def lent(enclave: str, of: Callable[[str], frozenset[str]]) -> frozenset[str]:
+        def with_fitting(enclave: str, of: Callable[[str], frozenset[str]]) -> frozenset[str]:
             parts = set(enclave.split("/"))
-            lenders = (each for each in self.writes if parts <= set(each.split("/")))
-            return frozenset().union(*map(of, lenders))
+            fitting = (each for each in self.writes if parts <= set(each.split("/")))
+            return frozenset().union(*map(of, fitting))
 
         return Finite(
-            {each: lent(each, self.writes.__getitem__) for each in self.writes},
-            {each: lent(each, self.reads.__getitem__) for each in self.writes},
-            {(e, side): lent(e, lambda of: self.stated[of, side]) for e, side in self.stated},  # noqa: B023
+            {each: with_fitting(each, self.writes.__getitem__) for each in self.writes},
+            {each: with_fitting(each, self.reads.__getitem__) for each in self.writes},
+            {
+                (e, side): with_fitting(e, lambda of: self.stated[of, side])  # noqa: B023
+                for e, side in self.stated
+            },
             self.level,
             self,
         )

@@ -446,10 +446,10 @@ class Side:
             return False
         return any(
             self._by_permissions(vendor, each, domain, verb, topic)
-            for each in (enclave, *self._lenders(vendor, enclave))
+            for each in (enclave, *self._fitting_others(vendor, enclave))
         )
 
-    def _lenders(self, vendor: Vendor, enclave: str) -> Iterator[str]:
+    def _fitting_others(self, vendor: Vendor, enclave: str) -> Iterator[str]:
         """The enclaves whose permissions Cyclone DDS takes for those of another one."""
         if vendor in CYCLONE_DDS and not self._is_unique(enclave):
             parts = set(enclave.split("/"))

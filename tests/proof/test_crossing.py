@@ -70,7 +70,7 @@ def without_settings(keystore: Path, _: Path) -> None:
         (
             settings('enclaves = ["/r1/*"]', 'enclaves = ["/r1/router"]'),
             1,
-            "router of /r1/base /r1/router, where /fleet/* crosses -> /router: /",
+            "router of /r1/base /r1/router, which passes on /fleet/* -> /router: /",
         ),
         (
             settings('enclaves = ["/r1/*"]', 'enclaves = ["/r1/*"]\ncrossing = ["/fleet/state"]'),
@@ -157,7 +157,7 @@ def test_a_review_compares_what_crosses(routed: Path, tmp_path: Path) -> None:
 
 
 def test_a_policy_says_nothing_of_crossing_and_that_is_said(routed: Path) -> None:
-    said = "what BASE lets cross between Zenoh routers"
+    said = "what BASE lets pass between Zenoh routers"
     assert said in no_new_access(routed, "narrow", "robot.xml")[1]
     assert said not in no_new_access(routed, "wide", "robot.xml")[1]
 
@@ -174,7 +174,7 @@ crossing = ["/fleet/*"]
         (FLEET, 0, ""),
         (FLEET.replace("/fleet/*", "/fleet/state"), 0, "- more protection: crossing of router"),
         (FLEET.replace("/fleet/*", "/r1/*"), 1, "crossing of router /r1/router /fleet/* -> /r1/*"),
-        ("[robots.r1]\n", 1, "router of /r1/base /r1/router, where /fleet/* crosses -> /router"),
+        ("[robots.r1]\n", 1, "router of /r1/base /r1/router, which passes on /fleet/* -> /router"),
     ],
 )
 def test_what_crosses_by_a_fleet_file_is_compared(

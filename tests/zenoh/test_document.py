@@ -198,7 +198,7 @@ def test_what_is_accepted_with_access_control_opens() -> None:
 def test_a_short_file_that_means_too_much() -> None:
     many = [str(each) for each in range(1, 4000)]
     subject = {"id": "s", "cert_common_names": many, "usernames": many}
-    with pytest.raises(DocumentError, match=r"stand for .* rules; sros reads at most"):
+    with pytest.raises(DocumentError, match=r"combine to .* rules; sros reads at most"):
         read(control(subjects=[subject]))
 
 

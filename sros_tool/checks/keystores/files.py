@@ -406,13 +406,13 @@ class _Links:
     def __init__(self, root: str) -> None:
         self._real_root = os.path.realpath(root)
         self._folders: dict[str, str] = {}
-        self._ends: dict[str, str] = {}
+        self._link_targets: dict[str, str] = {}
 
     def check(self, link: str) -> Iterator[Finding]:
         """Yield findings about one link."""
         target = os.readlink(link)  # noqa: PTH115 - a Path of each of very many takes long
         end = os.path.normpath(os.path.join(link.rpartition(os.sep)[0], target))
-        real = self._ends.get(end)
+        real = self._link_targets.get(end)
         if real is None and not Path(link).exists():
             # `check_enclave` reports a missing file that an enclave needs.
             path = Path(link)
@@ -422,12 +422,12 @@ class _Links:
         if target.startswith(os.sep):
             yield LINK_ABSOLUTE.found(link, f"it leads to '{target}'", link)
         if real is None:
-            real = self._end_of(link, end)
+            real = self._link_target(link, end)
         if real != self._real_root and not real.startswith(self._real_root + os.sep):
             yield LINK_OUTSIDE.found(link, f"it leads to '{real}'", link)
 
-    def _end_of(self, link: str, end: str) -> str:
-        """Return the real path of a link's target ``end``, and cache it for files.
+    def _link_target(self, link: str, end: str) -> str:
+        """Return the real path of the target ``end`` of a link, and cache it for files.
 
         The folder of ``link`` contains no link, so ".." in the path can be removed first.
         """
@@ -436,8 +436,8 @@ class _Links:
         parent, name = os.path.split(end)
         if parent not in self._folders:
             self._folders[parent] = os.path.realpath(parent)
-        self._ends[end] = f"{self._folders[parent]}/{name}"
-        return self._ends[end]
+        self._link_targets[end] = f"{self._folders[parent]}/{name}"
+        return self._link_targets[end]
 
 
 def _holds_key(keystore: CheckedKeystore, path: str, info: os.stat_result) -> bool:

@@ -51,7 +51,7 @@ def also_fitting(
             for attribute in _SEPARATORS.split(subject.strip())
         }:
             having.setdefault(part, set()).add(name)
-    lenders = {}
+    fitting_others = {}
     for name, subject in certified.items():
         own = certified_text(traits, subject)
         several = [having.get(plain(part), set()) for part in _SEPARATORS.split(own) if part]
@@ -62,8 +62,8 @@ def also_fitting(
             if any(same_subject(traits.subjects, one.strip(), own) for one in granted[each])
         )
         if others:
-            lenders[name] = others
-    return lenders
+            fitting_others[name] = others
+    return fitting_others
 
 
 def certified_text(traits: VendorTraits, subject: str) -> str:

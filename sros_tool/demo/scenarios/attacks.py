@@ -575,7 +575,7 @@ _RIGHTS_ROWS: tuple[Row, ...] = (
             Identity(Undefended(template=forger.open_default), "newcomer"),
             RowStatus.HEARD,
             "an enclave without a policy may do everything",
-            removed="the template's denial by default",
+            removed="the template's rule to deny by default",
         ),
     ),
 )
@@ -662,7 +662,7 @@ _IDENTITY_ROWS: tuple[Row, ...] = (
         _succeeds(
             "identity of another CA, to a listener of that CA",
             Identity(FOREIGN, "talker"),
-            "a different CA",
+            "the wrong CA",
         ),
     ),
     *tries(

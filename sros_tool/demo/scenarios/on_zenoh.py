@@ -407,7 +407,7 @@ _CONNECTION_ROWS = (
         _let_in(
             "a certificate of another CA, which is trusted",
             zenoh_forger.both_cas_trusted,
-            "a different CA",
+            "the wrong CA",
         ),
     ),
     *tries(
@@ -607,7 +607,7 @@ def _trespasses() -> tuple[Row, ...]:
                 "the rules allow it",
                 zenoh_forger.guest_may_use_the_topic,
                 "rule added",
-                "the missing rule",
+                "the denial",
             ),
         )
     return tuple(rows)
@@ -692,22 +692,22 @@ _ROUTERS = _scenario(
     _attempt(
         "talker to listener at another router",
         RowStatus.HEARD,
-        "both routers allow a name to which both enclaves have rights, if the name may cross",
+        "both routers pass on a name that --cross allows and to which both enclaves have rights",
         hears("listener", "talker"),
         _far_pair(zenoh_forger.far_router),
     ),
     _attempt(
-        "talker to listener at the same router, the topic may not cross",
+        "talker to listener at the same router, --cross excludes the topic",
         RowStatus.HEARD,
-        "the limit on crossing concerns only other routers",
+        "--cross limits only what passes between routers",
         hears("listener", _NEAR.name),
         _NOT_CROSSING,
         world="not crossing",
     ),
     _attempt(
-        "talker to listener at another router, the topic may not cross",
+        "talker to listener at another router, --cross excludes the topic",
         RowStatus.NOT_HEARD,
-        "a router allows another router only names that may cross",
+        "a router passes on to another router only the names of --cross",
         hears("listener", "talker"),
         _NOT_CROSSING,
         (hears("listener", _NEAR.name),),
@@ -779,7 +779,7 @@ _WILDCARD_ROWS = (
                 party,
                 denied,
                 "a rule applies to a wildcard only if it covers all of it, and sros writes no"
-                " denials inside wildcards",
+                " deny rules inside wildcards",
                 OWN,
                 _PEERS,
             ),
@@ -797,7 +797,7 @@ _WILDCARD_ROWS = (
                 "a denial of the name applies only to the name, not to a wider expression",
                 zenoh_forger.denial_in_a_wildcard,
                 "denial in a wildcard",
-                "exact permission",
+                "an exact list of the allowed names",
             ),
         )
     ),
@@ -1070,7 +1070,7 @@ _OPEN_ROWS = (
             (*_topic_pair(), _attacker("guest that looks around", Role.OBSERVER, OWN)),
             world=_PEERS,
         ),
-        "a node of rmw_zenoh needs the whole graph, or it sees nothing",
+        "a node of rmw_zenoh asks for the whole graph: a denied node would see none of it",
         "give an identity only to those who may see all names of the robot",
     ),
 )

@@ -190,7 +190,7 @@ def collect(
         inbox: the folder with a folder for each robot.
         now: the present time.
         restored: robots whose disk was restored, so that one lower sequence number is accepted.
-        allow_refusal: vendors whose nodes may stop to work by the renewal.
+        allow_refusal: vendors whose nodes may stop working by the renewal.
         keyring: opens the keys of the CAs.
         dry_run: change nothing.
 
@@ -611,7 +611,7 @@ class _Renewals:
                 if request.name in names:
                     raise _RefusedError("the message has another request for this enclave")
                 names.add(request.name)
-                outcome, why = self._judge(robot, message, request)
+                outcome, why = self._decide_request(robot, message, request)
             except SrosError as error:
                 outcome, why = "refused", error.what
             result = result._replace(outcome=outcome, why=why)
@@ -623,8 +623,10 @@ class _Renewals:
                 judged.append(_Judged(result))
         return judged
 
-    def _judge(self, robot: Robot, message: _Verified, request: SigningRequest) -> tuple[str, str]:
-        """Return the outcome of a request, and why; "renewed" means that it may be signed.
+    def _decide_request(
+        self, robot: Robot, message: _Verified, request: SigningRequest
+    ) -> tuple[str, str]:
+        """Return the outcome of a request, and why; it has to be signed if this is "renewed".
 
         Raises:
             SrosError: it must not be signed.

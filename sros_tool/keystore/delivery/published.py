@@ -1,6 +1,7 @@
 """What was published last for a fleet, as the keystore records it in ``published.json``.
 
-The file saves work and keeps versions rising; what robots trust never rests on it.
+The file saves work, and has the last version numbers, so that the next ones are higher.  Robots
+never rely on it.
 """
 
 from __future__ import annotations

@@ -438,7 +438,7 @@ def import_answer(
         pinned: SHA-256 of permissions CAs; if not empty, one of these CAs must have signed the
             answer, also with ``force``.
         force: accept an answer that is older than the present files, or comes from other CAs.
-        allow_refusal: vendors whose nodes of the enclave may stop to work.
+        allow_refusal: vendors whose nodes of the enclave may stop working.
 
     Raises:
         DocumentError: ``data`` is not an answer.

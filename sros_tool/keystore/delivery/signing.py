@@ -139,7 +139,7 @@ def sign_request(
         answer: the path for the answer, which is written after the keystore has changed.
         force: replace ``answer`` if it exists.
         domain: the ROS domain that the keystore has to be for.
-        allow_refusal: vendors whose nodes may stop to work.
+        allow_refusal: vendors whose nodes may stop working.
 
     Raises:
         PkiError: the request is not valid.
@@ -151,7 +151,7 @@ def sign_request(
     """
     request = load_request(data, "that was given")
     if only:
-        _check_asked([request], only)
+        _check_requested_enclaves([request], only)
     name = check_enclave_name(request.name)
     stated = _stated(policy, [name])
     if answer is not None:
@@ -244,7 +244,7 @@ def certify_requests(
             "the input has no signing request", "", "Give the request.pem files of enclaves."
         )
     if only:
-        _check_asked(requests, only)
+        _check_requested_enclaves(requests, only)
     _check_distinct(requests)
     stated = _stated(policy, [check_enclave_name(request.name) for request in requests])
     change = KeystoreChange(
@@ -281,7 +281,7 @@ def _split_requests(data: bytes) -> list[bytes]:
     return [part + _END + b"\n" for part in parts] + ([rest] if rest.strip() else [])
 
 
-def _check_asked(requests: Sequence[SigningRequest], only: Sequence[str]) -> None:
+def _check_requested_enclaves(requests: Sequence[SigningRequest], only: Sequence[str]) -> None:
     """Raise `KeystoreError` unless the requests are for the enclaves ``only``, in this order."""
     if len(requests) != len(only):
         raise KeystoreError(

@@ -148,7 +148,7 @@ class KeystoreChange:
             root: the keystore.
             now: the time of the change.
             keyring: opens the keys of the CAs.
-            allow_refusal: vendors whose nodes may stop to work.
+            allow_refusal: vendors whose nodes may stop working.
             dry_run: change nothing.
             fresh: the keystore does not exist yet.
         """
@@ -516,7 +516,7 @@ class KeystoreChange:
         ``aim`` says for error messages why the change needs a revocation list, such as ``revoke``.
 
         Raises:
-            KeystoreError: nodes of a vendor would stop to work.
+            KeystoreError: nodes of a vendor would stop working.
         """
         if self.is_guess:
             text = (

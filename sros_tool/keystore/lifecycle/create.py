@@ -223,7 +223,7 @@ def create_permission(
 
     Whoever kept the replaced permissions can use them until they expire.  ``revoke_old`` prevents
     that: the enclaves get new certificates for the same keys, and all earlier certificates are
-    revoked.  The nodes of the vendors in ``allow_refusal`` may stop to work.
+    revoked.  The nodes of the vendors in ``allow_refusal`` may stop working.
     """
     for name in names:
         check_enclave_name(name)

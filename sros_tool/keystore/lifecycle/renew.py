@@ -64,7 +64,7 @@ def renew(
     replaced at once.  Whoever has the key can use a replaced certificate until it expires or is
     revoked; ``revoke_old`` revokes all earlier certificates of the renewed enclaves, and gives them
     subjects that no earlier permissions fit.  The nodes of the vendors in ``allow_refusal`` may
-    stop to work.
+    stop working.
 
     Raises:
         KeystoreError: enclaves cannot be renewed (the error names all of them), or vendors would

@@ -139,7 +139,7 @@ def rotate_ca(
     begins.  ``keyring`` opens the present keys; ``new_keys`` names the places of new keys outside
     of the keystore.  In a keystore with a fleet, a stage that cuts off robots, because they have
     not confirmed the stage before, needs ``allow_unconfirmed``.  The nodes of the vendors in
-    ``allow_refusal`` may stop to work.
+    ``allow_refusal`` may stop working.
 
     Raises:
         KeystoreError: a key is missing, an enclave cannot be moved to the new CA, robots would be

@@ -266,7 +266,7 @@ def update_keystore(
         allow_looser: accept settings that allow more than before.
         revoke_old: issue all certificates again, with subjects that no earlier permissions fit, and
             revoke all earlier certificates.
-        allow_refusal: vendors whose nodes may stop to work.
+        allow_refusal: vendors whose nodes may stop working.
         replace_edits: accept that ``target`` replaces edits by hand in the settings or the
             governance, because it contains or undoes them.
         seen: the settings that ``target`` was made from.
