@@ -429,7 +429,7 @@ _KNOWN_BY: dict[str, Callable[[Process, ObservedNode, Mapping[str, int]], bool]]
 
 
 def _process_ids_of_cyclone(pids: Sequence[int], domain: int) -> Mapping[str, int]:
-    """Return the process ids that participants of Cyclone DDS say; none if it cannot be loaded."""
+    """Return process ids as Cyclone DDS participants state them; none if it cannot be loaded."""
     if not pids:
         return {}
     asking = [sys.executable, "-P", "-m", "sros_tool.runtime.cyclone", f"{domain}", *map(str, pids)]
@@ -1229,7 +1229,7 @@ def _text(lines: Iterable[str]) -> str:
 def _lost_endpoints(
     before: Observation, now: Observation, denied: Iterable[DeniedRight]
 ) -> list[str]:
-    """Return what nodes did before, are not ``denied``, and do not do now, as text."""
+    """Return the endpoints, as text, that nodes had before and lack now, unless ``denied``."""
     expected = {*_endpoints(before.nodes)} - {
         f"{node} {way} {topic}"
         for right in denied

@@ -132,7 +132,7 @@ def loadable_environment(
     if not with_zenoh:
         vendor = vendor_of(used) if target else shipped_vendor(used, environment)
         state = _check_joining(name, folder, state, vendor, JoinContext(domain, now, zone))
-    problems = state.problems_at_home if target else state.problems
+    problems = state.problems_in_keystore if target else state.problems
     if problems:
         raise KeystoreError(
             f"a process cannot run in enclave {name}",
@@ -608,7 +608,7 @@ def _check_mounted(root: Path, enclave: str, target: Path) -> None:
             "The container would get the private keys of all these enclaves.",
             f"Export this enclave alone, {export}, and name DIR as the keystore.",
         )
-    if open_keystore(root).is_home and target == root.absolute():
+    if open_keystore(root).is_original and target == root.absolute():
         raise KeystoreError(
             f"a container cannot use '{target}' itself",
             "Some files of an enclave are links to other files of the keystore, which the "

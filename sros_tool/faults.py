@@ -26,7 +26,7 @@ REPLACE = (
     "Replace the file: `rm {path} && sros create_enclave {root} {enclave}` links the keystore's "
     "file, or issues the file again."
 )
-AT_HOME = "keystore that has the CA keys"
+ORIGINAL_KEYSTORE = "keystore that has the CA keys"
 """How the remedies for an export name the keystore that issued it."""
 
 _IN_EXPORT = {
@@ -436,12 +436,12 @@ class Fault(Enum):
         """Return the remedy for this fault in ``file`` of an export, which has no CA keys."""
         text = self.remedy_in(file)
         if self is Fault.GOVERNANCE_DOMAIN:
-            return text.replace("To add a domain", f"To add a domain in the {AT_HOME}")
+            return text.replace("To add a domain", f"To add a domain in the {ORIGINAL_KEYSTORE}")
         if "`" not in text:
             return text
         if text in _IN_EXPORT:
             return _IN_EXPORT[text]
-        return f"In the {AT_HOME}: {text} Then export the enclave again."
+        return f"In the {ORIGINAL_KEYSTORE}: {text} Then export the enclave again."
 
 
 FAULTS = {fault.id: fault for fault in Fault}

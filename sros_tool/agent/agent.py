@@ -321,7 +321,7 @@ class _Round:
                 self._folder,
                 release,
                 settings.robot,
-                now=self._certain_with(release, certain),
+                now=self._time_to_be_valid_at(release, certain),
                 installed=state.accepted,
                 pinned=frozenset(settings.authorities),
                 new_keys=keys,
@@ -354,7 +354,7 @@ class _Round:
         _drop_installed_keys(self._folder, keys)
         return installation
 
-    def _certain_with(self, release: Release, certain: datetime) -> datetime:
+    def _time_to_be_valid_at(self, release: Release, certain: datetime) -> datetime:
         """Return the time at which a release has to be valid.
 
         If documents have proven that the clock is behind, the keystore's clock counts, by which the
@@ -375,7 +375,7 @@ class _Round:
         return False
 
     def _record_due(self, names: Sequence[str]) -> None:
-        """Record restarts before the change: who is killed in between looks once too often."""
+        """Record restarts before the change, so that the agent knows them if it is killed."""
         self._state = replace(self._state, due=tuple(sorted({*self._state.due, *names})))
         self._save()
 
@@ -632,7 +632,7 @@ def _expiry(enclave: _Opened | None) -> EnclaveExpiry:
 
 
 def _short(problems: Iterable[str]) -> tuple[str, ...]:
-    """Return problems as a confirmation can have them."""
+    """Return problems in the form of a confirmation: not too long, and not too many."""
     texts = []
     for problem in dict.fromkeys(problems):
         text = "".join(each if each.isprintable() else "?" for each in problem)

@@ -494,7 +494,7 @@ def _had_certificate(folder: Folder, name: str) -> bool:
 
 
 def _apply(folder: Path, changes: Mapping[str, _Change]) -> dict[str, str]:
-    """Make all changes at once; if that fails, those of each enclave, whole or not at all.
+    """Make all changes at once; if that fails, change each enclave by itself, whole or not at all.
 
     Return the enclaves that could not be changed, and why.
 

@@ -279,7 +279,7 @@ def _of_enclaves(keystore: Keystore, lifetimes: Iterable[Lifetime]) -> Iterator[
     for lifetime in lifetimes:
         yield Expiry("certificate", lifetime.name, lifetime.certificate.not_after)
         yield Expiry("permissions", lifetime.name, lifetime.permissions.not_after)
-        if not keystore.is_home:
+        if not keystore.is_original:
             yield from _exported(keystore, lifetime.name)
 
 

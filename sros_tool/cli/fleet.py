@@ -333,7 +333,7 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
             alike.setdefault(_DURATION.sub("", unnamed), {})[robot.robot] = unnamed
     names = [robot.robot for robot in collected.robots]
     for texts in alike.values():
-        yield f"{_runs(texts, names)}: {_joined(texts)}"
+        yield f"{_robot_names(texts, names)}: {_joined(texts)}"
     for name, request in sorted(
         requests, key=lambda request: REQUEST_OUTCOMES.index(request[1].outcome)
     ):
@@ -773,7 +773,7 @@ def _rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str,
         return
     yield "robot", "state", "confirmed", "to do", "what"
     for group in groups:
-        names = _runs(group.names, compared.status.names, compared.status.groups)
+        names = _robot_names(group.names, compared.status.names, compared.status.groups)
         age = _age(group.confirmed(compared.at), compared.at)
         yield names, _word(group.state), age, group.to_do, group.what
 
@@ -786,7 +786,7 @@ def _page_rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple
 
     for group in _groups(compared, robots):
         status, most = compared.status, len(group.robots)
-        names = _runs(group.names, status.names, status.groups, most)
+        names = _robot_names(group.names, status.names, status.groups, most)
         received = group.confirmed(compared.at).received
         expiry = [moment for robot in group.robots for moment in robot.expiry.values()]
         yield (
@@ -809,7 +809,7 @@ _UNITS = {"d": 86400, "h": 3600, "min": 60, "s": 1}
 
 
 def _joined(texts: Mapping[str, str]) -> str:
-    """Return the texts of robots that differ only in durations, such as "2 min to 5 min behind".
+    """Join texts of robots that differ only in durations, such as "2 min to 5 min behind".
 
     The text of a single robot has its name in place of `_ROBOT`.
     """
@@ -847,13 +847,13 @@ def _places(robots: Iterable[str]) -> dict[str, int]:
     return {name: place for place, name in enumerate(sorted(robots, key=_natural))}
 
 
-def _runs(
+def _robot_names(
     names: Iterable[str],
     everybody: Iterable[str],
     groups: Mapping[str, Sequence[str]] = MappingProxyType({}),
     most: int = _MOST_GROUPS,
 ) -> str:
-    """Return at most ``most`` names of robots, those of a whole group as "pickers (all 40)".
+    """Return at most ``most`` names of robots; a whole group becomes "pickers (all 40)".
 
     Many neighbors in the fleet, with names that differ in a number, become "r4 to r50".
     """
@@ -893,7 +893,7 @@ def _dds_counts(compared: ComparedFleet) -> Iterator[str]:
     """Yield the robots with an outdated DDS, or the number of findings on the DDS of robots."""
     status, outdated = compared.status, compared.outdated_dds
     if outdated:
-        robots = _runs(outdated, status.names, status.groups)
+        robots = _robot_names(outdated, status.names, status.groups)
         only = "the exit status is 1 only for a DDS" if status.complete else "a DDS"
         yield (
             f"{only} to upgrade, for known vulnerabilities: {robots}; "

@@ -309,7 +309,7 @@ def _show(
         result,
         shown,
         _created_lines(result),
-        told=_told_of(result, as_json),
+        told=_hints(result, as_json),
         after=filter(None, lasting),
     )
     if findings and not as_json:
@@ -330,7 +330,7 @@ def _created_lines(result: Creation) -> Iterator[str]:
         yield from enclave_lines(names, text)
 
 
-def _told_of(result: Creation, as_json: bool) -> Iterator[str]:
+def _hints(result: Creation, as_json: bool) -> Iterator[str]:
     """Yield hints for standard error: how enclaves get to robots, and unchanged enclaves."""
     from sros_tool.keystore.fleet import publish_command
     from sros_tool.keystore.layout import FLEET

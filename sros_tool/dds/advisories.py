@@ -1,4 +1,4 @@
-"""Known DDS vulnerabilities products, as advisories in the OSV format.
+"""Known vulnerabilities of DDS products, as advisories in the OSV format.
 
 The advisories that ship with sros are in ``advisories.json`` next to this module: what the history
 of eProsima/Fast-DDS says of each release line of Fast DDS (as of 2026-08-20).  An event ``fixed``

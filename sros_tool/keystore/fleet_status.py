@@ -268,7 +268,7 @@ class RobotStatus:
 
     @property
     def settled(self) -> bool:
-        """Whether nothing is to be done with the robot: it has what it should, or nothing to have.
+        """Whether nothing is to be done: the robot's files are current, or it has no enclaves.
 
         All enclaves of a revoked robot are gone: the others need the revocation list.
         """
@@ -402,7 +402,7 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
         statuses = tuple(status.without_list() for status in statuses)
     return FleetStatus(
         root,
-        stages.at_home,
+        stages.of_keystore,
         statuses,
         unassigned,
         older=older,
@@ -419,7 +419,7 @@ class _Difference(NamedTuple):
     """A confirmed file that differs from the keystore.
 
     ``confirmed`` is the SHA-256 of the robot's file, "" if the robot has none; ``certificates`` are
-    the SHA-256 of the certificates in the robot's file.  ``at_home`` says whether an export has a
+    the SHA-256 of the certificates in the robot's file.  ``exported`` says whether an export has a
     file at this path; None: the file in the keystore cannot be read.  ``own`` says whether the path
     belongs to an enclave of the robot.
     """
@@ -427,7 +427,7 @@ class _Difference(NamedTuple):
     path: str
     confirmed: str
     certificates: tuple[str, ...]
-    at_home: bool | None
+    exported: bool | None
     own: bool
 
 
@@ -475,13 +475,15 @@ def _compare_robots(root: Path, fleet: Fleet, robots: Sequence[Robot]) -> list[_
 
     def work(part: Sequence[Robot]) -> list[_ComparedRobot]:
         with Folder(root) as folder:
-            at_home = _Home(root, folder)
-            return [_compare(root, fleet, robot, at_home) for robot in part]
+            files = _KeystoreFiles(root, folder)
+            return [_compare(root, fleet, robot, files) for robot in part]
 
     return [compared for _, part in map_slices(robots, work) for compared in part]
 
 
-def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _ComparedRobot:
+def _compare(
+    root: Path, fleet: Fleet, robot: Robot, keystore_files: _KeystoreFiles
+) -> _ComparedRobot:
     enclaves = enclaves_of_robot(root, fleet, robot)
     notes: list[str] = []
     received = None
@@ -499,7 +501,7 @@ def _compare(root: Path, fleet: Fleet, robot: Robot, at_home: _Home) -> _Compare
     expiring: dict[str, set[str]] = {kind: set() for kind in _EXPIRING}
     left = set(confirmed.files)
     for name in enclaves:
-        for path, file in at_home.files_of(name).items():
+        for path, file in keystore_files.files_of(name).items():
             left.discard(path)
             sha256, kind = confirmed.files.get(path, ""), _kind_of(path)
             if file and sha256 == file.sha256:
@@ -539,27 +541,27 @@ def _notes_on_clock(received: Received) -> Iterator[str]:
         yield "its clock is earlier than documents that it has verified"
 
 
-class _FileAtHome(NamedTuple):
+class _KeystoreFile(NamedTuple):
     sha256: str
     certificates: tuple[str, ...]
 
 
-class _Home:
+class _KeystoreFiles:
     """Reader of the digests of enclave files in a keystore; shared files are read once."""
 
     def __init__(self, root: Path, folder: Folder) -> None:
         self._root = root
         self._folder = folder
-        self._shared: dict[tuple[str, str], _FileAtHome | None] = {}
+        self._shared: dict[tuple[str, str], _KeystoreFile | None] = {}
 
-    def files_of(self, name: str) -> Mapping[str, _FileAtHome | None]:
+    def files_of(self, name: str) -> Mapping[str, _KeystoreFile | None]:
         """Map the paths of an enclave's exported files, without the key, to their digests.
 
         A path maps to None if its file cannot be read, or is missing although every export needs
         it.
         """
         folder = enclave_folder(name)
-        files: dict[str, _FileAtHome | None] = dict.fromkeys(
+        files: dict[str, _KeystoreFile | None] = dict.fromkeys(
             f"{folder}/{file}" for file in REQUIRED_FILES if file != KEY_FILE
         )
         up = "../" * folder.count("/")
@@ -570,7 +572,7 @@ class _Home:
                     files[path] = self._linked(path, up) if entry.is_symlink() else self._file(path)
         return files
 
-    def _linked(self, path: str, up: str) -> _FileAtHome | None:
+    def _linked(self, path: str, up: str) -> _KeystoreFile | None:
         """Return the digests of the file that a link leads to; None if it cannot be read.
 
         ``up`` is the relative path from the link to the folder of all enclaves.
@@ -585,17 +587,17 @@ class _Home:
             return self._shared[place]
         return None
 
-    def _file(self, path: str) -> _FileAtHome | None:
+    def _file(self, path: str) -> _KeystoreFile | None:
         return self._read(path, self._folder.read)
 
-    def _read(self, path: str, read: Callable[[str], bytes]) -> _FileAtHome | None:
+    def _read(self, path: str, read: Callable[[str], bytes]) -> _KeystoreFile | None:
         try:
             data = read(path)
         except (SrosError, OSError):
             return None
         has_certificates = _kind_of(path) in (*_AUTHORITIES, "certificate")
         certificates = certificate_digests(data) if has_certificates else ()
-        return _FileAtHome(hashlib.sha256(data).hexdigest(), certificates)
+        return _KeystoreFile(hashlib.sha256(data).hexdigest(), certificates)
 
 
 # ── what a robot has instead ───────────────────────────────────────────────────────────────
@@ -717,7 +719,7 @@ class _Known:
             since,
             owner,
             other_robot.name if other_robot else "",
-            surplus=difference.at_home is False,
+            surplus=difference.exported is False,
         )
 
     def _identify(self, difference: _Difference, kind: str, name: str) -> tuple[State, str, str]:
@@ -725,7 +727,7 @@ class _Known:
 
         The name is "" unless the file belongs to another enclave than ``name``.
         """
-        if difference.at_home is None:
+        if difference.exported is None:
             return State.BROKEN, "", ""
         if not difference.confirmed:
             return State.MISSING, "", ""
@@ -830,15 +832,15 @@ class _Stages:
     def __init__(self, keystore: Keystore) -> None:
         rotation = read_rotation(keystore)
         is_complete = rotation.stage is RotationStage.NONE
-        self.at_home = self.COMPLETE if is_complete else rotation.stage.value
+        self.of_keystore = self.COMPLETE if is_complete else rotation.stage.value
         self._new: dict[str, str] = {}
-        self._at_home: dict[str, tuple[tuple[str, ...], str]] = {}
+        self._of_kind: dict[str, tuple[tuple[str, ...], str]] = {}
         for file, roles in keystore.authority_files.items():
             certificates = tuple(map(digest, keystore.certificates_of(file)))
             new = [replaced.new for replaced in rotation.replacements if replaced.file == file]
             for kind in (f"{role}_ca" for role in roles):
                 self._new[kind] = new[0] if new else certificates[0]
-                self._at_home[kind] = certificates, self.at_home if new else self.COMPLETE
+                self._of_kind[kind] = certificates, self.of_keystore if new else self.COMPLETE
 
     def of(self, compared: _ComparedRobot) -> str:
         """Return the stage of the robot's least advanced CA file; "" if it confirmed no CA file."""
@@ -850,8 +852,8 @@ class _Stages:
         return min(stages, key=self.ORDER.index, default="")
 
     def _stage(self, kind: str, certificates: tuple[str, ...]) -> str:
-        if certificates == self._at_home[kind][0]:
-            return self._at_home[kind][1]
+        if certificates == self._of_kind[kind][0]:
+            return self._of_kind[kind][1]
         if not certificates:
             return self.UNKNOWN
         new = self._new[kind]

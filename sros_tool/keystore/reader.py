@@ -260,7 +260,7 @@ class Keystore:
         self.once("check", lambda: check_keystore(self.root))
 
     @property
-    def is_home(self) -> bool:
+    def is_original(self) -> bool:
         """Whether it is a keystore with CAs or settings, and not an export for a robot."""
         return any(map(self.has, (PUBLIC, PRIVATE, SETTINGS)))
 
@@ -661,9 +661,9 @@ class OpenedEnclave:
         return self.permissions.grant_of(self.subject) if self.permissions else None
 
     @property
-    def problems_at_home(self) -> tuple[Problem, ...]:
+    def problems_in_keystore(self) -> tuple[Problem, ...]:
         """The problems, except the missing key of an enclave whose key is on the robot."""
-        return _at_home(self.problems, self.key_on_robot)
+        return _problems_in_keystore(self.problems, self.key_on_robot)
 
     def domains(self) -> DomainSet | None:
         """Return the ROS domains that the governance names, or None without governance."""
@@ -712,7 +712,7 @@ class EnclaveIdentity(NamedTuple):
     problems: tuple[Problem, ...]
 
 
-def _at_home(problems: tuple[Problem, ...], key_on_robot: bool) -> tuple[Problem, ...]:
+def _problems_in_keystore(problems: tuple[Problem, ...], key_on_robot: bool) -> tuple[Problem, ...]:
     """Return the problems, except a missing key that is on the robot."""
     on_robot = (KEY_FILE, Fault.FILE_MISSING) if key_on_robot else None
     return tuple(problem for problem in problems if (problem.file, problem.fault) != on_robot)
@@ -784,7 +784,7 @@ class _EnclaveFiles:
         files, _ = self._read_all(_IDENTITY_FILES)
         certificate, *_ = self._checked_identity(files)
         return EnclaveIdentity(
-            certificate, _at_home(tuple(self._problems), key_on_robot(self._folder))
+            certificate, _problems_in_keystore(tuple(self._problems), key_on_robot(self._folder))
         )
 
     def check(self, domain: int | None) -> OpenedEnclave:

@@ -171,7 +171,7 @@ def by_domains(
     key_domains: Mapping[Right, frozenset[int | None]],
     fleet: Fleet | None = None,
 ) -> dict[DomainSet | None, set[Right]]:
-    """Map sets of ROS domains to those of the rights that hold there; None: in every domain.
+    """Map sets of ROS domains to the rights that apply there; None: in every domain.
 
     ``documents`` are the permissions of enclaves, whose rules name domains; ``key_domains`` are as
     in `RightsSource`.  An enclave without permissions is for the domain that ``fleet`` states for
@@ -595,7 +595,7 @@ def compare_sources(first: RightsSource, second: RightsSource) -> SourcesDiffere
 def _unanswered(
     first: Collection[Right], second: Collection[Right], difference: RightsDifference
 ) -> list[Right]:
-    """Return the rights of ``second`` to use a name that only in ``first`` an enclave offers.
+    """Return the rights of ``second`` to use a name that enclaves offer only in ``first``.
 
     For example, a right to subscribe to a topic that no enclave may publish any more, because the
     right to publish it is gone or denied.  Names with wildcards are left out.
@@ -617,13 +617,15 @@ def _unanswered(
     if not asked:
         return []
     names = {(OFFERING_SIDE[right.right], right.name) for right in asked}
-    before, after = _offered(first, names), _offered(second, names)
+    before, after = _allowed_pairs(first, names), _allowed_pairs(second, names)
     lost = before - after
     return sorted(right for right in asked if (OFFERING_SIDE[right.right], right.name) in lost)
 
 
-def _offered(rights: Iterable[Right], names: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
-    """Return those of the pairs of a right and a name that some enclave is allowed."""
+def _allowed_pairs(
+    rights: Iterable[Right], names: Iterable[tuple[str, str]]
+) -> set[tuple[str, str]]:
+    """Return the pairs of a right and a name that the rights allow to at least one enclave."""
     rules, enclaves = Rules(rights), {right.enclave for right in rights}
     return {
         (word, name)

@@ -239,7 +239,7 @@ def no_such_enclave(
     except InvalidNameError as error:
         return error
     why = f"The keystore has {first_few(names, _SHOWN) or 'no enclave'}."
-    if not keystore.is_home:
+    if not keystore.is_original:
         where = f"`sros distribute_key KEYSTORE {name} {quote(str(root))}`"
         return KeystoreError(what, why, f"If it is not a typo, export it with {where}.")
     if not may_create:

@@ -247,7 +247,7 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
         governance=_of_all(path, folders.values()),
         authorities=_authorities(folders.values()),
         trusts=_trusts(trusting, _expiries(path)),
-        later=keystore.template if keystore.is_home else None,
+        later=keystore.template if keystore.is_original else None,
         certified=_certified(folders),
     )
     if not has_zenoh_files(path, hidden=True):

@@ -1,4 +1,4 @@
-"""Zenoh configurations processes as rmw_zenoh reads them, without paths and without keys.
+"""Zenoh configurations of processes, as rmw_zenoh reads them, without paths and without keys.
 
 `ZenohNetwork` has the settings for all processes of a keystore.
 

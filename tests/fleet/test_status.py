@@ -15,7 +15,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from sros_tool.cli import fleet as fleet_verbs
-from sros_tool.cli.fleet import ComparedFleet, _facts, _joined, _runs
+from sros_tool.cli.fleet import ComparedFleet, _facts, _joined, _robot_names
 from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
     RobotDds,
@@ -552,9 +552,9 @@ def test_fifty_robots_of_which_the_same_is_to_be_said_share_a_line(field: Field)
 def test_robots_are_named_by_group_and_by_neighbors_of_one_name() -> None:
     pickers = [f"p{number}" for number in range(1, 41)]
     everybody, groups = ["dispatcher", *pickers], {"pickers": pickers, "none": []}
-    assert _runs(pickers, everybody, groups) == "pickers (all 40)"
-    assert _runs(everybody, everybody, groups) == "pickers (all 40), dispatcher (41 robots)"
-    some = _runs(everybody[:6], everybody, groups)
+    assert _robot_names(pickers, everybody, groups) == "pickers (all 40)"
+    assert _robot_names(everybody, everybody, groups) == "pickers (all 40), dispatcher (41 robots)"
+    some = _robot_names(everybody[:6], everybody, groups)
     assert some == "dispatcher, p1 to p5 (6 robots)"
 
 

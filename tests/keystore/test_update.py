@@ -105,7 +105,7 @@ def sound(root: Path) -> None:
     assert not remains(root.parent)
     check_whole(root)
     for name in list_enclaves(root):
-        assert open_enclave(enclave_path(root, name), now=LATER).problems_at_home == (), name
+        assert open_enclave(enclave_path(root, name), now=LATER).problems_in_keystore == (), name
     # No ledger has the CA that ros2/sros2 made.
     left = set(history(root, now=LATER).unexplained)
     assert left <= {"public/identity_ca.cert.pem", "public/permissions_ca.cert.pem"}

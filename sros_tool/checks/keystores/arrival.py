@@ -265,7 +265,7 @@ def _enclave(
     state = evaluation.state
     loadable = not (state.problems or evaluation.stopped())
     # On the robot, where there is no ledger, a key that is missing is lost.
-    at_home = (keystore.root / LEDGER).is_file()
-    elsewhere = at_home and state.key_on_robot and not state.problems_at_home
+    has_ledger = (keystore.root / LEDGER).is_file()
+    elsewhere = has_ledger and state.key_on_robot and not state.problems_in_keystore
     until = state.valid_until()
     return ArrivedEnclave(name, loadable, str(domains or ""), until, elsewhere, state.token)

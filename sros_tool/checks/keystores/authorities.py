@@ -17,7 +17,7 @@ from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
-from sros_tool.faults import AT_HOME
+from sros_tool.faults import ORIGINAL_KEYSTORE
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import FLEET_REMEDY
 from sros_tool.keystore.issuing.ca_service import is_ca_service
@@ -348,7 +348,7 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
         why = f"{part.error.what}. {part.error.why}".strip()
         yield UNREADABLE.found(part.path, why, keystore.shown(part.path), remedy=part.error.remedy)
     unread = {part.path for part in keystore.unread}
-    if keystore.is_home:
+    if keystore.is_original:
         for role in (IDENTITY, PERMISSIONS):
             path = ca_certificate(role)
             if role not in keystore.authorities and path not in unread:
@@ -510,8 +510,8 @@ def shared_ca_findings(
         accepted = keystore.accepts(
             ONE_AUTHORITY, lambda settings: not settings.separate_authorities
         )
-        at_home = f"In the {AT_HOME}: {ONE_AUTHORITY.remedy}"
-        remedy = _separation(keystore) if keystore.can_issue else at_home
+        in_keystore = f"In the {ORIGINAL_KEYSTORE}: {ONE_AUTHORITY.remedy}"
+        remedy = _separation(keystore) if keystore.can_issue else in_keystore
         yield ONE_AUTHORITY.found("the CAs", text, file, remedy=remedy, accepted=accepted)
 
 

@@ -444,7 +444,7 @@ def _domains(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Findi
     text += f"the governance for {governed}"
     fewer = bool(allowed.ranges) and all(domain in governed for domain in allowed)
     # On a robot nothing says what was meant, and no node talks in a domain that it should not.
-    kind = FEWER_DOMAINS if fewer and not enclave.keystore.is_home else DOMAINS
+    kind = FEWER_DOMAINS if fewer and not enclave.keystore.is_original else DOMAINS
     yield kind.found(enclave.name, text, file)
 
 

@@ -72,7 +72,7 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
     A key that is only on the robot is no fault in the keystore itself.
     """
     state = enclave.state
-    for problem in state.problems_at_home if enclave.keystore.is_home else state.problems:
+    for problem in state.problems_in_keystore if enclave.keystore.is_original else state.problems:
         kind = _LOADING_KINDS[f"enclave.{problem.fault.id}"]
         text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
         file = enclave.file(problem.file)
@@ -266,7 +266,7 @@ def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
 def _weak(enclave: CheckedEnclave) -> Iterator[Finding]:
     """Yield findings about weak cryptography of an enclave; the CAs are checked elsewhere."""
     for file, text in weaknesses(enclave.state):
-        if not enclave.keystore.is_home or file not in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):
+        if not enclave.keystore.is_original or file not in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):
             yield WEAK.found(enclave.name, text, enclave.file(file))
 
 
@@ -276,7 +276,7 @@ def _on_token(enclave: CheckedEnclave, place: TokenUri) -> Iterator[Finding]:
     yield ON_TOKEN.found(name, f"its key is {place.object!r} on the token {place.token!r}", file)
     if any((enclave.folder / each).exists() for each in ZENOH_FILES):
         yield TOKEN_ON_ZENOH.found(name, "it has no key.pem", file)
-    here = not enclave.keystore.is_home or Path(place.pin_source).exists()
+    here = not enclave.keystore.is_original or Path(place.pin_source).exists()
     for problem in (pin_file_problem(place), pin_line_break(place)) if here else ():
         if problem:
             yield PIN_FILE.found(name, problem, file)

@@ -253,7 +253,7 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
     if names is None:
         yield from _hidden_enclaves(keystore)
         yield from _below(root, keystore, links, trusted, kept)
-        if kept and not (keystore.is_home and _has_links(keystore)):
+        if kept and not (keystore.is_original and _has_links(keystore)):
             yield HOME_OR_ROBOT.found(root, f"it has {some_names(kept)}", root)
         return
     passed: set[Path] = set()
@@ -296,7 +296,7 @@ def _below(
     keys = {os.path.join(root, ENCLAVES, name[1:], KEY_FILE) for name in keystore.names}
     keys |= {os.path.join(root, ENCLAVES, KEY_FILE)}
     keys |= set(map(_mounted, keys))
-    home = keystore.is_home
+    original = keystore.is_original
     unread: list[OSError] = []
     for parent, folders, files in os.walk(start, onerror=unread.append):
         folders.sort()
@@ -310,7 +310,7 @@ def _below(
                 yield from links.check(path)
                 continue
             yield from _writers(path, info, trusted)
-            yield from _open_folder(path, root, info.st_mode, home)
+            yield from _open_folder(path, root, info.st_mode, original)
         if parent == root and AGENT in folders:
             folders.remove(AGENT)  # of `sros agent`, closed to others
         inside = os.path.relpath(parent, root)
@@ -327,12 +327,12 @@ def _below(
                 if name == KEY_URI_FILE or name.endswith("_ca.cert.pem"):
                     with suppress(OSError):  # `check_enclave` reports an unreadable one
                         if _holds_key(keystore, path, info):
-                            yield from _other(keystore, path, info, home)
-            elif keystore.looks_like_home and _is_kept(keystore, path, info):
+                            yield from _other(keystore, path, info, original)
+            elif keystore.looks_like_original and _is_kept(keystore, path, info):
                 kept.append(os.path.relpath(path, root))
                 yield from key_mode_findings(path, info.st_mode)
             else:
-                yield from _other(keystore, path, info, home)
+                yield from _other(keystore, path, info, original)
     for error in unread:
         yield _unread(error, root)
 
@@ -375,10 +375,10 @@ def _interrupted(parent: Path, root: str) -> Finding:
     return INTERRUPTED.found(root, text, str(parent / STAGE))
 
 
-def _open_folder(path: str, root: str, mode: int, home: bool) -> Iterator[Finding]:
+def _open_folder(path: str, root: str, mode: int, original: bool) -> Iterator[Finding]:
     inside = Path(path).relative_to(root)
     # Others cannot enter what is below a closed top folder.
-    asked = inside.parts[0] in _KEY_FOLDERS and (len(inside.parts) == 1 or not home)
+    asked = inside.parts[0] in _KEY_FOLDERS and (len(inside.parts) == 1 or not original)
     if asked and mode & 0o077 and not mode & stat.S_IWOTH:
         text, remedy = f"its mode is {stat.S_IMODE(mode):04o}", f"Run `chmod 700 {quote(path)}`."
         yield FOLDER_OPEN.found(path, text, path, remedy=remedy)
@@ -468,7 +468,7 @@ def _is_kept(keystore: CheckedKeystore, path: str, info: os.stat_result) -> bool
 
 
 def _other(
-    keystore: CheckedKeystore, path: str, info: os.stat_result, home: bool
+    keystore: CheckedKeystore, path: str, info: os.stat_result, original: bool
 ) -> Iterator[Finding]:
     """Yield findings about a file that belongs to no enclave, such as a misplaced key."""
     root = os.fspath(keystore.root)
@@ -481,7 +481,7 @@ def _other(
         return
     if holds_key:
         yield from key_mode_findings(path, info.st_mode)
-        if place == PRIVATE or not home:
+        if place == PRIVATE or not original:
             text = "it contains a private key that belongs to no enclave"
             yield CA_KEY_ON_ROBOT.found(path, text, path)
         else:

@@ -56,7 +56,7 @@ from sros_tool.dds.decision.vendors import TESTED, Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
-from sros_tool.faults import AT_HOME
+from sros_tool.faults import ORIGINAL_KEYSTORE
 from sros_tool.keystore.fleet import publish_command, stated_distributions
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
@@ -159,7 +159,7 @@ def keystore_findings(
             if each := summary_of(enclave):
                 issued.append(each)
             grant = enclave.state.grant
-            if grant and not keystore.is_home:  # a keystore of many robots has too many names
+            if grant and not keystore.is_original:  # a keystore of many robots has too many names
                 topics[name] = names_without_wildcards(grant)
             tick()
         return found, issued, topics
@@ -183,7 +183,7 @@ def keystore_findings(
     real_root = os.path.realpath(root)
     located = (_at_real_file(finding, root, real_root) for finding in found)
     found = with_causes(joined([_with_names(finding, root) for finding in located]))
-    if not keystore.is_home:
+    if not keystore.is_original:
         return found
     return _with_cause_of_expiry(_with_cause_of_ros2(found, opened), root)
 
@@ -280,7 +280,7 @@ def _with_names(finding: Finding, root: Path) -> Finding:
     """Return the finding with KEYSTORE and ENCLAVE in its remedy replaced by keystore and "
     "enclave."""
     remedy = finding.remedy
-    if AT_HOME not in remedy:
+    if ORIGINAL_KEYSTORE not in remedy:
         remedy = re.sub(r"\bKEYSTORE\b", lambda _: quote(str(root)), remedy)
     if finding.subject.startswith("/") and "," not in finding.subject:
         remedy = re.sub(r"\bENCLAVE\b", lambda _: quote(finding.subject), remedy)

@@ -153,14 +153,14 @@ class CheckedKeystore:
         return self._part(FLEET, lambda: edited_fleet(self.opened, self.ledger), "")
 
     @property
-    def looks_like_home(self) -> bool:
+    def looks_like_original(self) -> bool:
         """Whether the folder has the layout of a keystore with CAs, even on a robot."""
-        return self.opened.is_home
+        return self.opened.is_original
 
     @property
-    def is_home(self) -> bool:
+    def is_original(self) -> bool:
         """Whether this is the original keystore with its CAs, and not on a robot."""
-        return self.looks_like_home and not self.on_robot
+        return self.looks_like_original and not self.on_robot
 
     @property
     def root(self) -> Path:
@@ -174,7 +174,9 @@ class CheckedKeystore:
     @property
     def can_issue(self) -> bool:
         """Whether the keystore has its CAs, so that sros commands can issue and sign in it."""
-        return self.is_home and any((self.root / folder).exists() for folder in (PUBLIC, SETTINGS))
+        return self.is_original and any(
+            (self.root / folder).exists() for folder in (PUBLIC, SETTINGS)
+        )
 
     def accepts(self, kind: FindingKind, chosen: Callable[[Template], bool]) -> str:
         """Return text naming the template or keystore that accepts a weakness; "" if none does.
@@ -190,7 +192,7 @@ class CheckedKeystore:
             name = self.settings.name
             template = _shipped(name) or self.settings
             return f"template {name}" if chosen(template) else ""
-        if self.is_home:
+        if self.is_original:
             return ""
         for name in template_names():
             if chosen(_load_shipped(name)):

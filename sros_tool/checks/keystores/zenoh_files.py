@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import SrosError
-from sros_tool.faults import AT_HOME, Fault
+from sros_tool.faults import ORIGINAL_KEYSTORE, Fault
 from sros_tool.keystore.layout import PERMISSIONS, SETTINGS, ZENOH_FILES
 
 if TYPE_CHECKING:
@@ -128,10 +128,9 @@ def _of_opened(enclave: CheckedEnclave, opened: OpenedZenoh) -> Iterator[Finding
         if kind := _KINDS.get(problem.fault.value):
             text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
             remedy = kind.remedy
-            if not enclave.keystore.is_home:
-                remedy = (
-                    f"In the {AT_HOME}: run `sros zenoh KEYSTORE`. Then export the enclave again."
-                )
+            if not enclave.keystore.is_original:
+                remedy = f"In the {ORIGINAL_KEYSTORE}: run `sros zenoh KEYSTORE`."
+                remedy += " Then export the enclave again."
             yield kind.found(enclave.name, text, enclave.file(problem.file), remedy=remedy)
 
 
@@ -164,7 +163,7 @@ def check_network(
             yield SHARED_NODE.found(first, str(shared), str(keystore.opened.folder(first)))
     for name, why in drift.left_out.items():
         if only is None or name in only:
-            faults = {e.fault for e in keystore.enclave(name).problems_at_home}
+            faults = {e.fault for e in keystore.enclave(name).problems_in_keystore}
             remedy = _RENEW if faults and faults <= _EXPIRED else ""
             yield LEFT_OUT.found(
                 name, why.rstrip("."), str(keystore.opened.folder(name)), remedy=remedy

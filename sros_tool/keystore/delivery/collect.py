@@ -164,7 +164,7 @@ class CollectedInbox(NamedTuple):
 
     @property
     def complete(self) -> bool:
-        """Whether no message, request or release was refused, and what is allowed was signed."""
+        """Whether no message, request or release was refused, and all that may be signed is."""
         if self.published and self.published.refused:
             return False
         requests = (request for robot in self.robots for request in robot.requests)
@@ -716,7 +716,7 @@ def _revoke_again(
     keyring: Keyring,
     dry_run: bool,
 ) -> tuple[str, list[Note], list[FileChange]]:
-    """Revoke what lists of robots revoke and the keystore does not; refuse what they vouched for.
+    """Revoke the enclaves that only lists of robots revoke, and refuse requests that they signed.
 
     ``telling`` are robots with such lists.  Certificates that the ledger lacks are recorded.  If
     the lists cannot be signed, nothing is signed; a note says it of the list of a CA service, which

@@ -243,7 +243,7 @@ def released_enclave(root: Path, name: str, now: datetime) -> ReleasedEnclave:
     """
     evaluation = _evaluated(root, name, now)
     state = evaluation.state
-    problems = state.problems_at_home
+    problems = state.problems_in_keystore
     lasting = [str(problem) for problem in problems if problem.fault not in _OF_TIME]
     if lasting or (evaluation.problems and not problems):
         raise _not_running(root, name, lasting or evaluation.problems)
@@ -332,7 +332,7 @@ _FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES)
 
 
 def _read_files(root: Path, name: str, wanted: Iterable[str]) -> dict[str, bytes]:
-    """Map the paths of those of an enclave's files that exist to their content.
+    """Map the paths of the ``wanted`` files of an enclave to their content; skip missing files.
 
     Raises:
         KeystoreError: a file other than that of the key has a private key.

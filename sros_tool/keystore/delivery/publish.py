@@ -556,11 +556,11 @@ class _Run:
         self._notes: list[Note] = []
 
     def check_restored(self, restored: bool, new_folder: bool, keyring: Keyring) -> None:
-        """Refuse a folder with later news than the keystore knows, and one that may have had some.
+        """Refuse a folder that has, or may have had, later releases than the keystore knows.
 
-        If it is said that the keystore was ``restored``, later releases are not refused, and what
-        they revoke is revoked again.  A folder without anything that was published has to be said
-        to be a ``new_folder``.  In both cases, numbers and versions go on from the seconds since
+        With ``restored`` (the keystore comes from a backup), later releases are not refused, and
+        what they revoke is revoked again.  A folder without any release is refused unless the user
+        says ``new_folder``.  In both cases, numbers and versions go on from the seconds since
         1970: nobody knows which were given before.
 
         Raises:

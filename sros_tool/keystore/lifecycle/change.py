@@ -598,7 +598,7 @@ def _left_by_ros2(keystore: Keystore, names: Iterable[str], now: datetime) -> It
         yield document_entry(now, "governance", message)._replace(reason=_ADOPTED)
     for name in names:
         state = keystore.enclave(name, now=now)
-        files = {problem.file for problem in state.problems_at_home}
+        files = {problem.file for problem in state.problems_in_keystore}
         if state.certificate and "cert.pem" not in files:
             yield certificate_entry(now, "certificate", state.certificate, name, _ADOPTED)
         message = state.files.get(PERMISSIONS_FILE, b"")
