@@ -631,7 +631,8 @@ def check_requirements(
     Args:
         path: A policy file or a keystore.
         requirements: The TOML file of the requirements, or several.
-        fleet: The file with the robots that the placeholders of a policy stand for.
+        fleet: The file with the robots that the placeholders of a policy and its requirements stand
+            for; a keystore has its own.
         template: The keystore template, by name or file, whose protection a policy gets. Without
             it, the default template is assumed where the policy states no protection, and a finding
             reports this.
@@ -668,7 +669,6 @@ def check_requirements(
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(WORLDS)}.")
     of, only = _domain(domain), _vendors(vendor, distribution)
     files = [requirements] if isinstance(requirements, str | PathLike) else requirements
-    read = read_all_requirements(map(Path, files))
     system = load_system(
         Path(path),
         at=_moment(now),
@@ -678,7 +678,7 @@ def check_requirements(
         only=only,
         template=load_template(template) if template else None,
     )
-    findings = requirement_findings(read, system)
+    findings = requirement_findings(read_all_requirements(map(Path, files), system.fleet), system)
     return tuple(
         finding for finding in findings if finding.severity > NOTE or finding.kind.prominent
     )

@@ -344,8 +344,8 @@ def check(
             every += decide(lambda path: _system(path, at, template))
         findings = [_shown(finding) for finding in every]
     chosen = selection.choose(findings)
-    if form == "text" and at.fleet:
-        _print_text(chosen, _with_enclaves(at.fleet, paths))
+    if form == "text":
+        _print_text(chosen, _fleet_of(at, paths))
     else:
         _SHOW[form](chosen, selection)
     return _status(chosen, fail_on)
@@ -366,13 +366,15 @@ def _requirements(
     from sros_tool.proof.findings import requirement_findings
     from sros_tool.proof.requirements import dropped_findings, read_all_requirements
 
-    read = read_all_requirements(files)
-    path = _one_path(family, paths, "--requirements") if read else None
+    path = _one_path(family, paths, "--requirements")
 
     def decide(load: Callable[[Path], System]) -> list[Finding]:
-        findings = list(requirement_findings(read, load(path))) if path else []
+        system = load(path)
+        wanted = read_all_requirements(files, system.fleet)
+        findings = requirement_findings(wanted, system)
         if earlier:
-            findings += dropped_findings(read_all_requirements(earlier), read, str(files[0]))
+            before = read_all_requirements(earlier, system.fleet)
+            findings += dropped_findings(before, wanted, str(files[0]))
         return findings
 
     return decide
@@ -424,9 +426,9 @@ def _system(path: Path, at: Circumstances, template: str | None = None) -> Syste
 
 
 def _suggested(system: System) -> str:
-    from sros_tool.proof.findings import render_requirements, suggest
+    from sros_tool.proof.suggestions import render_requirements, suggest
 
-    return render_requirements(suggest(system.rights, system.worlds), system.file)
+    return render_requirements(suggest(system.rights, system.worlds, system.fleet), system.file)
 
 
 def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:
@@ -647,16 +649,25 @@ def _print_markdown(chosen: ChosenFindings, _selection: FindingFilter) -> None:
     echo_lines(findings_markdown(chosen))
 
 
-def _with_enclaves(fleet: Fleet, paths: Sequence[Path]) -> Fleet:
-    """Return the fleet with the enclave paths that policy files define for it."""
+def _fleet_of(at: Circumstances, paths: Sequence[Path]) -> Fleet | None:
+    """Return the fleet of policy files, with the enclave paths that they define, or of a keystore.
+
+    It is None if there is none, or if it cannot be read.
+    """
     from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.keystore.fleet import load_fleet
     from sros_tool.policy.document import read_policy
 
+    if at.fleet is None:
+        opened = [at.opened[path] for path in paths if path in at.opened]
+        with suppress(SrosError):  # what is wrong with it is a finding
+            return load_fleet(opened[0]) if len(opened) == 1 else None
+        return None
     patterns: list[str] = []
     for path in paths:
         with suppress(SrosError):  # what is wrong with it is a finding
-            patterns += FleetPolicy(read_policy(path, placeholders=True), fleet).patterns
-    return fleet.with_enclaves(patterns)
+            patterns += FleetPolicy(read_policy(path, placeholders=True), at.fleet).patterns
+    return at.fleet.with_enclaves(patterns)
 
 
 def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Finding, str]]:
@@ -674,7 +685,9 @@ def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Findi
         path, robot = path_of_robots(fleet, finding.subject)
         if not robot:
             path, robot = name_of_robots(fleet, f"{path} {finding.text}")
-        place = (finding.id, finding.file, finding.line, finding.accepted, finding.remedy)
+        # The documents of robots are in folders with their names.
+        file = name_of_robots(fleet, finding.file)[0] if robot else finding.file
+        place = (finding.id, file, finding.line, finding.accepted, finding.remedy)
         number[path, robot, place] += 1  # of several that an enclave has there
         groups.setdefault((place, path, number[path, robot, place]), []).append((finding, robot))
     for (first, _), *others in groups.values():

@@ -10,10 +10,10 @@ This module reads no files.
 
 from __future__ import annotations
 
+import fnmatch
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from functools import lru_cache, partial
 from itertools import product
 
@@ -44,6 +44,9 @@ from sros_tool.proof.requirements import (
 )
 from sros_tool.proof.worlds import Topics, TopicUser, World, named, shortest, valid_topics
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS
+
+MOST_STEPS = 8_000_000
+"""Highest number of search steps for names that wildcards share: about twenty seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,11 +248,14 @@ def _each(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
                 yield right, part, part.topics(name)
 
 
-def _match(patterns: Sequence[str], enclave: str) -> bool:
-    """Return whether an enclave matches a pattern of the list, and none of its exceptions."""
-    return any(
-        fnmatchcase(enclave, pattern) for pattern in patterns if pattern[0] != EXCEPT
-    ) and not any(fnmatchcase(enclave, pattern[1:]) for pattern in patterns if pattern[0] == EXCEPT)
+def _matching(patterns: Sequence[str], enclaves: Collection[str]) -> set[str]:
+    """Return the enclaves that match a pattern of the list, and none of its exceptions."""
+    matching: set[str] = set()
+    excepted: set[str] = set()
+    for pattern in patterns:
+        to = excepted if pattern[0] == EXCEPT else matching
+        to.update(fnmatch.filter(enclaves, pattern.removeprefix(EXCEPT)))
+    return matching - excepted
 
 
 def _use(enclave: str, right: str, part: _Part, topics: Topics, topic: str) -> Use:
@@ -273,10 +279,11 @@ def _first_uses(
     rights: RightNames, world: World, limit: SearchLimit, without: Sequence[str] = ()
 ) -> dict[str, Use]:
     """Map enclaves with one of the rights to their shortest use; leave out ``without``."""
+    left_out = _matching(without, world.enclaves)
     uses: dict[str, Use] = {}
     for right, part, topics in _each(rights):
         for met in world.side(part.writes).meeting(topics, limit):
-            if _match(without, met.enclave):
+            if met.enclave in left_out:
                 continue
             if topic := world.use(met, topics, limit):
                 use = _use(met.enclave, right, part, topics, topic)
@@ -438,7 +445,7 @@ def _shared_by(
 
 def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with the shortest name that a wildcard allows beyond the requirement."""
-    enclaves = [enclave for enclave in world.enclaves if _match(requirement.enclaves, enclave)]
+    enclaves = sorted(_matching(requirement.enclaves, world.enclaves))
     uses: dict[str, Use] = {}
     for right, names in requirement.rights:
         for part in _sufficient_parts(right):
@@ -463,7 +470,7 @@ _READ_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/parameter_events"))
 
 def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with the shortest name for which an enclave has another right."""
-    enclaves = [enclave for enclave in world.enclaves if _match(requirement.enclaves, enclave)]
+    enclaves = sorted(_matching(requirement.enclaves, world.enclaves))
     uses: dict[str, Use] = {}
     for writes, ordinary in ((True, _WRITTEN_BY_EVERY_NODE), (False, _READ_BY_EVERY_NODE)):
         allowed = NameSet.union(
@@ -534,10 +541,9 @@ def _of_kinds(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
 
 def _influence(requirement: Apart, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with a shortest chain from a source to a target, not through ``through``."""
-    through = {enclave for enclave in world.enclaves if _match(requirement.through, enclave)}
-    inside = [enclave for enclave in world.enclaves if enclave not in through]
-    sources = [name for name in inside if _match(requirement.sources, name)]
-    targets = {name for name in inside if _match(requirement.targets, name)}
+    through = _matching(requirement.through, world.enclaves)
+    sources = sorted(_matching(requirement.sources, world.enclaves) - through)
+    targets = _matching(requirement.targets, world.enclaves) - through
     chain = _shortest_chain(world, sources, targets, through, limit)
     if not chain:
         return None
@@ -565,9 +571,7 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
         case Apart():
             patterns = (*requirement.sources, *requirement.targets, *requirement.through)
     for pattern in dict.fromkeys(patterns):
-        if not any(
-            fnmatchcase(enclave, pattern.removeprefix(EXCEPT)) for enclave in world.enclaves
-        ):
+        if not fnmatch.filter(world.enclaves, pattern.removeprefix(EXCEPT)):
             yield f"there is no enclave {pattern}"
     match requirement:
         case Only() | AtMost() | NotBoth():
@@ -603,7 +607,7 @@ def _always(requirement: Requirement, world: World) -> str:
     count = len(world.enclaves)
     match requirement:
         case Only(enclaves=enclaves) if any(map(is_expression, enclaves)):
-            if all(_match(enclaves, enclave) for enclave in world.enclaves):
+            if len(_matching(enclaves, world.enclaves)) == count:
                 return f"all {count} enclaves are among them"
         case AtMost(most=most) if most >= count:
             return f"there are only {count} enclaves"
@@ -611,11 +615,9 @@ def _always(requirement: Requirement, world: World) -> str:
             if all(any(covers(name, "/*") for name in names) for _, names in rights):
                 return "wildcards may match every name"
         case Apart():
-            left = [
-                enclave for enclave in world.enclaves if not _match(requirement.through, enclave)
-            ]
-            sources = {name for name in left if _match(requirement.sources, name)}
-            targets = {name for name in left if _match(requirement.targets, name)}
+            through = _matching(requirement.through, world.enclaves)
+            sources = _matching(requirement.sources, world.enclaves) - through
+            targets = _matching(requirement.targets, world.enclaves) - through
             if not any(sources - {target} for target in targets):
                 return "no two enclaves are left to keep apart"
     return ""
@@ -740,10 +742,9 @@ class _Flow:
         Only readers for which ``is_new`` returns True are considered.  Exact topics come first, and
         only those for which ``is_unused`` returns True.
         """
-        written = self._world.side(True).of[enclave] - _IGNORED
-        around = written.around()
-        for topic in sorted(around.exact if around else (), key=_plain_first):
-            if topic in written and is_unused(topic):
+        written, around, exact = self._world.written_by(enclave, _IGNORED)
+        for topic in sorted(exact, key=_plain_first):
+            if is_unused(topic):
                 for reader in self._world.readers_of(topic):
                     if reader == enclave or not is_new(reader):
                         continue

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
@@ -14,25 +11,20 @@ from sros_tool.checks.requirements import ASSUMED, NOT_CROSSING, NOT_ON_ZENOH, V
 from sros_tool.dds.decision.vendors import together
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import (
-    READING_SERVICES,
     action_part,
-    expression_problem,
     is_expression,
     service_of,
 )
-from sros_tool.policy.model import OTHER_SIDE, RIGHTS, Level, Source
-from sros_tool.policy.rights import KIND_OF, Right
-from sros_tool.proof.decide import KeptUse, Use, Verdict, Witness, Worlds, influencers
+from sros_tool.policy.model import Source
+from sros_tool.policy.rights import KIND_OF
+from sros_tool.proof.decide import MOST_STEPS, KeptUse, Use, Verdict, Witness, Worlds
 from sros_tool.proof.requirements import (
     Apart,
     AtMost,
     Must,
-    Nobody,
     NotBoth,
-    Only,
     Protected,
     Requirement,
-    Widest,
     demand,
 )
 from sros_tool.proof.system import Place, System
@@ -118,10 +110,6 @@ class Decided:
     kept: tuple[tuple[Requirement, KeptUse], ...] = ()
 
 
-_MOST_STEPS = 8_000_000
-"""Highest number of search steps for names that wildcards share: about twenty seconds."""
-
-
 def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
     """Return the decisions on requirements in all worlds.
 
@@ -129,7 +117,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
         DocumentError: there are too many wildcards to decide a requirement.
     """
     violations, vacuous, assumed, kept = [], [], [], []
-    limit = SearchLimit(_MOST_STEPS)
+    limit = SearchLimit(MOST_STEPS)
     worlds = Worlds(system.worlds)
     for requirement in requirements:
         verdicts = list(worlds.decide(requirement, limit))
@@ -311,174 +299,3 @@ def assumption_text(name: str) -> str:
     """Return a clause that says that the protection of a name is assumed, not stated."""
     assumed = f"that of the template {DEFAULT_TEMPLATE} is assumed"
     return f"the policy does not say how {name} is protected, and {assumed}"
-
-
-# ── requirements that a policy meets ───────────────────────────────────────────────────────
-
-_NOWHERE = Source("", 0)
-_OF_EVERY_NODE = frozenset({"/rosout", "/parameter_events"})
-_FEW = 3
-"""Highest number of enclaves with a right to a name for which a limit is proposed."""
-_MOST = 1000
-"""Highest number of candidates, so that a person can read the proposals."""
-_WIDE_LIST = 50
-"""Highest number of names that are joined into one requirement."""
-
-
-def suggest(rights: Iterable[Right], worlds: Sequence[World]) -> tuple[Requirement, ...]:
-    """Propose requirements that hold in all worlds, by the allowed ``rights``.
-
-    Raises:
-        DocumentError: there are too many wildcards to decide a requirement.
-    """
-    requirements: list[Requirement] = []
-    limit = SearchLimit(_MOST_STEPS)
-    all_worlds = Worlds(worlds)
-    for requirement in islice(_candidates(_Stated(rights), worlds), _MOST):
-        verdicts = all_worlds.decide(requirement, limit)
-        if not any(verdict.witness or verdict.empty or verdict.always for _, verdict in verdicts):
-            last = _joined(requirements[-1], requirement) if requirements else None
-            requirements[-1:] = [last] if last else [*requirements[-1:], requirement]
-    return tuple(requirements)
-
-
-def _joined(requirement: Requirement, other: Requirement) -> Requirement | None:
-    """Return a requirement that demands the same as two, or None if they cannot be joined."""
-    match requirement, other:
-        case (
-            Nobody(rights=(("request", some),)),
-            Nobody(rights=(("request", more),)),
-        ) if len(some) < _WIDE_LIST:
-            return replace(requirement, rights=(("request", (*some, *more)),))
-        case Protected(names=some, level=level), Protected(names=more) if other.level is level:
-            return replace(requirement, names=(*some, *more))
-    return None
-
-
-class _Stated:
-    """Which enclaves state each right to a name, and the wildcards of each right."""
-
-    def __init__(self, rights: Iterable[Right]) -> None:
-        self.users: dict[tuple[str, str], set[str]] = defaultdict(set)
-        self.wild: dict[str, set[str]] = defaultdict(set)
-        for right in rights:
-            if right.kind == "dds" or expression_problem(right.name):
-                continue  # permissions of others may have any text
-            if is_expression(right.name):
-                self.wild[right.right].add(right.name)
-            else:
-                self.users[right.right, right.name].add(right.enclave)
-
-    def names(self, right: str) -> list[str]:
-        """Return the names without wildcards that a right is stated for, sorted."""
-        return sorted(name for of, name in self.users if of == right)
-
-
-def _candidates(stated: _Stated, worlds: Sequence[World]) -> Iterator[Requirement]:
-    for right in ("publish", "call", "request"):
-        yield from _alone(stated, right)
-    yield from _unused_services(stated)
-    yield from _limits(stated)
-    yield from _gates(worlds[0])
-    for kind, pair in RIGHTS.items():
-        if any(stated.wild[right] or stated.names(right) for right in pair):
-            yield Protected(source=_NOWHERE, names=((kind, "/*"),), level=Level.ENCRYPT)
-    for right in ("publish", "request", "call"):
-        wild = tuple(sorted(stated.wild[right]))
-        yield Widest(source=_NOWHERE, rights=((right, wild),), enclaves=("*",))
-
-
-def _alone(stated: _Stated, right: str) -> Iterator[Only]:
-    """Yield a requirement for each enclave that is the only one with a right to a received name."""
-    other = OTHER_SIDE[right]
-    names: dict[str, list[str]] = defaultdict(list)
-    for name in stated.names(right):
-        users = stated.users[right, name]
-        if len(users) == 1 and name not in _OF_EVERY_NODE and (other, name) in stated.users:
-            names[next(iter(users))].append(name)
-    for enclave, found in sorted(names.items()):
-        yield Only(source=_NOWHERE, rights=((right, tuple(found)),), enclaves=(enclave,))
-
-
-def _unused_services(stated: _Stated) -> Iterator[Nobody]:
-    """Yield requirements that nobody calls services that change a node and that no enclave uses."""
-    last = {name.rpartition("/")[2] for name in stated.names("reply") if name.count("/") > 1}
-    for each in sorted(last.difference(READING_SERVICES)):
-        yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{each}",)),))
-
-
-def _limits(stated: _Stated) -> Iterator[AtMost]:
-    """Yield limits for names that only few enclaves publish."""
-    names: dict[int, list[str]] = defaultdict(list)
-    for name in stated.names("publish"):
-        if name not in _OF_EVERY_NODE and ("subscribe", name) in stated.users:
-            names[len(stated.users["publish", name])].append(name)
-    for count in range(2, _FEW + 1):
-        if names[count]:
-            yield AtMost(source=_NOWHERE, rights=(("publish", tuple(names[count])),), most=count)
-
-
-def _gates(world: World) -> Iterator[Apart]:
-    """Yield requirements that some enclaves can be influenced only by way of one other enclave."""
-    for target, sources in sorted(influencers(world, SearchLimit()).items()):
-        if len(sources) == 1:
-            yield Apart(source=_NOWHERE, sources=("*",), targets=(target,), through=tuple(sources))
-
-
-# ── writing ────────────────────────────────────────────────────────────────────────────────
-
-_HEAD = """\
-# Requirements that hold for {of} today, for all names that could ever be used.
-# Keep those that have to hold tomorrow, say why, and delete the others.
-"""
-
-
-def render_requirements(requirements: Iterable[Requirement], of: str) -> str:
-    """Return requirements as TOML, with their demands as comments.
-
-    ``of`` names the source at the top.  `sros_tool.proof.requirements.parse_requirements` returns
-    equal requirements, with other places.
-    """
-    lines = [_HEAD.format(of=json.dumps(of))]
-    for requirement in requirements:
-        lines += [f"# {demand(requirement)}", f"[[{requirement.KIND}]]"]
-        lines += [f"{key} = {_toml(value)}" for key, value in _values(requirement)]
-        lines.append("")
-    return "\n".join(lines)
-
-
-def _values(requirement: Requirement) -> Iterator[tuple[str, object]]:
-    match requirement:
-        case Only() | Widest():
-            yield from requirement.rights
-            yield "enclaves", requirement.enclaves
-        case AtMost():
-            yield from requirement.rights
-            yield "enclaves", requirement.most
-        case Nobody():
-            yield from requirement.rights
-        case Protected():
-            for kind in RIGHTS:
-                if found := [name for of, name in requirement.names if of == kind]:
-                    yield kind, found
-            yield "level", requirement.level.value.lower()
-        case Apart():
-            yield "from", requirement.sources
-            yield "to", requirement.targets
-            if requirement.through:
-                yield "through", requirement.through
-        case _:
-            raise AssertionError(requirement)
-
-
-_WIDTH = 80
-
-
-def _toml(value: object) -> str:
-    if not isinstance(value, tuple | list):
-        return json.dumps(value)
-    texts = [json.dumps(each) for each in value]
-    line = f"[{', '.join(texts)}]"
-    if len(line) <= _WIDTH:
-        return line
-    return "\n".join(("[", *(f"  {text}," for text in texts), "]"))

@@ -11,6 +11,10 @@ Names are absolute ROS names, with the wildcards of policies; enclaves are names
 ``--match``, and those that a list excepts have ``!`` before them.  The class of a kind says what it
 demands.
 
+Names and enclaves can have the placeholders of policies, which a fleet fills in.  A table with
+``{robot}`` or ``{namespace}`` stands for a requirement for each robot; ``{robots}`` and
+``{namespaces}`` stand for one name for each robot.
+
 Whoever changes a policy can also change its requirements.  A requirement counts as kept if
 requirements of the new file together demand at least as much, whatever their names and order.
 """
@@ -18,8 +22,9 @@ requirements of the new file together demand at least as much, whatever their na
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,10 +32,17 @@ from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import DROPPED
 from sros_tool.errors import DocumentError
 from sros_tool.files import read_toml
+from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.names import expression_problem, is_expression
 from sros_tool.policy.model import RIGHTS, Level, Source
 from sros_tool.policy.patterns import covers, overlap
-from sros_tool.policy.placeholders import has_placeholder
+from sros_tool.policy.placeholders import (
+    Placeholder,
+    fill,
+    has_placeholder,
+    parts_of,
+    placeholders_of,
+)
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.values import shows
 from sros_tool.wording import first_few
@@ -39,21 +51,28 @@ from sros_tool.xml import read_bytes
 _MOST_REQUIREMENTS = 1000
 _MOST_TEXTS = 1000  # of one key
 _MOST_PAIRS = 20_000  # that requirements of one file make of the names of two lists
+_MOST_FILLED = 20_000  # with the robots of a fleet
 _LONGEST_TEXT = 500  # characters of a name or a reason
 EXCEPT = "!"
 """Prefix of an enclave that is excepted from a list of enclaves."""
+_WORDS = ("name", "why")
+"""Keys with words, which are in every table."""
 _LEVELS = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Requirement:
-    """Base class of requirements: place of its table in the file, its name and reason (or "")."""
+    """Base class of requirements: place of its table in the file, its name and reason (or "").
+
+    ``robot`` is the robot whose values its placeholders have, or "".
+    """
 
     KIND: ClassVar[str]
 
     source: Source
     name: str = ""
     why: str = ""
+    robot: str = ""
 
     def __str__(self) -> str:
         """Return the requirement's own name, or the sentence with its demand."""
@@ -209,35 +228,74 @@ def _listed(names: Iterable[str]) -> str:
 # ── reading ────────────────────────────────────────────────────────────────────────────────
 
 
-def read_requirements(path: Path) -> tuple[Requirement, ...]:
+def read_requirements(
+    path: Path, fleet: Fleet | None = None, robots: Container[str] | None = None
+) -> tuple[Requirement, ...]:
     """Return the requirements in a TOML file, in their order.
+
+    Args:
+        path: the file.
+        fleet: the robots that placeholders stand for; None if there are none.
+        robots: names of the robots of ``fleet`` that requirements are wanted for; None for all.
 
     Raises:
         DocumentError: the file cannot be read, or a part of it is not valid; the error has file and
             line.
     """
-    return parse_requirements(read_bytes(path, "requirements file", most=1024 * 1024), str(path))
+    data = read_bytes(path, "requirements file", most=1024 * 1024)
+    return parse_requirements(data, str(path), fleet, robots)
 
 
-def read_all_requirements(paths: Iterable[Path]) -> tuple[Requirement, ...]:
-    """Return the requirements in several TOML files.
+def read_all_requirements(
+    paths: Iterable[Path], fleet: Fleet | None = None
+) -> tuple[Requirement, ...]:
+    """Return the requirements in several TOML files, for all robots of ``fleet``.
 
     Raises:
         DocumentError: as `read_requirements`.
     """
-    return tuple(requirement for path in paths for requirement in read_requirements(path))
+    return tuple(requirement for path in paths for requirement in read_requirements(path, fleet))
 
 
-def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
+def parse_requirements(
+    data: bytes, file: str, fleet: Fleet | None = None, robots: Container[str] | None = None
+) -> tuple[Requirement, ...]:
     """Return the requirements in a TOML document, which errors and sources call ``file``.
 
     Raises:
         DocumentError: a part of it is not valid.
     """
+    stated = _stated_tables(data, file)
+    filled = (table for one in stated for table in _filled(one, fleet, robots))
+    requirements = []
+    left = _MOST_PAIRS
+    for table in filled:
+        requirement = _READERS[table.kind](table)
+        requirements.append(requirement)
+        if len(requirements) > _MOST_FILLED:
+            raise DocumentError(
+                f"{table.source}: with the robots of the fleet, the tables up to this line are "
+                f"more than {_MOST_FILLED} requirements",
+                "",
+                "Name a group of robots, as in {robot:carriers}, or divide the file.",
+            )
+        left -= _pairs(requirement)
+        if left < 0:
+            raise DocumentError(
+                f"{requirement.source}: the requirements up to this line compare more than "
+                f"{_MOST_PAIRS} pairs of names",
+                "Every name of one list is compared with every name of the other.",
+                "Write patterns in place of names, or divide the file.",
+            )
+    return tuple(requirements)
+
+
+def _stated_tables(data: bytes, file: str) -> list[_Table]:
+    """Return the tables of a TOML document, in the order of their lines."""
     document = read_toml(data, f"the requirements file '{file}'")
     text = data.decode()
     places = _places(text)
-    tables: list[tuple[int, _Table]] = []
+    tables: list[_Table] = []
     for kind, requirements in document.items():
         if kind not in _READERS:
             line = next((n for n, each in _headers(text) if each == kind), 0)
@@ -256,7 +314,7 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
                 f"Write [[{kind}]] before every requirement, and no such line in a text.",
             )
         tables += [
-            (line, _Table(kind, table, Source(file, line), keys))
+            _Table(kind, table, Source(file, line), keys)
             for (line, keys), table in zip(lines, requirements, strict=True)
         ]
     if not tables:
@@ -267,20 +325,7 @@ def parse_requirements(data: bytes, file: str) -> tuple[Requirement, ...]:
         )
     if len(tables) > _MOST_REQUIREMENTS:
         raise DocumentError(f"'{file}' has more than {_MOST_REQUIREMENTS} requirements")
-    requirements = tuple(
-        _READERS[table.kind](table) for _, table in sorted(tables, key=lambda e: e[0])
-    )
-    left = _MOST_PAIRS
-    for requirement in requirements:
-        left -= _pairs(requirement)
-        if left < 0:
-            raise DocumentError(
-                f"{requirement.source}: the requirements up to this line compare more than "
-                f"{_MOST_PAIRS} pairs of names",
-                "Every name of one list is compared with every name of the other.",
-                "Write patterns in place of names, or divide the file.",
-            )
-    return requirements
+    return sorted(tables, key=lambda table: table.source.line)
 
 
 def _pairs(requirement: Requirement) -> int:
@@ -327,6 +372,7 @@ class _Table:
     values: Mapping[str, Any]
     source: Source
     lines: Mapping[str, int]
+    robot: str = ""
 
     def known(self, *keys: str) -> dict[str, Any]:
         """Return the arguments that all requirements have.
@@ -334,7 +380,7 @@ class _Table:
         Raises:
             DocumentError: a key of the table is not in ``keys``.
         """
-        every = (*keys, "name", "why")
+        every = (*keys, *_WORDS)
         for key in self.values:
             if key not in every:
                 raise self.error(
@@ -342,8 +388,8 @@ class _Table:
                     f"{_short(key)} is not a key of [[{self.kind}]]",
                     (f"There are {', '.join(every)}."),
                 )
-        texts = {key: self.text(key) if key in self.values else "" for key in ("name", "why")}
-        return {"source": self.source, **texts}
+        texts = {key: self.text(key) if key in self.values else "" for key in _WORDS}
+        return {"source": self.source, "robot": self.robot, **texts}
 
     def text(self, key: str) -> str:
         value = self.values.get(key)
@@ -376,7 +422,7 @@ class _Table:
         """Return a list of absolute names, perhaps with wildcards."""
         names = self.texts(key, least=least)
         for name in names:
-            problem = _placeholder_problem(name) or expression_problem(name)
+            problem = expression_problem(name)
             if not problem and name[0] not in "/*":
                 problem = "It is not absolute: it does not begin with '/' or '*'."
             if not problem and name == "/":
@@ -390,7 +436,7 @@ class _Table:
         enclaves = self.texts(key)
         for enclave in enclaves:
             name = enclave.removeprefix(EXCEPT)
-            problem = "" if name == "/" else _placeholder_problem(name) or expression_problem(name)
+            problem = "" if name == "/" else expression_problem(name)
             if not problem and name[0] not in "/*?[":
                 problem = "An enclave begins with '/'."
             if problem:
@@ -410,16 +456,156 @@ class _Table:
             )
         return rights
 
-    def error(self, key: str, what: str, why: str) -> DocumentError:
+    def with_names(self, change: Callable[[str], list[str]]) -> _Table:
+        """Return the table with other names in place of each name that has a placeholder."""
+
+        def several(part: object) -> list[Any]:
+            return change(part) if isinstance(part, str) and has_placeholder(part) else [part]
+
+        def changed(value: object) -> object:
+            match value:
+                case str():
+                    return several(value)[0]
+                case list():
+                    return [one for part in value for one in several(part)]
+                case dict():
+                    return {key: changed(part) for key, part in value.items()}
+                case _:
+                    return value
+
+        values = {
+            key: value if key in _WORDS else changed(value) for key, value in self.values.items()
+        }
+        return replace(self, values=values)
+
+    def error(self, key: str, what: str, why: str, remedy: str = "") -> DocumentError:
         place = Source(self.source.file, self.lines.get(key, self.source.line))
-        return DocumentError(f"{place}: {what}", why)
+        return DocumentError(f"{place}: {what}", why, remedy)
 
 
-def _placeholder_problem(name: str) -> str:
-    """Return why a name with a placeholder is refused, as a sentence, or ""."""
-    if not has_placeholder(name):
-        return ""
-    return "Requirements have no placeholders: write a table for each robot, or a wildcard."
+# ── placeholders ───────────────────────────────────────────────────────────────────────────
+
+
+def _filled(table: _Table, fleet: Fleet | None, robots: Container[str] | None) -> Iterator[_Table]:
+    """Yield a table with its placeholders filled in: once, or for each of the robots it is about.
+
+    Raises:
+        DocumentError: there is no fleet, or a placeholder is not valid or has no value.
+    """
+    used = _placeholders(table)
+    if not used:
+        yield table
+        return
+    members = _members(table, used, fleet)
+    kept = {
+        group: tuple(robot for robot in every if robots is None or robot.name in robots)
+        for group, every in members.items()
+    }
+    # A list that would lose all its names would demand something else.
+    several = {group: kept[group] or every for group, every in members.items()}
+    singular = [placeholder for placeholder in used if not placeholder.plural]
+    groups = list(dict.fromkeys(placeholder.group for placeholder in singular if placeholder.group))
+    if len(groups) > 1:
+        raise table.error(
+            used[singular[-1]],
+            f"{' and '.join(map(str, singular))} are of different groups",
+            "In one table, they stand for the same robot.",
+            "Write a table for each group.",
+        )
+    if not singular:
+        yield table.with_names(partial(_filled_names, several=several))
+        return
+    for robot in kept[groups[0] if groups else ""]:
+        own = table.with_names(partial(_filled_names, several=several, robot=robot))
+        words = {key: _filled_words(own.values[key], robot) for key in _WORDS if key in own.values}
+        yield replace(own, values={**own.values, **words}, robot=robot.name)
+
+
+def _placeholders(table: _Table) -> dict[Placeholder, str]:
+    """Map the placeholders in the names of a table to a key that has them."""
+    used: dict[Placeholder, str] = {}
+    for key, value in table.values.items():
+        for name in filter(has_placeholder, () if key in _WORDS else _names_in(value)):
+            try:
+                found = placeholders_of(parts_of(name.removeprefix(EXCEPT)))
+            except ValueError as error:
+                text = f"{_short(name)} is not valid in {key}"
+                raise table.error(key, text, str(error)) from None
+            if isinstance(value, str) and any(placeholder.plural for placeholder in found):
+                raise table.error(
+                    key,
+                    f"{_short(name)} is not valid in {key}",
+                    "It stands for several names, but only one can be here.",
+                )
+            used |= dict.fromkeys(found, key)
+    return used
+
+
+def _members(
+    table: _Table, used: Mapping[Placeholder, str], fleet: Fleet | None
+) -> dict[str, tuple[Robot, ...]]:
+    """Map the groups of placeholders to their robots; "" stands for the whole fleet."""
+    members: dict[str, tuple[Robot, ...]] = {}
+    for placeholder, key in used.items():
+        if fleet is None:
+            raise table.error(
+                key,
+                f"{placeholder} stands for robots, but no fleet says which",
+                "",
+                "For a policy, name the fleet file with --fleet; a keystore of a fleet has one.",
+            )
+        try:
+            robots = fleet.members(placeholder.group)
+        except DocumentError as error:
+            raise table.error(key, error.what, error.why, error.remedy) from error
+        if not robots:
+            raise table.error(
+                key,
+                f"{placeholder} stands for no robot",
+                "With it, the requirement would demand nothing.",
+                "Name a robot of this group in the fleet file, or remove the requirement.",
+            )
+        members[placeholder.group] = robots
+    return members
+
+
+def _names_in(value: object) -> Iterator[str]:
+    """Yield the names in a value of a table."""
+    match value:
+        case str():
+            yield value
+        case list():
+            for part in value:
+                yield from _names_in(part)
+        case dict():
+            for part in value.values():
+                yield from _names_in(part)
+
+
+def _filled_names(
+    name: str, several: Mapping[str, Sequence[Robot]], robot: Robot | None = None
+) -> list[str]:
+    """Return the names that a name, perhaps with `EXCEPT` before it, stands for."""
+    begin = EXCEPT if name.startswith(EXCEPT) else ""
+    parts = parts_of(name.removeprefix(begin))
+    if robot:
+        parts = fill(parts, robot.name, robot.namespace)
+    plural = placeholders_of(parts)
+    filled = (
+        [fill(parts, each.name, each.namespace, plural=True) for each in several[plural[0].group]]
+        if plural
+        else [parts]
+    )
+    return [begin + "".join(map(str, each)) for each in filled]
+
+
+def _filled_words(text: object, robot: Robot) -> object:
+    """Return the name or reason of a requirement with the values of a robot."""
+    if not isinstance(text, str):
+        return text
+    for placeholder, own in (("robot", robot.name), ("namespace", robot.namespace)):
+        text = text.replace(str(Placeholder(placeholder)), own)
+    return text
 
 
 def _only(table: _Table) -> Only:

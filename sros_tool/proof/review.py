@@ -8,7 +8,7 @@ result names what was not compared.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
@@ -29,7 +29,7 @@ from sros_tool.fleet.fleet_file import read_connections, read_fleet
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import Lifetime, Threshold, UnreadableEnclave, due_enclaves
-from sros_tool.keystore.layout import KEY_FILE, SETTINGS, is_keystore
+from sros_tool.keystore.layout import FLEET, KEY_FILE, SETTINGS, is_keystore
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.policy.document import read_policy
@@ -317,7 +317,7 @@ class _Review:
         for each in of_head:
             yield from self._checked("policy", str(each), partial(self._findings, each, head_fleet))
         keystores = yield from self._keystores(self.head)
-        yield from self._requirements(of_head, head_fleet, keystores)
+        yield from self._requirements(of_head, head_fleet, base_fleet, keystores)
         if self.base:
             yield from self._checked(
                 "new-access",
@@ -694,31 +694,33 @@ class _Review:
 
     # ── requirements ───────────────────────────────────────────────────────────────────────
 
-    def _read_requirements(
-        self, side: CommitFiles
-    ) -> Generator[ReviewStep, None, list[Requirement]]:
-        """Return the requirements in BASE or HEAD; yield the steps that read them."""
-        requirements: list[Requirement] = []
+    def _requirement_files(self, side: CommitFiles) -> Generator[ReviewStep, None, dict[str, Path]]:
+        """Return the requirements files of BASE or HEAD; yield the steps that read them."""
+        files: dict[str, Path] = {}
         for path in self.request.requirements:
             try:
                 file = side.file(path)
                 if file:
-                    requirements += read_requirements(file)
+                    files[path] = file
                 elif side is self.head:
                     raise self._missing(path)
             except SrosError as error:
                 yield ReviewStep("requirements", path, _UNDECIDED, error)
-        return requirements
+        return files
 
     def _requirements(
-        self, policies: Sequence[Path], fleet: Fleet | None, keystores: Mapping[str, Path]
+        self,
+        policies: Sequence[Path],
+        fleet: Fleet | None,
+        base_fleet: Fleet | None,
+        keystores: Mapping[str, Path],
     ) -> Iterator[ReviewStep]:
         if not self.request.requirements:
             return
-        wanted = yield from self._read_requirements(self.head)
-        earlier: list[Requirement] = []
+        files = yield from self._requirement_files(self.head)
+        base_files: dict[str, Path] = {}
         if self.base:
-            earlier = yield from self._read_requirements(self.base)
+            base_files = yield from self._requirement_files(self.base)
         at, zone = self.request.at, self.request.zone
         systems: dict[str, Callable[[], System]] = {
             path: partial(load_system, folder, at=at, zone=zone)
@@ -726,17 +728,30 @@ class _Review:
         }
         if self.request.policies:
             named = " ".join(self.request.policies)
-            systems[named] = lambda: policy_system(_together(policies, fleet), at=at)
+            systems[named] = lambda: replace(
+                policy_system(_together(policies, fleet), at=at), fleet=fleet
+            )
         for subject, load in systems.items():
             try:
                 system = load()
-            except SrosError as error:
-                yield ReviewStep("requirements", subject, _UNDECIDED, error)
+                before = self._keystore_fleet(subject) if subject in keystores else base_fleet
+            except (SrosError, OSError) as error:
+                known = error if isinstance(error, SrosError) else DocumentError(str(error))
+                yield ReviewStep("requirements", subject, _UNDECIDED, known)
                 continue
+            wanted = yield from _read(files, system.fleet)
+            # A robot that leaves the fleet drops no requirement.
+            robots = system.fleet.robots if system.fleet else None
+            earlier = yield from _read(base_files, before or system.fleet, robots)
             yield from self._checked("requirements", subject, partial(_decided, wanted, system))
             if dropped_requirements(earlier, wanted):
                 decide = partial(self._dropped, earlier, wanted, system)
                 yield from self._checked("requirements-before", subject, decide)
+
+    def _keystore_fleet(self, path: str) -> Fleet | None:
+        """Return the fleet of a keystore in BASE; None if it has none."""
+        file = self.base.file(f"{path}/{FLEET}") if self.base else None
+        return read_fleet(file) if file else None
 
     def _dropped(
         self, earlier: Sequence[Requirement], wanted: Sequence[Requirement], system: System
@@ -822,6 +837,19 @@ def _status(chosen: ChosenFindings) -> int:
 def _decided(requirements: Sequence[Requirement], system: System) -> tuple[int, ChosenFindings]:
     chosen = FindingFilter().choose(requirement_findings(requirements, system))
     return _status(chosen), chosen
+
+
+def _read(
+    files: Mapping[str, Path], fleet: Fleet | None, robots: Container[str] | None = None
+) -> Generator[ReviewStep, None, list[Requirement]]:
+    """Return the requirements of files, by path; yield the steps that cannot read them."""
+    requirements: list[Requirement] = []
+    for path, file in files.items():
+        try:
+            requirements += read_requirements(file, fleet, robots)
+        except SrosError as error:
+            yield ReviewStep("requirements", path, _UNDECIDED, error)
+    return requirements
 
 
 def _together(files: Sequence[Path], fleet: Fleet | None) -> Policy:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from itertools import product
 from pathlib import Path
@@ -26,6 +26,7 @@ from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.explain.answer import Evaluator
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.robots import Fleet
+from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import (
     KEY_FILE,
     KEY_URI_FILE,
@@ -91,7 +92,7 @@ class System:
 
     ``file`` is its path, ``rights`` are the allowed rights as it states them, and ``places`` tells
     where it states them.  ``left_out`` is the reason why there is no Zenoh world, if Zenoh
-    cannot enforce the policy.
+    cannot enforce the policy.  ``fleet`` has the robots of the policy or keystore, or is None.
     """
 
     file: str
@@ -99,6 +100,7 @@ class System:
     places: Places
     rights: frozenset[Right]
     left_out: SrosError | None = None
+    fleet: Fleet | None = None
 
 
 def load_system(
@@ -138,8 +140,10 @@ def load_system(
                 "Leave --template out, or check the policy.",
             )
         return _keystore_system(opened or Keystore(path), at, zone, domain, only)
-    policy = read_policy_for(path, fleet)
-    return policy_system(policy, at=at, domain=domain or 0, only=only, template=template)
+    system = policy_system(
+        read_policy_for(path, fleet), at=at, domain=domain or 0, only=only, template=template
+    )
+    return replace(system, fleet=fleet)
 
 
 # ── a policy ───────────────────────────────────────────────────────────────────────────────
@@ -441,7 +445,7 @@ def _keystore_system(
         name: [Place(right, Source(files[name], 0)) for right in rights if right.enclave == name]
         for name in names
     }
-    return System(str(root), tuple(worlds), Places(places), rights)
+    return System(str(root), tuple(worlds), Places(places), rights, fleet=load_fleet(keystore))
 
 
 def _link_domains(worlds: Sequence[World]) -> None:

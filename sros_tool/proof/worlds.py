@@ -16,8 +16,9 @@ from functools import cached_property, lru_cache
 from itertools import count
 from string import ascii_letters, digits
 from types import MappingProxyType
+from typing import NamedTuple
 
-from sros_tool.automata import Automaton, Letters, NameSet, SearchLimit
+from sros_tool.automata import Automaton, Letters, NameSet, SearchLimit, Surroundings
 from sros_tool.dds.decision.access import Access, AccessVerb
 from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.vendors import Style
@@ -265,6 +266,17 @@ Confirm = Callable[[str, bool, str], bool]
 """Function (enclave, writes, topic): whether the world's engine allows writing (or reading)."""
 
 
+class Written(NamedTuple):
+    """The topics that an enclave may write, and those of them that are stated exactly.
+
+    ``around`` is what `NameSet.around` returns for them.
+    """
+
+    names: NameSet
+    around: Surroundings | None
+    exact: tuple[str, ...]
+
+
 class World:
     """The topics that all enclaves may write and read, with one vendor or on Zenoh.
 
@@ -318,6 +330,7 @@ class World:
         self.demanded = demanded
         self._readers_of: dict[str, list[str]] = {}
         self._shared: dict[tuple[str, str], str | None] = {}
+        self._written: dict[str, Written] = {}
 
     def _with_fitting(self, name: str, access: Mapping[str, TopicAccess]) -> TopicAccess:
         every = [
@@ -423,6 +436,15 @@ class World:
     def router_of(self, enclave: str) -> str:
         """Return the router that an enclave connects to; "" if there are not several routers."""
         return self.crossing.router_of.get(enclave, "") if self.crossing else ""
+
+    def written_by(self, enclave: str, without: NameSet) -> Written:
+        """Return the topics that an enclave may write, except ``without``, always the same."""
+        if enclave not in self._written:
+            names = self.side(True).of[enclave] - without
+            around = names.around()
+            exact = tuple(topic for topic in around.exact if topic in names) if around else ()
+            self._written[enclave] = Written(names, around, exact)
+        return self._written[enclave]
 
     def shared(self, writer: str, reader: str, written: NameSet, limit: SearchLimit) -> str | None:
         """Return a topic in ``written`` that the reader may read and that gets to it, or None.

@@ -366,7 +366,6 @@ def _with_requirements(
 
     if len(drawing.sources) > 1:
         raise UsageError("--requirements takes one policy or keystore", "", "Name only one SOURCE.")
-    wanted = read_requirements(file)
     system = load_system(
         drawing.sources[0],
         at=drawing.now,
@@ -375,6 +374,7 @@ def _with_requirements(
         template=load_template(drawing.template) if drawing.template else None,
         opened=opened,
     )
+    wanted = read_requirements(file, system.fleet)
     decided = decide_all(wanted, system)
     findings = decided_findings(decided, system)
     violations = tuple(

@@ -189,7 +189,7 @@ def test_more_wildcards_than_can_be_decided_are_one_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each ``?`` after a star doubles what has to be told apart."""
-    monkeypatch.setattr(findings, "_MOST_STEPS", 5000)
+    monkeypatch.setattr(findings, "MOST_STEPS", 5000)
     policy, required = tmp_path / "hard.xml", tmp_path / "hard.toml"
     policy.write_text(policy_text({"/e": publish("/*a" + "?" * 200)}))
     required.write_text(f'[[widest]]\npublish = ["/*a*{"?" * 180}"]\nenclaves = ["*"]\n')

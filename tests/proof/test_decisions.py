@@ -11,8 +11,9 @@ import pytest
 from sros_tool.files import templates_dir
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
-from sros_tool.proof.findings import Decided, decide_all, requirement_findings, suggest
+from sros_tool.proof.findings import Decided, decide_all, requirement_findings
 from sros_tool.proof.requirements import Only, Protected, parse_requirements
+from sros_tool.proof.suggestions import suggest
 from sros_tool.proof.system import System, load_system, policy_system
 from tests.support.harness import policy_text, sros
 

@@ -12,7 +12,6 @@ from sros_tool.dds.decision.vendors import Style
 from sros_tool.errors import DocumentError
 from sros_tool.policy.model import ALLOW, Level, Source
 from sros_tool.policy.rights import Right
-from sros_tool.proof.findings import render_requirements, suggest
 from sros_tool.proof.requirements import (
     Apart,
     AtMost,
@@ -27,6 +26,7 @@ from sros_tool.proof.requirements import (
     parse_requirements,
     read_requirements,
 )
+from sros_tool.proof.suggestions import render_requirements, suggest
 from sros_tool.proof.worlds import TopicAccess, World
 
 EVERY_KIND = """\
@@ -146,8 +146,8 @@ WRONG = {
     '[[nobody]]\npublish = ["~/x"]': "'~/x' is not valid in publish",
     '[[nobody]]\npublish = ["/x y"]': "'/x y' is not valid in publish",
     '[[nobody]]\npublish = ["/[^a]"]': "'/[^a]' is not valid in publish",
-    '[[nobody]]\npublish = ["/{robot}/x"]': "Requirements have no placeholders",
-    '[[widest]]\npublish = []\nenclaves = ["/{robot}/x"]': "Requirements have no placeholders",
+    '[[nobody]]\npublish = ["/{robot}/x"]': "{robot} stands for robots, but no fleet says which",
+    '[[widest]]\npublish = []\nenclaves = ["/{robot}/x"]': "r.toml:3: {robot} stands for robots",
     f"{NOBODY}why = 1": "r.toml:3: why has 1, which is not a text",
     f'{NOBODY}why = ""': "r.toml:3: why has '', which is not a text",
     f'{NOBODY}name = "{"n" * 501}"': "r.toml:3: name has",

@@ -1,0 +1,337 @@
+"""Proposals for requirements: what holds today, for a fleet with placeholders for its robots."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import islice
+
+from sros_tool.automata import SearchLimit
+from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.names import READING_SERVICES, expression_problem, is_expression
+from sros_tool.policy.model import OTHER_SIDE, RIGHTS, Level, Source
+from sros_tool.policy.placeholders import Placeholder
+from sros_tool.policy.rights import Right
+from sros_tool.proof.decide import MOST_STEPS, Worlds, influencers
+from sros_tool.proof.requirements import (
+    Apart,
+    AtMost,
+    Nobody,
+    Only,
+    Protected,
+    Requirement,
+    RightNames,
+    Widest,
+    demand,
+)
+from sros_tool.proof.worlds import World
+
+_NOWHERE = Source("", 0)
+_OF_EVERY_NODE = frozenset({"/rosout", "/parameter_events"})
+_FEW = 3
+"""Highest number of enclaves with a right to a name for which a limit is proposed."""
+_MOST = 1000
+"""Highest number of candidates for each robot, so that a person can read the proposals."""
+_MOST_ROBOTS = 100
+"""Highest number of robots whose candidates are decided."""
+_WIDE_LIST = 50
+"""Highest number of names that are joined into one requirement."""
+
+
+def suggest(
+    rights: Iterable[Right], worlds: Sequence[World], fleet: Fleet | None = None
+) -> tuple[Requirement, ...]:
+    """Propose requirements that hold in all worlds, by the allowed ``rights``.
+
+    What holds for each robot of ``fleet``, or of one of its groups, is proposed once, with
+    placeholders.
+
+    Raises:
+        DocumentError: there are too many wildcards to decide a requirement.
+    """
+    requirements: list[Requirement] = []
+    limit = SearchLimit(MOST_STEPS)
+    all_worlds = Worlds(worlds)
+    most = _MOST * min(len(fleet.robots) if fleet else 1, _MOST_ROBOTS)
+    for requirement in islice(_candidates(_Stated(rights), worlds), most):
+        verdicts = all_worlds.decide(requirement, limit)
+        if not any(verdict.witness or verdict.empty or verdict.always for _, verdict in verdicts):
+            last = _joined(requirements[-1], requirement) if requirements else None
+            requirements[-1:] = [last] if last else [*requirements[-1:], requirement]
+    return tuple(_for_each_robot(requirements, fleet) if fleet else requirements)
+
+
+def _joined(requirement: Requirement, other: Requirement) -> Requirement | None:
+    """Return a requirement that demands the same as two, or None if they cannot be joined."""
+    match requirement, other:
+        case (
+            Nobody(rights=(("request", some),)),
+            Nobody(rights=(("request", more),)),
+        ) if len(some) < _WIDE_LIST:
+            return replace(requirement, rights=(("request", (*some, *more)),))
+        case Protected(names=some, level=level), Protected(names=more) if other.level is level:
+            return replace(requirement, names=(*some, *more))
+    return None
+
+
+class _Stated:
+    """Which enclaves state each right to a name, and the wildcards of each right."""
+
+    def __init__(self, rights: Iterable[Right]) -> None:
+        self.users: dict[tuple[str, str], set[str]] = defaultdict(set)
+        self.wild: dict[str, set[str]] = defaultdict(set)
+        for right in rights:
+            if right.kind == "dds" or expression_problem(right.name):
+                continue  # permissions of others may have any text
+            if is_expression(right.name):
+                self.wild[right.right].add(right.name)
+            else:
+                self.users[right.right, right.name].add(right.enclave)
+
+    def names(self, right: str) -> list[str]:
+        """Return the names without wildcards that a right is stated for, sorted."""
+        return sorted(name for of, name in self.users if of == right)
+
+
+def _candidates(stated: _Stated, worlds: Sequence[World]) -> Iterator[Requirement]:
+    for right in ("publish", "call", "request"):
+        yield from _alone(stated, right)
+    yield from _unused_services(stated)
+    yield from _limits(stated)
+    yield from _gates(worlds[0])
+    for kind, pair in RIGHTS.items():
+        if any(stated.wild[right] or stated.names(right) for right in pair):
+            yield Protected(source=_NOWHERE, names=((kind, "/*"),), level=Level.ENCRYPT)
+    for right in ("publish", "request", "call"):
+        wild = tuple(sorted(stated.wild[right]))
+        yield Widest(source=_NOWHERE, rights=((right, wild),), enclaves=("*",))
+
+
+def _alone(stated: _Stated, right: str) -> Iterator[Only]:
+    """Yield a requirement for each enclave that is the only one with a right to a received name."""
+    other = OTHER_SIDE[right]
+    names: dict[str, list[str]] = defaultdict(list)
+    for name in stated.names(right):
+        users = stated.users[right, name]
+        if len(users) == 1 and name not in _OF_EVERY_NODE and (other, name) in stated.users:
+            names[next(iter(users))].append(name)
+    for enclave, found in sorted(names.items()):
+        yield Only(source=_NOWHERE, rights=((right, tuple(found)),), enclaves=(enclave,))
+
+
+def _unused_services(stated: _Stated) -> Iterator[Nobody]:
+    """Yield requirements that nobody calls services that change a node and that no enclave uses."""
+    last = {name.rpartition("/")[2] for name in stated.names("reply") if name.count("/") > 1}
+    for each in sorted(last.difference(READING_SERVICES)):
+        yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{each}",)),))
+
+
+def _limits(stated: _Stated) -> Iterator[AtMost]:
+    """Yield limits for names that only few enclaves publish."""
+    names: dict[int, list[str]] = defaultdict(list)
+    for name in stated.names("publish"):
+        if name not in _OF_EVERY_NODE and ("subscribe", name) in stated.users:
+            names[len(stated.users["publish", name])].append(name)
+    for count in range(2, _FEW + 1):
+        if names[count]:
+            yield AtMost(source=_NOWHERE, rights=(("publish", tuple(names[count])),), most=count)
+
+
+def _gates(world: World) -> Iterator[Apart]:
+    """Yield requirements that some enclaves can be influenced only by way of one other enclave."""
+    for target, sources in sorted(influencers(world, SearchLimit()).items()):
+        if len(sources) == 1:
+            yield Apart(source=_NOWHERE, sources=("*",), targets=(target,), through=tuple(sources))
+
+
+# ── for a fleet ────────────────────────────────────────────────────────────────────────────
+
+Names = tuple[str, ...]
+
+
+def _for_each_robot(requirements: Iterable[Requirement], fleet: Fleet) -> Iterator[Requirement]:
+    """Yield requirements that demand the same, with placeholders for the robots of a fleet."""
+    stated = tuple(requirements)
+    alike: dict[Requirement, dict[str, Requirement]] = {}
+    for requirement in stated:
+        robot = _robot_of(requirement, fleet)
+        kind = _placed(requirement, robot) if robot else requirement
+        alike.setdefault(kind, {})[robot.name if robot else ""] = requirement
+    for kind, of_robots in alike.items():
+        if "" in of_robots:
+            yield _with_lists(kind, lambda names, value: _joined_names(names, value, fleet))
+        elif (group := _group_of(of_robots, fleet)) is not None:
+            first = next(iter(of_robots))
+            yield _placed(of_robots[first], fleet.robots[first], group)
+        else:
+            yield from of_robots.values()
+
+
+def _robots_in(name: str, fleet: Fleet) -> set[str]:
+    """Return the robots whose name is a part of a name, or whose namespace it begins with."""
+    parts = name.split("/")
+    robots = fleet.robots.keys() & set(parts)
+    for end in range(2, len(parts)):
+        of_space = fleet.by_namespace.get("/".join(parts[:end]), ())
+        robots |= set(of_space) if len(of_space) == 1 else set()
+    return robots
+
+
+def _robot_of(requirement: Requirement, fleet: Fleet) -> Robot | None:
+    """Return the only robot that a requirement names, or None."""
+    named: set[str] = set()
+
+    def collect(names: Names, _: str) -> Names:
+        named.update(*(_robots_in(name, fleet) for name in names))
+        return names
+
+    _with_lists(requirement, collect)
+    return fleet.robots[named.pop()] if len(named) == 1 else None
+
+
+def _placed(requirement: Requirement, robot: Robot, group: str = "") -> Requirement:
+    """Return a requirement with placeholders for a robot of a group."""
+    return _with_lists(
+        requirement,
+        lambda names, value: tuple(
+            _with_placeholder(e, robot, Placeholder(value, group=group)) for e in names
+        ),
+    )
+
+
+def _with_placeholder(name: str, robot: Robot, placeholder: Placeholder) -> str:
+    """Return a name with a placeholder for the namespace of a robot before it, or for its name."""
+    begin, rest = "", name
+    space = f"{robot.namespace}/"
+    if placeholder.value == "namespace" and robot.namespace != "/" and name.startswith(space):
+        begin, rest = str(placeholder), name[len(robot.namespace) :]
+    own = str(placeholder._replace(value="robot"))
+    return begin + "/".join(own if part == robot.name else part for part in rest.split("/"))
+
+
+def _joined_names(names: Names, value: str, fleet: Fleet) -> Names:
+    """Return names with a placeholder for those that are there for each robot of a group."""
+    alike: dict[str, dict[str, str]] = {}
+    for name in names:
+        robots = _robots_in(name, fleet)
+        robot = fleet.robots[robots.pop()] if len(robots) == 1 else None
+        placeholder = Placeholder(value, plural=True)
+        kind = _with_placeholder(name, robot, placeholder) if robot else name
+        alike.setdefault(kind, {})[robot.name if robot else ""] = name
+    joined: list[str] = []
+    for of_robots in alike.values():
+        group = None if "" in of_robots else _group_of(of_robots, fleet)
+        if group is None:
+            joined += of_robots.values()
+        else:
+            first = next(iter(of_robots))
+            placeholder = Placeholder(value, plural=True, group=group)
+            joined.append(_with_placeholder(of_robots[first], fleet.robots[first], placeholder))
+    return tuple(joined)
+
+
+def _group_of(robots: Collection[str], fleet: Fleet) -> str | None:
+    """Return the group with exactly these robots, "" for the whole fleet; None if there is none."""
+    groups = {"": tuple(fleet.robots), **fleet.groups}
+    return next((name for name in groups if set(groups[name]) == set(robots)), None)
+
+
+def _with_lists(requirement: Requirement, change: Callable[[Names, str], Names]) -> Requirement:
+    """Return a requirement with other lists of names and enclaves.
+
+    ``change`` gets a list, and the placeholder value that suits it: "namespace" for names, "robot"
+    for enclaves.
+    """
+
+    def rights(stated: RightNames) -> RightNames:
+        return tuple((right, change(names, "namespace")) for right, names in stated)
+
+    match requirement:
+        case Only() | Widest():
+            return replace(
+                requirement,
+                rights=rights(requirement.rights),
+                enclaves=change(requirement.enclaves, "robot"),
+            )
+        case AtMost() | Nobody():
+            return replace(requirement, rights=rights(requirement.rights))
+        case Protected():
+            kinds = dict.fromkeys(kind for kind, _ in requirement.names)
+            named = {
+                kind: change(
+                    tuple(name for of, name in requirement.names if of == kind), "namespace"
+                )
+                for kind in kinds
+            }
+            pairs = tuple((kind, name) for kind in named for name in named[kind])
+            return replace(requirement, names=pairs)
+        case Apart():
+            return replace(
+                requirement,
+                sources=change(requirement.sources, "robot"),
+                targets=change(requirement.targets, "robot"),
+                through=change(requirement.through, "robot"),
+            )
+        case _:
+            raise AssertionError(requirement)
+
+
+# ── writing ────────────────────────────────────────────────────────────────────────────────
+
+_HEAD = """\
+# Requirements that hold for {of} today, for all names that could ever be used.
+# Keep those that have to hold tomorrow, say why, and delete the others.
+"""
+
+
+def render_requirements(requirements: Iterable[Requirement], of: str) -> str:
+    """Return requirements as TOML, with their demands as comments.
+
+    ``of`` names the source at the top.  `sros_tool.proof.requirements.parse_requirements` returns
+    equal requirements, with other places.
+    """
+    lines = [_HEAD.format(of=json.dumps(of))]
+    for requirement in requirements:
+        lines += [f"# {demand(requirement)}", f"[[{requirement.KIND}]]"]
+        lines += [f"{key} = {_toml(value)}" for key, value in _values(requirement)]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _values(requirement: Requirement) -> Iterator[tuple[str, object]]:
+    match requirement:
+        case Only() | Widest():
+            yield from requirement.rights
+            yield "enclaves", requirement.enclaves
+        case AtMost():
+            yield from requirement.rights
+            yield "enclaves", requirement.most
+        case Nobody():
+            yield from requirement.rights
+        case Protected():
+            for kind in RIGHTS:
+                if found := [name for of, name in requirement.names if of == kind]:
+                    yield kind, found
+            yield "level", requirement.level.value.lower()
+        case Apart():
+            yield "from", requirement.sources
+            yield "to", requirement.targets
+            if requirement.through:
+                yield "through", requirement.through
+        case _:
+            raise AssertionError(requirement)
+
+
+_WIDTH = 80
+
+
+def _toml(value: object) -> str:
+    if not isinstance(value, tuple | list):
+        return json.dumps(value)
+    texts = [json.dumps(each) for each in value]
+    line = f"[{', '.join(texts)}]"
+    if len(line) <= _WIDTH:
+        return line
+    return "\n".join(("[", *(f"  {text}," for text in texts), "]"))

@@ -1,0 +1,199 @@
+"""Requirements with placeholders: for each robot of a fleet, and proposals with them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sros_tool.errors import DocumentError
+from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.proof.findings import decide_all
+from sros_tool.proof.requirements import (
+    Requirement,
+    demand,
+    dropped_requirements,
+    parse_requirements,
+)
+from sros_tool.proof.suggestions import render_requirements, suggest
+from sros_tool.proof.system import load_system
+from tests.proof.test_review import Change
+from tests.support.harness import policy_text, publish, sros
+
+FLEET = Fleet.of(
+    [
+        Robot("r1", "/hall/r1", groups=("carriers",)),
+        Robot("r2", "/hall/r2", groups=("carriers",)),
+        Robot("arm", "/"),
+    ],
+    ("carriers", "nobody"),
+)
+EACH = """\
+[[only]]
+name = "{robot} drives alone"
+why = "in {namespace}"
+publish = ["{namespace}/cmd_vel"]
+enclaves = ["/{robot}/mux"]
+"""
+FROM_OTHERS = """\
+[[apart]]
+from = ["/{robots}/*", "!/{robot:carriers}/*"]
+to = ["/{robot}/base"]
+"""
+ONE_LIST = """\
+[[nobody]]
+publish = ["{namespaces}/stop", "/{robots:carriers}/*/stop", "/plain"]
+"""
+BOTH = """\
+[[not_both]]
+first = { publish = ["{namespace}/a"] }
+second = { call = ["{namespace}/b"] }
+[[must]]
+enclave = "/{robot}/mux"
+call = ["{namespace}/b"]
+"""
+
+
+def read(text: str, fleet: Fleet | None = FLEET) -> tuple[Requirement, ...]:
+    return parse_requirements(text.encode(), "r.toml", fleet)
+
+
+def test_a_table_with_a_robot_is_a_requirement_for_each() -> None:
+    each = read(EACH)
+    assert [demand(one) for one in each] == [
+        "only /arm/mux may publish /cmd_vel",
+        "only /r1/mux may publish /hall/r1/cmd_vel",
+        "only /r2/mux may publish /hall/r2/cmd_vel",
+    ]
+    assert [one.robot for one in each] == ["arm", "r1", "r2"]
+    assert (each[1].name, each[1].why) == ("r1 drives alone", "in /hall/r1")
+    assert [demand(one) for one in read(BOTH)][:2] == [
+        "nobody may both publish /a and call action /b",
+        "nobody may both publish /hall/r1/a and call action /hall/r1/b",
+    ]
+    assert demand(read(BOTH)[-1]) == "/r2/mux has to be able to call action /hall/r2/b"
+
+
+def test_names_of_several_robots_are_in_one_requirement() -> None:
+    (one,) = read(ONE_LIST)
+    names = "/stop, /hall/r1/stop, /hall/r2/stop, /r1/*/stop, /r2/*/stop, /plain"
+    assert dict(getattr(one, "rights"))["publish"] == tuple(names.split(", "))  # noqa: B009
+    assert [demand(each) for each in read(FROM_OTHERS)] == [
+        "/arm/*, /r1/*, /r2/* (but not /r1/*) must not influence /r1/base",
+        "/arm/*, /r1/*, /r2/* (but not /r2/*) must not influence /r2/base",
+    ]
+
+
+WRONG = {
+    '[[nobody]]\npublish = ["/{robbot}/x"]': "r.toml:2: '/{robbot}/x' is not valid in publish",
+    '[[nobody]]\npublish = ["/{robot}*/x"]': "A wildcard is in the same part as {robot}",
+    '[[nobody]]\npublish = ["/x}"]': "It has a brace outside of a placeholder",
+    '[[nobody]]\npublish = ["{namespace}"]': "'/' is not valid in publish",
+    '[[nobody]]\npublish = ["/{robot:carrier}/x"]': "r.toml:2: the fleet has no group 'carrier'",
+    '[[nobody]]\npublish = ["/{robots:nobody}/x"]': "{robots:nobody} stands for no robot",
+    '[[must]]\nenclave = "/{robots}/x"\ncall = ["/x"]': "It stands for several names",
+    '[[only]]\npublish = ["/{robot:nobody}"]\nenclaves = ["/{robot:carriers}"]': "no robot",
+}
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_a_placeholder_without_a_value_is_an_error(text: str) -> None:
+    with pytest.raises(DocumentError) as caught:
+        read(text)
+    assert WRONG[text] in str(caught.value)
+
+
+def test_one_table_is_about_one_group() -> None:
+    fleet = Fleet.of([Robot("a", "/a", groups=("one",)), Robot("b", "/b", groups=("two",))])
+    text = '[[only]]\npublish = ["/{robot:one}"]\nenclaves = ["/{robot:two}"]'
+    with pytest.raises(DocumentError, match=r"\{robot:one} and \{robot:two} are of different"):
+        read(text, fleet)
+
+
+def test_a_robot_that_leaves_drops_nothing_and_a_changed_group_does() -> None:
+    text = EACH + FROM_OTHERS + ONE_LIST
+    left = Fleet.of([robot for robot in FLEET.robots.values() if robot.name != "r2"])
+    left = Fleet.of(left.robots.values(), ("carriers",))
+    before = parse_requirements(text.encode(), "r.toml", FLEET, left.robots)
+    assert dropped_requirements(before, read(text, left)) == ()
+    moved = Fleet.of([robot._replace(groups=()) for robot in left.robots.values()])
+    after = parse_requirements((EACH + ONE_LIST.replace(":carriers", "")).encode(), "r", moved)
+    dropped = dropped_requirements(before, after)
+    assert [type(each.requirement).KIND for each in dropped] == ["apart"]
+
+
+POLICY = policy_text(
+    {
+        "/{robot}/mux": publish("{namespace}/cmd_vel"),
+        "/{robot}/base": '<topics subscribe="ALLOW"><topic>{namespace}/cmd_vel</topic></topics>',
+        "/{robot:carriers}/lift": publish("{namespace}/lift"),
+        "/desk": '<topics subscribe="ALLOW"><topic>{namespaces:carriers}/lift</topic></topics>',
+    }
+)
+FILE = """\
+[robots]
+r1 = { groups = ["carriers"] }
+r2 = { groups = ["carriers"] }
+r3 = {}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "robot.xml").write_text(POLICY)
+    (tmp_path / "fleet.toml").write_text(FILE)
+    (tmp_path / "r.toml").write_text(EACH)
+    return tmp_path
+
+
+def test_proposals_for_a_fleet_demand_what_those_for_its_robots_demand(folder: Path) -> None:
+    from sros_tool.fleet.fleet_file import read_fleet
+
+    fleet = read_fleet(folder / "fleet.toml")
+    system = load_system(folder / "robot.xml", at=datetime(2027, 1, 1, tzinfo=UTC), fleet=fleet)
+    each, folded = (suggest(system.rights, system.worlds, of) for of in (None, fleet))
+    text = render_requirements(folded, "robot.xml")
+    assert "# only /{robot}/mux may publish {namespace}/cmd_vel\n" in text
+    assert "# only /{robot:carriers}/lift may publish {namespace:carriers}/lift\n" in text
+    filled = parse_requirements(text.encode(), "r.toml", fleet)
+    assert sorted(map(demand, filled)) == sorted(map(demand, each))
+    assert decide_all(filled, system).violations == ()
+
+
+def test_a_finding_for_all_robots_is_shown_once(folder: Path) -> None:
+    words = ("--requirements", "r.toml", "--include", "requirement.*")
+    of_policy = ("check", "robot.xml", "--fleet", "fleet.toml")
+    assert sros(*of_policy, *words, cwd=folder).status == 0
+    wide = POLICY.replace("/lift</topic>", "/lift</topic><topic>{namespace}/cmd_*</topic>", 1)
+    (folder / "robot.xml").write_text(wide)
+    ended = sros(*of_policy, *words, cwd=folder)
+    assert (ended.status, ended.out.count("requirement.violated")) == (1, 1), ended.out
+    assert "only /r1/mux may publish /r1/cmd_vel: in /r1" in ended.out
+    assert "the same for 1 more robot: r2" in ended.out
+    of_one = sros("check", "robot.xml", "--requirements", "r.toml", cwd=folder)
+    assert "stands for" in of_one.err or "Without a fleet" in of_one.err
+    keys = ("-k", "ks", "-p", "robot.xml", "--fleet", "fleet.toml")
+    sros("generate_artifacts", *keys, cwd=folder).ok()
+    ended = sros("check", "ks", *words, cwd=folder)
+    assert (ended.status, ended.out.count("requirement.violated")) == (1, 1), ended.out
+    assert "the same for 1 more robot: r2" in ended.out
+    one = sros("check", "ks", *words, "--json", cwd=folder)
+    assert one.out.count('"requirement.violated"') == 2
+
+
+def test_a_review_fills_in_the_fleet_of_each_commit(tmp_path: Path) -> None:
+    change = Change(tmp_path)
+    change.base = ""
+    change.commit({"robot.xml": POLICY, "fleet.toml": FILE, "r.toml": EACH + FROM_OTHERS})
+    words = ("--policy", "robot.xml", "--fleet", "fleet.toml", "--requirements", "r.toml")
+    change.commit({"fleet.toml": FILE.replace('r2 = { groups = ["carriers"] }\n', "")})
+    left = change.review(*words)
+    assert "requirements robot.xml: nothing found" in left.out, left
+    assert "requirements-before" not in left.out
+    change.commit({"fleet.toml": FILE.replace('r2 = { groups = ["carriers"] }', "r2 = {}")})
+    moved = change.review(*words)
+    assert "requirements-before robot.xml: 1 requirement dropped" in moved.out, moved.out
+    change.commit({"fleet.toml": FILE, "r.toml": EACH})
+    dropped = change.review(*words)
+    assert "requirements-before robot.xml: 2 requirements dropped" in dropped.out, dropped.out
