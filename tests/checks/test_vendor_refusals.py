@@ -18,7 +18,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import ERROR, WARNING, Finding
 from sros_tool.dds.decision.vendors import TESTED, Signers, together
 from sros_tool.errors import PkiError
-from sros_tool.faults import AT_HOME, Fault
+from sros_tool.faults import ORIGINAL_KEYSTORE, Fault
 from sros_tool.keystore.delivery.robot import RequestAnswer, check_answer, seal
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
@@ -222,7 +222,9 @@ def test_the_cause_is_found_once_wherever_the_files_lie(row: Row, bench: Bench) 
         if place == "export":
             named = [each for each in found if each.id == wanted]
             assert any(row.says in each.text and row.remedy in each.remedy for each in named), named
-            assert all("KEYSTORE" not in it.remedy or AT_HOME in it.remedy for it in found)
+            assert all(
+                "KEYSTORE" not in it.remedy or ORIGINAL_KEYSTORE in it.remedy for it in found
+            )
 
 
 def signed_below(bench: Bench) -> None:
