@@ -120,8 +120,10 @@ def test_requirements_that_a_pull_request_drops_are_decided(origin: Origin, tmp_
     assert "`requirement.dropped`" in said
     assert "only /mux may publish /cmd_vel: the new file has no such requirement" in said
     assert "but only /mux may publish /cmd_vel" in said
-    status, said, _ = run_action(origin, clone, **ALL, new_access="allow")
+    allowed = {"new_access": "allow", "dropped_requirements": "allow"}
+    status, said, _ = run_action(origin, clone, **ALL, **allowed)
     assert status == 0, said
+    assert said.startswith("## Review: only what is allowed was found, but 2 things were left out")
 
 
 @sometimes("the installation of the action")

@@ -237,9 +237,9 @@ def diff_policy(
     if form == "json":
         print_json(policy_difference(first, second, compared))
     elif form == "markdown":
-        echo_lines(rights_markdown(first, second))
+        echo_lines(rights_markdown(first, second, compared))
     else:
-        lines = _difference_lines(difference, first.fleet, second.fleet)
+        lines = difference_lines(difference, first.fleet, second.fleet)
         for line in (*lines, *_protection_lines(protections), *unanswered_lines(compared)):
             echo(line)
         count = len(difference.only_first) + len(difference.only_second)
@@ -259,17 +259,15 @@ A comment on GitHub has at most 65,536 characters; Mermaid draws at most 50,000,
 """
 
 
-def rights_markdown(first: RightsSource, second: RightsSource) -> str:
+def rights_markdown(first: RightsSource, second: RightsSource, compared: SourcesDifference) -> str:
     """Return how rights differ as Markdown, with a picture."""
-    from sros_tool.keystore.rights import compare_sources
     from sros_tool.markdown import bounded, code, fenced, plain
     from sros_tool.report.sources import drawn_difference
 
-    compared = compare_sources(first, second)
     drawn = drawn_difference(
         first, second, compared.rights, letters=_MOST_PICTURE, arrows=_MOST_LINKS
     )
-    lines = _difference_lines(compared.rights, first.fleet, second.fleet)
+    lines = difference_lines(compared.rights, first.fleet, second.fleet)
     lines += _protection_lines(compared.protections)
     parts = []
     rest = "which `sros diff_policy` shows"
@@ -311,7 +309,7 @@ def _protection_lines(protections: Iterable[tuple[str, StatedProtection]]) -> li
     ]
 
 
-def _difference_lines(
+def difference_lines(
     difference: RightsDifference, first: Fleet | None, second: Fleet | None
 ) -> list[str]:
     """Return the lines for a difference; lines that differ only in the robot are merged."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -30,7 +30,7 @@ from sros_tool.wording import counted
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.proof.repository import Repository
-    from sros_tool.proof.review import Review, ReviewRequest, ReviewStep
+    from sros_tool.proof.review import Review, ReviewRequest, ReviewStep, RightsChange
 
     _PathsType = click.ParamType[tuple[str, ...]]
 else:  # generic from click 8.2 on
@@ -41,7 +41,7 @@ _MOST = 60_000
 _MOST_REASONS = 20
 """Maximum number of lines below a failed step."""
 _SIGNS = {0: "🟢", 1: "🔴", 2: "⚪"}
-_WORDS = {0: "nothing found", 1: "found", 2: "could not be decided"}
+_SIGN_ALLOWED = "🟡"
 _TITLES = {
     "new-access": "New access",
     "requirements": "Requirements",
@@ -118,7 +118,14 @@ def _paths_option(name: str, metavar: str, help_text: str) -> Callable[[Decorate
     type=click.Choice(["fail", "allow"]),
     default="fail",
     show_default=True,
-    help="Whether new access, or access that a dropped requirement forbade, makes the review fail.",
+    help="Whether new access, or a changed policy that is not reviewed, makes the review fail.",
+)
+@click.option(
+    "--dropped-requirements",
+    type=click.Choice(["fail", "allow"]),
+    default="fail",
+    show_default=True,
+    help="Whether requirements of BASE that HEAD drops or weakens make the review fail.",
 )
 @click.option(
     "--renew-within",
@@ -164,6 +171,7 @@ def review(
     keystore: tuple[tuple[str, ...], ...],
     leave_out: tuple[tuple[str, ...], ...],
     new_access: str,
+    dropped_requirements: str,
     renew_within: str,
     folder: Path,
     remote: str | None,
@@ -191,8 +199,8 @@ def review(
             --policy robot/robot.xml --requirements robot/requirements.toml \
             --keystore keystore --summary /tmp/review.md --sarif /tmp/review.sarif
 
-    Exit status: 0 if nothing was found, 1 if something was, 2 if something could not be
-    decided.
+    Exit status: 0 if nothing was found, or only what is allowed; 1 if something was found, 2 if
+    something could not be decided.
     """
     from sros_tool.keystore.expiry import parse_threshold
     from sros_tool.proof.commit_files import checked_path
@@ -228,6 +236,7 @@ def review(
             checked_path(fleet) if fleet else "",
             keystores,
             new_access == "allow",
+            dropped_requirements == "allow",
             threshold,
             left_out,
             now(),
@@ -244,7 +253,12 @@ def review(
 
         steps = [
             StepResult(
-                step.kind, result.shown(step.subject) or None, step.status, _sentence(result, step)
+                step.kind,
+                result.shown(step.subject) or None,
+                step.status,
+                step.allowed,
+                _sentence(result, step),
+                [result.shown(line) for line in _reasons(step)],
             )
             for step in result.steps
         ]
@@ -349,8 +363,19 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             return chosen.summary()
         case AccessChange(growth=growth):
             return access_summary(growth)
-        case RightsChange():
-            return "the rights that are written differ"
+        case RightsChange(compared=compared, absolute=absolute):
+            added, gone = len(compared.rights.only_second), len(compared.rights.only_first)
+            clauses = [
+                f"{counted(count, what)} {said}"
+                for count, what, said in (
+                    (added, "written right", "added"),
+                    (gone, "written right", "gone"),
+                    (len(compared.protections), "stated protection", "changed"),
+                    (len(absolute), "name", "made absolute"),
+                )
+                if count
+            ]
+            return ", ".join(clauses)
         case DroppedRequirements(count=count, chosen=chosen):
             dropped = counted(count, "requirement")
             return f"{dropped} dropped or changed, decided as they were before: {chosen.summary()}"
@@ -378,25 +403,43 @@ def _text(result: Review) -> list[str]:
 
 
 def _reasons(step: ReviewStep) -> list[str]:
-    """Return what a reviewer has to read: new access, also if it is accepted; rights that nobody
-    answers any more; the findings of a failed step.
+    """Return what a reviewer has to read: new access and dropped requirements, also if they are
+    allowed; rights that nobody answers any more; the findings of a failed step.
     """
     from sros_tool.checks.registry import ChosenFindings
-    from sros_tool.cli.policy import added_lines, unanswered_lines
-    from sros_tool.keystore.rights import compare_sources
+    from sros_tool.cli.policy import added_lines, difference_lines, unanswered_lines
     from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange
 
     match step.content:
         case AccessChange(after=after, growth=growth):
             return added_lines(after, growth)
-        case RightsChange(before=before, after=after):
-            return [*unanswered_lines(compare_sources(before, after))]
-        case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen) if step.status:
-            return [
-                f"{finding.place}: {finding.severity.word}: {finding.text} [{finding.id}]"
-                for finding in chosen.shown
-            ]
+        case RightsChange(before=before, after=after, compared=compared):
+            differing = difference_lines(compared.rights, before.fleet, after.fleet)
+            return [*unanswered_lines(compared), *_absolute_lines(step.content), *differing]
+        case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen) if (
+            step.status or step.allowed
+        ):
+            return [_finding_line(finding) for finding in chosen.shown]
     return []
+
+
+def _finding_line(finding: Finding) -> str:
+    """Return a finding in one line, for a dropped requirement with its line in BASE."""
+    from sros_tool.checks.requirements import DROPPED
+
+    subject = "" if finding.subject == finding.file else f"{finding.subject}: "
+    line = f"{finding.place}: {finding.severity.word}: {subject}{finding.text} [{finding.id}]"
+    places = finding.related if finding.kind is DROPPED else ()
+    return line + "".join(f" ({place.text}: {place})" for place in places)
+
+
+def _absolute_lines(change: RightsChange) -> Iterator[str]:
+    """Yield a line for each name that does not move with the namespace of its node any more."""
+    for right, written, source, _, profile in change.absolute:
+        yield (
+            f"~ {right.enclave} {right.describe()} is written with a / at its beginning now: "
+            f"it stays {written} in other namespaces than {profile.ns}  ({source})"
+        )
 
 
 def _verdict(result: Review) -> str:
@@ -407,6 +450,8 @@ def _verdict(result: Review) -> str:
         for count, word in zip(counts, ("failed", "could not be decided"), strict=True)
         if count
     ]
+    if allowed := sum(step.allowed for step in result.steps):
+        words.append(f"{counted(allowed, 'step')} found what is allowed")
     left_out = f"; but {'; '.join(result.left_out)}" if result.left_out else ""
     compared = f" compared with {result.base}" if result.base else ""
     return f"{result.head}{compared}: {' and '.join(words) or 'nothing found'}{left_out}"
@@ -416,9 +461,11 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
     """Return the review as Markdown: the steps in short, then each of them, the worst first."""
     from sros_tool.markdown import bounded, code, plain
 
-    verdict = _WORDS[result.status] if result.status != 1 else "something found"
+    allowed = any(step.allowed for step in result.steps)
+    passed = "only what is allowed was found" if allowed else "nothing found"
+    verdict = (passed, "something found", "could not be decided")[result.status]
     lines = (
-        f"{_SIGNS[step.status]} {_TITLES[step.kind]}"
+        f"{_SIGN_ALLOWED if step.allowed else _SIGNS[step.status]} {_TITLES[step.kind]}"
         f"{' ' + code(result.shown(step.subject)) if step.subject else ''}: "
         f"{code(_sentence(result, step))}"
         for step in _by_weight(result)
@@ -443,9 +490,11 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
 
 
 def _by_weight(result: Review) -> list[ReviewStep]:
-    """Sort the steps: failed ones first, then by importance."""
+    """Sort the steps: failed ones first, then allowed ones, then by importance."""
     kinds = list(_TITLES)
-    return sorted(result.steps, key=lambda step: (not step.status, kinds.index(step.kind)))
+    return sorted(
+        result.steps, key=lambda step: (not step.status, not step.allowed, kinds.index(step.kind))
+    )
 
 
 def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
@@ -475,8 +524,12 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
             return findings(chosen) if chosen.shown else ""
         case AccessChange(before=before, after=after, growth=growth):
             return access_markdown(before, after, growth)
-        case RightsChange(before=before, after=after):
-            return rights_markdown(before, after)
+        case RightsChange(before=before, after=after, compared=compared) as change:
+            text = rights_markdown(before, after, compared) if compared else ""
+            if lines := list(_absolute_lines(change)):
+                title = f"### {counted(len(lines), 'name')} made absolute"
+                text += f"{title}\n\n{bounded(map(code, lines), 6000, rest)}\n"
+            return text
         case DroppedRequirements(chosen=chosen):
             title = "### The requirements changed: these are checked as they were before"
             return f"{title}\n\n{findings(chosen)}"

@@ -1134,6 +1134,27 @@ _LOOKED_AT = 256 * 1024
 """Size in bytes of the largest file without the ending ``.xml`` that is searched for a policy."""
 
 
+def join_policies(policies: Sequence[Policy]) -> Policy:
+    """Return one policy with the enclaves of several policies of a robot or a fleet.
+
+    A policy may include the enclaves of another one; ``policies`` has at least one policy.
+
+    Raises:
+        PolicyError: two policies state the same enclave at different places.
+    """
+    enclaves: dict[str, Enclave] = {}
+    for enclave in (enclave for policy in policies for enclave in policy.enclaves):
+        other = enclaves.setdefault(enclave.path, enclave)
+        if other.source != enclave.source:
+            raise PolicyError(
+                f"{enclave.source}: enclave {enclave.path} is in another policy, too",
+                f"The other one is at {other.source}.",
+                "Name only policies of one robot, and state each enclave in one of them.",
+            )
+    fallbacks = tuple(fallback for policy in policies for fallback in policy.fallbacks)
+    return replace(policies[0], enclaves=tuple(enclaves.values()), fallbacks=fallbacks)
+
+
 def policy_files(folder: Path) -> Iterator[Path]:
     """Yield the paths of the policies in a folder and below it, sorted.
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, NamedTuple
@@ -21,7 +21,7 @@ from sros_tool.checks.kind import WARNING, Finding
 from sros_tool.checks.registry import ChosenFindings, FindingFilter
 from sros_tool.checks.requirements import VACUOUS
 from sros_tool.checks.targets import Circumstances, path_findings, policy_findings
-from sros_tool.errors import DocumentError, PolicyError, SrosError
+from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
@@ -31,10 +31,10 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import Lifetime, Threshold, UnreadableEnclave, due_enclaves
 from sros_tool.keystore.layout import FLEET, KEY_FILE, SETTINGS, is_keystore
 from sros_tool.keystore.reader import Keystore
-from sros_tool.keystore.rights import RightsSource, load_rights
+from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import Policy
-from sros_tool.policy.rights import policy_rights
+from sros_tool.policy.model import Enclave
+from sros_tool.policy.rights import PlacedRight, placed_rights, policy_rights
 from sros_tool.proof.commit_files import (
     CommitFiles,
     includes_files,
@@ -54,7 +54,7 @@ from sros_tool.proof.requirements import (
     read_requirements,
 )
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
-from sros_tool.proof.system import System, load_system, policy_system
+from sros_tool.proof.system import System, load_system
 from sros_tool.values import Words
 from sros_tool.wording import first_few
 
@@ -81,9 +81,10 @@ class ReviewRequest:
     """What to review; paths are relative to the top of the repository.
 
     ``head`` is the commit to review, ``base`` the commit to compare with ("": none). With
-    ``allow_new_access``, new access is shown but does not make the review fail. The review fails if
-    an enclave expires within ``renew_within``.  ``left_out`` are files and folders of policies that
-    are not reviewed.
+    ``allow_new_access``, new access and unreviewed policies are shown but do not make the review
+    fail; with ``allow_dropped_requirements``, neither do requirements that HEAD drops or weakens.
+    The review fails if an enclave expires within ``renew_within``.  ``left_out`` are files and
+    folders of policies that are not reviewed.
     """
 
     repository: Repository
@@ -94,6 +95,7 @@ class ReviewRequest:
     fleet: str
     keystores: tuple[str, ...]
     allow_new_access: bool
+    allow_dropped_requirements: bool
     renew_within: Threshold
     left_out: tuple[str, ...]
     at: datetime
@@ -111,10 +113,16 @@ class AccessChange:
 
 @dataclass(frozen=True, slots=True)
 class RightsChange:
-    """The rights of a policy in BASE and in HEAD."""
+    """How the rights of all reviewed policies in HEAD differ from those in BASE.
+
+    ``absolute`` are the rights whose names are absolute in HEAD, and were relative to the namespace
+    in BASE: users who put the node into another namespace do not move these names any more.
+    """
 
     before: RightsSource
     after: RightsSource
+    compared: SourcesDifference
+    absolute: tuple[PlacedRight, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,13 +169,15 @@ class ReviewStep:
 
     ``kind`` is "files", "policy", "requirements", "requirements-before", "new-access", "rights",
     "keystore" or "expiry"; ``subject`` is the path that the step is about.  If the result is an
-    error, it says why the step could not be decided.
+    error, it says why the step could not be decided.  ``allowed``: the step found something that
+    the request allows, so that its status is 0.
     """
 
     kind: str
     subject: str
     status: int
     content: Content
+    allowed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,8 +243,12 @@ class StepResult(NamedTuple):
     """Path that the step checks; null for the whole commit."""
     status: int
     """Exit status of the step: 0, 1 or 2, as for the review."""
+    allowed: bool
+    """Whether the step found something that an option allows; its status is 0 then."""
     result: str
     """The result as a sentence, or why the step could not be decided."""
+    lines: Sequence[str]
+    """New access, dropped requirements, changed rights, or findings of a failed step."""
 
 
 class ReviewResult(NamedTuple):
@@ -245,7 +259,7 @@ class ReviewResult(NamedTuple):
     head: str
     """The full id of the commit that was reviewed."""
     status: int
-    """Exit status: 0 nothing found, 1 findings, 2 a step could not be decided."""
+    """Exit status: 0 nothing found that fails, 1 findings, 2 a step could not be decided."""
     steps: Sequence[StepResult]
     """The steps of the review."""
     findings: Sequence[Finding]
@@ -288,10 +302,11 @@ class _Review:
     head: CommitFiles
     base: CommitFiles | None
 
-    @property
-    def _new_access(self) -> int:
-        """The exit status of a step that finds new access: 0 if the request allows it, else 1."""
-        return _OK if self.request.allow_new_access else _FOUND
+    def _allows(self, kind: str) -> bool:
+        """Return whether the request allows what steps of this kind find."""
+        if kind == "requirements-before":
+            return self.request.allow_dropped_requirements
+        return kind in ("new-access", "files") and self.request.allow_new_access
 
     def all(self) -> Iterator[ReviewStep]:
         asked = self.request
@@ -319,21 +334,18 @@ class _Review:
         keystores = yield from self._keystores(self.head)
         yield from self._requirements(of_head, head_fleet, base_fleet, keystores)
         if self.base:
+            named = " ".join(asked.policies)
+            before = cache(partial(load_policies, of_base, _BASE, base_fleet))
+            after = cache(partial(load_policies, of_head, _HEAD, head_fleet))
             yield from self._checked(
                 "new-access",
-                " ".join(asked.policies),
-                lambda: self._access(of_base, base_fleet, of_head, head_fleet),
+                named,
+                lambda: self._access(of_base, base_fleet, before, after),
                 if_any=bool(asked.policies),
             )
-            for each in of_head:
-                path = str(each.relative_to(self.head.folder))
-                before = self.base.folder / path
-                if before in of_base:
-                    yield from self._checked(
-                        "rights",
-                        path,
-                        partial(self._rights, (before, base_fleet), (each, head_fleet)),
-                    )
+            yield from self._checked(
+                "rights", named, partial(self._rights, before, after), if_any=bool(of_base)
+            )
         for path, keystore in keystores.items():
             yield from self._keystore(path, keystore)
         if self.base:
@@ -344,8 +356,8 @@ class _Review:
         for error in self.head.refused + (self.base.refused if self.base else []):
             yield ReviewStep("files", "", _UNDECIDED, error)
 
-    @staticmethod
     def _checked(
+        self,
         kind: str,
         subject: str,
         decide: Callable[[], tuple[int, Content] | None],
@@ -362,7 +374,9 @@ class _Review:
         except OSError as error:  # such as a name that is too long for this system
             decided = _UNDECIDED, DocumentError(f"'{error.filename}': {error.strerror}")
         if decided:
-            yield ReviewStep(kind, subject, *decided)
+            status, content = decided
+            allowed = status == _FOUND and self._allows(kind)
+            yield ReviewStep(kind, subject, _OK if allowed else status, content, allowed)
 
     # ── files ──────────────────────────────────────────────────────────────────────────────
 
@@ -455,7 +469,7 @@ class _Review:
                 if before.get(where) != (value := after.get(where)):
                     said = "is gone, which" if value is None else f"is {value}, which"
                     lines.append((f"{said} can change which keys Ansible delivers, and how", where))
-        return (self._new_access, Facts(tuple(lines))) if lines else None
+        return (_FOUND, Facts(tuple(lines))) if lines else None
 
     def _others(self, reviewed: Sequence[Path], fleet: Fleet | None) -> tuple[int, Content] | None:
         """Return the step on policy files that were changed or renamed, but are not reviewed."""
@@ -471,20 +485,20 @@ class _Review:
         for path in self._policies_among(changed, self.head):
             if self.request.repository.content(entries[path].id) not in shipped:
                 lines.append((f"{_NOT_USED} --leave-out {quote(path)}, or delete it", path))
-                status = self._new_access
+                status = _FOUND
         for path in self._used_in_part(changed, reviewed, fleet):
             lines.append(("changes and is used only in part: the rest is not reviewed", path))
-            status = self._new_access
+            status = _FOUND
         for path in self._not_reviewed_users(changed):
             lines.append(("is not reviewed, and includes a file that changes", path))
-            status = self._new_access
+            status = _FOUND
         sizes = self.request.repository.sizes(names)
         for path, entry in changed:
             if sizes.get(entry.id, 0) > _MOST_OUTSIDE and entry.mode in FILES:
                 lines.append(("changes and is too large to be reviewed", path))
             if said := self._unseen(path, entry):
                 lines.append((f"changes and is not reviewed: it is {said}", path))
-                status = self._new_access
+                status = _FOUND
         gone = [
             (path, entry)
             for path, entry in self._changed(self.base, self.head)
@@ -637,6 +651,8 @@ class _Review:
             yield "nothing is compared with an earlier commit, as asked"
         if asked.allow_new_access:
             yield "new access does not fail the review, as asked"
+        if asked.allow_dropped_requirements:
+            yield "dropped requirements do not fail the review, as asked"
         for path in asked.left_out:
             yield f"policies in '{path}' are not reviewed, as asked"
         if asked.keystores:
@@ -670,27 +686,33 @@ class _Review:
         self,
         of_base: Sequence[Path],
         base_fleet: Fleet | None,
-        of_head: Sequence[Path],
-        head_fleet: Fleet | None,
+        before: Callable[[], AccessSource],
+        after: Callable[[], AccessSource],
     ) -> tuple[int, Content]:
-        after = load_policies(of_head, _HEAD, head_fleet)
+        head = after()
         if not of_base:
             assert self.base
             for path in self.request.policies:  # raises the reason why it was not read
                 self.base.policies(path, placeholders=base_fleet is not None)
             new = (("is new, so that all of its access is new", " ".join(self.request.policies)),)
-            return self._new_access, Facts(new)
-        return self._compared(load_policies(of_base, _BASE, base_fleet), after)
+            return _FOUND, Facts(new)
+        return self._compared(before(), head)
 
     def _compared(self, before: AccessSource, after: AccessSource) -> tuple[int, Content]:
         growth = compare_access(before, after)
-        return (self._new_access if growth else _OK), AccessChange(before, after, growth)
+        return (_FOUND if growth else _OK), AccessChange(before, after, growth)
 
+    @staticmethod
     def _rights(
-        self, before: tuple[Path, Fleet | None], after: tuple[Path, Fleet | None]
+        before: Callable[[], AccessSource], after: Callable[[], AccessSource]
     ) -> tuple[int, Content] | None:
-        first, second = load_rights(*before), load_rights(*after)
-        return None if first.rights == second.rights else (_OK, RightsChange(first, second))
+        base, head = before(), after()
+        first, second = base.as_rights(), head.as_rights()
+        absolute = _made_absolute(base.enclaves.values(), head.enclaves.values())
+        compared = compare_sources(first, second)
+        if not compared and not absolute:
+            return None
+        return _OK, RightsChange(first, second, compared, absolute)
 
     # ── requirements ───────────────────────────────────────────────────────────────────────
 
@@ -728,9 +750,7 @@ class _Review:
         }
         if self.request.policies:
             named = " ".join(self.request.policies)
-            systems[named] = lambda: replace(
-                policy_system(_together(policies, fleet), at=at), fleet=fleet
-            )
+            systems[named] = lambda: load_system(policies, at=at, fleet=fleet)
         for subject, load in systems.items():
             try:
                 system = load()
@@ -760,7 +780,7 @@ class _Review:
         findings = dropped_findings(earlier, wanted, " ".join(self.request.requirements))
         broken = requirement_findings(dropped, system)
         chosen = FindingFilter(exclude=(VACUOUS.id,)).choose([*findings, *broken])
-        return self._new_access, DroppedRequirements(len(dropped), chosen)
+        return _FOUND, DroppedRequirements(len(dropped), chosen)
 
     # ── keystores ──────────────────────────────────────────────────────────────────────────
 
@@ -788,7 +808,7 @@ class _Review:
             if before:
                 return self._compared(load_side(before), load_side(folder))
             new = (("is new, so that all of its access is new", path),)
-            return self._new_access, Facts(new)
+            return _FOUND, Facts(new)
 
         yield from self._checked("keystore", path, findings)
         if self.base:
@@ -830,6 +850,20 @@ def _same(base: CommitFiles | None, head: CommitFiles, path: str) -> bool:
     return base is not None and base.files.get(path) == head.files.get(path)
 
 
+def _made_absolute(before: Iterable[Enclave], after: Iterable[Enclave]) -> tuple[PlacedRight, ...]:
+    """Return the rights that begin with / in ``after``, and were relative in ``before``."""
+    relative, absolute = (
+        {
+            placed.right: placed
+            for enclave in enclaves
+            for placed in placed_rights(enclave)
+            if placed.written.startswith("/") is begins
+        }
+        for enclaves, begins in ((before, False), (after, True))
+    )
+    return tuple(placed for right, placed in absolute.items() if right in relative)
+
+
 def _status(chosen: ChosenFindings) -> int:
     return _FOUND if chosen.fails(WARNING) else _OK
 
@@ -850,26 +884,3 @@ def _read(
         except SrosError as error:
             yield ReviewStep("requirements", path, _UNDECIDED, error)
     return requirements
-
-
-def _together(files: Sequence[Path], fleet: Fleet | None) -> Policy:
-    """Return the policies of one robot or one fleet, joined into one policy.
-
-    Raises:
-        PolicyError: there is no policy, or two policies have the same enclave.
-    """
-    if not files:
-        raise PolicyError("requirements need a policy, and HEAD has no policy")
-    policies = [read_policy_for(file, fleet) for file in files]
-    first, *others = policies
-    enclaves = {enclave.path: enclave for enclave in first.enclaves}
-    for enclave in (enclave for policy in others for enclave in policy.enclaves):
-        if enclave.path in enclaves:
-            raise PolicyError(
-                f"{enclave.source}: enclave {enclave.path} is in another policy, too",
-                f"The other one is at {enclaves[enclave.path].source}.",
-                "Review the policies of each robot in a review of its own.",
-            )
-        enclaves[enclave.path] = enclave
-    fallbacks = tuple(fallback for policy in policies for fallback in policy.fallbacks)
-    return replace(first, enclaves=tuple(enclaves.values()), fallbacks=fallbacks)

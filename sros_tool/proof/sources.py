@@ -54,7 +54,13 @@ from sros_tool.pki.certificates import (
     subject_text,
 )
 from sros_tool.pki.crl import embedded_lists, load_crl, names_issuers, refusal_of, signed_by
-from sros_tool.policy.document import PolicyFiles, policy_files, read_policy, refuse_fallbacks
+from sros_tool.policy.document import (
+    PolicyFiles,
+    join_policies,
+    policy_files,
+    read_policy,
+    refuse_fallbacks,
+)
 from sros_tool.policy.model import Enclave, Policy, Source, StatedProtection, stated_protections
 from sros_tool.policy.rights import Right, placed_rights, policy_rights
 from sros_tool.proof.commit_files import PREFIX, Revision, find_revision
@@ -149,6 +155,19 @@ class AccessSource:
             return certified.subject
         known = self.permissions.get(enclave)
         return next((grant.subject for grant in known.grants), "") if known else ""
+
+    def as_rights(self) -> RightsSource:
+        """Return the rights that a policy gives, without how it would be signed."""
+        return RightsSource(
+            Path(self.shown),
+            self.kind,
+            self.rights,
+            self.scope,
+            sound=True,
+            notes=self.notes,
+            fleet=self.fleet,
+            protections=self.protections,
+        )
 
     def sources_of(self, enclave: str) -> dict[Right, Source]:
         """Map the rights of an enclave to their file and line; empty without a policy."""
@@ -449,26 +468,18 @@ def _read(path: Path, fleet: Fleet | None, read: PolicyFiles | None = None) -> _
 
 
 def _of_policies(shown: str, policies: list[_Read]) -> AccessSource:
-    enclaves: dict[str, Enclave] = {}
-    for policy, _ in policies:
-        refuse_fallbacks(policy)
-    for enclave in (enclave for policy, _ in policies for enclave in policy.enclaves):
-        if enclave.path in enclaves:
-            raise DocumentError(
-                f"{enclave.source}: enclave {enclave.path} is in another policy, too",
-                f"The other one is at {enclaves[enclave.path].source}.",
-                "Compare one policy with another, or name each enclave in one file.",
-            )
-        enclaves[enclave.path] = enclave
     if not policies:
         raise DocumentError(f"'{shown}' has no policies", "", "Name a policy file.")
+    policy = join_policies([policy for policy, _ in policies])
+    refuse_fallbacks(policy)
+    enclaves = {enclave.path: enclave for enclave in policy.enclaves}
     permissions = {
         path: permissions_for(
             enclave, subject=subject_text(common_name(path)), validity=_VALID, domains=ALL_DOMAINS
         )
         for path, enclave in enclaves.items()
     }
-    rights = frozenset(right for policy, _ in policies for right in policy_rights(policy))
+    rights = frozenset(policy_rights(policy))
     stated = stated_protections(enclaves.values())
     fleets = [fleet for _, fleet in policies if fleet]
     patterns = dict.fromkeys(enclave for fleet in fleets for enclave in fleet.enclaves)

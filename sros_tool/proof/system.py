@@ -22,7 +22,7 @@ from sros_tool.dds.decision.vendors import TESTED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
 from sros_tool.dds.permissions import Grant
-from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.errors import KeystoreError, PolicyError, SrosError, UsageError
 from sros_tool.explain.answer import Evaluator
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.robots import Fleet
@@ -43,7 +43,7 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
-from sros_tool.policy.document import refuse_fallbacks
+from sros_tool.policy.document import join_policies, policy_files, refuse_fallbacks
 from sros_tool.policy.model import (
     ALLOW,
     PROTECT,
@@ -104,7 +104,7 @@ class System:
 
 
 def load_system(
-    path: Path,
+    path: Path | Sequence[Path],
     *,
     at: datetime,
     zone: tzinfo = UTC,
@@ -114,10 +114,11 @@ def load_system(
     template: Template | None = None,
     opened: Keystore | None = None,
 ) -> System:
-    """Return the worlds of a policy file, or of a keystore with its signed documents.
+    """Return the worlds of policies, or of a keystore with its signed documents.
 
     Args:
-        path: the policy file or the keystore.
+        path: the keystore, a policy file or a folder of policies; or several policies, which count
+            as one.
         at: the time for which rights are decided.
         zone: the time zone of robots, in which some vendors read dates.
         domain: the ROS domain; for a keystore, None stands for all domains.
@@ -128,11 +129,13 @@ def load_system(
         opened: the keystore at ``path``, if it is open already.
 
     Raises:
-        DocumentError: the file cannot be read, or only Zenoh is wanted and cannot enforce it.
+        DocumentError: a file cannot be read, there is no policy, two policies state the same
+            enclave, or only Zenoh is wanted and cannot enforce the policy.
         KeystoreError: the keystore cannot be read, or what Zenoh enforces in it is not known.
         UsageError: a template was given for a keystore.
     """
-    if is_keystore(path):
+    paths = [path] if isinstance(path, Path) else path
+    if isinstance(path, Path) and is_keystore(path):
         if template:
             raise UsageError(
                 f"'{path}' is a keystore, which has its own governance",
@@ -140,9 +143,13 @@ def load_system(
                 "Leave --template out, or check the policy.",
             )
         return _keystore_system(opened or Keystore(path), at, zone, domain, only)
-    system = policy_system(
-        read_policy_for(path, fleet), at=at, domain=domain or 0, only=only, template=template
-    )
+    files = [file for each in paths for file in (policy_files(each) if each.is_dir() else [each])]
+    if not files:
+        raise PolicyError(
+            "requirements need a policy, and there is no policy", "", "Name a policy."
+        )
+    policy = join_policies([read_policy_for(file, fleet) for file in files])
+    system = policy_system(policy, at=at, domain=domain or 0, only=only, template=template)
     return replace(system, fleet=fleet)
 
 

@@ -108,6 +108,46 @@ def test_rights_that_move_to_a_second_policy_are_seen(change: Change) -> None:
     assert change.review("--policy", "robot.xml", "--leave-out", "tests/second.xml").status == 0
 
 
+def test_dropping_a_requirement_is_a_consent_of_its_own(change: Change) -> None:
+    """It is named also where it is allowed, and never called nothing."""
+    change.commit(
+        {"robot.xml": policy_text(WIDER), "robot.toml": ONLY.replace('"/a"', '"/a", "/b"')}
+    )
+    words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    failed = change.review(*words)
+    lines = (
+        "  robot.toml: warning: only /a may publish /x: only this is left of it: only /a, /b may "
+        f"publish /x [requirement.dropped] (required before: git:{change.base[:12]}:robot.toml:1)",
+        "  robot.xml:6: error: /b: may publish /x, but only /a may publish /x "
+        "[requirement.violated]",
+    )
+    assert failed.status == 1 and all(line in failed.out for line in lines), failed
+    assert "1 step failed and 1 step found what is allowed" in failed.out
+    allowed = change.review(*words, "--dropped-requirements", "allow", "--json").ok()
+    steps = {step["step"]: step for step in json.loads(allowed.out)["steps"]}
+    assert steps["requirements-before"]["allowed"] and steps["new-access"]["allowed"]
+    assert all(line.strip() in str(steps["requirements-before"]) for line in lines)
+
+
+def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) -> None:
+    reads = '<topics subscribe="ALLOW"><topic>x</topic></topics>'
+    change.base = change.commit({"second.xml": policy_text({"/c": reads})})
+    change.commit(
+        {
+            "robot.xml": policy_text({"/b": publish("/y")}),
+            "second.xml": policy_text({"/c": reads.replace(">x<", ">/x<")}),
+        }
+    )
+    ended = change.review("--policy", "robot.xml\nsecond.xml")
+    said = ended.out.partition("\nrights ")[2].splitlines()
+    assert "written rights gone, 1 name made absolute" in said[0], ended
+    assert "  ! /c may subscribe /x, but no enclave may publish it any more" in said
+    assert "  - /a ALLOW publish topic /x" in said
+    (absolute,) = (line for line in said if line.startswith("  ~"))
+    assert "/c subscribe topic /x is written with a / at its beginning now" in absolute
+    assert absolute.endswith("(second.xml:3)")
+
+
 def test_a_common_part_that_ships_with_sros_needs_no_review(change: Change) -> None:
     part, name = (change.folder / "common/lifecycle_node.xml").read_text(), "common/new.xml"
     change.commit({name: part})
