@@ -522,7 +522,7 @@ def explain_access(
     """
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.explain.answer import Evaluator, ask
-    from sros_tool.explain.asking import AskedEnclave, AskingContext, meant, signed_enclave
+    from sros_tool.explain.asking import AskedEnclave, AskingContext, question_meant, signed_enclave
     from sros_tool.explain.explanation import explain
     from sros_tool.keystore.reader import Keystore as OpenedOnce
 
@@ -542,7 +542,7 @@ def explain_access(
     asked = AskedEnclave(signed._replace(keystore=opened, policy=own), stated)
     context = asking.context(signed.joined_domains)
     evaluator = Evaluator(Vendor(vendor), asked.enclave, context)
-    question, _ = meant(evaluator, asked, question, kind)
+    question, _ = question_meant(evaluator, asked, question, kind)
     answer = explain(evaluator, question)
     _, colon, reason = answer.text.partition(": ")
     return AccessAnswer(

@@ -837,7 +837,7 @@ class _Search:
         found = {automaton for leaf in _leaves(node) for automaton in leaf.automata}
         self._machine = _machine(tuple(sorted(found, key=_order)))
         self._needed = _needed(node)
-        self._taken = _Taken(name for name in taken if node.truth(_asked_of(name)))
+        self._taken = _ExcludedNames(name for name in taken if node.truth(_asked_of(name)))
 
     def shortest(self, limit: SearchLimit, longest: int | None) -> str | None:
         """Return a shortest name of the set, or None if the set is empty."""
@@ -999,7 +999,7 @@ def _rank(letter: str) -> tuple[int, str]:
     return (at if at >= 0 else len(_PREFERRED)), letter
 
 
-class _Taken:
+class _ExcludedNames:
     """Names that a search leaves out, as a tree of their letters.
 
     A place is the number of a node of the tree; -1 is every place outside of it.

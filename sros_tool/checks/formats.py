@@ -195,7 +195,7 @@ def keystore_metrics(
         KeystoreError: the path is not a keystore, or some enclaves cannot be listed.
     """
     lifetimes, unreadable = survey(keystore)
-    expiries = [*_shared(keystore), *_of_enclaves(keystore, lifetimes)]
+    expiries = [*_shared(keystore), *_enclave_expiries(keystore, lifetimes)]
     earliest: dict[str, datetime] = {}
     for expiry in expiries:
         earliest[expiry.kind] = min(expiry.moment, earliest.get(expiry.kind, expiry.moment))
@@ -275,7 +275,7 @@ def _shared(keystore: Keystore) -> Iterator[Expiry]:
             yield Expiry("crl", "", crl.next_update)
 
 
-def _of_enclaves(keystore: Keystore, lifetimes: Iterable[Lifetime]) -> Iterator[Expiry]:
+def _enclave_expiries(keystore: Keystore, lifetimes: Iterable[Lifetime]) -> Iterator[Expiry]:
     for lifetime in lifetimes:
         yield Expiry("certificate", lifetime.name, lifetime.certificate.not_after)
         yield Expiry("permissions", lifetime.name, lifetime.permissions.not_after)

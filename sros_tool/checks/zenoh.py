@@ -253,19 +253,21 @@ def configuration_findings(path: Path) -> Iterator[Finding]:
 def document_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     """Yield the findings in a configuration."""
     for setting in document.unknown:
-        yield _at(document, UNKNOWN_SETTING, setting, f"Zenoh up to 1.10 has no {setting}")
+        yield _finding_at(document, UNKNOWN_SETTING, setting, f"Zenoh up to 1.10 has no {setting}")
     yield from _links(document)
     yield from _open_features(document)
     if not document.access.enabled:
         kind = ROUTER_WITHOUT_RULES if document.mode is Mode.ROUTER else SESSION_WITHOUT_RULES
-        yield _at(document, kind, f"{_ACCESS}/enabled", "access_control is off")
+        yield _finding_at(document, kind, f"{_ACCESS}/enabled", "access_control is off")
         return
     yield from _rules(document)
     yield from _subjects(document)
     yield from _denials(document)
 
 
-def _at(document: ConfigurationDocument, kind: FindingKind, path: str, text: str) -> Finding:
+def _finding_at(
+    document: ConfigurationDocument, kind: FindingKind, path: str, text: str
+) -> Finding:
     return kind.found(document.mode.value, text, document.name, document.line_of(path))
 
 
@@ -279,20 +281,20 @@ def _links(document: ConfigurationDocument) -> Iterator[Finding]:
             allowed = document.protocols is None or endpoint.protocol in document.protocols
             if not allowed:
                 text = f"{what} has {endpoint.text}, and the protocols are {_listed(document)}"
-                yield _at(document, ENDPOINT_REFUSED, f"{what}/endpoints", text)
+                yield _finding_at(document, ENDPOINT_REFUSED, f"{what}/endpoints", text)
             elif not endpoint.is_encrypted():
                 default = "" if f"{what}/endpoints" in document.lines else ", by default"
                 text = f"{what} has {endpoint.text}{default}"
-                yield _at(document, PLAIN_ENDPOINT, f"{what}/endpoints", text)
+                yield _finding_at(document, PLAIN_ENDPOINT, f"{what}/endpoints", text)
     if not any(endpoint.is_encrypted() for _, endpoints in both for endpoint in endpoints):
         return
     if document.protocols is None or set(document.protocols) - ENCRYPTED:
         text = f"the protocols are {_listed(document)}"
-        yield _at(document, PROTOCOLS_OPEN, f"{_LINK}/protocols", text)
+        yield _finding_at(document, PROTOCOLS_OPEN, f"{_LINK}/protocols", text)
     for endpoint in document.listen:
         if endpoint.is_encrypted() and not endpoint.option("enable_mtls", document.tls.mutual):
             text = f"it listens at {endpoint.text}, and enable_mtls is off"
-            yield _at(document, NO_MUTUAL_TLS, f"{_TLS}/enable_mtls", text)
+            yield _finding_at(document, NO_MUTUAL_TLS, f"{_TLS}/enable_mtls", text)
     yield from _names(document)
     closing = "close_link_on_expiration"
     for endpoint in (*document.listen, *document.connect):
@@ -300,7 +302,7 @@ def _links(document: ConfigurationDocument) -> Iterator[Finding]:
             closing, document.tls.closes_on_expiration
         ):
             text = f"{closing} is off for {endpoint.text}"
-            yield _at(document, EXPIRED_STAYS, f"{_TLS}/{closing}", text)
+            yield _finding_at(document, EXPIRED_STAYS, f"{_TLS}/{closing}", text)
             break
 
 
@@ -313,9 +315,11 @@ def _names(document: ConfigurationDocument) -> Iterator[Finding]:
         and not endpoint.option("verify_name_on_connect", document.tls.verifies_name)
     ]
     access = document.access
-    if unverified and (not access.enabled or access.allows_by_default or _of_everybody(document)):
+    if unverified and (
+        not access.enabled or access.allows_by_default or _allowing_subjects_without_name(document)
+    ):
         text = f"verify_name_on_connect is off for {unverified[0].text}"
-        yield _at(document, NAME_NOT_VERIFIED, f"{_TLS}/verify_name_on_connect", text)
+        yield _finding_at(document, NAME_NOT_VERIFIED, f"{_TLS}/verify_name_on_connect", text)
 
 
 def _listed(document: ConfigurationDocument) -> str:
@@ -329,10 +333,12 @@ def _open_features(document: ConfigurationDocument) -> Iterator[Finding]:
     ):
         if on:
             stated = "on" if f"{path}/enabled" in document.lines else "on, by default"
-            yield _at(document, kind, f"{path}/enabled", f"{path} is {stated}")
+            yield _finding_at(document, kind, f"{path}/enabled", f"{path} is {stated}")
     if document.adminspace and (document.adminspace_readable or document.adminspace_writable):
         can = "it can be written" if document.adminspace_writable else "it can be read"
-        yield _at(document, ADMIN_SPACE, "adminspace/enabled", f"adminspace is on, and {can}")
+        yield _finding_at(
+            document, ADMIN_SPACE, "adminspace/enabled", f"adminspace is on, and {can}"
+        )
 
 
 # ── access control ─────────────────────────────────────────────────────────────────────────
@@ -342,10 +348,10 @@ def _rules(document: ConfigurationDocument) -> Iterator[Finding]:
     access = document.access
     if access.allows_by_default:
         text = "default_permission is allow"
-        yield _at(document, DEFAULT_ALLOW, f"{_ACCESS}/default_permission", text)
+        yield _finding_at(document, DEFAULT_ALLOW, f"{_ACCESS}/default_permission", text)
     elif not any(rule.allows for s in access.subjects for rule in access.rules_of(s.id)):
         text = "no policy gives a subject a rule that allows"
-        yield _at(document, NOTHING_ALLOWED, f"{_ACCESS}/policies", text)
+        yield _finding_at(document, NOTHING_ALLOWED, f"{_ACCESS}/policies", text)
         return
     used = {rule.id for subject in access.subjects for rule in access.rules_of(subject.id)}
     unused = [(f"rule {rule.id}", rule.line) for rule in access.rules if rule.id not in used]
@@ -358,7 +364,7 @@ def _rules(document: ConfigurationDocument) -> Iterator[Finding]:
         yield UNUSED.found(name, f"no policy names {name}", document.name, line)
 
 
-def _of_everybody(document: ConfigurationDocument) -> list[AclSubject]:
+def _allowing_subjects_without_name(document: ConfigurationDocument) -> list[AclSubject]:
     """Return the subjects without a name that have a rule that allows something."""
     access = document.access
     return [
@@ -371,7 +377,7 @@ def _of_everybody(document: ConfigurationDocument) -> list[AclSubject]:
 
 def _subjects(document: ConfigurationDocument) -> Iterator[Finding]:
     access = document.access
-    open_to_all = _of_everybody(document)
+    open_to_all = _allowing_subjects_without_name(document)
     if open_to_all and is_self_limiting(document):
         text = f"no subject has a name: {_ids(open_to_all)}"
         yield SELF_LIMITING.found(document.mode.value, text, document.name, open_to_all[0].line)

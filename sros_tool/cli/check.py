@@ -989,7 +989,7 @@ def metrics(
             keystore, now=moment, zone=local_zone(os.environ), policies=wanted
         )
         gauges = keystore_metrics(keystore, findings, now=moment, each_enclave=not earliest)
-        gauges += _of_processes(moment, known) if runtime else ()
+        gauges += _process_metrics(moment, known) if runtime else ()
     text = render_metrics(gauges)
     changes = file_change(output, existed=output.exists()) if output else ()
     saved = save(output, text.encode()) if output and not dry_run else ""
@@ -1003,7 +1003,9 @@ def metrics(
         echo_document(text)
 
 
-def _of_processes(moment: datetime, advisories: tuple[Advisory, ...] | None) -> tuple[Metric, ...]:
+def _process_metrics(
+    moment: datetime, advisories: tuple[Advisory, ...] | None
+) -> tuple[Metric, ...]:
     from sros_tool.checks.processes import runtime_metrics
     from sros_tool.runtime.processes import ProcessTable
 

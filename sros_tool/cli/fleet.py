@@ -546,8 +546,8 @@ def _status(
     by the advisories of sros; --robot and --advisories name them.
 
     The revocation list is in force on a robot that has it and says that no restart is due. Robots
-    do not say which earlier files a process has: after any change, the list counts again once the
-    processes were restarted.
+    do not say which earlier files a process has: after any change of files, the list is in force
+    again only after the processes were restarted.
 
     Example:
       $ sros fleet status keystore

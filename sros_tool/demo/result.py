@@ -551,7 +551,7 @@ class ScenarioResult:
 
     @property
     def not_tried(self) -> tuple[str, ...]:
-        """Tests that a proof of the user's keystore needs and the demo did not run.
+        """Tests that the demo did not run, although a proof of the user's keystore needs them.
 
         The demo's own keystores only show what works, and prove nothing about others.
         """

@@ -275,7 +275,7 @@ def taken_for_action(question: Question, action: Question) -> Note:
     return Note("explain.an-action", text)
 
 
-def meant(
+def question_meant(
     evaluator: Evaluator, asked: AskedEnclave, question: Question, kind: str | None
 ) -> tuple[Question, tuple[Note, ...]]:
     """Return the question to answer, and a note if it is not the question that was asked."""

@@ -137,7 +137,7 @@ class SearchedKeystore:
             identity = "".join(word.zfill(8) for word in guid.split(":"))
         return self._by_identity.get(identity[:IDENTITY_DIGITS], "")
 
-    def meant(self, enclave: str) -> tuple[str, ...]:
+    def enclaves_meant(self, enclave: str) -> tuple[str, ...]:
         """Return the enclaves that a name may mean; () if the keystore has the enclave."""
         names = self._keystore.names
         return () if enclave in names else likely_enclaves(enclave, names)
@@ -436,12 +436,12 @@ def _dropped(lines: Iterable[str], root: str) -> Iterator[LogFinding]:
             first.name,
             f"{'' if first.name else 'the process with the zid '}{who} may not {what}: the process "
             "that logged this drops the message by its rules, and reports it nowhere else",
-            _of_dropped(first, what, root),
+            _dropped_finding(first, what, root),
             zenoh=True,
         )
 
 
-def _of_dropped(dropped: DroppedMessage, what: str, root: str) -> str:
+def _dropped_finding(dropped: DroppedMessage, what: str, root: str) -> str:
     if not dropped.name:
         return (
             "The log line with `on Interface(...)+CertCommonName(...)` and this zid has the name "
@@ -532,7 +532,7 @@ class _Examiner:
         place, inside, name = path.rpartition("/enclaves/")
         if not inside or self._keystore is None:
             return ""
-        if meant := self._keystore.meant(f"/{name}"):
+        if meant := self._keystore.enclaves_meant(f"/{name}"):
             return f"Perhaps you mean {' or '.join(meant)}. {remedy}"
         if self._find(f"/{name}") is None or Path(place).resolve() == Path(self._root).resolve():
             return ""

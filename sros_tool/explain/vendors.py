@@ -12,7 +12,13 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.distributions import SUPPORTED, Shipped
 from sros_tool.errors import Note, SrosError
 from sros_tool.explain.answer import Answer, Evaluator, Provenance, Question, ask
-from sros_tool.explain.asking import Asked, AskedEnclave, AskingContext, ZenohInBrief, meant
+from sros_tool.explain.asking import (
+    Asked,
+    AskedEnclave,
+    AskingContext,
+    ZenohInBrief,
+    question_meant,
+)
 from sros_tool.explain.explanation import explain, likely_names
 from sros_tool.keystore.layout import (
     SETTINGS,
@@ -161,7 +167,7 @@ def explain_on_dds(
     vendor, why = chosen
     enclave = asked.enclave
     evaluator = Evaluator(vendor, enclave, context)
-    question, taken = meant(evaluator, asked, question, kind)
+    question, taken = question_meant(evaluator, asked, question, kind)
     answer = explain(evaluator, question)
     beside = _beside(enclave, question, context)
     notes = (
@@ -382,7 +388,8 @@ class VendorOfKeystore(NamedTuple):
 
     def outcomes(self, question: Question) -> tuple[VendorOutcome, ...]:
         """Return the outcome for each enclave, sorted by name."""
-        from sros_tool.explain.who import in_domains, of_each  # one enclave needs none
+        # Imported here, because a question about one enclave needs neither.
+        from sros_tool.explain.who import decide_each, first_allowing_domain
 
         def outcome(name: str) -> VendorOutcome:
             enclave = load_enclave_of(self.keystore, name, at=self.asking.at)
@@ -393,10 +400,10 @@ class VendorOfKeystore(NamedTuple):
                 expression = answer.decision.expression or ""
                 return VendorOutcome(name, answer.outcome, answer.reason, answer.text, expression)
 
-            decision, domains = in_domains(_parts(enclave, self.asking.domain), decided)
+            decision, domains = first_allowing_domain(_parts(enclave, self.asking.domain), decided)
             return decision._replace(domains=domains)
 
-        return of_each(self.keystore.names if self.names is None else self.names, outcome)
+        return decide_each(self.keystore.names if self.names is None else self.names, outcome)
 
     def printed(self, question: Question, outcomes: Sequence[VendorOutcome]) -> WhoByVendor:
         """Return the outcomes in the form that ``--json`` prints."""

@@ -138,7 +138,7 @@ def names_meant(decider: Decider, question: Question, enclaves: Container[str]) 
     return Note("explain.likely-name", text)
 
 
-def in_domains(
+def first_allowing_domain(
     parts: Iterable[DomainSet], decide: Callable[[int], _Outcome]
 ) -> tuple[_Outcome, str]:
     """Return the decision of the first domain that allows it, or else of the first domain.
@@ -152,7 +152,7 @@ def in_domains(
     return (allowing or outcomes)[0][1], str(domains)
 
 
-def of_each(names: Sequence[str], decide: Callable[[str], _Outcome]) -> tuple[_Outcome, ...]:
+def decide_each(names: Sequence[str], decide: Callable[[str], _Outcome]) -> tuple[_Outcome, ...]:
     """Return the decision on each of the enclaves, sorted by name; uses all cores."""
     from sros_tool.parallel import map_slices, tick  # a question about one enclave needs none
 

@@ -21,7 +21,13 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.explain.answer import Answer, Evaluator, PolicyChange, Question, StatedInPolicy
-from sros_tool.explain.asking import Asked, AskedEnclave, AskingContext, ZenohInBrief, meant
+from sros_tool.explain.asking import (
+    Asked,
+    AskedEnclave,
+    AskingContext,
+    ZenohInBrief,
+    question_meant,
+)
 from sros_tool.explain.explanation import explain
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -337,7 +343,7 @@ class ZenohEvaluator:
         if own.process is None:
             return answer
         if own.process.mode is Mode.ROUTER:
-            return self._of_router(answer, own.process, brief=brief)
+            return self._answer_for_router(answer, own.process, brief=brief)
         router = self._router_of(enclave)
         if router.process is None:
             text = f"no link to the router {router.enclave}: {router.problem}"
@@ -520,7 +526,9 @@ class ZenohEvaluator:
 
     # ── decisions ──────────────────────────────────────────────────────────────────────────
 
-    def _of_router(self, answer: ZenohAnswer, own: ZenohProcess, *, brief: bool) -> ZenohAnswer:
+    def _answer_for_router(
+        self, answer: ZenohAnswer, own: ZenohProcess, *, brief: bool
+    ) -> ZenohAnswer:
         """Return the answer for a router's enclave, which may do what passes through the router.
 
         Every session that may receive a message accepts it from the router, and also from a second
@@ -800,16 +808,17 @@ class ZenohOfKeystore:
 
     def outcomes(self, question: Question) -> tuple[ZenohAnswer, ...]:
         """Return the answer for each enclave, without the enclaves at the other end."""
-        from sros_tool.explain.who import in_domains, of_each  # one enclave needs none
+        # Imported here, because a question about one enclave needs neither.
+        from sros_tool.explain.who import decide_each, first_allowing_domain
 
         def answer(name: str) -> ZenohAnswer:
             def decided(domain: int) -> ZenohAnswer:
                 return self._evaluators[domain].answer(name, question, reach=False, brief=True)
 
-            decision, domains = in_domains(self._parts, decided)
+            decision, domains = first_allowing_domain(self._parts, decided)
             return replace(decision, domains=domains)
 
-        return of_each(self._names, answer)
+        return decide_each(self._names, answer)
 
     def printed(self, question: Question, outcomes: Sequence[ZenohAnswer]) -> WhoOnZenoh:
         """Return what ``--json`` prints for these answers."""
@@ -946,7 +955,7 @@ def explain_on_zenoh(
             "Name the keystore before the enclave.",
         )
     stated = Evaluator(Vendor.STANDARD, enclave, context)
-    question, taken = meant(stated, asked, question, kind)
+    question, taken = question_meant(stated, asked, question, kind)
     evaluator = ZenohEvaluator(keystore, at=context.at, domain=context.domain)
     answer = evaluator.answer(enclave.name, question)
     outdated = evaluator.out_of_date(answer)

@@ -720,18 +720,18 @@ class RecordedRights:
         self._looked_up: dict[str, _OfLedger] = {}
 
     @cached_property
-    def _of_all(self) -> _OfLedger:
+    def _whole_ledger(self) -> _OfLedger:
         return _OfLedger(
             self._whole or self._keystore.ledger_with("what", "permissions"), self._keystore
         )
 
-    def _of(self, name: str) -> _OfLedger:
+    def _ledger_part(self, name: str) -> _OfLedger:
         """Return the part of the ledger about an enclave, and perhaps about others."""
         file, are_few = self._keystore.ledger_file, len(self._looked_up) < _MOST_LOOKUPS
-        if self._whole or "_of_all" in self.__dict__ or not file.is_indexed:
-            return self._of_all
+        if self._whole or "_whole_ledger" in self.__dict__ or not file.is_indexed:
+            return self._whole_ledger
         if not are_few and file.is_complete:
-            return self._of_all
+            return self._whole_ledger
         if name not in self._looked_up:
             if not are_few:
                 self._looked_up.clear()
@@ -748,7 +748,7 @@ class RecordedRights:
 
     def nodes(self, name: str) -> str:
         """Return the nodes of an enclave's last permissions, as text from the ledger."""
-        last = self._of(name).last
+        last = self._ledger_part(name).last
         return last[name].nodes if name in last else ""
 
     def latest(self, name: str, digest: str) -> Entry | None:
@@ -758,12 +758,12 @@ class RecordedRights:
         """
         with suppress(KeystoreError):
             self.policy(name, digest)
-            return self._of(name).last.get(name)
+            return self._ledger_part(name).last.get(name)
         return None
 
     def unproven(self) -> dict[str, Entry]:
         """Map enclaves to their last entries, if these are from before the hash chain."""
-        of_all = self._of_all
+        of_all = self._whole_ledger
         if not of_all.unchained:
             return {}
         return {name: entry for name, entry in of_all.last.items() if name not in of_all.chained}
@@ -778,7 +778,7 @@ class RecordedRights:
         Raises:
             KeystoreError: it is not the last document that the ledger records for the enclave.
         """
-        recorded = self._of(name)
+        recorded = self._ledger_part(name)
         last, trust = recorded.last.get(name), ""
         if last and last.sha256 != digest:
             why = (

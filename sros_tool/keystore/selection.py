@@ -90,7 +90,7 @@ def select_enclaves(
                 f"See `sros list_enclaves {quote(str(root))}`.",
             )
         chosen |= dict.fromkeys(fitting)
-    return tuple(chosen | dict.fromkeys(_of_robots(keystore, robots, checked, {})))
+    return tuple(chosen | dict.fromkeys(_robots_enclaves(keystore, robots, checked, {})))
 
 
 def select_to_revoke(
@@ -116,7 +116,7 @@ def select_to_revoke(
     if fleet := checked_fleet(keystore) if robots else None:
         possible = _possible_enclaves(keystore, fleet, robots)
         unrecorded = unrecorded_enclaves(fleet, possible, set(robots))
-    chosen |= dict.fromkeys(_of_robots(keystore, robots, True, unrecorded))
+    chosen |= dict.fromkeys(_robots_enclaves(keystore, robots, True, unrecorded))
     below = [name for each in unrecorded.values() for name in each.below]
     left = {name for each in unrecorded.values() for name in each.naming} - chosen.keys()
     return tuple(chosen), tuple(_unrecorded_notes(keystore.root, sorted(below), sorted(left)))
@@ -158,7 +158,7 @@ def _some(names: list[str]) -> str:
     return first_few(names, _SHOWN)
 
 
-def _of_robots(
+def _robots_enclaves(
     keystore: Keystore, robots: Sequence[str], checked: bool, unrecorded: Mapping[str, Unrecorded]
 ) -> list[str]:
     if not robots:

@@ -308,7 +308,7 @@ def _other_signer(signer: x509.Certificate | None, authority: x509.Certificate) 
     """Return a clause on the wrong signer; ``signer`` is None if it is not embedded."""
     name = authority.subject.rfc4514_string()
     if signer is None:
-        return f"by a certificate that is not embedded, not by the permissions CA {name}"
+        return f"not by the permissions CA {name}, but by a signer whose certificate it lacks"
     if signer.subject != authority.subject:
         return f"by {signer.subject.rfc4514_string()}, not by the permissions CA {name}"
     same_key = _public_key(signer) == _public_key(authority)

@@ -263,21 +263,21 @@ class Names:
 
     def covering(self, name: str) -> Iterator[str]:
         """Yield the other expressions that cover ``name`` (see `covers`), in set order."""
-        for wide in self._that_may_cover(name):
+        for wide in self._cover_candidates(name):
             if wide != name and self._tried(covers(wide, name), wide, name):
                 yield wide
 
     def meets(self, name: str) -> bool:
         """Return whether an expression of the set overlaps with ``name``."""
         if is_expression(name):
-            candidates = map(self._names.__getitem__, self._that_may_meet(name))
+            candidates = map(self._names.__getitem__, self._overlap_candidates(name))
             return any(self._tried(overlap(e, name), e, name) for e in candidates)
         return name in self._exact or (bool(self._wild) and any(self.covering(name)))
 
     def meeting(self, name: str) -> Iterator[str]:
         """Yield the expressions of the set that overlap with ``name``, in the order of the set."""
         if is_expression(name):
-            for expression in map(self._names.__getitem__, sorted(self._that_may_meet(name))):
+            for expression in map(self._names.__getitem__, sorted(self._overlap_candidates(name))):
                 if self._tried(overlap(expression, name), expression, name):
                     yield expression
             return
@@ -290,7 +290,7 @@ class Names:
             self._limit.spend(len(one) + len(other))
         return fits
 
-    def _that_may_cover(self, name: str) -> Iterable[str]:
+    def _cover_candidates(self, name: str) -> Iterable[str]:
         if len(self._wild) <= _FEW:
             return self._wild
         text = _letters_of(name)
@@ -323,7 +323,7 @@ class Names:
             found.setdefault(key, []).append(number)
         return found
 
-    def _that_may_meet(self, expression: str) -> Sequence[int]:
+    def _overlap_candidates(self, expression: str) -> Sequence[int]:
         """Return the numbers of expressions that could overlap with ``expression``."""
         if len(self._names) <= _FEW:
             return range(len(self._names))

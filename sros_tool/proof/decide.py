@@ -240,7 +240,7 @@ def _sufficient_parts(right: str) -> tuple[_Part, ...]:
     return tuple(part for part in _parts_of(right) if part.writes or right == "subscribe")
 
 
-def _each(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
+def _topics_of_rights(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
     """Yield the DDS topics of some rights, each with its right."""
     for right, names in rights:
         for name in names:
@@ -281,7 +281,7 @@ def _first_uses(
     """Map enclaves with one of the rights to their shortest use; leave out ``without``."""
     left_out = _matching(without, world.enclaves)
     uses: dict[str, Use] = {}
-    for right, part, topics in _each(rights):
+    for right, part, topics in _topics_of_rights(rights):
         for met in world.side(part.writes).meeting(topics, limit):
             if met.enclave in left_out:
                 continue
@@ -507,7 +507,7 @@ def _unprotected(requirement: Protected, world: World, limit: SearchLimit) -> Wi
     if weak is None:
         return None
     uses = []
-    for topics in _of_kinds(requirement.names):
+    for topics in _topics_of_names(requirement.names):
         if topic := world.example(weak, topics, limit):
             uses.append(Use("", "", topics.ros_name(topic), topic, True))
     return Witness((min(uses, key=_better),)) if uses else None
@@ -518,13 +518,13 @@ def _assumed(requirement: Requirement, world: World, limit: SearchLimit) -> str:
     if not isinstance(requirement, Protected) or world.demanded is None:
         return ""
     names = []
-    for topics in _of_kinds(requirement.names):
+    for topics in _topics_of_names(requirement.names):
         if topic := world.example(~world.demanded, topics, limit):
             names.append(topics.ros_name(topic))
     return shortest(names) or ""
 
 
-def _of_kinds(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
+def _topics_of_names(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
     """Yield the DDS topics of names, given as pairs of kind and name, without duplicates."""
     return iter(
         dict.fromkeys(

@@ -359,7 +359,7 @@ def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
         domains = _domains(base, head)
         for vendor in TESTED:
             fitting_others = _fitting_others(vendor, base, head)
-            access = _of_vendor(vendor, fitting_others)
+            access = _access_on_vendor(vendor, fitting_others)
             traits = vendor.traits
             worlds.append(
                 _World(
@@ -373,7 +373,7 @@ def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
             )
     if base.zenoh is not None or head.zenoh is not None:
         worlds.append(
-            _World(_ZENOH, Style.FNMATCH, _zenoh_domains(base, head), _on_zenoh(base, head))
+            _World(_ZENOH, Style.FNMATCH, _zenoh_domains(base, head), _access_on_zenoh(base, head))
         )
     return worlds
 
@@ -421,7 +421,7 @@ def _fitting_others(vendor: Vendor, *sides: AccessSource) -> _FittingOthers:
     return lambda side, enclave: by_side[id(side)].get(enclave, ())
 
 
-def _of_vendor(vendor: Vendor, fitting_others: _FittingOthers) -> _AccessOf:
+def _access_on_vendor(vendor: Vendor, fitting_others: _FittingOthers) -> _AccessOf:
     def access_by(
         side: AccessSource, governance: Governance, name: str, subject: str, at: int
     ) -> Access:
@@ -456,10 +456,10 @@ def _of_vendor(vendor: Vendor, fitting_others: _FittingOthers) -> _AccessOf:
     return access
 
 
-def _on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
+def _access_on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
     """Return a function for access on Zenoh: by the rules of a side, or else by its rights."""
     stated = {
-        id(side): _of_rights(side, _domains_of_robots(side, other))
+        id(side): _access_by_rights(side, _domains_of_robots(side, other))
         for side, other in ((base, head), (head, base))
         if side.zenoh is None
     }
@@ -483,7 +483,9 @@ def _on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
     return access
 
 
-def _of_rights(side: AccessSource, robots: Mapping[str, int]) -> Callable[[str, int], _Access]:
+def _access_by_rights(
+    side: AccessSource, robots: Mapping[str, int]
+) -> Callable[[str, int], _Access]:
     """Return a function for the access that ROS rights give in a domain.
 
     ``robots`` maps enclaves of a policy to the domain of their robot, if the fleet states one.
@@ -815,7 +817,7 @@ class _Stated:
         self, names: NameSet, key: tuple[str, AccessVerb, str], world: _World, limit: SearchLimit
     ) -> str | None:
         """Return an example name; if possible, the same as in another world, or a stated name."""
-        for topic in chain(self._examples[key], self._meant(key[2])):
+        for topic in chain(self._examples[key], self._likely_topics(key[2])):
             if topic in names and (world.longest is None or len(topic.encode()) <= world.longest):
                 self._examples[key] += [topic] if topic not in self._examples[key] else []
                 return topic
@@ -824,7 +826,7 @@ class _Stated:
             self._examples[key].append(example)
         return example
 
-    def _meant(self, expression: str) -> Iterator[str]:
+    def _likely_topics(self, expression: str) -> Iterator[str]:
         """Yield some exact topics of the new rights that begin as the expression does."""
         prefix = literal_prefix(expression)
         if prefix != expression:

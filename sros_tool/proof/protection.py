@@ -72,7 +72,7 @@ def _demanded_governance(stated: Sequence[StatedProtection], domains: DomainSet)
     return Governance((replace(rule, topic_access_rules=(*topics.values(), every)),))
 
 
-def _of_payloads(governance: Governance) -> Governance:
+def _payload_governance(governance: Governance) -> Governance:
     """Return a governance in which the protection of data is the strongest of all layers."""
 
     def strongest(domain: DomainRule, topic: TopicRule) -> TopicRule:
@@ -121,7 +121,7 @@ def less_protection(
         yield from _looser_governance(old.governance, new.governance, limit)
     elif new.governance:
         least = _demanded_governance(old.protections or (), new.governance.domains().closed())
-        yield from _looser_governance(least, _of_payloads(new.governance), limit)
+        yield from _looser_governance(least, _payload_governance(new.governance), limit)
     if old.authorities is not None and new.authorities is not None:
         for role, fingerprint in sorted(new.authorities - old.authorities):
             yield SettingChange(

@@ -284,7 +284,7 @@ class Repository:
             DocumentError: a tree is missing or malformed, or has a name that no file system allows.
         """
         wanted = list(dict.fromkeys(ids))
-        trees = _of_kind("tree", wanted, self._objects(wanted))
+        trees = _contents_of_kind("tree", wanted, self._objects(wanted))
         return {each: _entries(data, len(each) // 2) for each, data in trees.items()}
 
     def contents(self, ids: Iterable[str]) -> dict[str, bytes]:
@@ -294,7 +294,7 @@ class Repository:
             DocumentError: a file is missing, damaged, or larger than `_MOST_BYTES`.
         """
         wanted = list(dict.fromkeys(ids))
-        return _of_kind("blob", wanted, self._objects(wanted))
+        return _contents_of_kind("blob", wanted, self._objects(wanted))
 
     def sizes(self, ids: Iterable[str]) -> dict[str, int]:
         """Return the sizes of objects in bytes, by id; missing objects are left out."""
@@ -340,11 +340,11 @@ class Repository:
         room = _AT_ONCE
         for each, size in sizes.items():
             if part and size > room:
-                yield _of_kind("blob", part, self._read(part, sizes))
+                yield _contents_of_kind("blob", part, self._read(part, sizes))
                 part, room = [], _AT_ONCE
             part.append(each)
             room -= size
-        yield _of_kind("blob", part, self._read(part, sizes))
+        yield _contents_of_kind("blob", part, self._read(part, sizes))
 
     def content(self, digits: str) -> bytes:
         """Return the content of one file, by its id; repeated calls use a cache.
@@ -527,7 +527,7 @@ def _content(repository: Repository, digits: str) -> bytes:
     return repository.contents([digits])[digits]
 
 
-def _of_kind(
+def _contents_of_kind(
     kind: str, ids: Sequence[str], objects: Mapping[str, tuple[str, bytes]]
 ) -> dict[str, bytes]:
     """Return the contents of objects, by id.

@@ -180,30 +180,30 @@ def demand(requirement: Requirement) -> str:
     """Return a requirement's demand as a clause, such as ``nobody may publish /x``."""
     match requirement:
         case Only(rights=rights, enclaves=enclaves):
-            return f"only {_those(enclaves)} may {_said(rights)}"
+            return f"only {_enclaves_text(enclaves)} may {_rights_text(rights)}"
         case Nobody(rights=rights):
-            return f"nobody may {_said(rights)}"
+            return f"nobody may {_rights_text(rights)}"
         case Must(rights=rights, enclave=enclave):
-            return f"{enclave} has to be able to {_said(rights, 'and')}"
+            return f"{enclave} has to be able to {_rights_text(rights, 'and')}"
         case AtMost(rights=rights, most=most):
-            return f"at most {most} enclave{'' if most == 1 else 's'} may {_said(rights)}"
+            return f"at most {most} enclave{'' if most == 1 else 's'} may {_rights_text(rights)}"
         case Widest(rights=rights, enclaves=enclaves):
-            return f"wildcards may let {_those(enclaves)} only {_said(rights)}"
+            return f"wildcards may let {_enclaves_text(enclaves)} only {_rights_text(rights)}"
         case NothingBut(rights=rights, enclaves=enclaves):
-            return f"{_those(enclaves)} may do nothing but {_said(rights)}"
+            return f"{_enclaves_text(enclaves)} may do nothing but {_rights_text(rights)}"
         case NotBoth(first=first, second=second):
-            return f"nobody may both {_said(first)} and {_said(second)}"
+            return f"nobody may both {_rights_text(first)} and {_rights_text(second)}"
         case Protected(names=names, level=level):
             shown = _listed([f"{kind.removesuffix('s')} {name}" for kind, name in names])
             return f"{shown} has to be {'encrypted' if level is Level.ENCRYPT else 'signed'}"
         case Apart(sources=sources, targets=targets, through=through):
-            past = f" except through {_those(through)}" if through else ""
-            return f"{_those(sources)} must not influence {_those(targets)}{past}"
+            past = f" except through {_enclaves_text(through)}" if through else ""
+            return f"{_enclaves_text(sources)} must not influence {_enclaves_text(targets)}{past}"
         case _:
             raise AssertionError(requirement)
 
 
-def _said(rights: RightNames, link: str = "or") -> str:
+def _rights_text(rights: RightNames, link: str = "or") -> str:
     """Return rights in words, such as ``publish /cmd_vel or call action /dock``."""
     texts = (
         f"{right}{' action' if KIND_OF[right] == 'actions' else ''} {_listed(names)}"
@@ -212,7 +212,7 @@ def _said(rights: RightNames, link: str = "or") -> str:
     return f" {link} ".join(texts)
 
 
-def _those(enclaves: Iterable[str]) -> str:
+def _enclaves_text(enclaves: Iterable[str]) -> str:
     """Return a list of enclaves in words, with its exceptions."""
     names = list(enclaves)
     excepted = [name[len(EXCEPT) :] for name in names if name.startswith(EXCEPT)]

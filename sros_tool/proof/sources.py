@@ -194,11 +194,11 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
             compared.
     """
     if str(path).startswith(PREFIX):
-        return _of_revision(find_revision(str(path)), fleet)
+        return _access_at_revision(find_revision(str(path)), fleet)
     if path.is_dir() and not is_keystore(path) and not (path / PERMISSIONS_FILE).exists():
         files = list(policy_files(path))
         if files:
-            return _of_policies(str(path), [_read(file, fleet) for file in files])
+            return _access_of_policies(str(path), [_read(file, fleet) for file in files])
     source = load_rights(path, fleet, hidden=True)
     for note in source.notes:
         if not source.sound or note.id in UNCERTAIN:
@@ -208,11 +208,11 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
                 f"`sros check {quote(str(path))}` shows what is wrong with it.",
             )
     if source.kind == "policy":
-        return _of_policies(str(path), [_read(path, fleet)])
-    return _of_source(path, source)
+        return _access_of_policies(str(path), [_read(path, fleet)])
+    return _access_of_source(path, source)
 
 
-def _of_source(path: Path, source: RightsSource) -> AccessSource:
+def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
     side = AccessSource(
         str(path),
         source.kind,
@@ -263,7 +263,7 @@ def _of_source(path: Path, source: RightsSource) -> AccessSource:
     } | {KEYSTORE_ITSELF: (path / ca_certificate(IDENTITY), path / CRL)}
     side = replace(
         side,
-        governance=_of_all(path, folders.values()),
+        governance=_common_governance(path, folders.values()),
         authorities=_authorities(folders.values()),
         trusts=_trusts(trusting, _expiries(path)),
         later=keystore.template if keystore.is_original else None,
@@ -316,7 +316,7 @@ def _zenoh_file(path: Path, document: ConfigurationDocument) -> SignedConfigurat
     return SignedConfiguration(document, SIGNED if is_signed(path, data, certificate) else "broken")
 
 
-def _of_all(root: Path, folders: Iterable[Path]) -> Governance:
+def _common_governance(root: Path, folders: Iterable[Path]) -> Governance:
     """Return the governance of a keystore, after a check that all enclaves have the same one.
 
     Raises:
@@ -446,10 +446,10 @@ def _without_dates(permissions: Permissions) -> Permissions:
     )
 
 
-def _of_revision(revision: Revision, fleet: Fleet | None) -> AccessSource:
+def _access_at_revision(revision: Revision, fleet: Fleet | None) -> AccessSource:
     try:
         policies = [_read(policy.place, fleet, policy.read) for policy in revision.policies()]
-        side = _of_policies(str(revision), policies)
+        side = _access_of_policies(str(revision), policies)
     except SrosError as error:
         texts = (revision.shown(part) for part in (error.what, error.why, error.remedy))
         raise DocumentError(*texts) from error
@@ -467,7 +467,7 @@ def _read(path: Path, fleet: Fleet | None, read: PolicyFiles | None = None) -> _
     return expanded.policy(), fleet.with_enclaves(expanded.patterns)
 
 
-def _of_policies(shown: str, policies: list[_Read]) -> AccessSource:
+def _access_of_policies(shown: str, policies: list[_Read]) -> AccessSource:
     if not policies:
         raise DocumentError(f"'{shown}' has no policies", "", "Name a policy file.")
     policy = join_policies([policy for policy, _ in policies])
@@ -495,4 +495,4 @@ def load_policies(files: Iterable[Path], shown: str, fleet: Fleet | None = None)
     Raises:
         SrosError: a policy cannot be read, or two policies have the same enclave.
     """
-    return _of_policies(shown, [_read(file, fleet) for file in files])
+    return _access_of_policies(shown, [_read(file, fleet) for file in files])

@@ -570,7 +570,7 @@ class Places:
     @classmethod
     def of_policy(cls, policy: Policy) -> Places:
         """Return the index of the rights in a policy, with their lines."""
-        return cls({enclave.path: _Lazy(enclave) for enclave in policy.enclaves})
+        return cls({enclave.path: _AllowedRights(enclave) for enclave in policy.enclaves})
 
     def find(self, use: Use) -> Place | None:
         """Return a right that permits a use, if possible one without wildcards, or None."""
@@ -591,7 +591,7 @@ class Places:
         return best
 
 
-class _Lazy:
+class _AllowedRights:
     """The allowed rights of an enclave in a policy, computed again each time they are iterated."""
 
     def __init__(self, enclave: Enclave) -> None:

@@ -233,7 +233,7 @@ def check_upgrade(
         findings += _upgrade(files.only(enclaves), before, later, vendor)
         findings += _vulnerabilities(before, later, vendor, at.advisories)
         if not files.keystore:
-            findings += _of_nodes_in_policy(path, at, before, later)
+            findings += _rights_needed_after(path, at, before, later)
     compared = {name for enclaves in by_distribution.values() for name in enclaves}
     found = joined(list(dict.fromkeys(findings)))
     return UpgradeFindings(found, len(compared), len(files.enclaves))
@@ -278,7 +278,7 @@ def _upgrade(
             yield kind.found(change.enclave, change.text, change.file, remedy=change.remedy)
     yield from _nodes(files, before, after)
     if vendor in ("", _ZENOH):
-        yield from _on_zenoh(files, before, after)
+        yield from _zenoh_findings(files, before, after)
 
 
 def _products(
@@ -316,7 +316,7 @@ def _vulnerabilities(
             yield VULNERABILITIES.found(title, "; ".join(parts))
 
 
-def _of_nodes_in_policy(
+def _rights_needed_after(
     path: Path, at: Circumstances, before: Distribution, after: Distribution
 ) -> Iterator[Finding]:
     """Yield rights that a policy denies and that nodes need only after the update."""
@@ -400,7 +400,7 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
                 )
                 for shipped in (before, after)
             ]
-            if found := list(_of_enclave(files, name, sides, number, where, by_vendors)):
+            if found := list(_changes_of_enclave(files, name, sides, number, where, by_vendors)):
                 yield from found
                 break
 
@@ -442,7 +442,7 @@ class _Decided:
         return any(cause.outcome is Outcome.CRASHES for cause in self.causes)
 
 
-def _of_enclave(
+def _changes_of_enclave(
     files: DecidedFiles,
     name: str,
     sides: Sequence[_Decided],
@@ -533,7 +533,9 @@ def _nodes(files: DecidedFiles, before: Distribution, after: Distribution) -> It
 # ── Zenoh ──────────────────────────────────────────────────────────────────────────────────
 
 
-def _on_zenoh(files: DecidedFiles, before: Distribution, after: Distribution) -> Iterator[Finding]:
+def _zenoh_findings(
+    files: DecidedFiles, before: Distribution, after: Distribution
+) -> Iterator[Finding]:
     """Yield findings on what another release of rmw_zenoh changes for a keystore's Zenoh files."""
     old, new = before.zenoh, after.zenoh
     if old == new or not files.keystore or not has_zenoh_files(files.keystore.root, hidden=True):

@@ -90,7 +90,7 @@ def focused(
         UsageError: nothing in the sources has such a name.
     """
     system = _System(picture, sources)
-    wanted = dict.fromkeys(meant for word in words for meant in system.meant(word))
+    wanted = dict.fromkeys(meant for word in words for meant in system.names_meant(word))
     focuses = tuple(system.focus(kind, name) for kind, name in wanted)
     if routers > 1:
         left_out = f"; what passes between the {routers} Zenoh routers is not considered"
@@ -249,7 +249,7 @@ class _System:
         self._known = {(name.kind, name.name) for name in picture.names}
         self._paths: list[HopPath] = []
 
-    def meant(self, word: str) -> Iterator[tuple[str, str]]:
+    def names_meant(self, word: str) -> Iterator[tuple[str, str]]:
         """Yield kind and name of every name or enclave that ``word`` can stand for.
 
         An exact name counts if a right states it, or if the wildcard of a right matches it.

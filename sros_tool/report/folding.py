@@ -606,8 +606,8 @@ class _Draft:
                 more = [what for key, what in own.items() if key not in other]
                 fewer = [what for key, what in other.items() if key not in own]
                 differing_parts.update(more)
-                only = dict.fromkeys(self._said(more, n))
-                missing = dict.fromkeys(self._said(fewer, n, near[n]))
+                only = dict.fromkeys(self._in_words(more, n))
+                missing = dict.fromkeys(self._in_words(fewer, n, near[n]))
                 # An enclave that both have differs by something else, such as a fault.
                 has = tuple(text for text in only if text not in missing)
                 lacks = tuple(text for text in missing if text not in only)
@@ -622,7 +622,7 @@ class _Draft:
         names = (focus.name for focus in self._picture.focus)
         return {unit for name in names for unit in self._text(name).units}
 
-    def _said(
+    def _in_words(
         self, drawn: Sequence[Edge | str], unit: int, instead: int | None = None
     ) -> Iterator[str]:
         """Yield enclaves and rights in words; the name of ``unit`` replaces that of ``instead``."""

@@ -231,7 +231,7 @@ class _Stat(NamedTuple):
     is_idle: bool
 
 
-class _Looked(NamedTuple):
+class _ProcessData(NamedTuple):
     """The data that was read of a process; it is valid as long as ``stat`` does not change."""
 
     stat: _Stat
@@ -244,7 +244,7 @@ class ProcessTable:
 
     def __init__(self, proc: Path = Path("/proc")) -> None:
         self._proc = proc
-        self._looked: dict[int, _Looked] = {}
+        self._looked: dict[int, _ProcessData] = {}
         self._reader = FileReader()
         self._ticks = os.sysconf("SC_CLK_TCK")
 
@@ -295,8 +295,8 @@ class ProcessTable:
             os.close(handle)
 
     def _look(
-        self, pid: int, folder: int, before: _Looked | None, begin: datetime
-    ) -> _Looked | None:
+        self, pid: int, folder: int, before: _ProcessData | None, begin: datetime
+    ) -> _ProcessData | None:
         """Return the data of a process; None if it has ended or runs no program.
 
         ``begin`` is the time from which the kernel counts the start times of processes.
@@ -320,9 +320,9 @@ class ProcessTable:
                 unseen = UnseenProcess(pid, command, why, _may_speak(command))
                 process = None
             if _stat(folder).identity == stat.identity:
-                return _Looked(stat, process, unseen)
+                return _ProcessData(stat, process, unseen)
         why = "it keeps starting other programs"
-        return _Looked(stat, None, UnseenProcess(pid, command, why, _may_speak(command)))
+        return _ProcessData(stat, None, UnseenProcess(pid, command, why, _may_speak(command)))
 
     def _with_files(self, process: Process, folder: int) -> Process:
         """Return the process with the state of its files, resolved as the process sees them."""

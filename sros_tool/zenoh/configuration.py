@@ -478,8 +478,8 @@ def is_endpoint(text: str) -> bool:
 def check_network(network: ZenohNetwork) -> None:
     """Raise `UsageError` for a network in which processes cannot communicate.
 
-    Hosts are compared by name: two names may be one host, but only names such as localhost surely
-    are this host.
+    Hosts are compared by name, although two names may mean the same host: only names such as
+    localhost certainly mean this host.
     """
     if network.routers:
         _check_routers(network)

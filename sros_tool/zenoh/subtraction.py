@@ -310,7 +310,8 @@ def _matches(wide: str, narrow: str) -> bool:
 def _chunks(first: str, some: tuple[str, ...], kinds: frozenset[frozenset[str]]) -> Chunks:
     """Return few chunks that match exactly the names of ``first`` whose kind is in ``kinds``.
 
-    What is allowed after a chunk is also allowed after a chunk that fewer of ``some`` match.
+    The kind of a chunk is the set of the chunks in ``some`` that match it.  If a kind is allowed,
+    so is each kind that is a part of it.
     """
     every = _kinds(first, some)
 

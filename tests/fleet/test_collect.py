@@ -32,7 +32,7 @@ from sros_tool.keystore.delivery.collect import (
     CollectedInbox,
     CollectedMessage,
     CollectedRequest,
-    _Judged,
+    _DecidedRequest,
     collect,
 )
 from sros_tool.keystore.delivery.published import read_published
@@ -749,7 +749,7 @@ def test_one_request_that_cannot_be_signed_does_not_make_as_many_changes_as_robo
     taken: list[Any] = []
     for number in range(64):
         request: Any = SimpleNamespace(pem=b"", name=f"/r{number}/base")
-        judged = _Judged(CollectedRequest(request.name, "", "renewed", ""), request)
+        judged = _DecidedRequest(CollectedRequest(request.name, "", "renewed", ""), request)
         taken.append(SimpleNamespace(requests=[judged]))
     collecting._sign(
         home.root, taken, now=DUE, allow_refusal=(), keyring=IN_KEYSTORE, dry_run=False

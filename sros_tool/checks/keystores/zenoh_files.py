@@ -120,10 +120,12 @@ def check_own_zenoh(enclave: CheckedEnclave) -> Iterator[Finding]:
         return
     from sros_tool.keystore.zenoh_files import open_zenoh  # most keystores have no such files
 
-    yield from _of_opened(enclave, open_zenoh(enclave.folder, enclave.name, enclave.state))
+    yield from _configuration_findings(
+        enclave, open_zenoh(enclave.folder, enclave.name, enclave.state)
+    )
 
 
-def _of_opened(enclave: CheckedEnclave, opened: OpenedZenoh) -> Iterator[Finding]:
+def _configuration_findings(enclave: CheckedEnclave, opened: OpenedZenoh) -> Iterator[Finding]:
     for problem in opened.problems:
         if kind := _KINDS.get(problem.fault.value):
             text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
@@ -156,7 +158,7 @@ def check_network(
         return
     for file in drift.files:
         if only is None or file.enclave in only:
-            yield from _of_drift(keystore, file)
+            yield from _drift_findings(keystore, file)
     for shared in shared_nodes(drift.nodes):
         if only is None or not {*shared.enclaves, *shared.others}.isdisjoint(only):
             first = shared.enclaves[0]
@@ -170,7 +172,7 @@ def check_network(
             )
 
 
-def _of_drift(keystore: CheckedKeystore, drift: Drifted) -> Iterator[Finding]:
+def _drift_findings(keystore: CheckedKeystore, drift: Drifted) -> Iterator[Finding]:
     """Yield a finding for each difference between a configuration and the keystore."""
     from sros_tool.keystore.zenoh_files import Drift, open_zenoh
 
@@ -183,6 +185,6 @@ def _of_drift(keystore: CheckedKeystore, drift: Drifted) -> Iterator[Finding]:
         return
     state = keystore.enclave(drift.enclave)
     enclave = CheckedEnclave(keystore, drift.enclave, state)
-    found = list(_of_opened(enclave, open_zenoh(enclave.folder, drift.enclave, state)))
+    found = list(_configuration_findings(enclave, open_zenoh(enclave.folder, drift.enclave, state)))
     text = "the settings and the permissions of the keystore give another configuration"
     yield from found or [OUT_OF_DATE.found(drift.enclave, text, file)]

@@ -411,7 +411,7 @@ class _GrantRules:
 
     def _names_of(self, entries: Iterable[_Entry]) -> NameSet:
         texts = tuple([_usable_expression(self._traits, entry.expression) for entry in entries])
-        return _of_texts(self._traits.style, texts)
+        return _cached_names(self._traits.style, texts)
 
     def _fits(self, entry: _Entry, wanted: tuple[str, ...]) -> bool:
         style, named = self._traits.style, entry.partitions
@@ -425,7 +425,7 @@ class _GrantRules:
 
 
 @lru_cache(maxsize=8192)  # several vendors, and several enclaves, have the same names
-def _of_texts(style: Style, texts: tuple[str, ...]) -> NameSet:
+def _cached_names(style: Style, texts: tuple[str, ...]) -> NameSet:
     from sros_tool.dds.decision.expressions import names_of
 
     return names_of(style, texts)
@@ -493,7 +493,7 @@ class GovernedDomain:
         """Yield each topic rule in order, with all topics that its expression matches."""
         for rule in self._topic_rules:
             text = _usable_expression(self._traits, rule.topic_expression)
-            yield _of_texts(self._traits.style, (text,)), rule
+            yield _cached_names(self._traits.style, (text,)), rule
 
     def all_controlled(self) -> bool:
         """Return whether every topic rule controls reading and writing."""

@@ -280,18 +280,18 @@ def _widen_tokens(copy: KeystoreCopy, wider: Callable[[str], str]) -> None:
 def earlier_session_file(copy: KeystoreCopy) -> None:
     """Put back the guest's session file of an earlier policy, which gave it the topic."""
     path = copy.folder("guest") / SESSION_FILE
-    path.write_bytes(_of_earlier_policy(copy))
+    path.write_bytes(_session_file_of_earlier_policy(copy))
 
 
 def earlier_session_file_of_one_that_limits_itself(copy: KeystoreCopy) -> None:
     """Put back the guest's earlier file where every session enforces only its own rights."""
-    earlier = json.loads(_of_earlier_policy(copy))
+    earlier = json.loads(_session_file_of_earlier_policy(copy))
     sessions_that_limit_themselves(copy)
     _for_everybody(copy.router)(earlier)
     (copy.folder("guest") / SESSION_FILE).write_text(json.dumps(earlier), encoding="utf-8")
 
 
-def _of_earlier_policy(copy: KeystoreCopy) -> bytes:
+def _session_file_of_earlier_policy(copy: KeystoreCopy) -> bytes:
     """Give the guest the topic, take it away again, and return the session file from before."""
     through_the_router(copy)
     _change_rights(copy, zenoh_policy(copy.topic, guest_talks=True))

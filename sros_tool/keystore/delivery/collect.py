@@ -212,7 +212,7 @@ def collect(
         forgotten = Forgotten(keystore, now)
         telling: list[str] = []
         changes: list[FileChange] = []
-        taken: list[_Taken] = []
+        taken: list[_ReceivedMessage] = []
         for message in _read_inbox(inbox, fleet, verifier):
             if message.verified:
                 message.requests = renewals.judge(message.robot, message.verified)
@@ -256,7 +256,9 @@ def collect(
     )
 
 
-def _refused(before: Mapping[str, RefusedMessage], taken: Sequence[_Taken]) -> dict[str, str]:
+def _refused(
+    before: Mapping[str, RefusedMessage], taken: Sequence[_ReceivedMessage]
+) -> dict[str, str]:
     """Map robots to why their last messages were refused; a missing message changes nothing."""
     refused = {}
     for message in taken:
@@ -280,7 +282,7 @@ class _Verified(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Taken:
+class _ReceivedMessage:
     """The message of a robot on its way through the steps of `collect`."""
 
     robot: Robot
@@ -295,9 +297,9 @@ class _Taken:
     stranger: x509.Certificate | None = None
     """The certificate of the signer of a message that does not count."""
     remarks: list[str] = field(default_factory=list)
-    requests: list[_Judged] = field(default_factory=list)
+    requests: list[_DecidedRequest] = field(default_factory=list)
 
-    def without_confirmation(self) -> _Taken:
+    def without_confirmation(self) -> _ReceivedMessage:
         """Return the message without what was kept of it: there are thousands of robots."""
         if self.verified is None:
             return replace(self, crl=None, stranger=None)
@@ -334,7 +336,7 @@ class _File(NamedTuple):
     written: datetime
 
 
-def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Taken]:
+def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_ReceivedMessage]:
     """Yield the message of each robot of the fleet, verified."""
     try:
         folder = Folder(inbox)
@@ -350,11 +352,13 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Tak
             try:
                 file = _read_message(folder, robot.name)
                 if not is_revoked:
-                    yield verifier.take(robot, file) if file else _Taken(robot, "missing")
+                    yield verifier.take(robot, file) if file else _ReceivedMessage(robot, "missing")
                     continue
-                taken = _Taken(robot, "revoked")
+                taken = _ReceivedMessage(robot, "revoked")
             except _RefusedError as refusal:
-                taken = _Taken(robot, "revoked" if is_revoked else "refused", refusal.what)
+                taken = _ReceivedMessage(
+                    robot, "revoked" if is_revoked else "refused", refusal.what
+                )
             if is_revoked and folder.state(robot.name) is not None:
                 taken.why = "all its enclaves were revoked; its message does not count"
             if file:
@@ -362,7 +366,7 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Tak
             yield taken
 
 
-def _add_signed_by_others(taken: _Taken, message: bytes) -> None:
+def _add_signed_by_others(taken: _ReceivedMessage, message: bytes) -> None:
     """Add what CAs signed in a message that does not count: revocation list and certificate."""
     with suppress(SrosError):
         signed = smime.parse_new(message)
@@ -427,7 +431,7 @@ class _Verifier:
         self._searched = 0
         self._authorities = keystore.authority(IDENTITY)
 
-    def take(self, robot: Robot, file: _File) -> _Taken:
+    def take(self, robot: Robot, file: _File) -> _ReceivedMessage:
         """Return a robot's message, verified, and what to keep of it.
 
         Raises:
@@ -446,7 +450,7 @@ class _Verifier:
         sequence = verified.confirmation.sequence
         assert sequence
         if before and before.sha256 == sha256:
-            return _Taken(robot, "unchanged", verified=verified, remarks=remarks)
+            return _ReceivedMessage(robot, "unchanged", verified=verified, remarks=remarks)
         if before and sequence <= before.sequence and robot.name not in self._restored:
             raise _RefusedError(
                 f"its sequence number {sequence} is not higher than {before.sequence}, the number "
@@ -460,7 +464,9 @@ class _Verifier:
         )
         if note := received.clock_note():
             remarks.append(note)
-        return _Taken(robot, "kept", verified=verified, received=received, remarks=remarks)
+        return _ReceivedMessage(
+            robot, "kept", verified=verified, received=received, remarks=remarks
+        )
 
     def _arrival(self, file: _File, last: Received | None) -> datetime:
         """Return when a message arrived: when its file was written, but after the one before.
@@ -575,7 +581,7 @@ def _proves(entry: Entry, sha256: str) -> bool:
 
 
 @dataclass(slots=True)
-class _Judged:
+class _DecidedRequest:
     """A request for renewal; ``request`` is None unless it is to be signed."""
 
     result: CollectedRequest
@@ -597,9 +603,9 @@ class _Renewals:
         self._fleet = fleet
         self._now = now
 
-    def judge(self, robot: Robot, message: _Verified) -> list[_Judged]:
+    def judge(self, robot: Robot, message: _Verified) -> list[_DecidedRequest]:
         """Return the requests of a message, and whether each one may be signed."""
-        judged: list[_Judged] = []
+        judged: list[_DecidedRequest] = []
         names: set[str] = set()
         for text in message.confirmation.requests or ():
             result = CollectedRequest("", "", "refused", "")
@@ -618,9 +624,9 @@ class _Renewals:
             if outcome == "renewed":
                 present = self._keystore.certificate_of(request.name)
                 vouching = (message.certificate.serial_number, present.serial_number)
-                judged.append(_Judged(result, request, vouching))
+                judged.append(_DecidedRequest(result, request, vouching))
             else:
-                judged.append(_Judged(result))
+                judged.append(_DecidedRequest(result))
         return judged
 
     def _decide_request(
@@ -710,7 +716,7 @@ def _revoke_again(
     root: Path,
     forgotten: Forgotten,
     telling: Sequence[str],
-    taken: Sequence[_Taken],
+    taken: Sequence[_ReceivedMessage],
     *,
     now: datetime,
     keyring: Keyring,
@@ -757,7 +763,7 @@ def _revoke_again(
 
 def _sign(
     root: Path,
-    taken: Sequence[_Taken],
+    taken: Sequence[_ReceivedMessage],
     *,
     now: datetime,
     allow_refusal: Sequence[Vendor],
@@ -775,7 +781,7 @@ def _sign(
     notes: list[Note] = []
     changes: list[FileChange] = []
 
-    def sign(robots: Sequence[Sequence[_Judged]]) -> SrosError | None:
+    def sign(robots: Sequence[Sequence[_DecidedRequest]]) -> SrosError | None:
         """Sign the requests of robots; return the error if that fails."""
         requests = [request.request for judged in robots for request in judged if request.request]
         try:
@@ -796,7 +802,7 @@ def _sign(
         changes.extend(changes_below(root, signed.changes))
         return None
 
-    def sign_parts(robots: Sequence[Sequence[_Judged]], error: SrosError | None) -> None:
+    def sign_parts(robots: Sequence[Sequence[_DecidedRequest]], error: SrosError | None) -> None:
         if error and len(robots) > 1:
             middle = len(robots) // 2
             for part in (robots[:middle], robots[middle:]):

@@ -255,7 +255,7 @@ def released_enclave(root: Path, name: str, now: datetime) -> ReleasedEnclave:
 
 
 def released_files(root: Path, name: str) -> dict[str, bytes]:
-    """Map the paths of all files of an enclave but its key to their content, not evaluated.
+    """Map the paths of all files of an enclave, except its key, to their content, not evaluated.
 
     Raises:
         KeystoreError: a file has a private key.

@@ -426,7 +426,7 @@ class _Changed(NamedTuple):
     state: str
 
 
-class _Made(NamedTuple):
+class _ReleaseOutcome(NamedTuple):
     """What came of a robot's release; ``published`` is None if it was refused."""
 
     robot: str
@@ -547,7 +547,7 @@ class _Run:
         self._present = read_present(folder, self.roots)
         self._there = self._present.releases()
         self._composed: Composed | None = None
-        self._made: list[_Made] = []
+        self._made: list[_ReleaseOutcome] = []
         self._removed: list[str] = []
         self._damaged: set[str] = set()
         self._number = 0
@@ -788,7 +788,7 @@ class _Run:
             )
         authority = None if self._dry_run or not changed else change.permissions
 
-        def work(part: Sequence[_Changed]) -> list[_Made]:
+        def work(part: Sequence[_Changed]) -> list[_ReleaseOutcome]:
             return list(self._release_all(part, number, authority))
 
         alone = authority is not None and authority.on_token
@@ -813,7 +813,7 @@ class _Run:
 
     def _release_all(
         self, robots: Sequence[_Changed], number: int, authority: Authority | None
-    ) -> Iterator[_Made]:
+    ) -> Iterator[_ReleaseOutcome]:
         """Yield what came of each robot; without ``authority`` nothing is sealed and written."""
         evaluator = _Evaluator(self.keystore.root, self._now)
         new: list[tuple[_Changed, _RobotFiles, str]] = []
@@ -822,12 +822,12 @@ class _Run:
             try:
                 files = evaluator.files(robot.enclaves, before.evaluated if before else None)
             except SrosError as error:
-                yield _Made(robot.robot, None, why=str(error))
+                yield _ReleaseOutcome(robot.robot, None, why=str(error))
                 continue
             content = hashlib.sha256(listed_digests(files.files)).hexdigest()
             if before and before.content == content and self._has(robot.robot, before.release):
                 kept = before._replace(files=robot.state, evaluated=files.evaluated)
-                yield _Made(robot.robot, kept)
+                yield _ReleaseOutcome(robot.robot, kept)
             else:
                 new.append((robot, files, content))
             tick()
@@ -836,7 +836,7 @@ class _Run:
                 planned = PublishedRobot(
                     PublishedRelease(number, "0" * 64, 0), content, robot.state
                 )
-                yield _Made(robot.robot, planned, is_new=True, not_valid=files.not_valid)
+                yield _ReleaseOutcome(robot.robot, planned, is_new=True, not_valid=files.not_valid)
             return
         seals = seal_releases(
             [(robot.robot, number, files.files) for robot, files, _ in new], authority
@@ -848,7 +848,9 @@ class _Run:
                 release = PublishedRelease(number, digest, len(data))
                 _put(folder, release.path(robot.robot), data)
                 published = PublishedRobot(release, content, robot.state, files.evaluated)
-                yield _Made(robot.robot, published, is_new=True, not_valid=files.not_valid)
+                yield _ReleaseOutcome(
+                    robot.robot, published, is_new=True, not_valid=files.not_valid
+                )
 
     # ── metadata ───────────────────────────────────────────────────────────────────────────
 

@@ -224,7 +224,7 @@ class EnclaveWriter:
         if rights is None:
             return Issued(issuance, certificate)
         subject = subject_text(certificate.subject)
-        validity = self._of_permissions(name, certificate)
+        validity = self._validity_of_permissions(name, certificate)
         permissions = _permissions(rights, subject, validity)
         message = self._sign(name, permissions)
         if isinstance(rights, SignedRights):
@@ -261,7 +261,7 @@ class EnclaveWriter:
             KeystoreError: the permissions would not decide as the policy does.
         """
         name = rights.enclave.path
-        new = self._of_permissions(name, certificate)
+        new = self._validity_of_permissions(name, certificate)
         if not validity.lasts(new, self._now):
             return False
         permissions = _permissions(rights, subject_text(certificate.subject), validity)
@@ -272,7 +272,7 @@ class EnclaveWriter:
         longest = self._template.longest_validity(name)
         return usual if longest is None else usual.within(window(self._now, longest))
 
-    def _of_permissions(self, name: str, certificate: x509.Certificate) -> Window:
+    def _validity_of_permissions(self, name: str, certificate: x509.Certificate) -> Window:
         """Return the validity of an enclave's permissions, which expire with their certificate.
 
         They may begin before it: Fast DDS reads their dates in local time (`BACKDATE`).

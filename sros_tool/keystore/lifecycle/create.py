@@ -768,7 +768,7 @@ def write_enclaves(
 
 
 @dataclass(frozen=True, slots=True)
-class _Made:
+class _EnclaveOutcome:
     """The outcome for an enclave; ``superseded`` is its old certificate, if it gets revoked."""
 
     outcome: str
@@ -797,7 +797,7 @@ class _EnclaveMaker:
         self._revoke_old = revoke_old
         self._keep_same = keep_same
 
-    def make(self, name: str, policy: Enclave | None) -> _Made:
+    def make(self, name: str, policy: Enclave | None) -> _EnclaveOutcome:
         """Stage the missing files of an enclave, and permissions for ``policy`` if not None."""
         change, root = self._change, self._root
         present = present_files(root, name)
@@ -825,16 +825,16 @@ class _EnclaveMaker:
         if isinstance(identity, NewIdentity) and isinstance(identity.new_key, TokenKey):
             notes += tuple(token_notes(identity.new_key))
         if not present & _OF_KEY:
-            return _Made("created", notes)
+            return _EnclaveOutcome("created", notes)
         if PERMISSIONS_FILE in present and rights:
             (grant,) = issued.permissions.grants
             replaced = replaced_rights(name, earlier, grant, change.now) if earlier else None
             if old is None:
-                return _Made("changed", notes, replaced)
+                return _EnclaveOutcome("changed", notes, replaced)
             superseded = Superseded.by(name, old, issued.certificate, change.now)
-            return _Made("changed", notes, replaced and replaced.revoked(), superseded)
+            return _EnclaveOutcome("changed", notes, replaced and replaced.revoked(), superseded)
         completed = len(change.transaction.changes) > before
-        return _Made("completed" if completed else "kept", notes)
+        return _EnclaveOutcome("completed" if completed else "kept", notes)
 
     def _is_kept(self, certificate: x509.Certificate, rights: StatedRights) -> bool:
         """Return whether an enclave's permissions can stay, because they already state ``rights``.

@@ -108,7 +108,8 @@ class Forgotten:
     def unknown(self, keystore: Keystore) -> dict[str, Entry]:
         """Return the certificates that ``keystore`` neither issued nor revoked, as far as it knows.
 
-        A certificate that only a message showed is recorded again if a seal shows it.
+        A certificate that the ledger has only from a robot's message is included if a sealed
+        release shows it now.
         """
         recorded = keystore.ledger_file.with_values("serial", self.certificates).entries
         known = {

@@ -158,7 +158,7 @@ def restore_revocations(
         }
         # A CA service knows its certificates, also those of other sites.
         unknown = {} if change.identity.service else forgotten.unknown(change.keystore)
-        reasons = _of_revoked(change, unknown) | reasons
+        reasons = _reasons_of_revoked(change, unknown) | reasons
         recorded = change.keystore.ledger_file.with_values("serial", reasons).entries
         issued = {
             entry.serial: entry
@@ -219,7 +219,7 @@ def restore_revocations(
     return change.result(Changed, outcomes=dict.fromkeys(again, "revoked"))
 
 
-def _of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) -> dict[str, str]:
+def _reasons_of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) -> dict[str, str]:
     """Map the serial numbers of certificates of revoked enclaves to the reasons of these."""
     enclaves = {entry.enclave for entry in unknown.values()}
     reasons = {

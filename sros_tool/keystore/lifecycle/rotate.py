@@ -162,7 +162,7 @@ def rotate_ca(
                 raise _would_cut_off(root, rotation, cut_off)
             stage = rotator.go_to(stage, roles, new_keys, validity, progress)
             if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
-                change.notes += _of_no_robot(change.keystore, change.names)
+                change.notes += _no_robot_notes(change.keystore, change.names)
             change.finish()
     return _step(
         change,
@@ -222,7 +222,7 @@ def robots_cut_off(
     )
 
 
-def _of_no_robot(keystore: Keystore, names: Iterable[str]) -> Iterator[Note]:
+def _no_robot_notes(keystore: Keystore, names: Iterable[str]) -> Iterator[Note]:
     """Yield a note on enclaves without a robot in the fleet, whose state no confirmation shows."""
     fleet = load_fleet(keystore)
     without = [name for name in names if robot_of(fleet, name) is None] if fleet else []
