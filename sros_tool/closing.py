@@ -807,7 +807,9 @@ class OpenRobot:
             f"{unit_instance(enclave)}.env": render_environment(of_enclave, "docker")
             for enclave, of_enclave in variables.items()
         }
-        services = ["# Rename the services to those of your own file, and give both to Docker Compose 2."]
+        services = [
+            "# Rename the services to those of your own file; give both to Docker Compose 2."
+        ]
         for process in observed.processes:
             of_enclave = variables[process.enclave]
             if process.unit:
