@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         DescribedList,
         DescribedPermissions,
         DescribedToken,
+        EnclaveFacts,
         GrantFacts,
         ListFacts,
         RemoteFacts,
@@ -185,10 +186,8 @@ def _keystore(keystore: DescribedKeystore) -> Iterator[str]:
     yield f"  {counted(len(keystore.enclaves), 'enclave')}"
     for enclave in keystore.enclaves:
         facts = enclave.facts
-        state = "loadable" if facts.loadable else "NOT LOADABLE"
-        if enclave.key_on_robot and not facts.problems:
-            state = "key on its robot"
-        elif facts.token:
+        state = _state(facts, key_on_robot=enclave.key_on_robot)
+        if facts.token:
             state += f", key on the token {facts.token.token}"
         yield f"    {enclave.name}  {state}, expires {_moment(facts.expires)}"
         for problem in facts.problems:
@@ -227,9 +226,15 @@ def _moment(moment: datetime | None) -> str:
     return iso(moment) if moment else "at an unknown time"
 
 
+def _state(facts: EnclaveFacts, *, key_on_robot: bool) -> str:
+    if key_on_robot and not facts.problems:
+        return "key on its robot"
+    return "loadable" if facts.loadable else "NOT LOADABLE"
+
+
 def _enclave(enclave: DescribedEnclave) -> Iterator[str]:
     facts = enclave.facts
-    yield f"enclave {enclave.path}: {'loadable' if facts.loadable else 'NOT LOADABLE'}"
+    yield f"enclave {enclave.path}: {_state(facts, key_on_robot=enclave.key_on_robot)}"
     for problem in facts.problems:
         yield f"  {problem}"
     yield f"  expires {_moment(facts.expires)}, by what expires first"

@@ -394,6 +394,8 @@ class DescribedEnclave(NamedTuple):
     """The folder of an enclave."""
 
     path: NamedPath
+    key_on_robot: bool
+    """Whether the key was made on the robot and is not here."""
     facts: EnclaveFacts
     """The enclave's files."""
     zenoh: ZenohFiles | None
@@ -546,8 +548,11 @@ def describe(
         of_enclave = (CERTIFICATE_FILE, PERMISSIONS_FILE, KEY_URI_FILE)
         if any((path / name).exists() for name in of_enclave):
             state = open_enclave(path, now=now, files=files)
-            facts = _enclave_facts(evaluated("", path, state, at=now))
-            return DescribedEnclave(path, facts, _zenoh(path, now))
+            evaluation = evaluated("", path, state, at=now)
+            facts = (
+                _facts_in_keystore(evaluation) if state.key_on_robot else _enclave_facts(evaluation)
+            )
+            return DescribedEnclave(path, state.key_on_robot, facts, _zenoh(path, now))
         refuse_earlier(path)
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
@@ -686,12 +691,16 @@ def _zenoh(folder: Path, now: datetime) -> ZenohFiles | None:
 
 
 def _enclave(keystore: Keystore, name: str, now: datetime) -> KeystoreEnclave:
-    """Describe an enclave of a keystore; a key that is only on the robot is no problem there."""
+    """Describe an enclave of a keystore."""
     state = keystore.enclave(name, now=now)
     evaluation = evaluated(name, keystore.folder(name), state, at=now)
-    problems = [*evaluation.problems, *evaluation.for_some(state.problems)]
-    facts = _enclave_facts(evaluation)._replace(problems=problems)
-    return KeystoreEnclave(name, state.key_on_robot, facts)
+    return KeystoreEnclave(name, state.key_on_robot, _facts_in_keystore(evaluation))
+
+
+def _facts_in_keystore(evaluation: EvaluatedEnclave) -> EnclaveFacts:
+    """Describe the files of an enclave; a key that is only on its robot is no problem there."""
+    problems = [*evaluation.problems, *evaluation.for_some(evaluation.state.problems)]
+    return _enclave_facts(evaluation)._replace(problems=problems)
 
 
 def _enclave_facts(evaluation: EvaluatedEnclave) -> EnclaveFacts:

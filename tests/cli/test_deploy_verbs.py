@@ -175,6 +175,8 @@ def test_from_the_request_to_a_running_process(keystore: Path, tmp_path: Path) -
     assert NAME in sros("list_enclaves", keystore).ok().out
     assert sros("inspect", keystore, "--history").ok().out.count(NAME) == 3
     assert f"{NAME}  key on its robot, expires" in sros("inspect", keystore).ok().out
+    one = sros("inspect", keystore, NAME).ok().out
+    assert one.splitlines()[0].endswith(f"{NAME}: key on its robot"), one
     folder = sros("inspect", tmp_path / "robot" / FOLDER).ok().out
     assert sros("inspect", tmp_path / "robot", NAME).ok().out == folder
     no_keystore = sros("inspect", tmp_path / "robot" / FOLDER, NAME)
