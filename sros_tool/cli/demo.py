@@ -50,7 +50,8 @@ def _complete_scenario(
     type=click.Choice(["auto", "rclpy", "cyclone", "zenoh"]),
     default="auto",
     show_default=True,
-    help="Middleware of the nodes; auto uses rclpy if its RMW enforces security, else Cyclone DDS.",
+    help="Middleware of the nodes; auto uses rclpy if its RMW enforces security, else Cyclone DDS; "
+    "for a talker or listener without security Cyclone DDS, which also hears open nodes on others.",
 )
 @click.option(
     "--scenario",
@@ -80,7 +81,11 @@ def _complete_scenario(
     help="Exit with 0 even if this attack succeeds or cannot be tried in your keystore; "
     "can be repeated.",
 )
-@click.option("--topic", help="ROS topic of talkers and listeners.  [default: /chatter]")
+@click.option(
+    "--topic",
+    help="ROS topic of talkers and listeners, of std_msgs/msg/String; a listener also counts the "
+    "messages of other types.  [default: /chatter]",
+)
 @click.option(
     "--domain",
     type=int,
@@ -153,8 +158,10 @@ def demo(
 
     With talker, listener or router, run only this node until Ctrl-C, with the present environment
     variables, so that you can see who hears whom. The node runs on Cyclone DDS, rclpy, or Zenoh,
-    which also needs a router. The node says at once whether it is secured. Of the options, only
-    --backend and --topic apply.
+    which also needs a router. The node says at once whether it is secured. In an enclave, it needs
+    only the right for its topic, whatever its nodes are called. A listener reads
+    std_msgs/msg/String, and counts the messages of any other type that the topic has; a talker says
+    if nobody can take its type. Of the options, only --backend and --topic apply.
 
     Example:
       $ sros demo --topic /camera/image
@@ -229,7 +236,7 @@ def demo(
 
 def _run_by_hand(ctx: click.Context, role: str, backend: str, topic: str | None) -> NoReturn:
     """Run a node until it is stopped, and end with its exit status."""
-    from sros_tool.demo.backend import HandNode, run_by_hand
+    from sros_tool.demo.backend import HandNode, backend_by_hand, run_by_hand
     from sros_tool.demo.scenarios.model import DEFAULT_TOPIC, Role, check_topic
 
     for parameter in ctx.command.params:
@@ -239,8 +246,7 @@ def _run_by_hand(ctx: click.Context, role: str, backend: str, topic: str | None)
             option = parameter.opts[0]
             raise UsageError(f"a {role} takes no {option}", "", "Leave it out.")
     if backend == "auto":
-        on_zenoh = os.environ.get("RMW_IMPLEMENTATION") == "rmw_zenoh_cpp" or role == "router"
-        backend = "zenoh" if on_zenoh else "cyclone"
+        backend = backend_by_hand(Role(role), os.environ)
     node = HandNode(Role(role), backend, check_topic(DEFAULT_TOPIC if topic is None else topic))
     sys.exit(run_by_hand(node, echo))
 

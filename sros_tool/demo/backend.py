@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import select
+import shlex
 import signal
 import subprocess
 import sys
@@ -19,18 +20,21 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import ProtectionKind
 from sros_tool.demo.casting import naming_arguments
+from sros_tool.demo.nodes import STRING
 from sros_tool.demo.scenarios.model import Condition, Role
 from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.policy.patterns import matches
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
-from sros_tool.runtime.events import Event, EventKind, parse_event
+from sros_tool.runtime.events import Event, EventKind, ProcessStage, parse_event
 from sros_tool.runtime.netns import end_with_starter
 from sros_tool.runtime.rmw import (
     RMW,
+    built_without_security,
     cyclone_explains,
     middleware_of,
     rmw_implementations,
@@ -42,7 +46,7 @@ from sros_tool.runtime.stacks import (
     cyclone_stack,
     rclpy_stacks,
 )
-from sros_tool.runtime.variables import ENABLE, ENCLAVE, choose_loadable, domain_of
+from sros_tool.runtime.variables import ENABLE, ENCLAVE, KEYSTORE, choose_loadable, domain_of
 from sros_tool.translate import governance_for
 
 AUTO, RCLPY, CYCLONE, ZENOH = "auto", "rclpy", "cyclone", "zenoh"
@@ -339,6 +343,37 @@ def security_of(node: HandNode, environment: Mapping[str, str]) -> str:
     return f"{node.role} on {_LIBRARIES[node.backend]}{topic}, domain {domain}: {security}"
 
 
+def backend_by_hand(role: Role, environment: Mapping[str, str]) -> str:
+    """Return the backend of a node by hand, if the user names none.
+
+    Secured nodes of Fast DDS and of Cyclone DDS do not hear each other (tested: 2.14.5 and 0.10.2),
+    but open ones do.
+    """
+    if role is Role.ROUTER or environment.get(RMW) == "rmw_zenoh_cpp":
+        return ZENOH
+    rmw = _rmw_here(environment)
+    on_cyclone = vendor_of(rmw) is Vendor.CYCLONE or built_without_security(rmw, environment)
+    fits = environment.get(ENABLE) == "true" and vendor_of(rmw) and not on_cyclone
+    return RCLPY if fits and importlib.util.find_spec("rclpy") else CYCLONE
+
+
+def _rmw_here(environment: Mapping[str, str]) -> str:
+    """Return the RMW on DDS of this shell or machine, or ""."""
+    installed = rmw_implementations(environment)
+    return environment.get(RMW) or next(filter(vendor_of, installed), "")
+
+
+def _deaf_to(node: HandNode, environment: Mapping[str, str]) -> str:
+    """Return which nodes a secured node does not hear, as the ROS of this shell lets expect."""
+    rmw = _rmw_here(environment)
+    is_deaf = node.backend == CYCLONE and vendor_of(rmw) not in (None, Vendor.CYCLONE)
+    if not is_deaf or environment.get(ENABLE) != "true":
+        return ""
+    lacks = built_without_security(rmw, environment)
+    but = "was built without security here" if lacks else "needs --backend rclpy"
+    return f"secured nodes on {rmw} and this one do not hear each other; {rmw} {but}"
+
+
 def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
     """Run a node until it is stopped by a signal; return its exit status.
 
@@ -348,11 +383,13 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
         SrosError: The environment demands security, and the enclave cannot be loaded.
     """
     say(f"{security_of(node, os.environ)} (stop with Ctrl-C)")
+    if deaf := _deaf_to(node, os.environ):
+        say(deaf)
     events, writing = os.pipe()
     module = f"sros_tool.demo.{_MODULES[node.backend]}_node"
     command = [sys.executable, "-P", "-m", module, node.role.value, "--period", "1"]
     if node.role is not Role.ROUTER:
-        command += ["--topic", node.topic]
+        command += ["--topic", node.topic, "--by-hand"]
     if node.backend == ZENOH and os.environ.get(ENCLAVE):
         command += ["--ros-args", "--enclave", os.environ[ENCLAVE], "--"]
     if node.backend == RCLPY:  # what it logs of its messages is said here already
@@ -369,18 +406,22 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, stop)
         with open(events, "rb", buffering=0) as pipe:
-            _tell(node, pipe.fileno(), say)
+            last = _tell(node, pipe.fileno(), say)
         status = process.wait()
     if stopped.is_set():
         say("stopped")
+    elif last and last.stage is ProcessStage.ENDPOINT and os.environ.get(ENABLE) == "true":
+        what = "publish" if node.role is Role.TALKER else "subscribe"
+        asked = shlex.join((os.environ.get(KEYSTORE, ""), os.environ.get(ENCLAVE) or "/", what))
+        say(f"whether its enclave may do that: sros explain {asked} {node.topic}")
     elif status and node.backend == RCLPY:
         say("`sros doctor` says whether rclpy on this machine can be secured")
     return status
 
 
-def _tell(node: HandNode, pipe: int, say: Callable[[str], None]) -> None:
-    """Pass the node's reports to ``say`` until the node ends."""
-    data = b""
+def _tell(node: HandNode, pipe: int, say: Callable[[str], None]) -> Event | None:
+    """Pass the node's reports to ``say`` until the node ends, and return the last one."""
+    data, seen, event = b"", "", None
     connected = node.backend != ZENOH
     while len(data) < _LONGEST_LINE:
         ready, _, _ = select.select([pipe], [], [], _SILENCE)
@@ -391,14 +432,15 @@ def _tell(node: HandNode, pipe: int, say: Callable[[str], None]) -> None:
                     "starts one), or it refuses this node"
                 )
             elif node.role is Role.LISTENER:
-                say(f"heard nothing for {_SILENCE:.0f} s")
+                say(f"heard nothing for {_SILENCE:.0f} s{f', although {seen}' if seen else ''}")
             continue
         if not (more := os.read(pipe, 65536)):
-            return
+            return event
         *lines, data = (data + more).split(b"\n")
         for line in lines:
             event = parse_event(line, Path("the node's report"))
             connected = connected or event.kind is EventKind.READY
+            seen = event.text if event.kind is EventKind.SEEN else seen
             if text := _line(event):
                 say(text)
     raise SrosError("a node reported too long a message", f"It is over {_LONGEST_LINE} bytes long.")
@@ -414,5 +456,7 @@ def _line(event: Event) -> str:
             return f"{event.kind}: {' '.join(event.text.split())}"
         case EventKind.READY:
             return "ready"
+        case EventKind.SEEN if not event.text.endswith(f"of {STRING}"):
+            return event.text
         case _:
             return ""

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 from types import FrameType
 
-from sros_tool.demo.nodes import ROLES, Call, Hear, enclave_in, parse_options
+from sros_tool.demo.nodes import ROLES, Call, Hear, enclave_in, parse_options, ros_type
 from sros_tool.errors import SrosError
 from sros_tool.names import dds_names
 from sros_tool.runtime.cyclone import Participant, Reader, SecurityRefusedError
@@ -27,13 +27,14 @@ from sros_tool.runtime.variables import choose_loadable, domain_of
 _POLL_SECONDS = 0.02
 
 
-class _CycloneNode:
+class CycloneNode:
     """A node in a DDS participant; `poll` hands over received messages."""
 
-    def __init__(self, participant: Participant) -> None:
-        self._participant = participant
+    def __init__(self, participant: Participant, *, reliable: bool) -> None:
+        self._participant, self._reliable = participant, reliable
         self._name = os.urandom(16).hex()
         self._readers: list[tuple[Reader, Hear]] = []
+        self._counters: list[tuple[Reader, Callable[[int], None]]] = []
 
     def publisher(self, name: str) -> Hear:
         """Return a function that publishes a text."""
@@ -41,7 +42,21 @@ class _CycloneNode:
 
     def subscribe(self, name: str, hear: Hear) -> None:
         """Subscribe to a topic; ``hear`` is called with every text received."""
-        self._readers.append((self._participant.reader(self.wire_name(name)), hear))
+        reader = self._participant.reader(self.wire_name(name), reliable=self._reliable)
+        self._readers.append((reader, hear))
+
+    def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
+        """Return the ROS type of each discovered publisher, or else subscription, of a topic."""
+        participant, topic = self._participant, self.wire_name(name)
+        found = participant.publications() if of_publishers else participant.subscriptions()
+        return [ros_type(endpoint.type_name) for endpoint in found if endpoint.topic == topic]
+
+    def count(self, name: str, kind: str, heard: Callable[[int], None]) -> str:
+        """Count the messages of a type."""
+        package, _, name_of_type = kind.rpartition("/")
+        type_name = f"{package.replace('/', '::')}::dds_::{name_of_type}_"
+        self._counters.append((self._participant.counter(self.wire_name(name), type_name), heard))
+        return ""
 
     def serve(self, name: str, answer: Callable[[str], str]) -> None:
         """Offer a service; ``answer`` is called with a request and returns the reply."""
@@ -88,6 +103,8 @@ class _CycloneNode:
         for reader, hear in self._readers:
             for text in reader.take():
                 hear(text)
+        for reader, heard in self._counters:
+            heard(reader.count())
 
 
 _ROLES = tuple(role for role in ROLES if role not in ("relay", "router"))
@@ -109,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say(options.role, choice.note)
         with Participant(domain_of(os.environ), choice.enclave) as participant:
             stage = ProcessStage.ENDPOINT
-            node = _CycloneNode(participant)
+            node = CycloneNode(participant, reliable=not options.by_hand)
             role = ROLES[options.role](node, options, events)
             stage = ProcessStage.RUNNING
             events.report(EventKind.READY)

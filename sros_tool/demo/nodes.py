@@ -10,13 +10,16 @@ import argparse
 import math
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
 from sros_tool.runtime.events import EventKind, EventWriter
+from sros_tool.wording import counted
 
 _COMPOSED_SERVICE = "/add_two_ints"
 
@@ -32,7 +35,8 @@ class NodeOptions:
     ``text`` is sent in messages, and identifies a server.  ``server`` is the text of the action
     server that an action client uses ("": unknown).  ``also`` are further topics for an observer.
     On Zenoh, messages of a talker have ``size`` bytes or more, and ``patience`` is how long a
-    process waits for its connection, in seconds.
+    process waits for its connection, in seconds.  A talker or listener ``by_hand`` needs no right
+    but that of its topic, and reports what others have on the topic (`OtherTypes`).
     """
 
     role: str
@@ -44,6 +48,7 @@ class NodeOptions:
     also: tuple[str, ...] = ()
     size: int = 0
     patience: float = 60.0
+    by_hand: bool = False
 
     @property
     def service(self) -> str:
@@ -98,6 +103,9 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
         default=NodeOptions.patience,
         metavar="SECONDS",
         help="time to wait for a connection on Zenoh (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--by-hand", action="store_true", help="report what others have on the topic, of any type"
     )
     parser.add_argument(
         "--report", type=Path, metavar="FILE", help="append the events to FILE as JSON lines"
@@ -161,6 +169,15 @@ class Node(Protocol):
     def subscribe(self, name: str, hear: Hear) -> None:
         """Subscribe to a topic; ``hear`` is called with every text received."""
 
+    def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
+        """Return the type of each discovered publisher, or else subscription, of a topic."""
+
+    def count(self, name: str, kind: str, heard: Callable[[int], None]) -> str:
+        """Count messages of a type that is no string; return why that cannot be done, or "".
+
+        ``heard`` is called with the number of messages that were received since.
+        """
+
     def serve(self, name: str, answer: Callable[[str], str]) -> None:
         """Offer a service; ``answer`` is called with a request and returns the reply."""
 
@@ -198,6 +215,16 @@ class NodeRole:
             self._due = max(self._due + self._options.period, time.monotonic())
             self.act()
 
+    def _other_types(self, *, of_publishers: bool) -> OtherTypes | None:
+        """Begin to discover what others have on the topic of a node by hand."""
+        options, node = self._options, self._node
+        if not options.by_hand:
+            return None
+        node.watch()
+        types = partial(node.types, options.topic, of_publishers=of_publishers)
+        count = partial(node.count, options.topic) if of_publishers else None
+        return OtherTypes(options, self._events, types, count)
+
     def sent(self, text: str) -> None:
         """Report a message that was sent."""
         self._sent += 1
@@ -209,11 +236,77 @@ class NodeRole:
         self._events.report(EventKind.HEARD, text, count=self._heard)
 
 
+class OtherTypes:
+    """What others have on the topic of a talker or listener by hand, which itself has strings.
+
+    ``types`` returns the ROS type of each publisher, or for a talker of each subscription; a
+    listener gets ``count``, as `Node.count` with a topic.
+    """
+
+    def __init__(
+        self,
+        options: NodeOptions,
+        events: EventWriter,
+        types: Callable[[], Sequence[str]],
+        count: Callable[[str, Callable[[int], None]], str] | None = None,
+    ) -> None:
+        self._topic, self._period = options.topic, options.period
+        self._events, self._types, self._count = events, types, count
+        self._seen: Mapping[str, int] = {}
+        self._why_not: dict[str, str] = {}
+        self._heard: Counter[str] = Counter()
+        self._due = 0.0
+
+    def step(self) -> None:
+        """Report what changed, and how many messages were heard, once in a period."""
+        if (moment := time.monotonic()) < self._due:
+            return
+        self._due = moment + self._period
+        if (seen := Counter(self._types())) != self._seen:
+            self._seen = seen
+            self._events.report(EventKind.SEEN, "; ".join(map(self._described, sorted(seen))))
+        for kind in [kind for kind, number in self._heard.items() if number]:
+            text = f"{counted(number := self._heard[kind], 'message')} of {kind}"
+            self._heard[kind] -= number
+            self._events.report(EventKind.HEARD, text, count=number)
+
+    def _described(self, kind: str) -> str:
+        what = "publisher" if self._count else "subscription"
+        text = f"{self._topic} has {counted(self._seen[kind], what)} of {kind}"
+        if kind == STRING:
+            return text
+        if self._count is None:
+            return f"{text}, which does not take this talker's {STRING}"
+        if kind not in self._why_not:
+            self._heard[kind] = 0
+            self._why_not[kind] = self._count(kind, partial(self._keep, kind))
+        return f"{text}{self._why_not[kind]}"
+
+    def _keep(self, kind: str, number: int) -> None:
+        self._heard[kind] += number
+
+
+STRING = "std_msgs/msg/String"
+"""The type of what talkers publish, and listeners read."""
+
+
+def ros_type(of_dds: str) -> str:
+    """Return the name in ROS of a type: std_msgs/msg/String of std_msgs::msg::dds_::String_."""
+    return of_dds.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
+
+
 class _Talker(NodeRole):
     """A talker that publishes its text with a running number."""
 
     def prepare(self) -> None:
         self._publish = self._node.publisher(self._options.topic)
+        self._others = self._other_types(of_publishers=False)
+
+    def step(self) -> None:
+        """Publish, and look for subscriptions of other types."""
+        super().step()
+        if self._others:
+            self._others.step()
 
     def act(self) -> None:
         text = f"{self._options.text}: {self._sent + 1}"
@@ -226,6 +319,12 @@ class _Listener(NodeRole):
 
     def prepare(self) -> None:
         self._node.subscribe(self._options.topic, self.heard)
+        self._others = self._other_types(of_publishers=True)
+
+    def step(self) -> None:
+        """Look for publishers of other types."""
+        if self._others:
+            self._others.step()
 
 
 class _Relay(_Talker):

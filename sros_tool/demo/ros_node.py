@@ -12,9 +12,16 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
-from sros_tool.demo.nodes import FIBONACCI_ORDER, NodeOptions, fibonacci, parse_options
+from sros_tool.demo.nodes import (
+    FIBONACCI_ORDER,
+    NodeOptions,
+    OtherTypes,
+    fibonacci,
+    parse_options,
+)
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 
 _LOG_FLUSH_SECONDS = 0.3
@@ -55,7 +62,7 @@ def _run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> 
         from rclpy.signals import SignalHandlerOptions
 
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
-        nodes.append(rclpy.create_node(name))
+        nodes.append(_by_hand(name) if options.by_hand else rclpy.create_node(name))
         stage = ProcessStage.ENDPOINT
         nodes += build(nodes[0], options, events) or ()
         stage = ProcessStage.RUNNING
@@ -74,6 +81,19 @@ def _run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> 
             rclpy.try_shutdown()
     events.report(EventKind.DONE)
     return 0
+
+
+def _by_hand(name: str) -> Any:
+    """Return a node without what would need the rights of a node of this name."""
+    import rclpy
+    from rclpy.parameter import Parameter
+
+    return rclpy.create_node(
+        name,
+        enable_rosout=False,
+        start_parameter_services=False,
+        parameter_overrides=[Parameter("start_type_description_service", value=False)],
+    )
 
 
 def _spin(nodes: Sequence[Any], ended: Callable[[], bool]) -> None:
@@ -127,6 +147,13 @@ def _talker(node: Any, options: NodeOptions, events: EventWriter) -> None:
         events.report(EventKind.SENT, text, count=sent)
 
     node.create_timer(options.period, speak)
+    if options.by_hand:
+        types = partial(_types_of, node.get_subscriptions_info_by_topic, options.topic)
+        node.create_timer(options.period, OtherTypes(options, events, types).step)
+
+
+def _types_of(infos: Callable[[str], Sequence[Any]], topic: str) -> Sequence[str]:
+    return [info.topic_type for info in infos(topic)]
 
 
 def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
@@ -142,7 +169,28 @@ def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
         events.report(EventKind.HEARD, message.data, count=heard)
 
     # rclpy keeps subscriptions alive through the node.
-    node.create_subscription(String, options.topic, hear, _QUEUE_DEPTH)
+    if not options.by_hand:
+        node.create_subscription(String, options.topic, hear, _QUEUE_DEPTH)
+        return
+    from rclpy.qos import qos_profile_sensor_data  # hears publishers of any reliability
+
+    texts = node.create_subscription(String, options.topic, hear, qos_profile_sensor_data)
+    types = partial(_types_of, node.get_publishers_info_by_topic, options.topic)
+
+    def count(kind: str, heard: Callable[[int], None]) -> str:
+        package, _, name = kind.replace("/", ".").rpartition(".")
+        try:
+            message = getattr(importlib.import_module(package), name)
+        except (ImportError, AttributeError) as error:
+            return f", which this listener cannot hear ({error}): add --backend cyclone"
+        if {*types()} != {kind}:
+            return ", which this listener cannot hear next to another type: add --backend cyclone"
+        node.destroy_subscription(texts)  # Fast DDS takes one type of a topic in a process
+        get = (message, options.topic, lambda _raw: heard(1), qos_profile_sensor_data)
+        node.create_subscription(*get, raw=True)
+        return ""
+
+    node.create_timer(options.period, OtherTypes(options, events, types, count).step)
 
 
 def _observer(node: Any, options: NodeOptions, events: EventWriter) -> None:

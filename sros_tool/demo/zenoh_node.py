@@ -34,6 +34,7 @@ from sros_tool.demo.nodes import (
     NodeRole,
     enclave_in,
     parse_options,
+    ros_type,
 )
 from sros_tool.graph.zenoh_tokens import NODE, configuration
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
@@ -126,6 +127,23 @@ class _ZenohNode:
             self._announce("MS", name, kind)
         key = self._key_of(name, kind)
         self._keep(self._session.declare_subscriber(key, lambda it: hear(_text_of(it.payload))))
+
+    def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
+        """Return the ROS type of each publisher, or else subscription, of a topic in the graph."""
+        return [ros_type(kind) for kind, _ in self._types(name, "MP" if of_publishers else "MS")]
+
+    def _types(self, name: str, kind: str) -> list[tuple[str, str]]:
+        """Return the type, with its hash, of each endpoint of a kind that a topic has."""
+        chunks = (token.split("/") for token in tuple(self._graph) if _kind_of(token) == kind)
+        wire = self.wire_name(name)
+        return [(of[10], of[11]) for of in chunks if len(of) > 11 and of[9] == wire]
+
+    def count(self, name: str, kind: str, heard: Callable[[int], None]) -> str:
+        """Count the messages of a type, by its hashes in the graph."""
+        for typed in {typed for typed in self._types(name, "MP") if ros_type(typed[0]) == kind}:
+            key = self._key_of(name, typed)
+            self._keep(self._session.declare_subscriber(key, lambda _: heard(1)))
+        return ""
 
     def serve(self, name: str, answer: Callable[[str], str]) -> None:
         """Offer a service; ``answer`` gets each request and returns the reply."""

@@ -64,8 +64,11 @@ STRING_TYPE = "std_msgs::msg::dds_::String_"
 _NOT_ALLOWED_BY_SECURITY = -13
 _ANY_STATE = 0x7F
 _BUILTIN_PARTICIPANTS, _BUILTIN_PUBLICATIONS = 0x7FFF0000 + 1, 0x7FFF0000 + 3
-_KEEP_LAST, _RELIABLE, _XCDR1 = 0, 1, 0
+_BUILTIN_SUBSCRIPTIONS = 0x7FFF0000 + 4
+_KEEP_LAST, _BEST_EFFORT, _RELIABLE, _XCDR1, _XCDR2 = 0, 0, 1, 0, 2
 _STRING_OPS = (ctypes.c_uint32 * 3)(0x01 << 24 | 0x05 << 16, 0, 0)
+_OCTET_OPS = (ctypes.c_uint32 * 3)(0x01 << 24 | 0x01 << 16, 0, 0)
+"""One byte, with which every message begins: the rest of a message is not read."""
 _NO_OPTIMIZE = 1
 
 _FILE_PROPERTIES = {
@@ -99,7 +102,7 @@ class SecurityRefusedError(DdsError):
 
 
 class Publication(NamedTuple):
-    """A discovered writer: its DDS topic name and DDS type name."""
+    """A discovered writer or reader: its DDS topic name and DDS type name."""
 
     topic: str
     type_name: str
@@ -136,18 +139,35 @@ class Participant:
         """
         return Writer(self._library, self._endpoint("writer", topic))
 
-    def reader(self, topic: str) -> Reader:
-        """Return a reliable DataReader of strings on the DDS topic ``topic`` ("rt/chatter").
+    def reader(self, topic: str, *, reliable: bool = True) -> Reader:
+        """Return a DataReader of strings on the DDS topic ``topic`` ("rt/chatter").
+
+        Only a reader that is not reliable receives from best-effort writers.
 
         Raises:
             SecurityRefusedError: the permissions deny it.
             DdsError: creating it failed for another reason.
         """
-        return Reader(self._library, self._endpoint("reader", topic), self.handle)
+        handle = self._endpoint("reader", topic, reliable=reliable)
+        return Reader(self._library, handle, self.handle)
+
+    def counter(self, topic: str, type_name: str) -> Reader:
+        """Return a best-effort DataReader of any DDS type, which can only count messages.
+
+        Raises:
+            SecurityRefusedError: the permissions deny it.
+            DdsError: creating it failed for another reason.
+        """
+        handle = self._endpoint("reader", topic, type_name, reliable=False)
+        return Reader(self._library, handle, self.handle)
 
     def publications(self) -> tuple[Publication, ...]:
         """Return this participant's writers and the discovered writers, sorted by topic."""
         return tuple(sorted(self._discovered(_BUILTIN_PUBLICATIONS, _publication_of)))
+
+    def subscriptions(self) -> tuple[Publication, ...]:
+        """Return this participant's readers and the discovered readers, sorted by topic."""
+        return tuple(sorted(self._discovered(_BUILTIN_SUBSCRIPTIONS, _publication_of)))
 
     def process_ids(self) -> dict[str, int]:
         """Map the discovered participants of this machine that tell it to their process ids.
@@ -198,24 +218,31 @@ class Participant:
     ) -> None:
         self.close()
 
-    def _endpoint(self, kind: str, topic: str) -> int:
+    def _endpoint(
+        self, kind: str, topic: str, type_name: str = STRING_TYPE, *, reliable: bool = True
+    ) -> int:
         api = self._library.api
         self._library.log.clear()
+        sample: type[StringSample | ctypes.c_uint8] = StringSample
+        ops, forms = _STRING_OPS, [_XCDR1]
+        if type_name != STRING_TYPE:
+            sample, ops, forms = ctypes.c_uint8, _OCTET_OPS, [_XCDR1, _XCDR2]
         descriptor = TopicDescriptor(
-            size=ctypes.sizeof(StringSample),
-            align=ctypes.alignment(StringSample),
+            size=ctypes.sizeof(sample),
+            align=ctypes.alignment(sample),
             flags=_NO_OPTIMIZE,
-            type_name=STRING_TYPE.encode(),
+            type_name=type_name.encode(),
             op_count=2,
-            ops=_STRING_OPS,
+            ops=ops,
             meta=b"",
         )
         with _qos(self._library) as qos:
-            api.dds_qset_reliability(qos, _RELIABLE, 100_000_000)
+            api.dds_qset_reliability(qos, _RELIABLE if reliable else _BEST_EFFORT, 100_000_000)
             api.dds_qset_history(qos, _KEEP_LAST, 10)
-            api.dds_qset_data_representation(qos, 1, (ctypes.c_int16 * 1)(_XCDR1))
+            api.dds_qset_data_representation(qos, len(forms), (ctypes.c_int16 * len(forms))(*forms))
+            # Without QoS: topics of one name and several types must not differ in it.
             made = api.dds_create_topic(
-                self.handle, ctypes.byref(descriptor), topic.encode(), qos, None
+                self.handle, ctypes.byref(descriptor), topic.encode(), None, None
             )
             if made < 0:
                 raise self._failure(made, f"cannot create topic {topic}")
@@ -286,6 +313,10 @@ class Reader:
     def take(self) -> tuple[str, ...]:
         """Return the messages received since the last call, oldest first."""
         return tuple(_take(self._library, self.handle, 64, _string_of))
+
+    def count(self) -> int:
+        """Return how many messages were received since the last call."""
+        return len(_take(self._library, self.handle, 64, lambda _: None))
 
     def matched(self) -> int:
         """Return the number of writers that this reader receives from."""

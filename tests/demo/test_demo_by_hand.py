@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -11,10 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.demo.backend import HandNode, security_of
+from sros_tool.demo.backend import HandNode, backend_by_hand, security_of
+from sros_tool.demo.cyclone_node import CycloneNode
+from sros_tool.demo.nodes import ROLES, NodeOptions
 from sros_tool.demo.scenarios.model import Role
-from sros_tool.errors import SrosError, UsageError
-from tests.support.children import PATIENCE
+from sros_tool.errors import SrosError, UnavailableError, UsageError
+from sros_tool.runtime.cyclone import Participant, load_cyclone
+from sros_tool.runtime.events import EventWriter, read_events
+from sros_tool.runtime.rmw import _RMW_INDEX
+from tests.support.children import LATE, PATIENCE, apart
 from tests.support.harness import sros
 
 TALKER = HandNode(Role.TALKER, "cyclone", "/chatter")
@@ -46,6 +52,62 @@ def test_a_node_on_zenoh_says_its_configuration() -> None:
     assert security_of(node, {"ZENOH_SESSION_CONFIG_URI": "/a.json5"}).endswith("by /a.json5")
     with pytest.raises(UsageError, match="only Zenoh has routers"):
         HandNode(Role.ROUTER, "rclpy", "/chatter")
+
+
+def test_a_secured_node_runs_on_what_the_robot_runs_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: object())
+    library = tmp_path / "lib/librmw_fastrtps_shared_cpp.so"
+    for path in (library, tmp_path / f"{_RMW_INDEX}/rmw_fastrtps_cpp"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    robot = {"AMENT_PREFIX_PATH": str(tmp_path), "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"}
+    secured = {**robot, "ROS_SECURITY_ENABLE": "true"}
+    assert backend_by_hand(Role.LISTENER, robot) == "cyclone"
+    assert backend_by_hand(Role.LISTENER, secured) == "rclpy"
+    on_cyclone = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
+    assert backend_by_hand(Role.LISTENER, {**secured, **on_cyclone}) == "cyclone"
+    assert backend_by_hand(Role.LISTENER, {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}) == "zenoh"
+    library.write_bytes(b"this Fast DDS version doesn't have the security libraries")
+    assert backend_by_hand(Role.LISTENER, secured) == "cyclone"
+
+
+@pytest.mark.dds
+def test_a_node_by_hand_says_what_others_have_of_another_type(tmp_path: Path) -> None:
+    try:
+        load_cyclone()
+    except UnavailableError as error:
+        pytest.skip(str(error))
+    report = tmp_path / "report"
+    odometry, twist = "nav_msgs::msg::dds_::Odometry_", "geometry_msgs::msg::dds_::Twist_"
+
+    def played() -> list[str]:
+        listens = NodeOptions("listener", "/odom", 0.05, by_hand=True)
+        drives = NodeOptions("talker", "/cmd_vel", 0.05, by_hand=True)
+        events, end = EventWriter(report), time.monotonic() + LATE
+        with Participant(5) as robot, Participant(5) as stranger:
+            robot.counter("rt/cmd_vel", twist)
+            writer = robot._endpoint("writer", "rt/odom", odometry)
+            node = CycloneNode(stranger, reliable=False)
+            roles = [ROLES[of.role](node, of, events) for of in (listens, drives)]
+            while time.monotonic() < end:
+                robot._library.api.dds_write(writer, ctypes.byref(ctypes.c_uint8(1)))
+                for role in roles:
+                    role.step()
+                node.poll()
+                texts = [e.text for e in read_events(report) if e.text]
+                told = {t.lstrip("0123456789").replace("messages", "message") for t in texts}
+                told -= {text for text in told if text.startswith("Hello World")}
+                if len(told) > 2:
+                    return sorted(told)
+                time.sleep(0.02)
+        return []
+
+    heard, driven, seen = apart(played)
+    assert heard == " message of nav_msgs/msg/Odometry"
+    assert driven.startswith("/cmd_vel has 1 subscription of geometry_msgs/msg/Twist, which does")
+    assert seen == "/odom has 1 publisher of nav_msgs/msg/Odometry"
 
 
 @pytest.mark.parametrize("options", [["--json"], ["--scenario", "attacks"], ["--domain", "3"]])
