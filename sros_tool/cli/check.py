@@ -428,7 +428,7 @@ def _system(path: Path, at: Circumstances, template: str | None = None) -> Syste
 def _suggested(system: System) -> str:
     from sros_tool.proof.suggestions import render_requirements, suggest
 
-    return render_requirements(suggest(system.rights, system.worlds, system.fleet), system.file)
+    return render_requirements(suggest(system.rights, system.worlds, system.fleet()), system.file)
 
 
 def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:

@@ -22,7 +22,7 @@ requirements of the new file together demand at least as much, whatever their na
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -228,37 +228,39 @@ def _listed(names: Iterable[str]) -> str:
 # ── reading ────────────────────────────────────────────────────────────────────────────────
 
 
-def read_requirements(
-    path: Path, fleet: Fleet | None = None, robots: Container[str] | None = None
-) -> tuple[Requirement, ...]:
-    """Return the requirements in a TOML file, in their order.
+FleetSource = Callable[[], Fleet | None]
+"""Function that returns the robots that placeholders stand for; it is called only if needed."""
 
-    Args:
-        path: the file.
-        fleet: the robots that placeholders stand for; None if there are none.
-        robots: names of the robots of ``fleet`` that requirements are wanted for; None for all.
+
+def _no_fleet() -> None:
+    return None
+
+
+def read_requirements(path: Path, fleet: FleetSource = _no_fleet) -> tuple[Requirement, ...]:
+    """Return the requirements in a TOML file, in their order, for the robots of a fleet.
 
     Raises:
         DocumentError: the file cannot be read, or a part of it is not valid; the error has file and
             line.
+        SrosError: as ``fleet`` raises it.
     """
     data = read_bytes(path, "requirements file", most=1024 * 1024)
-    return parse_requirements(data, str(path), fleet, robots)
+    return parse_requirements(data, str(path), fleet)
 
 
 def read_all_requirements(
-    paths: Iterable[Path], fleet: Fleet | None = None
+    paths: Iterable[Path], fleet: FleetSource = _no_fleet
 ) -> tuple[Requirement, ...]:
-    """Return the requirements in several TOML files, for all robots of ``fleet``.
+    """Return the requirements in several TOML files.
 
     Raises:
-        DocumentError: as `read_requirements`.
+        SrosError: as `read_requirements`.
     """
     return tuple(requirement for path in paths for requirement in read_requirements(path, fleet))
 
 
 def parse_requirements(
-    data: bytes, file: str, fleet: Fleet | None = None, robots: Container[str] | None = None
+    data: bytes, file: str, fleet: FleetSource = _no_fleet
 ) -> tuple[Requirement, ...]:
     """Return the requirements in a TOML document, which errors and sources call ``file``.
 
@@ -266,7 +268,7 @@ def parse_requirements(
         DocumentError: a part of it is not valid.
     """
     stated = _stated_tables(data, file)
-    filled = (table for one in stated for table in _filled(one, fleet, robots))
+    filled = (table for one in stated for table in _filled(one, fleet))
     requirements = []
     left = _MOST_PAIRS
     for table in filled:
@@ -486,7 +488,7 @@ class _Table:
 # ── placeholders ───────────────────────────────────────────────────────────────────────────
 
 
-def _filled(table: _Table, fleet: Fleet | None, robots: Container[str] | None) -> Iterator[_Table]:
+def _filled(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
     """Yield a table with its placeholders filled in: once, or for each of the robots it is about.
 
     Raises:
@@ -496,13 +498,7 @@ def _filled(table: _Table, fleet: Fleet | None, robots: Container[str] | None) -
     if not used:
         yield table
         return
-    members = _members(table, used, fleet)
-    kept = {
-        group: tuple(robot for robot in every if robots is None or robot.name in robots)
-        for group, every in members.items()
-    }
-    # A list that would lose all its names would demand something else.
-    several = {group: kept[group] or every for group, every in members.items()}
+    members = _members(table, used, fleet())
     singular = [placeholder for placeholder in used if not placeholder.plural]
     groups = list(dict.fromkeys(placeholder.group for placeholder in singular if placeholder.group))
     if len(groups) > 1:
@@ -513,10 +509,10 @@ def _filled(table: _Table, fleet: Fleet | None, robots: Container[str] | None) -
             "Write a table for each group.",
         )
     if not singular:
-        yield table.with_names(partial(_filled_names, several=several))
+        yield table.with_names(partial(_filled_names, several=members))
         return
-    for robot in kept[groups[0] if groups else ""]:
-        own = table.with_names(partial(_filled_names, several=several, robot=robot))
+    for robot in members[groups[0] if groups else ""]:
+        own = table.with_names(partial(_filled_names, several=members, robot=robot))
         words = {key: _filled_words(own.values[key], robot) for key in _WORDS if key in own.values}
         yield replace(own, values={**own.values, **words}, robot=robot.name)
 

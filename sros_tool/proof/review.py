@@ -8,7 +8,7 @@ result names what was not compared.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
@@ -48,6 +48,7 @@ from sros_tool.proof.findings import requirement_findings
 from sros_tool.proof.growth import Growth, compare_access
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import (
+    FleetSource,
     Requirement,
     dropped_findings,
     dropped_requirements,
@@ -760,9 +761,7 @@ class _Review:
                 yield ReviewStep("requirements", subject, _UNDECIDED, known)
                 continue
             wanted = yield from _read(files, system.fleet)
-            # A robot that leaves the fleet drops no requirement.
-            robots = system.fleet.robots if system.fleet else None
-            earlier = yield from _read(base_files, before or system.fleet, robots)
+            earlier = yield from _read(base_files, partial(_still_there, before, system.fleet))
             yield from self._checked("requirements", subject, partial(_decided, wanted, system))
             if dropped_requirements(earlier, wanted):
                 decide = partial(self._dropped, earlier, wanted, system)
@@ -873,14 +872,30 @@ def _decided(requirements: Sequence[Requirement], system: System) -> tuple[int, 
     return _status(chosen), chosen
 
 
+def _still_there(before: Fleet | None, after: FleetSource) -> Fleet | None:
+    """Return the fleet ``before`` without the robots that left it.
+
+    So a robot that leaves drops no requirement.  A group that lost all its robots still has them.
+    """
+    now = after()
+    if before is None or now is None:
+        return before or now
+    gone = before.robots.keys() - now.robots.keys()
+    emptied = [members for members in before.groups.values() if gone.issuperset(members)]
+    gone = gone.difference(*emptied) if gone != before.robots.keys() else set()
+    return Fleet.of(
+        (robot for robot in before.robots.values() if robot.name not in gone), before.groups
+    )
+
+
 def _read(
-    files: Mapping[str, Path], fleet: Fleet | None, robots: Container[str] | None = None
+    files: Mapping[str, Path], fleet: FleetSource
 ) -> Generator[ReviewStep, None, list[Requirement]]:
     """Return the requirements of files, by path; yield the steps that cannot read them."""
     requirements: list[Requirement] = []
     for path, file in files.items():
         try:
-            requirements += read_requirements(file, fleet, robots)
+            requirements += read_requirements(file, fleet)
         except SrosError as error:
             yield ReviewStep("requirements", path, _UNDECIDED, error)
     return requirements

@@ -6,10 +6,11 @@ The access on one vendor, or on Zenoh, is called a world.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, tzinfo
+from functools import partial
 from itertools import product
 from pathlib import Path
 from shlex import quote
@@ -26,7 +27,7 @@ from sros_tool.errors import KeystoreError, PolicyError, SrosError, UsageError
 from sros_tool.explain.answer import Evaluator
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.fleet import load_fleet
+from sros_tool.keystore.fleet import checked_fleet
 from sros_tool.keystore.layout import (
     KEY_FILE,
     KEY_URI_FILE,
@@ -92,7 +93,7 @@ class System:
 
     ``file`` is its path, ``rights`` are the allowed rights as it states them, and ``places`` tells
     where it states them.  ``left_out`` is the reason why there is no Zenoh world, if Zenoh
-    cannot enforce the policy.  ``fleet`` has the robots of the policy or keystore, or is None.
+    cannot enforce the policy.  ``fleet`` returns the robots of the policy or keystore, or None.
     """
 
     file: str
@@ -100,7 +101,7 @@ class System:
     places: Places
     rights: frozenset[Right]
     left_out: SrosError | None = None
-    fleet: Fleet | None = None
+    fleet: Callable[[], Fleet | None] = lambda: None
 
 
 def load_system(
@@ -150,7 +151,7 @@ def load_system(
         )
     policy = join_policies([read_policy_for(file, fleet) for file in files])
     system = policy_system(policy, at=at, domain=domain or 0, only=only, template=template)
-    return replace(system, fleet=fleet)
+    return replace(system, fleet=lambda: fleet)
 
 
 # ── a policy ───────────────────────────────────────────────────────────────────────────────
@@ -452,7 +453,9 @@ def _keystore_system(
         name: [Place(right, Source(files[name], 0)) for right in rights if right.enclave == name]
         for name in names
     }
-    return System(str(root), tuple(worlds), Places(places), rights, fleet=load_fleet(keystore))
+    return System(
+        str(root), tuple(worlds), Places(places), rights, fleet=partial(checked_fleet, keystore)
+    )
 
 
 def _link_domains(worlds: Sequence[World]) -> None:

@@ -13,7 +13,6 @@ from sros_tool.proof.findings import decide_all
 from sros_tool.proof.requirements import (
     Requirement,
     demand,
-    dropped_requirements,
     parse_requirements,
 )
 from sros_tool.proof.suggestions import render_requirements, suggest
@@ -56,7 +55,7 @@ call = ["{namespace}/b"]
 
 
 def read(text: str, fleet: Fleet | None = FLEET) -> tuple[Requirement, ...]:
-    return parse_requirements(text.encode(), "r.toml", fleet)
+    return parse_requirements(text.encode(), "r.toml", lambda: fleet)
 
 
 def test_a_table_with_a_robot_is_a_requirement_for_each() -> None:
@@ -111,18 +110,6 @@ def test_one_table_is_about_one_group() -> None:
         read(text, fleet)
 
 
-def test_a_robot_that_leaves_drops_nothing_and_a_changed_group_does() -> None:
-    text = EACH + FROM_OTHERS + ONE_LIST
-    left = Fleet.of([robot for robot in FLEET.robots.values() if robot.name != "r2"])
-    left = Fleet.of(left.robots.values(), ("carriers",))
-    before = parse_requirements(text.encode(), "r.toml", FLEET, left.robots)
-    assert dropped_requirements(before, read(text, left)) == ()
-    moved = Fleet.of([robot._replace(groups=()) for robot in left.robots.values()])
-    after = parse_requirements((EACH + ONE_LIST.replace(":carriers", "")).encode(), "r", moved)
-    dropped = dropped_requirements(before, after)
-    assert [type(each.requirement).KIND for each in dropped] == ["apart"]
-
-
 POLICY = policy_text(
     {
         "/{robot}/mux": publish("{namespace}/cmd_vel"),
@@ -156,7 +143,7 @@ def test_proposals_for_a_fleet_demand_what_those_for_its_robots_demand(folder: P
     text = render_requirements(folded, "robot.xml")
     assert "# only /{robot}/mux may publish {namespace}/cmd_vel\n" in text
     assert "# only /{robot:carriers}/lift may publish {namespace:carriers}/lift\n" in text
-    filled = parse_requirements(text.encode(), "r.toml", fleet)
+    filled = read(text, fleet)
     assert sorted(map(demand, filled)) == sorted(map(demand, each))
     assert decide_all(filled, system).violations == ()
 
@@ -178,6 +165,11 @@ def test_a_finding_for_all_robots_is_shown_once(folder: Path) -> None:
     ended = sros("check", "ks", *words, cwd=folder)
     assert (ended.status, ended.out.count("requirement.violated")) == (1, 1), ended.out
     assert "the same for 1 more robot: r2" in ended.out
+    edited = folder / "ks/fleet.toml"
+    edited.write_text(edited.read_text().replace("r2 =", "r4 ="))
+    hidden = sros("check", "ks", *words, cwd=folder)
+    assert (hidden.status, "is not the file that sros wrote" in hidden.err) == (2, True), hidden
+    edited.write_text(edited.read_text().replace("r4 =", "r2 ="))
     one = sros("check", "ks", *words, "--json", cwd=folder)
     assert one.out.count('"requirement.violated"') == 2
 
@@ -194,6 +186,9 @@ def test_a_review_fills_in_the_fleet_of_each_commit(tmp_path: Path) -> None:
     change.commit({"fleet.toml": FILE.replace('r2 = { groups = ["carriers"] }', "r2 = {}")})
     moved = change.review(*words)
     assert "requirements-before robot.xml: 1 requirement dropped" in moved.out, moved.out
+    change.commit({"fleet.toml": '[robots]\nr3 = { groups = ["carriers"] }\n', "r.toml": EACH})
+    of_group = change.review(*words)
+    assert "requirements-before robot.xml: 4 requirements dropped" in of_group.out, of_group.out
     change.commit({"fleet.toml": FILE, "r.toml": EACH})
     dropped = change.review(*words)
     assert "requirements-before robot.xml: 2 requirements dropped" in dropped.out, dropped.out
