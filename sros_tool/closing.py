@@ -896,7 +896,7 @@ class OpenRobot:
                 yield f"the policy does not have {name}, and the keystore does: {revoke}"
         for name in self._enclaves_left():
             remove = f"rm -r {shlex.quote(str(enclave_path(self.export, name)))}"
-            yield f"the export has {name}, and the keystore does not, nor revoked it: {remove}"
+            yield f"the export has {name}, which the keystore neither has nor revoked: {remove}"
         owner, export = self.export.stat().st_uid, self.export.absolute()
         users = sorted({process.user for process in observed.processes})
         for user in users:

@@ -36,7 +36,7 @@ class Coloured(NamedTuple):
 
 
 def visible(text: str) -> str:
-    """Return ``text`` with control characters as visible escapes, so that none steers a terminal.
+    """Return ``text`` with control characters as visible escapes, so that none controls a terminal.
 
     Newline and tab stay.
     """

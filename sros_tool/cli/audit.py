@@ -32,7 +32,7 @@ from sros_tool.cli.observing import (
     observe,
     observer_environment,
     observing_options,
-    why_empty,
+    why_no_node_was_observed,
 )
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UnavailableError, UsageError
@@ -163,7 +163,7 @@ def audit(
     if not audited.observation.nodes:
         raise UnavailableError(
             "there is nothing to audit: no node was observed",
-            why_empty(environment, snapshot.seconds, rmw, enclave),
+            why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave),
         )
     existed = patch is not None and patch.exists()
     written = _write_patch(audited, patch, dry_run=dry_run)

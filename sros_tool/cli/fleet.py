@@ -689,8 +689,8 @@ def _facts(compared: ComparedFleet) -> Iterator[str]:
         yield text
     yield from _expiry_facts(compared)
     if status.unassigned:
-        whom = "it" if status.unassigned == 1 else "them"
-        yield f"{counted(status.unassigned, 'enclave')} of no robot: nothing is known of {whom}"
+        number = counted(status.unassigned, "enclave")
+        yield f"{number} of no robot, whose state no confirmation shows"
 
 
 def _expiry_facts(compared: ComparedFleet) -> Iterator[str]:

@@ -237,7 +237,7 @@ def _enclave(enclave: DescribedEnclave) -> Iterator[str]:
     yield f"enclave {enclave.path}: {_state(facts, key_on_robot=enclave.key_on_robot)}"
     for problem in facts.problems:
         yield f"  {problem}"
-    yield f"  expires {_moment(facts.expires)}, by what expires first"
+    yield f"  expires {_moment(facts.expires)} (the first of its files)"
     yield f"  subject {facts.subject}, certificate until {_moment(facts.valid_until)}"
     identity = _named(facts.identity_ca, facts.identity_ca_sha256)
     permissions = _named(facts.permissions_ca, facts.permissions_ca_sha256)

@@ -256,7 +256,9 @@ def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
     return UnavailableError(error.what, why, "`sros doctor` shows what works here.")
 
 
-def why_empty(environment: Mapping[str, str], seconds: float, rmw: str, enclave: str | None) -> str:
+def why_no_node_was_observed(
+    environment: Mapping[str, str], seconds: float, rmw: str, enclave: str | None
+) -> str:
     """Return the likely reasons why no node was observed, and a remedy."""
     from sros_tool.runtime.variables import DOMAIN, ENABLE, KEYSTORE
 
@@ -458,7 +460,7 @@ def generate_policy(
             print_json(_printed(None, file, learned, seen.observation, dry_run))
         echo(_NO_NODES, err=True)
         print_notes(learned.notes)
-        echo(why_empty(environment, snapshot.seconds, rmw, enclave), err=True)
+        echo(why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave), err=True)
         return 1
     plan = draft(file, learned, None if flat else common)
     if not dry_run:

@@ -63,7 +63,7 @@ def escape(text: str) -> str:
     """Escape ``text`` for the content of an HTML element or an attribute value.
 
     A character that XML forbids, a control character or a line break becomes a visible escape: it
-    could steer a terminal that shows the file.
+    could control a terminal that shows the file.
     """
     return html.escape(visible_line(text))
 

@@ -181,7 +181,7 @@ class Configuration:
     def render(self, settings: SettingsEdition = SettingsEdition.RULES_ONCE) -> bytes:
         """Return the file: JSON, the same for equal configurations.
 
-        The file does not name the files of TLS: a session needs them from elsewhere to open.
+        The file does not name the files of TLS; $ZENOH_CONFIG_OVERRIDE has to name them.
         """
         rights = [render_rights(remote) for remote in self.access_control.remotes]
         return render_configuration(

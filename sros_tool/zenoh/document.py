@@ -226,12 +226,12 @@ def _root(data: bytes, name: str, *, lines: bool) -> _Section:
         text = data.decode()
         value = _of_yaml(text, name) if _has_ending(name) else parse_json5(text, lines=lines)
     except UnicodeDecodeError as error:
-        raise _not_json5(name)(
+        raise _json5_error_class(name)(
             f"the Zenoh configuration '{name}' is not UTF-8",
             f"The byte at {error.start} does not belong to UTF-8 text.",
         ) from error
     except Json5Error as error:
-        raise _not_json5(name)(
+        raise _json5_error_class(name)(
             f"the Zenoh configuration '{name}' is not JSON5",
             f"Line {error.line}: {error.problem}.",
         ) from error
@@ -272,7 +272,7 @@ def _of_yaml(text: str, name: str) -> object:
     return value
 
 
-def _not_json5(name: str) -> type[DocumentError]:
+def _json5_error_class(name: str) -> type[DocumentError]:
     """Return the error class for text that is not JSON5.
 
     By some file names, Zenoh reads such text as YAML, so sros does not know its meaning.
@@ -280,7 +280,7 @@ def _not_json5(name: str) -> type[DocumentError]:
     return UnreadConfigurationError if _has_ending(name) else DocumentError
 
 
-def _no_object(value: object) -> type[DocumentError]:
+def _object_error_class(value: object) -> type[DocumentError]:
     """Return the error class for a value that should be an object; Zenoh accepts some lists."""
     return UnreadConfigurationError if isinstance(value, list) else DocumentError
 
@@ -307,7 +307,7 @@ class _Section:
     def section(self, member: str) -> _Section:
         value = self.value.get(member, Json5Object(self.value.line))
         if not isinstance(value, Json5Object):
-            raise self.refused(member, "is not an object", _no_object(value))
+            raise self.refused(member, "is not an object", _object_error_class(value))
         return _Section(self.name, f"{self.path}/{member}".lstrip("/"), value)
 
     def boolean(self, member: str, default: bool, *, nullable: bool = True) -> bool:
@@ -366,7 +366,7 @@ class _Section:
         ):
             elements = value if isinstance(value, list) else ()
             inner = next((element for element in elements if isinstance(element, list)), None)
-            raise self.refused(member, "is not a list of objects", _no_object(inner))
+            raise self.refused(member, "is not a list of objects", _object_error_class(inner))
         return tuple(
             _Section(self.name, f"{self.path}/{member}[{number}]", element)
             for number, element in enumerate(value)

@@ -248,7 +248,7 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     shutil.copytree(robot.folder / "robot/export/enclaves/talker", robot.folder / LOST)
     said = robot.close("--apply", status=1).out
     assert (
-        f"the export has /lost, and the keystore does not, nor revoked it: rm -r {LOST}\n" in said
+        f"the export has /lost, which the keystore neither has nor revoked: rm -r {LOST}\n" in said
     )
     assert (robot.folder / LOST / "key.pem").exists()
     shutil.rmtree(robot.folder / LOST)
