@@ -45,7 +45,7 @@ from sros_tool.policy.placeholders import (
 )
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.values import shows
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 from sros_tool.xml import read_bytes
 
 _MOST_REQUIREMENTS = 1000
@@ -783,17 +783,27 @@ def dropped_findings(
 ) -> list[Finding]:
     """Return a finding for each requirement that ``after`` does not fully demand.
 
-    ``file`` is the path of the requirements ``after``.
+    Those of one table for several robots are one finding.  ``file`` is the path of the requirements
+    ``after``.
     """
+    tables: dict[tuple[Source, bool], list[DroppedRequirement]] = {}
+    for dropped in dropped_requirements(before, after):
+        tables.setdefault((dropped.requirement.source, bool(dropped.kept)), []).append(dropped)
     return [
         DROPPED.found(
-            ": ".join(filter(None, (requirement.name, requirement.demand))),
-            requirement.text(),
+            ": ".join(filter(None, (first.name, first.demand))),
+            first.text() + _also_for([other.requirement.robot for other in others]),
             file,
-            related=(RelatedPlace("required before", requirement.file, requirement.line or None),),
+            related=(RelatedPlace("required before", first.file, first.line or None),),
         )
-        for requirement in dropped_requirements(before, after)
+        for first, *others in tables.values()
     ]
+
+
+def _also_for(robots: Sequence[str]) -> str:
+    if not robots:
+        return ""
+    return f"; the same for {counted(len(robots), 'more robot')}: {first_few(robots, 4)}"
 
 
 # ── what a requirement demands, part by part ───────────────────────────────────────────────

@@ -190,5 +190,6 @@ def test_a_review_fills_in_the_fleet_of_each_commit(tmp_path: Path) -> None:
     of_group = change.review(*words)
     assert "requirements-before robot.xml: 4 requirements dropped" in of_group.out, of_group.out
     change.commit({"fleet.toml": FILE, "r.toml": EACH})
+    assert "; the same for 1 more robot: r2" in change.review(*words).out
     dropped = change.review(*words)
     assert "requirements-before robot.xml: 2 requirements dropped" in dropped.out, dropped.out
