@@ -28,6 +28,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, newer_files, process_findings
 from sros_tool.checks.requirements import VIOLATED
@@ -155,10 +156,11 @@ class ClosedProcess(NamedTuple):
     def as_it_runs(self, running: RunningProcesses) -> ClosedProcess:
         """Return a copy with the id that a process with this command has now.
 
-        A process that may run, but could not be examined, keeps its id, and so does a process
-        that its unit restarts.
+        With or without the enclave that ``sros run`` adds to the command.  A process that may run,
+        but could not be examined, keeps its id, and so does a process that its unit restarts.
         """
-        pids = [process.pid for process in running.processes if process.command == (*self.command,)]
+        commands = ((*self.command,), (*self.command, ROS_ARGS, "--enclave", self.enclave))
+        pids = [process.pid for process in running.processes if process.command in commands]
         unseen = {process.pid for process in running.unseen}
         if self.unit or running.hidden or self.pid in unseen or self.pid in pids:
             return self
@@ -310,6 +312,11 @@ class Closing(NamedTuple):
     """The proof that the robot is closed; empty before."""
     dry_run: DryRun
     changes: FileChanges
+
+    @property
+    def is_signed(self) -> bool:
+        """Whether the steps came to the end, so that the policy is what is signed."""
+        return all(step.state != "open" for step in self.steps)
 
     @property
     def left(self) -> Sequence[str]:
@@ -621,7 +628,7 @@ class OpenRobot:
             return closing._replace(problems=problems)
         if self.observed and len(closing.observed.processes) > len(self.observed.processes):
             self._write_processes(closing.observed)
-        changes = [*self._write_starts(closing.observed), *self._remove_revoked_enclaves()]
+        changes = [*self._write_starts(closing), *self._remove_revoked_enclaves()]
         denied = self._denied()
         newly = [right for right in denied if right not in denied_before]
         problems += self._problems(closing.observed, partial=partial)
@@ -763,7 +770,8 @@ class OpenRobot:
         rights = [f"{right['enclave']} {right['right']} {right['name']}" for right in lacking]
         return (
             f"'{self.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "
-            f"({first_few(rights, _MOST_NAMES)}); if they are right, add them: {add}"
+            f"({first_few(rights, _MOST_NAMES)}); if a process should not have them, stop it, and "
+            f"run `sros close {shlex.quote(str(self.folder))}`; if they are right, add them: {add}"
         )
 
     def _write_processes(self, observed: ObservedProcesses) -> None:
@@ -796,9 +804,9 @@ class OpenRobot:
             zone=shell.zone,
         ).variables
 
-    def _write_starts(self, observed: ObservedProcesses) -> list[FileChange]:
+    def _write_starts(self, closing: Closing) -> list[FileChange]:
         """Write the files that start each process with security; return what changed."""
-        folder = self.folder.absolute()
+        observed, folder = closing.observed, self.folder.absolute()
         variables = {
             process.enclave: self._variables(process.enclave, process.rmw)
             for process in observed.processes
@@ -822,15 +830,10 @@ class OpenRobot:
             name = object_name(process.enclave)
             service = render_container(Container(process.enclave, name, of_enclave, where), COMPOSE)
             services += ["services:", *service.splitlines()[1:]][len(services) > 1 :]
-        lines = [
-            "# Stop all of these processes: secured and open ones do not hear each other. Then",
-            "# start each of them by its command, in the place that starts it today.",
-        ]
-        for command, processes in observed.by_hand(folder).items():
-            lines += ["", f"# {', '.join(process.enclave for process in processes)}", command]
+        lines = self._command_lines(closing)
         launch = shlex.join(_launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
         lines += ["", "# Any launch file; each process needs name= in it.", launch]
-        files |= {COMMANDS: _text(lines), _SERVICES: _text(services)}
+        files |= {COMMANDS: _text(lines).lstrip(), _SERVICES: _text(services)}
         changes = unit_changes(self.start, files, force=True)
         write_units(self.start, files, changes)
         written = [FileChange(action, str(self.start / path)) for path, action in changes.items()]
@@ -843,8 +846,28 @@ class OpenRobot:
         ]
         for path in left:
             remove_file(path)
-            self._shell.say(f"removed {path}: no process of the policy is in its enclave any more")
+            self._shell.say(f"removed {path}: it was for an enclave without a known process")
         return [*written, *(FileChange("remove", str(path)) for path in left)]
+
+    def _command_lines(self, closing: Closing) -> list[str]:
+        """Return the commands that start processes by hand: first those that are due now."""
+        folder, due = self.folder.absolute(), closing.left_by_hand
+        commands = closing.observed.by_hand(folder)
+        rest = {command: commands[command] for command in commands if command not in due}
+        place = "by its command, in the place that starts it today."
+        lines = [
+            "# Stop all of these processes: secured and open ones do not hear each other. Then",
+            f"# start each of them {place}",
+        ]
+        if closing.secured:
+            lines = [f"# Stop each of these processes, and start it {place}"]
+        lines = [*lines, *_commands(due)] if due else []
+        for name in closing.new:
+            start = shlex.join(("sros", "run", str(self.export.absolute()), name))
+            lines += ["", f"# {name} is new: COMMAND is what starts it", f"{start} -- COMMAND"]
+        if rest:
+            lines += ["", "# These processes run closed, with the present files."]
+        return [*lines, *_commands(rest)]
 
     def _enclaves_left(self) -> list[str]:
         """Return the enclaves of the export that the keystore does not have any more."""
@@ -1004,7 +1027,7 @@ class OpenRobot:
         self._restart(sorted({*observed.units.values()} | of_drop_ins), dry_run=dry_run)
         changes = [FileChange("remove", str(path)) for path in drop_ins]
         closing = self._closing()._replace(dry_run=dry_run, changes=changes)
-        return closing if dry_run else closing._replace(problems=[*self._not_open(observed)])
+        return closing._replace(problems=[*self._not_open(observed)])
 
     def _not_open(self, observed: ObservedProcesses) -> Iterator[str]:
         """Yield how each process is started open that runs in an enclave, or does not run.
@@ -1039,7 +1062,22 @@ class OpenRobot:
         if dry_run:
             return closing
         proofs = self._proofs(closing, _START_SECONDS, partial=partial)
+        if changed := self._enclaves_changed() if self.policy.exists() else ():
+            where = "" if self.keystore.exists() else ", where the keystore is,"
+            self._shell.say(
+                f"'{self.policy}' is not what is signed, for {first_few(changed, _MOST_NAMES)}: "
+                f"`sros close {shlex.quote(str(self.folder))}`{where} signs it"
+            )
         return closing._replace(proofs=proofs)
+
+    def _enclaves_changed(self) -> list[str]:
+        """Return the enclaves whose signed rights are not those of the policy."""
+        only = ("--include", STALE.id, "--json")
+        words = ("check", str(self.export), "--policy", str(self.policy), *only)
+        _, output, _ = self._shell.run(words, False)
+        stale = [finding["subject"] for finding in json.loads(output)["findings"]]
+        policy = {enclave.path for enclave in read_policy(self.policy).enclaves}
+        return sorted({*stale, *policy.difference(list_enclaves(self.export))})
 
     def _proofs(self, closing: Closing, patience: float, *, partial: bool) -> list[Proof]:
         """Wait until each process runs in its enclave, and prove that the robot is closed."""
@@ -1056,7 +1094,8 @@ class OpenRobot:
             if time.monotonic() > end:
                 earlier = {enclave.name for _, enclave in self._secured(running)}
                 if not partial or earlier.intersection(missing) or expected == {*missing}:
-                    return [Proof(_CLAIM, False, self._why_missing(missing, running))]
+                    why = self._why_missing(missing, observed.as_they_run(running), running)
+                    return [Proof(_CLAIM, False, why)]
                 break
             time.sleep(0.2)
         nodes = self._observation().nodes
@@ -1086,10 +1125,17 @@ class OpenRobot:
         holds = {0: True, 1: False}.get(status)
         yield Proof("the requirements hold", holds, f"{reasons[status]}: {self.requirements}")
 
-    def _why_missing(self, missing: Sequence[str], running: RunningProcesses) -> str:
-        """Return which enclaves have no process, and which have one with earlier files."""
+    def _why_missing(
+        self, missing: Sequence[str], observed: ObservedProcesses, running: RunningProcesses
+    ) -> str:
+        """Return which enclaves have no process, or an open one, and which have earlier files."""
         earlier = {enclave.name: process.pid for process, enclave in self._secured(running)}
-        absent = [name for name in missing if name not in earlier]
+        are_open = {process.enclave: process.pid for process in observed.processes if process.pid}
+        absent = [
+            f"{name} (stop process {are_open[name]}, which is open)" if name in are_open else name
+            for name in missing
+            if name not in earlier
+        ]
         old = [f"{name} (process {earlier[name]})" for name in missing if name in earlier]
         reasons = [
             f"no secured process of {', '.join(absent)}; start it as {self.start / COMMANDS} says; "
@@ -1222,6 +1268,11 @@ _CLAIM = "every process runs in its enclave"
 
 def _may_enter(user: int, folder: os.stat_result) -> bool:
     return bool(folder.st_mode & (stat.S_IXUSR if folder.st_uid == user else 0o011))
+
+
+def _commands(by_hand: Mapping[str, Sequence[ClosedProcess]]) -> Iterator[str]:
+    for command, processes in by_hand.items():
+        yield from ("", f"# {', '.join(process.enclave for process in processes)}", command)
 
 
 def _text(lines: Iterable[str]) -> str:

@@ -30,6 +30,7 @@ from sros_tool.wording import counted, enumerated
 
 if TYPE_CHECKING:
     from sros_tool.closing import ClosedProcess, Closing, OpenRobot
+    from sros_tool.policy.model import Policy
 
 
 def _run(words: Sequence[str], live: bool) -> tuple[int, str, str]:
@@ -132,7 +133,7 @@ def close(
     )
     if as_json:
         print_json(closed)
-    elif undoes and not dry_run:
+    elif undoes:
         _show_undone(robot, closed)
     elif not dry_run:
         if not (applies or proves):
@@ -148,8 +149,11 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
     from sros_tool.closing import access_lines
     from sros_tool.policy.document import read_policy
 
+    policy = read_policy(robot.policy)
+    if not closed.is_signed:
+        return
     echo(f"who may do what, without what every node needs (all of it: {robot.page}):")
-    for line in access_lines(read_policy(robot.policy), robot.folder):
+    for line in access_lines(policy, robot.folder):
         echo(f"  {line}")
     echo(f"how to restart each process with security (all of it: {robot.start}):")
     for process in closed.observed.processes:
@@ -160,8 +164,11 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
             how = "closed"
         elif process.enclave in closed.secured:
             how = f"closed {_EARLIER}: {how}"
-        pid = f"process {process.pid}, known by its {process.known_by}"
-        echo(f"  {process.enclave}: {pid if process.pid else 'not running as observed'}: {how}")
+        pid = f"process {process.pid}"
+        pid += f", known by its {process.known_by}" if process.enclave not in closed.secured else ""
+        pid = pid if process.pid else "not running as observed"
+        nodes = _nodes(policy, process.enclave)
+        echo(f"  {process.enclave}: {pid}{nodes}: {how}")
     export = shlex.quote(str(robot.export.absolute()))
     for name in closed.new:
         echo(f"  {name}: new, start it with: sros run {export} {name} -- COMMAND")
@@ -172,6 +179,13 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
     if stays := len(closed.denied) - len(closed.newly_denied):
         rights = counted(stays, "right")
         echo(f"{rights} used when sros watched: denied as before (--json has all)")
+
+
+def _nodes(policy: Policy, enclave: str) -> str:
+    """Return the nodes of a process that has several: its one enclave has the name of one."""
+    own = policy.enclave(enclave)
+    nodes = [f"{node.ns.rstrip('/')}/{node.node}" for node in own.all_profiles()] if own else []
+    return f", with the nodes {enumerated(sorted(nodes))}" if len(nodes) > 1 else ""
 
 
 def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) -> None:
@@ -208,7 +222,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
         ask = f"sros close {folder} --proof"
         steps = f"stop the robot, start each process by the commands in {robot.start / COMMANDS}"
         if closed.secured:
-            steps = f"start them by the commands in {robot.start / COMMANDS}"
+            steps = f"stop them, start them by the first commands in {robot.start / COMMANDS}"
         if not closed.left:
             following = ask
         elif any(name in observed.units for name in closed.left):
@@ -222,6 +236,8 @@ def _show_undone(robot: OpenRobot, closed: Closing) -> None:
     """Print what still has to be done until the robot is open."""
     for problem in closed.problems:
         echo(problem)
+    if closed.dry_run:
+        return
     if closed.problems:
         ask = f"ask again with sros close {shlex.quote(str(robot.folder))} --undo"
         echo(f"the robot is not open yet; next: restart these, and {ask}", err=True)

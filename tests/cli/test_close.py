@@ -19,6 +19,7 @@ from sros_tool.closing import assign
 from sros_tool.graph import observe
 from sros_tool.graph.observation import Endpoint, ObservedNode
 from sros_tool.keystore.layout import list_enclaves
+from sros_tool.policy.document import read_policy
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.processes import (
     FileReader,
@@ -221,7 +222,9 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     again = robot.close("--for", "1s", status=1)
     assert policy.read_text() == changed
     assert "nothing is closed yet; fix this first:\n  'robot/policy.xml' stays as it " in again.out
-    assert "lacks 1 right seen now (/listener subscribe /chatter); if they are " in again.out
+    assert "lacks 1 right seen now (/listener subscribe /chatter); if a " in again.out
+    assert "; if they are right, add them: sros generate_policy robot/policy.xml" in again.out
+    assert "process should not have them, stop it, and run `sros close robot`; if" in again.out
     assert "generate_policy robot/policy.xml --enclave-per-node --domain 0\n" in again.out
     robot.remaining = (TALKER, ros_node("listener", "04"))
     said = robot.close("--apply").out
@@ -243,7 +246,10 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     mine.write_text("A=1\n")
     first = robot.close("--apply", status=1)
     assert f"the policy does not have /listener, and the keystore does: {revoke}\n" in first.out
-    assert "removed robot/start/listener.env: no process " in first.err and mine.exists()
+    assert (
+        "removed robot/start/listener.env: it was for an enclave without a " in first.err
+        and mine.exists()
+    )
     # An enclave that the keystore lost, and did not revoke, keeps its key.
     shutil.copytree(robot.folder / "robot/export/enclaves/talker", robot.folder / LOST)
     said = robot.close("--apply", status=1).out
@@ -320,18 +326,20 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     assert "stop process 4711, and start it with:\n  cd /opt && sros run " in ended.out
     assert ended.err.endswith("next: these commands, and then sros close robot --proof\n")
     assert (
-        "no: every process runs in its enclave: no secured process of /listener, /talker; "
-        in robot.close("--proof", status=1).out
-    )
+        "no: every process runs in its enclave: no secured process of /listener (stop process "
+        "4712, which is open), /talker (stop process 4711, which is open); "
+    ) in robot.close("--proof", status=1).out
     for root in ("robot/keystore", "robot/export"):
         denied = sros("explain", root, "/talker", "publish", "/x", cwd=robot.folder).out
         assert "merge_policy robot/policy.xml allow.xml --in-place\n" in denied
         assert denied.endswith("sros close robot\n")
     robot.by_hand = {"/talker"}
     ended = robot.close()
-    assert "/talker: process 4711, known by its process id: closed\n" in ended.out
+    assert "/talker: process 4711: closed\n" in ended.out
     assert "the robot runs closed, except for /listener (open), its files are valid" in ended.err
-    assert "; next: start them by the commands in robot/start/commands.txt, and ask" in ended.err
+    assert "; next: stop them, start them by the first commands in robot/start/c" in ended.err
+    commands = (robot.folder / "robot/start/commands.txt").read_text()
+    assert re.search(r"\A# Stop .*\n\n# /listener\n.*\n\n# These .*\n\n# /talker\n", commands)
     assert "start it with" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
     robot.by_hand = {"/talker", "/listener"}
@@ -347,7 +355,9 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     assert undone.out == "restart it open: cd /opt && /opt/run talker\n"
     assert "/listener does not run; start it open: cd /opt && /opt/run listener\n" in undone.err
     robot.absent = set()
+    would = robot.close("--undo", "--dry-run")
     undone = robot.close("--undo", status=1)
+    assert would.out == undone.out and not would.err
     assert undone.err == (
         "the robot is not open yet; next: restart these, and ask again with sros close robot "
         "--undo\n"
@@ -378,7 +388,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     )
     ended = robot.close(status=1)
     assert "; nothing was signed; if you want the change, edit robot/requirements.toml" in ended.out
-    assert "$ sros generate_artifacts" not in ended.err
+    assert "$ sros generate_artifacts" not in ended.err and "who may do what" not in ended.out
     assert list_enclaves(robot.folder / "robot/export") == (
         "/listener",
         "/sros_observer",
@@ -387,6 +397,8 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     (robot.folder / "robot/requirements.toml").unlink()
     ended = robot.close()
     assert "  /late: new, start it with: sros run " in ended.out
+    commands = (robot.folder / "robot/start/commands.txt").read_text()
+    assert commands.startswith("# /late is new: COMMAND is what starts it\nsros run ")
     assert "closed, except for /late (not running), its files" in ended.err
     export = robot.folder / "robot/export"
     environment = secured_environment(export, "/late", 0)
@@ -467,7 +479,10 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     needed.write_text("[[only]]\n")
     assert "[[only]] names no right" in robot.close("--proof", status=2).err
     needed.write_text('[[only]]\npublish = ["/chatter"]\nenclaves = ["/listener"]\n')
+    policy = robot.folder / "robot/policy.xml"
+    policy.write_text(policy.read_text().replace("chatter", "gossip", 1))
     ended = robot.close("--proof", status=1)
+    assert "policy.xml' is not what is signed, for /listener: `sros close robot` signs" in ended.err
     assert "no: the requirements hold: one is violated: robot/requirements.toml\n" in ended.out
     assert "/talker: may publish /chatter" in ended.err
     needed.write_text(kept)
@@ -698,12 +713,25 @@ def test_a_process_to_stop_is_named_by_the_id_that_it_has_now() -> None:
     for running, pid in (
         (RunningProcesses((process(7, "talk", "a"), again)), 7),
         (RunningProcesses((other, again)), 8),
+        (RunningProcesses((process(9, "talk", "a", "--ros-args", "--enclave", "/talker"),)), 9),
+        (RunningProcesses((process(9, "talk", "a", "--ros-args", "--enclave", "/other"),)), 0),
         (RunningProcesses((other,)), 0),
         (RunningProcesses((other,), hidden="those of other users"), 7),
         (RunningProcesses(unseen=(unseen,)), 7),
     ):
         assert talker.as_it_runs(running).pid == pid
     assert talker._replace(unit="talker.service").as_it_runs(RunningProcesses()).pid == 7
+
+
+def test_the_nodes_of_a_process_that_has_several(tmp_path: Path) -> None:
+    profiles = "".join(f'<profile ns="/p" node="{name}"/>' for name in ("tracker", "detector"))
+    file = tmp_path / "policy.xml"
+    file.write_text(
+        '<policy version="0.2.0"><enclaves><enclave path="/p/tracker"><profiles>'
+        f"{profiles}</profiles></enclave></enclaves></policy>"
+    )
+    nodes = close._nodes(read_policy(file), "/p/tracker")
+    assert nodes == ", with the nodes /p/detector and /p/tracker"
 
 
 def test_a_process_of_cyclone_dds_is_known_by_what_it_says() -> None:
