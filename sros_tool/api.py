@@ -610,12 +610,12 @@ def check(
         for policy in _several("policies", policies)
     )
     at = Circumstances(_moment(now), zone, _domain(domain), read, fleet=robots)
-    findings = dict.fromkeys(finding for path in paths for finding in path_findings(Path(path), at))
+    findings = path_findings(map(Path, paths), at)
     return FindingFilter(severity=levels[severity], strict=strict).choose(findings).shown
 
 
 def check_requirements(
-    path: AnyPath,
+    path: AnyPath | Sequence[AnyPath],
     requirements: AnyPath | Sequence[AnyPath],
     *,
     fleet: AnyPath | None = None,
@@ -629,7 +629,8 @@ def check_requirements(
     """Return a finding for each requirement that a policy or a keystore breaks, for all names.
 
     Args:
-        path: A policy file or a keystore.
+        path: A keystore, a policy file or a folder of policies; or several policies of one robot or
+            fleet, which count as one.
         requirements: The TOML file of the requirements, or several.
         fleet: The file with the robots that the placeholders of a policy and its requirements stand
             for; a keystore has its own.
@@ -670,7 +671,7 @@ def check_requirements(
     of, only = _domain(domain), _vendors(vendor, distribution)
     files = [requirements] if isinstance(requirements, str | PathLike) else requirements
     system = load_system(
-        Path(path),
+        [Path(path)] if isinstance(path, str | PathLike) else list(map(Path, path)),
         at=_moment(now),
         zone=zone,
         domain=of,

@@ -907,7 +907,7 @@ class OpenRobot:
         """Return what the keystore denies to the nodes as they were observed."""
         context = JoinContext(self.domain, self._shell.now(), self._shell.zone)
         vendor = chosen_vendor(None, None, self._shell.environment)[0]
-        enclaves = audited_enclaves(self._rights, vendor, context)
+        enclaves = audited_enclaves([self._rights], vendor, context)
         return audit(self._observation(), enclaves, _OBSERVER).denied
 
     def _problems(self, observed: ObservedProcesses, *, partial: bool) -> Iterator[str]:

@@ -63,6 +63,7 @@ from sros_tool.policy.model import (
     Policy,
     Profile,
     Source,
+    instances,
     stated_protections,
 )
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix
@@ -200,11 +201,12 @@ NO_COUNTERPART = FindingKind(
     "policy.no-counterpart",
     NOTE,
     "a name for which no enclave has the counterpart right",
-    "No enclave of the policy, in any ROS domain, may publish this subscribed topic, or serve this "
-    "called service or action. The name may have a typing error, or its counterpart is in another "
-    "policy.",
-    "sros: compares the rights of all enclaves in the policy.",
-    "Compare the names that senders and receivers have after remapping.",
+    "No enclave, in any ROS domain, may publish this subscribed topic, or serve this called "
+    "service or action. The name may have a typing error, or its counterpart is in a policy that "
+    "was not checked in the same command.",
+    "sros: compares the rights of all enclaves in the policies that are checked together.",
+    "Compare the names that senders and receivers have after remapping, and name all policies of "
+    "the robot in one command.",
 )
 MISSPELT = FindingKind(
     "policy.name-misspelt",
@@ -235,6 +237,17 @@ CONTRADICTING_PROTECTION = FindingKind(
     "sets it for all names that it matches. No keystore can follow this policy.",
     "DDS-Security 1.1, 9.4.1.2 (topic rules); sros: protect= in a policy.",
     "State the same protection in both places, or only in one of them.",
+)
+
+SEVERAL_INSTANCES = FindingKind(
+    "policy.several-instances",
+    NOTE,
+    "an enclave with the same node in several namespaces",
+    "Each process that runs in the enclave has the rights of the node in all these namespaces, so "
+    "one instance of the node can act for the others.",
+    "sros: the rights of all profiles of an enclave are joined.",
+    "Give each instance an enclave of its own, with its namespace also in path=, unless one "
+    "process runs all of them.",
 )
 
 _LONGEST = 247
@@ -371,6 +384,16 @@ def _as_action(right: str, name: str) -> str:
 
 def _place(source: Source) -> tuple[str, int | None]:
     return source.file, source.line or None
+
+
+def _check_instances(checked: _CheckedPolicy) -> Iterator[Finding]:
+    """Yield findings about enclaves that have a node in several namespaces."""
+    enclaves = checked.policy.enclaves
+    for (enclave, node), profiles in instances(enclaves).items():
+        names = [profile.ns for profile in profiles]
+        source = profiles[-1].source
+        text = f"{enclave} has the node {node} in {first_few(names, _NAMES_SHOWN)}"
+        yield SEVERAL_INSTANCES.found(enclave, text, source.file, source.line)
 
 
 def _check_protection(checked: _CheckedPolicy) -> Iterator[Finding]:
@@ -811,13 +834,13 @@ UNREACHABLE = FindingKind(
 )
 NO_EFFECT = FindingKind(
     "policy.deny-without-effect",
-    WARNING,
+    NOTE,
     "a denial of something that no rule allows",
-    "Everything that no rule allows is denied anyway. The denial has no effect, and on Cyclone "
-    "DDS it can block the other direction of the topic.",
-    "DDS-Security 1.1, 9.4.1.3 (the default is DENY); Cyclone DDS 0.10.2 refuses a topic of "
-    "which one direction is denied.",
-    "Remove the denial.",
+    "Everything that no rule allows is denied anyway. The denial has an effect only in a policy "
+    "that others merge with theirs, such as that of a package: a denial wins over what they allow "
+    "the enclave.",
+    "DDS-Security 1.1, 9.4.1.3 (the default is DENY); sros: merge_policy never weakens a denial.",
+    "Keep the denial if this right must never be added to the enclave.",
 )
 REDUNDANT_RULE = FindingKind(
     "policy.redundant-rule",
@@ -932,11 +955,12 @@ _CHECKS = (
     _check_rules,
     _check_nodes,
     _check_names,
-    _check_counterparts,
     _check_protection,
     _check_root_enclave,
     _check_portability,
 )
+_CHECKS_TOGETHER = (_check_counterparts, _check_instances)
+"""Checks for which the policies of a robot count as one policy."""
 _PLACE = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
 _SYNTAX = re.compile(r", line (?P<line>\d+), column \d+")  # in messages of libxml2
 _INCLUDES = tuple(f"{{http://www.w3.org/{year}/XInclude}}include" for year in (2001, 2003))
@@ -946,28 +970,41 @@ _MANY = 1000
 def findings_in(policy: Policy, distribution: str = "") -> Iterator[Finding]:
     """Yield all findings in a parsed policy, except the findings about its includes."""
     checked = _CheckedPolicy(policy, distribution)
-    for check in _CHECKS:
+    for check in (*_CHECKS, *_CHECKS_TOGETHER):
         yield from check(checked)
 
 
 def policy_file_findings(
-    path: Path, distribution: str = "", fleet: Fleet | None = None, policy: Policy | None = None
+    *paths: Path, distribution: str = "", fleet: Fleet | None = None, policy: Policy | None = None
 ) -> Iterator[Finding]:
-    """Yield all findings in a policy file; a file that cannot be read is a finding too.
+    """Yield all findings in policy files; a file that cannot be read is a finding too.
 
-    ``distribution`` is the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
-    ``fleet`` has the robots that its placeholders stand for.  ``policy`` is the parsed file, if
-    it is parsed already.
+    The counterparts of names are looked for in all the files together.
+
+    Args:
+        paths: the files.
+        distribution: the ROS 2 distribution of their nodes, such as ``humble``; "" is the latest.
+        fleet: the robots that their placeholders stand for.
+        policy: the policy in the only file, if it is parsed already.
     """
-    try:
-        policy = policy or read_policy_for(path, fleet)
-    except SrosError as error:
-        yield from _unreadable(path, error)
-        return
-    yield from findings_in(policy, distribution)
-    yield from _includes(path)
-    if fleet and (shared := [*_shared_namespaces(fleet)]):
-        yield SHARED_NAMESPACE.found(str(path), first_few(shared, 3, "; "), str(path))
+    enclaves: list[Enclave] = []
+    for path in paths:
+        try:
+            policy = policy if policy and len(paths) == 1 else read_policy_for(path, fleet)
+        except SrosError as error:
+            yield from _unreadable(path, error)
+            continue
+        enclaves += policy.enclaves
+        checked = _CheckedPolicy(policy, distribution)
+        for check in _CHECKS:
+            yield from check(checked)
+        yield from _includes(path)
+        if fleet and (shared := [*_shared_namespaces(fleet)]):
+            yield SHARED_NAMESPACE.found(str(path), first_few(shared, 3, "; "), str(path))
+    if policy:
+        together = replace(policy, enclaves=tuple(enclaves))
+        for check in _CHECKS_TOGETHER:
+            yield from check(_CheckedPolicy(together, distribution))
 
 
 def _shared_namespaces(fleet: Fleet) -> Iterator[str]:

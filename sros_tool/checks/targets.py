@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -56,12 +56,27 @@ class Circumstances:
         return self.opened.setdefault(root, Keystore(root))
 
 
-def path_findings(path: Path, at: Circumstances) -> list[Finding]:
-    """Return the findings at a path: a policy, a keystore, an enclave, or a folder of policies.
+def path_findings(paths: Iterable[Path], at: Circumstances) -> list[Finding]:
+    """Return the findings at paths: policies, folders of policies, keystores, or enclaves.
 
-    A file ``*.json5``, ``*.json`` or ``*.yaml`` is a Zenoh configuration.  Raises
+    All policies count as those of one robot or fleet: a name may have its counterpart in another
+    one.  A file ``*.json5``, ``*.json`` or ``*.yaml`` is a Zenoh configuration.  Raises
     `DocumentError` for any other path.
     """
+    findings, policies = [], []
+    for path in paths:
+        found = _no_policy_findings(path, at)
+        if found is None:
+            policies.append(path)
+        else:
+            findings += found
+    if policies:
+        findings += policy_findings(policies, at)
+    return list(dict.fromkeys(findings))
+
+
+def _no_policy_findings(path: Path, at: Circumstances) -> list[Finding] | None:
+    """Return the findings at a path; None if it has to be a policy, or a folder of policies."""
     if path.suffix in (".json5", ".json", ".yaml", ".yml") and not path.is_dir():
         from sros_tool.checks.zenoh import configuration_findings
 
@@ -74,28 +89,30 @@ def path_findings(path: Path, at: Circumstances) -> list[Finding]:
     ):
         root, name = locate_enclave(enclave)
         return _keystore(root, at, name)
-    return policy_findings(path, at)
+    return None
 
 
-def policy_findings(path: Path, at: Circumstances) -> list[Finding]:
-    """Return the findings about a policy file, or about the policies in a folder.
+def policy_findings(paths: Iterable[Path], at: Circumstances) -> list[Finding]:
+    """Return the findings about policy files, and about the policies in folders, all together.
 
     Raises:
-        DocumentError: there is no file at the path, or no policy in the folder.
+        DocumentError: there is no file at a path, or no policy in a folder.
     """
     from sros_tool.checks.policies import policy_file_findings
+
+    files = [file for path in paths for file in _policies_at(path)]
+    findings = policy_file_findings(*files, distribution=at.distribution, fleet=at.fleet)
+    return list(dict.fromkeys(findings))
+
+
+def _policies_at(path: Path) -> list[Path]:
     from sros_tool.policy.document import policy_files
 
     if not path.is_dir():
         read_bytes(path, "file")
-        return list(policy_file_findings(path, at.distribution, at.fleet))
-    policies = list(policy_files(path))
-    if policies:
-        return [
-            finding
-            for policy in policies
-            for finding in policy_file_findings(policy, at.distribution, at.fleet)
-        ]
+        return [path]
+    if policies := list(policy_files(path)):
+        return policies
     refuse_earlier(path)
     raise DocumentError(
         f"'{path}' is neither a keystore nor an enclave, and holds no policy",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,7 +49,7 @@ if TYPE_CHECKING:
 
 
 @verb("audit", cls=Watching)
-@click.argument("source", metavar="[POLICY|KEYSTORE]", type=PATH, required=False)
+@click.argument("sources", metavar="[POLICY...|KEYSTORE]", type=PATH, nargs=-1)
 @observing_options("Observe a robot that is secured already, in this enclave.")
 @click.option(
     "--vendor",
@@ -77,7 +78,7 @@ if TYPE_CHECKING:
 @dry_run_option
 @json_option
 def audit(
-    source: Path | None,
+    sources: tuple[Path, ...],
     watch: str | None,
     spin_time: float | None,
     domain: str | None,
@@ -92,12 +93,13 @@ def audit(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Report what a policy or keystore would deny to the nodes that are running now.
+    """Report what policies or a keystore would deny to the nodes that are running now.
 
     Nothing is denied: DDS has no permissive mode, so sros observes the ROS graph and decides about
     every endpoint as the DDS vendor would. A node is looked up in the enclave that the graph shows,
     or else in the enclave whose profiles name it. Observes until the graph stops changing; use
-    --watch to see what nodes do only later. The default is the keystore of $ROS_SECURITY_KEYSTORE.
+    --watch to see what nodes do only later. Several policies count as one. The default is the
+    keystore of $ROS_SECURITY_KEYSTORE.
 
     Example:
       $ sros audit robot.xml
@@ -123,7 +125,7 @@ def audit(
     from sros_tool.runtime.variables import ENCLAVE, domain_from
 
     check_duration(watch, spin_time)
-    source = source or keystore_from_environment()
+    sources = sources or (keystore_from_environment(),)
     environment = observer_environment(enclave, keystore, domain)
     if force and patch is None:
         raise UsageError("--force is for --patch only", "", "Leave it out.")
@@ -135,7 +137,7 @@ def audit(
         print_notes(unknown_distribution(os.environ))
     everything = {**os.environ, **environment}
     enclaves = audits.audited_enclaves(
-        source,
+        sources,
         chosen_vendor(vendor, distro, everything)[0],
         JoinContext(domain_from(everything) or 0, now(), local_zone(os.environ)),
         read_fleet(fleet_file) if fleet_file else None,
@@ -173,7 +175,8 @@ def audit(
         refused = sorted(audited.refused.items())
         print_json(
             AuditResult(
-                source,
+                sources[0],
+                sources[1:],
                 enclaves.what,
                 enclaves.vendor,
                 enclaves.context.domain,
@@ -197,9 +200,10 @@ def audit(
     if audited.allowed and not fine:
         echo(_NOT_ALL, err=True)
     if written:
-        policy = shlex.quote(str(source)) if enclaves.what == "policy" else "POLICY"
+        one_policy = enclaves.what == "policy" and len(sources) == 1
+        policy = shlex.quote(str(sources[0])) if one_policy else "POLICY"
         command = f"add it: sros merge_policy {policy} {shlex.quote(str(patch))} --in-place"
-        by_hand = _added_by_hand(source, read_fleet(fleet_file), audited) if fleet_file else ""
+        by_hand = _added_by_hand(sources, read_fleet(fleet_file), audited) if fleet_file else ""
         echo(f"{written}; {by_hand or command}", err=True)
     elif patch is None and audited.missing.profiles:
         echo(_TO_ALLOW, err=True)
@@ -233,18 +237,18 @@ def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:
     return save(patch, document)
 
 
-def _added_by_hand(source: Path, fleet: Fleet, audited: Audit) -> str:
-    """Return where to add the missing rights to a policy with placeholders, "" if it has none."""
+def _added_by_hand(sources: Sequence[Path], fleet: Fleet, audited: Audit) -> str:
+    """Return where to add the missing rights to policies with placeholders, "" without them."""
     from sros_tool.fleet.expansion import FleetPolicy
-    from sros_tool.policy.document import read_policy
+    from sros_tool.policy.document import join_policies, read_policy
 
-    stated = read_policy(source, placeholders=True)
+    stated = join_policies([read_policy(source, placeholders=True) for source in sources])
     policy = FleetPolicy(stated, fleet)
     if policy.policy() == stated:
         return ""
     missing = dict.fromkeys(profile.enclave for profile in audited.missing.profiles)
     of = dict.fromkeys(policy.stated(name)[0] for name in missing if name in policy)
-    places = [f"{enclave.source} ({enclave.path})" for enclave in of] or [str(source)]
+    places = [f"{enclave.source} ({enclave.path})" for enclave in of] or [str(sources[0])]
     return f"add its rights by hand, with placeholders, at {', '.join(places)}"
 
 

@@ -328,9 +328,9 @@ def check(
     if suggest:
         if form != "text" or requirements or earlier:
             raise UsageError("--suggest prints TOML", "", "Give it alone.")
-        path = _one_path(family, paths, "--suggest")
+        one_robot = _one_robot(family, paths, "--suggest")
         with progress("deciding"):
-            text = _suggested(_system(path, at, template))
+            text = _suggested(_system(one_robot, at, template))
         echo_document(text)
         return 0
     if template and not requirements:
@@ -341,7 +341,7 @@ def check(
     with progress("checking"):
         every = [*_findings(family, paths, at), *_stated_differences(paths, at)]
         if decide:
-            every += decide(lambda path: _system(path, at, template))
+            every += decide(lambda paths: _system(paths, at, template))
         findings = [_shown(finding) for finding in every]
     chosen = selection.choose(findings)
     if form == "text":
@@ -356,20 +356,20 @@ def _requirements(
     paths: tuple[Path, ...],
     files: tuple[Path, ...],
     earlier: tuple[Path, ...],
-) -> Callable[[Callable[[Path], System]], list[Finding]] | None:
+) -> Callable[[Callable[[Sequence[Path]], System]], list[Finding]] | None:
     """Return a function that checks the requirements of files; None without files.
 
-    The returned function gets a function that reads the policy or keystore at a path.
+    The returned function gets a function that reads the policies, or the keystore, at paths.
     """
     if not files:
         return None
     from sros_tool.proof.findings import requirement_findings
     from sros_tool.proof.requirements import dropped_findings, read_all_requirements
 
-    path = _one_path(family, paths, "--requirements")
+    one_robot = _one_robot(family, paths, "--requirements")
 
-    def decide(load: Callable[[Path], System]) -> list[Finding]:
-        system = load(path)
+    def decide(load: Callable[[Sequence[Path]], System]) -> list[Finding]:
+        system = load(one_robot)
         wanted = read_all_requirements(files, system.fleet)
         findings = requirement_findings(wanted, system)
         if earlier:
@@ -406,16 +406,32 @@ def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:
         path = paths[0] if paths else keystore_from_environment()
         if not path.is_dir() or is_keystore(path):
             return path
-    raise UsageError(f"{option} takes one policy file or keystore")
+    raise UsageError(
+        f"{option} takes one policy file or keystore", "", "Run the command once for each of them."
+    )
 
 
-def _system(path: Path, at: Circumstances, template: str | None = None) -> System:
+def _one_robot(family: str, paths: tuple[Path, ...], option: str) -> tuple[Path, ...]:
+    """Return the paths, which have to be a keystore, or policies of one robot or fleet."""
+    from sros_tool.keystore.layout import is_keystore
+
+    paths = paths or (() if family == "runtime" else (keystore_from_environment(),))
+    if not paths or (len(paths) > 1 and any(is_keystore(path) for path in paths)):
+        raise UsageError(
+            f"{option} takes one keystore, or the policies of one robot or fleet",
+            "Several policies count as one.",
+            "Name the keystore alone.",
+        )
+    return paths
+
+
+def _system(paths: Sequence[Path], at: Circumstances, template: str | None = None) -> System:
     from sros_tool.keystore.template import load_template
     from sros_tool.proof.system import load_system
 
     return load_system(
-        path,
-        opened=at.opened.get(path),
+        paths,
+        opened=at.opened.get(paths[0]),
         at=at.now,
         zone=at.zone,
         domain=at.domain,
@@ -520,7 +536,7 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
     if family == "policy":
         if not paths:
             raise UsageError("no policy is named", "", "Name a file, or a folder of policies.")
-        return [f for path in paths for f in policy_findings(path, at)]
+        return policy_findings(paths, at)
     if family == "keystore":
         if not paths and not os.environ.get(KEYSTORE_VARIABLE) and not Path(family).exists():
             raise UsageError(
@@ -543,12 +559,11 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
             )
         ]
     if paths:
-        every = (finding for path in paths for finding in path_findings(path, at))
-        return list(dict.fromkeys(every))
+        return path_findings(paths, at)
     findings = _runtime(at)
     root = os.environ.get("ROS_SECURITY_KEYSTORE")
     if root and is_keystore(Path(root)):
-        findings += path_findings(Path(root), at)
+        findings += path_findings([Path(root)], at)
     elif not root:
         looked = "checked the runtime only: no path is given and ROS_SECURITY_KEYSTORE is not set"
         echo(looked, err=True)

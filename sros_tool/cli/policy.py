@@ -81,7 +81,7 @@ def merge_policy(
       replaced 'robot.xml'
     """
     from sros_tool.policy.document import read_policy
-    from sros_tool.policy.merge import EditedText, MergedPolicy, merge_all, merge_notes
+    from sros_tool.policy.merge import EditedText, MergedPolicy, merge_all
 
     if in_place and output:
         raise UsageError("--in-place and --output exclude each other")
@@ -113,7 +113,7 @@ def merge_policy(
                 document=EditedText(merged.document, str(policy)).text if to_show else None,
                 dry_run=dry_run,
                 changes=changes,
-                notes=merge_notes(merged.contradictions),
+                notes=merged.notes(),
             )
         )
     elif dry_run:
@@ -127,7 +127,7 @@ def merge_policy(
         echo_document(merged.document)
     if not dry_run and not as_json:
         _print_added(merged)
-    print_notes(merge_notes(merged.contradictions))
+    print_notes(merged.notes())
     if saved:
         echo(saved, err=True)
 
@@ -137,9 +137,14 @@ def _print_added(merged: Merged) -> None:
     if not count:
         echo("no right was missing", err=True)
         return
+    from sros_tool.checks.policies import only_basic
+
     echo(f"added {counted(count, 'right')}", err=True)
-    for right in merged.added:
+    own = [right for right in merged.added if not only_basic([right])]
+    for right in own:
         echo(f"  {right}", err=True)
+    if others := count - len(own):
+        echo(f"  and {counted(others, 'right')} that every node needs", err=True)
 
 
 def _check_includes(policy: Path, output: Path, document: bytes) -> None:

@@ -259,6 +259,10 @@ class _Case:
 def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
     for name in filter(None, (claim.subject, claim.talker)):
         if problem := _why_not_running(name, record.parties[name]):
+            unexpected = problem.status is RowStatus.REFUSED is not claim.expected
+            if unexpected and _is_of_user(name, record.row):
+                hint = f'to expect this, write {{ party = "{name}", expected = "refused" }}'
+                return problem._replace(detail=f"{problem.detail}; {hint}")
             return _with_evidence(problem, claim, record)
     if claim.relation is Relation.IS_REFUSED:
         return _Finding(RowStatus.STARTED, f"{claim.subject} was not refused")
@@ -267,6 +271,11 @@ def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
     if record.window is None:
         return _undecided("not all processes were ready in time")
     return _JUDGES[claim.relation](_Case(claim, record))
+
+
+def _is_of_user(name: str, row: Row) -> bool:
+    """Return whether a party is of a user's scenario, which names enclaves by their paths."""
+    return any(e.name == name and e.identity.enclave.startswith("/") for e in row.parties)
 
 
 def _judge_hearing(case: _Case) -> _Finding:

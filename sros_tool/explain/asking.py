@@ -266,13 +266,18 @@ def _action_meant(
     return about_action(question, rights)
 
 
-def taken_for_action(question: Question, action: Question) -> Note:
-    """Return a note that a question about a service is answered for an action."""
+def taken_for_action(question: Question, action: Question) -> tuple[Note, ...]:
+    """Return a note that a question about a service is answered for an action.
+
+    None is needed for ``call``, which is the policy's word for actions.
+    """
+    if action.word == question.word:
+        return ()
     text = (
         f"{action.name} is an action in these rights, not a service: the answer is for '{action}'. "
         "To ask about a service, add --type service."
     )
-    return Note("explain.an-action", text)
+    return (Note("explain.an-action", text),)
 
 
 def question_meant(
@@ -282,7 +287,7 @@ def question_meant(
     if not kind:
         action = _action_meant(evaluator, question, lambda: asked.other_rights(question.name))
         if action:
-            return action, (taken_for_action(question, action),)
+            return action, taken_for_action(question, action)
     return question, ()
 
 

@@ -54,6 +54,7 @@ from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_encl
 from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
 from sros_tool.names import dds_names, expand, is_expression, nodes_served
+from sros_tool.policy.document import join_policies
 from sros_tool.policy.model import ALLOW, Policy
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, order
@@ -136,16 +137,19 @@ class AuditedEnclaves:
 
 
 def audited_enclaves(
-    path: Path, vendor: Vendor, context: JoinContext, fleet: Fleet | None = None
+    paths: Sequence[Path], vendor: Vendor, context: JoinContext, fleet: Fleet | None = None
 ) -> AuditedEnclaves:
-    """Return the enclaves of the policy or keystore at ``path``, with a vendor's decisions.
+    """Return the enclaves of a keystore, or of the policies of a robot, with a vendor's decisions.
 
     A policy counts as signed, with the governance of the default template; ``fleet`` has the robots
     that fill in its placeholders.
 
     Raises:
-        UsageError: ``path`` is neither a policy nor a keystore, or is a keystore with ``fleet``.
+        UsageError: a path is neither a policy nor a keystore, a keystore is one of several paths,
+            or is with ``fleet``.
+        PolicyError: two policies state the same enclave.
     """
+    path, *others = paths
     rights = load_rights(path, fleet)
     if fleet and rights.kind != "policy":
         raise UsageError(
@@ -154,6 +158,8 @@ def audited_enclaves(
             "Omit --fleet.",
         )
     if rights.kind == "keystore":
+        if others:
+            raise UsageError("a keystore is audited alone", "", f"Leave '{others[0]}' out.")
         names = enclave_names(path)
         with_nodes = [
             name for name in names if not (enclave_path(path, name) / ROUTER_FILE).exists()
@@ -167,7 +173,8 @@ def audited_enclaves(
         )
     protection = load_template(DEFAULT_TEMPLATE).protection
     governance = governance_for(protection, DomainSet.of((context.domain, context.domain)))
-    return policy_enclaves(read_policy_for(path, fleet), governance, vendor, context)
+    policy = join_policies([read_policy_for(each, fleet) for each in paths])
+    return policy_enclaves(policy, governance, vendor, context)
 
 
 def policy_enclaves(
@@ -256,6 +263,8 @@ class AuditResult(NamedTuple):
 
     source: Path
     """Path of the policy or keystore."""
+    others: Sequence[Path]
+    """Paths of other policies that were audited together with ``source``."""
     kind: Annotated[str, Words(("policy", "keystore"))]
     """Whether the source is a policy or a keystore."""
     vendor: Vendor

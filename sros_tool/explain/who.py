@@ -106,7 +106,7 @@ def ask_everybody(decider: Decider, question: Question, kind: str | None) -> Eve
     if not kind and unclear and question.type == "service":
         rights = rights_naming(decider.keystore, question.name)
         if action := about_action(question, rights):
-            taken = (taken_for_action(question, action),)
+            taken = taken_for_action(question, action)
             question, outcomes = action, decider.outcomes(action)
     return Everybody(question, outcomes, (*taken, *decider.notes(outcomes)))
 

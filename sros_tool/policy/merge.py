@@ -24,7 +24,16 @@ from lxml import etree
 from sros_tool.errors import DocumentError, Note, PolicyError
 from sros_tool.names import check_namespace, expand
 from sros_tool.policy.document import instruction_text, read_policy
-from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Level, Policy, Qualifier, stated_protections
+from sros_tool.policy.model import (
+    ALLOW,
+    DENY,
+    RIGHTS,
+    Level,
+    Policy,
+    Qualifier,
+    instances,
+    stated_protections,
+)
 from sros_tool.policy.rights import (
     RIGHT_ORDER,
     GroupRights,
@@ -338,12 +347,19 @@ def _encoding(data: bytes, root: etree._Element) -> str:
 class Merged:
     """A policy file after a merge: its new content, the added rights, and the contradictions.
 
-    Without additions ``document`` is the unchanged content of the file.
+    Without additions ``document`` is the unchanged content of the file.  ``instances`` are texts on
+    the enclaves that have a node in several namespaces only since the merge.
     """
 
     document: bytes
     added: tuple[Right, ...]
     contradictions: tuple[Contradiction, ...]
+    instances: tuple[str, ...] = ()
+
+    def notes(self) -> tuple[Note, ...]:
+        """Return notes on denials that win, and on enclaves that several instances share."""
+        shared = (Note("merge.several-instances", text) for text in self.instances)
+        return (*merge_notes(self.contradictions), *shared)
 
 
 @shows(optional=("document",))
@@ -379,7 +395,7 @@ def merge_into(path: Path, additions: Policy) -> Merged:
 def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
     """Merge several policies, one after the other, into the file at ``path``; write nothing."""
     document = read_bytes(path, "policy file")
-    before = read_policy(path, document)
+    first = before = read_policy(path, document)
     added: list[Right] = []
     contradictions: list[Contradiction] = []
     for additions in policies:
@@ -390,7 +406,15 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
             before = _proven(path, document, before, plan.added)
             added += plan.added
         _check_protection(path, before, additions)
-    return Merged(document, tuple(added), tuple(contradictions))
+    already = instances(first.enclaves)
+    shared = (
+        f"{enclave} has the node {node} in {first_few([profile.ns for profile in profiles], 3)}: "
+        "each process in this enclave has the rights of all of them. Put the namespace into path=, "
+        "too, to give each instance an enclave of its own."
+        for (enclave, node), profiles in instances(before.enclaves).items()
+        if already.get((enclave, node), ()) != profiles
+    )
+    return Merged(document, tuple(added), tuple(contradictions), tuple(shared))
 
 
 def _proven(path: Path, document: bytes, before: Policy, added: Sequence[Right]) -> Policy:

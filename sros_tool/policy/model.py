@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Annotated, NamedTuple
 
-from sros_tool.names import expand
+from sros_tool.names import expand, is_expression
 from sros_tool.values import Words, shows
 
 VERSION = "0.2.0"
@@ -118,6 +118,19 @@ class Enclave:
             block._replace(profiles=tuple(map(change, block.profiles))) for block in self.profiles
         )
         return replace(self, profiles=tuple(blocks))
+
+
+def instances(enclaves: Iterable[Enclave]) -> dict[tuple[str, str], tuple[Profile, ...]]:
+    """Map each enclave and node that has several namespaces to its profiles, one of each namespace.
+
+    Nodes whose names have wildcards are left out.  An enclave may occur several times.
+    """
+    found: dict[tuple[str, str], dict[str, Profile]] = {}
+    for enclave in enclaves:
+        for profile in enclave.all_profiles():
+            if profile.node and not is_expression(profile.node):
+                found.setdefault((enclave.path, profile.node), {})[profile.ns] = profile
+    return {key: tuple(by_ns.values()) for key, by_ns in found.items() if len(by_ns) > 1}
 
 
 @dataclass(frozen=True, slots=True)

@@ -330,12 +330,12 @@ class _Review:
                     for path in asked.policies
                     for file in self.base.policies(path, placeholders=base_fleet is not None)
                 ]
-        for each in of_head:
-            yield from self._checked("policy", str(each), partial(self._findings, each, head_fleet))
+        named = " ".join(asked.policies)
+        findings = partial(self._findings, of_head, head_fleet)
+        yield from self._checked("policy", named, findings, if_any=bool(of_head))
         keystores = yield from self._keystores(self.head)
         yield from self._requirements(of_head, head_fleet, base_fleet, keystores)
         if self.base:
-            named = " ".join(asked.policies)
             before = cache(partial(load_policies, of_base, _BASE, base_fleet))
             after = cache(partial(load_policies, of_head, _HEAD, head_fleet))
             yield from self._checked(
@@ -679,8 +679,8 @@ class _Review:
     def _circumstances(self, fleet: Fleet | None = None) -> Circumstances:
         return Circumstances(self.request.at, self.request.zone, fleet=fleet)
 
-    def _findings(self, policy: Path, fleet: Fleet | None) -> tuple[int, Content]:
-        chosen = FindingFilter().choose(policy_findings(policy, self._circumstances(fleet)))
+    def _findings(self, policies: Sequence[Path], fleet: Fleet | None) -> tuple[int, Content]:
+        chosen = FindingFilter().choose(policy_findings(policies, self._circumstances(fleet)))
         return _status(chosen), chosen
 
     def _access(
@@ -796,7 +796,7 @@ class _Review:
         def findings() -> tuple[int, Content]:
             findings = (
                 finding
-                for finding in path_findings(folder, self._circumstances())
+                for finding in path_findings([folder], self._circumstances())
                 if (finding.id != _FILE_MISSING or Path(finding.file).name != KEY_FILE)
                 and (not finding.file or _is_below(os.path.normpath(finding.file), (str(folder),)))
             )

@@ -118,8 +118,7 @@ def load_system(
     """Return the worlds of policies, or of a keystore with its signed documents.
 
     Args:
-        path: the keystore, a policy file or a folder of policies; or several policies, which count
-            as one.
+        path: the keystore; or policies and folders of policies, which count as one policy.
         at: the time for which rights are decided.
         zone: the time zone of robots, in which some vendors read dates.
         domain: the ROS domain; for a keystore, None stands for all domains.
@@ -127,7 +126,7 @@ def load_system(
         only: the names of the wanted worlds, from `WORLDS`; () stands for all. A keystore without
             Zenoh configurations has no Zenoh world.
         template: the template of the keystore for which a policy is meant.
-        opened: the keystore at ``path``, if it is open already.
+        opened: the keystore, if it is open already.
 
     Raises:
         DocumentError: a file cannot be read, there is no policy, two policies state the same
@@ -136,14 +135,14 @@ def load_system(
         UsageError: a template was given for a keystore.
     """
     paths = [path] if isinstance(path, Path) else path
-    if isinstance(path, Path) and is_keystore(path):
+    if len(paths) == 1 and is_keystore(paths[0]):
         if template:
             raise UsageError(
-                f"'{path}' is a keystore, which has its own governance",
+                f"'{paths[0]}' is a keystore, which has its own governance",
                 "A template is for a policy that is not signed yet.",
                 "Leave --template out, or check the policy.",
             )
-        return _keystore_system(opened or Keystore(path), at, zone, domain, only)
+        return _keystore_system(opened or Keystore(paths[0]), at, zone, domain, only)
     files = [file for each in paths for file in (policy_files(each) if each.is_dir() else [each])]
     if not files:
         raise PolicyError(

@@ -321,7 +321,7 @@ def _rights_needed_after(
 ) -> Iterator[Finding]:
     """Yield rights that a policy denies and that nodes need only after the update."""
     now, then = (
-        policy_findings(path, replace(at, distribution=distribution.named))
+        policy_findings([path], replace(at, distribution=distribution.named))
         for distribution in (before, after)
     )
     yield from (finding for finding in then if finding not in now)

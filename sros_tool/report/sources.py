@@ -222,7 +222,7 @@ def _read(path: Path, fleet: Fleet | None, drawing: Drawing) -> PictureSource:
         findings = (
             list(policy_file_findings(path, fleet=fleet, policy=source.policy))
             if source.policy
-            else path_findings(path, at)
+            else path_findings([path], at)
         )
     except SrosError:
         findings = []

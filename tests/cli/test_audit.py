@@ -39,6 +39,13 @@ def test_nothing_would_be_denied(program: Program) -> None:
     assert ended == Ended(0, "", summary)
 
 
+def test_several_policies_count_as_one(program: Program, tmp_path: Path) -> None:
+    (tmp_path / "hall.xml").write_text(POLICY.replace('"/t"', '"/l"').replace("talker", "listener"))
+    both = graph(FINE, ("/", "/", "listener", "02", ["publish rt/chatter"]))
+    ended = program(both, "robot.xml", "hall.xml", *SHORT, "--json")
+    assert (ended.status, json.loads(ended.out)["others"]) == (0, ["hall.xml"]), ended
+
+
 TO_ALLOW = (
     "to allow what is denied, add --patch missing.xml to this command: it writes missing rights "
     "as a policy, and names the command that adds them"
@@ -138,6 +145,7 @@ def test_json_has_a_stable_shape(program: Program) -> None:
                 "endpoints": [{"topic": "rt/x", "direction": "publish"}],
             }
         ],
+        "others": [],
         "refused": [],
         "unseen": [],
         "unjudged": [],

@@ -42,6 +42,21 @@ STILL = (
 )
 
 
+def test_a_merge_counts_what_every_node_needs_and_notes_a_shared_enclave(folder: Path) -> None:
+    """Only the namespace was changed for the second instance, and not the path of its enclave."""
+    node = policy_text({"/a": publish("z", "/rosout")})
+    (folder / "left.xml").write_text(node.replace('ns="/"', 'ns="/left"'))
+    said = sros("merge_policy", "a.xml", "left.xml").ok().err.splitlines()
+    assert said[:3] == [
+        "added 2 rights",
+        "  /a ALLOW publish topic /left/z",
+        "  and 1 right that every node needs",
+    ]
+    assert "note [merge.several-instances]: /a has the node n in /, /left: " in said[3]
+    found = sros("check", "a.xml", "left.xml", "--include", "policy.several-instances").ok().err
+    assert "nothing found (not shown: 1 note" in found
+
+
 def test_merge_to_stdout(folder: Path) -> None:
     before = snapshot(folder)
     ended = sros("merge_policy", "a.xml", "b.xml").ok()

@@ -166,9 +166,7 @@ def test_a_suggestion_holds(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("robot.xml", "robot.xml", "--requirements", "required.toml"), "takes one policy"),
-        (("runtime", "--requirements", "required.toml"), "takes one policy"),
-        ((".", "--requirements", "required.toml"), "takes one policy"),
+        (("runtime", "--requirements", "required.toml"), "takes one keystore, or the policies"),
         (("robot.xml", "--requirements", "gone.toml"), "gone.toml"),
         (("robot.xml", "--requirements", "robot.xml"), "not valid TOML"),
         (("required.toml", "--requirements", "required.toml"), "required.toml"),
@@ -183,6 +181,25 @@ def test_what_is_refused(words: tuple[str, ...], says: str, folder: Path) -> Non
     assert ended.status == 2
     assert says in ended.err
     assert "defect" not in ended.err
+
+
+def test_several_policies_of_a_robot_count_as_one(folder: Path, tmp_path: Path) -> None:
+    """A name has its other side, and a requirement is broken, in the other file."""
+    shutil.copy(folder / "required.toml", tmp_path)
+    base, more = tmp_path / "p/base.xml", tmp_path / "p/more.xml"
+    base.parent.mkdir()
+    base.write_text(policy_text({"/wheels": LISTEN.format("/cmd_vel"), "/lidar": publish("/s")}))
+    more.write_text(policy_text({"/mux": publish("/cmd_vel"), "/web": publish("/cmd_vel")}))
+    alone = sros("check", base, "--severity", "note").out
+    assert "no enclave may publish /cmd_vel" in alone
+    for paths in ((base, more), (base.parent,)):
+        found = sros("check", *paths, "--severity", "note", "--requirements", "required.toml",
+                     cwd=tmp_path)  # fmt: skip
+        assert found.status == 1 and "no enclave may publish" not in found.out, found
+        assert "/web: may publish /cmd_vel, but only /mux may publish /cmd_vel" in found.out
+    shutil.copy(base, more)
+    twice = sros("check", "p", "--requirements", "required.toml", cwd=tmp_path)
+    assert (twice.status, "is in another policy, too" in twice.err) == (2, True)
 
 
 def test_more_wildcards_than_can_be_decided_are_one_error(

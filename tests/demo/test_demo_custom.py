@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from sros_tool.demo.result import PartyRecord, RowRecord, judge_row
 from sros_tool.demo.scenarios import read_scenario
 from sros_tool.demo.scenarios.model import OWN, UNSECURED, Identity, Relation, Role, RowStatus
 from sros_tool.errors import DocumentError
+from sros_tool.runtime.events import Event, EventKind, ProcessStage
 from tests.support.harness import policy_text, publish, sros
 
 GOOD = """title = "who sees the camera"
@@ -139,6 +142,24 @@ def test_what_is_wrong_is_reported_with_its_line(
     assert told in str(caught.value)
 
 
+def test_what_to_write_for_a_party_that_its_own_enclave_refuses(folder: Path) -> None:
+    alone = GOOD.replace(CONTROL, "")
+    for enclave, remedy in (
+        ('enclave = "/arm/viewer"\n', r'party = "camera", expected = "refused" }'),
+        ("", "an unsecured listener that hears the same talker"),
+    ):
+        with pytest.raises(DocumentError) as caught:
+            read_scenario(write(folder, alone.replace('enclave = "/arm/camera"\n', enclave)))
+        assert remedy in str(caught.value)
+    row = read_scenario(write(folder, GOOD)).rows[0]
+    refused = PartyRecord(
+        events=(Event(EventKind.REFUSED, 99, "not allowed", stage=ProcessStage.ENDPOINT),)
+    )
+    record = RowRecord(replace(row, claims=(replace(row.claims[0], holds=False),)), 100,
+                       {"viewer": refused, "camera": refused}, None)  # fmt: skip
+    assert 'write { party = "viewer", expected = "refused" }' in judge_row(record).detail
+
+
 def test_two_parties_whose_logs_would_be_one_file(folder: Path) -> None:
     text = GOOD.replace('"camera"', '"a b"').replace('"viewer"', '"a_b"')
     with pytest.raises(DocumentError, match="line 11: there are two parties 'a_b'"):
@@ -183,7 +204,9 @@ def test_claims_in_a_list(folder: Path) -> None:
             read_scenario(write(folder, of_action))
     readable = '    { party = "adder", expected = "readable" },\n'
     silent = SERVICES.replace('"answered', '"not answered').replace(readable, "")
-    with pytest.raises(DocumentError, match=r"adder answers a client .*whom the same server"):
+    with pytest.raises(
+        DocumentError, match=r"adder answers a client .*unsecured client whom the same server"
+    ):
         read_scenario(write(folder, silent))
 
 

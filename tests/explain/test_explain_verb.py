@@ -522,7 +522,7 @@ def test_a_name_that_is_an_action_is_asked_about_as_one(
     found = explain(*place, *words) if by == "keystore" else explain(*words, *place)
     assert found.status == status
     assert f" {question}, on " in found.out.splitlines()[0]
-    assert "note [explain.an-action]" in found.err and question in found.err
+    assert ("note [explain.an-action]" in found.err) == (word == "serve")
     assert "<service>" not in found.out, "no right to a service is proposed"
     chosen = explain(*place, *words, "--type", "service")
     assert chosen.status == 1 and f"{word} service /fibonacci" in chosen.out
@@ -534,7 +534,7 @@ def test_a_name_that_is_an_action_is_asked_about_as_one_of_everybody(fibonacci: 
         found = explain(fibonacci, "--who", word, "/fibonacci")
         may = f"1 of 2 enclaves may {right} action /fibonacci\n"
         assert (found.status, found.out) == (0, f"{who}\n{may}")
-        assert "note [explain.an-action]" in found.err
+        assert ("note [explain.an-action]" in found.err) == (word == "serve")
     as_action = explain(fibonacci, "--who", "call", "/fibonacci", "--type", "action")
     assert as_action.out.splitlines()[0] == CLIENT
     assert "an-action" not in as_action.err
@@ -560,7 +560,7 @@ def test_an_action_is_one_where_wildcards_allow_services(tmp_path: Path) -> None
     sros("create_enclave", root, "/everything").ok()
     found = explain(root, "--who", "call", "/fibonacci")
     assert CLIENT in found.out and "/everything  by the wildcard" in found.out
-    assert "call action /fibonacci" in found.err
+    assert "may call action /fibonacci" in found.out
 
 
 def test_a_name_that_is_a_service_as_well_stays_one(tmp_path: Path) -> None:

@@ -75,6 +75,7 @@ from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import read_toml
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
+from sros_tool.policy.rights import Rules, policy_rights
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
 from sros_tool.xml import read_bytes
 
@@ -225,7 +226,8 @@ def _scenario(table: _Table) -> Scenario:
         if any(name.replace(" ", "_") == file for name in parties):
             raise party_table.error("name", f"there are two parties {party.name!r}")
         parties[party.name] = party
-    rows = tuple(_row(row_table, parties) for row_table in table.tables("row"))
+    rules = Rules(policy_rights(policy))
+    rows = tuple(_row(row_table, parties, rules) for row_table in table.tables("row"))
     title = table.text("title", table.path.stem)
     return Scenario(table.path.stem, title, rows, policy=lambda _topic: policy)
 
@@ -282,13 +284,13 @@ def _identity(table: _Table, policy: Policy) -> Identity:
     return Identity(keystores[word], enclave, tuple(variables.items()))
 
 
-def _row(table: _Table, parties: Mapping[str, Party]) -> Row:
+def _row(table: _Table, parties: Mapping[str, Party], rules: Rules) -> Row:
     name = table.text("name")
     claims = _claims(table, "claim", parties)
     controls = _claims(table, "control", parties)
     if not claims:
         raise table.error("name", f"the row {name!r} has no claim", _EXAMPLE)
-    _check_controls(table, claims, controls)
+    _check_controls(table, claims, controls, parties, rules)
     used = {word for claim in (*claims, *controls) for word in (claim.subject, claim.talker)}
     return Row(
         name,
@@ -344,7 +346,13 @@ def _claim(table: _Table, key: str, claim: Any, parties: Mapping[str, Party]) ->
     return Claim(relation, names[0], names[1] if len(names) > 1 else "", holds)
 
 
-def _check_controls(table: _Table, claims: Sequence[Claim], controls: Sequence[Claim]) -> None:
+def _check_controls(
+    table: _Table,
+    claims: Sequence[Claim],
+    controls: Sequence[Claim],
+    parties: Mapping[str, Party],
+    rules: Rules,
+) -> None:
     """Raise `DocumentError` if a row expects silence and no claim that something works."""
     happening = [claim for claim in (*claims, *controls) if _happens(claim)]
     for claim in claims:
@@ -352,15 +360,32 @@ def _check_controls(table: _Table, claims: Sequence[Claim], controls: Sequence[C
         if _happens(claim) or any(not heard or e.talker == claim.talker for e in happening):
             continue
         who = f"a listener hears {claim.talker}" if claim.talker else "something works"
-        control = "listener that hears the same talker"
+        remedy = "Add a control, such as a permitted listener that hears the same talker."
         if claim.relation is Relation.IS_ANSWERED:
             who = f"{claim.talker} answers a client"
-            control = "client whom the same server answers"
+            remedy = "Add a control, such as a permitted client whom the same server answers."
+        talker = parties[claim.talker or claim.subject]
+        if claim.talker and not talker.identity.enclave:
+            remedy = remedy.replace("a permitted", "an unsecured")
+        elif claim.talker and not _may_speak(talker, rules):
+            who = f"{who}, and nobody can: {talker.identity.enclave} lacks the right to speak there"
+            remedy = (
+                f"A process of this enclave is refused. Claim that: {{ party = "
+                f'"{talker.name}", expected = "refused" }}, with a control that something works.'
+            )
         raise table.error(
             "claim",
             f"no claim or control shows that {who} meanwhile: a crash would look the same",
-            f"Add a control, such as a permitted {control}.",
+            remedy,
         )
+
+
+def _may_speak(party: Party, rules: Rules) -> bool:
+    """Return whether a party's enclave may publish, serve or execute its name, as far as known."""
+    right = {Role.TALKER: "publish", Role.SERVER: "reply", Role.ACTION_SERVER: "execute"}
+    if party.role not in right or not party.topic:
+        return True
+    return rules.allow(party.identity.enclave, right[party.role], party.topic)
 
 
 def _happens(claim: Claim) -> bool:
