@@ -86,8 +86,10 @@ def _remove_stale(folder: Folder, prefix: str) -> None:
                 os.close(handle)
 
 
-def write_new_file(path: Path, data: bytes, *, for_user: int | None = None) -> None:
-    """Write a file that only its owner can read, and flush it to disk.
+def write_new_file(
+    path: Path, data: bytes, *, for_user: int | None = None, flush: bool = True
+) -> None:
+    """Write a file that only its owner can read, and flush it to disk unless ``flush`` is False.
 
     If root writes it into a folder of the user ``for_user``, that user becomes its owner.
 
@@ -101,7 +103,8 @@ def write_new_file(path: Path, data: bytes, *, for_user: int | None = None) -> N
             if os.geteuid() == 0 and folder.owner[0] == for_user:
                 os.fchown(handle, *folder.owner)
             write_all(handle, data)
-            os.fsync(handle)
+            if flush:
+                os.fsync(handle)
         except BaseException:
             folder.unlink(path.name, missing_ok=True)
             raise

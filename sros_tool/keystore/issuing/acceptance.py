@@ -206,9 +206,10 @@ def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
 
     with tempfile.TemporaryDirectory(prefix="sros-") as folder:
         for file, data in files.items():
-            write_new_file(Path(folder, file), data)
+            write_new_file(Path(folder, file), data, flush=False)
         if KEY_URI_FILE not in files:
-            write_new_file(Path(folder, REQUEST), b"\n")  # as where the key is on its robot
+            # As where the key is on its robot.
+            write_new_file(Path(folder, REQUEST), b"\n", flush=False)
         enclave = load_enclave(name, Path(folder), at=now)
     domains = enclave.joined_domains
     domain = next(iter(domains), 0) if domains else 0
