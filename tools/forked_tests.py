@@ -12,9 +12,13 @@ import traceback
 from collections.abc import Iterator, Sequence
 from multiprocessing.connection import Connection, Pipe, wait
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import pytest
+
+_Location = tuple[str, int | None, str]
+_Data = float | str | dict[str, Any]
+"""A report: the seconds of a test that passed, what ended its process, or what pytest makes."""
 
 _NUMBER_BYTES = 2
 """Bytes of a file's number in the pipe from which the processes take files."""
@@ -32,19 +36,20 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
     if option.processes < 2 or option.collectonly or not session.items or session.testsfailed:
         return None
     hook = session.config.hook
-    left = {item.nodeid for item in session.items}
+    left = {item.nodeid: item.location for item in session.items}
     with _Processes(session, option.processes) as processes:
-        for report in processes.reports():
-            hook.pytest_runtest_logreport(report=report)
-            if report.when == "teardown":
-                left.discard(report.nodeid)
-                hook.pytest_runtest_logfinish(nodeid=report.nodeid, location=report.location)
+        for nodeid, reports in processes.ended_tests():
+            location = left.pop(nodeid)
+            for data in reports:
+                hook.pytest_runtest_logreport(report=_report(session, nodeid, location, data))
+            hook.pytest_runtest_logfinish(nodeid=nodeid, location=location)
             if session.shouldfail:
                 raise session.Failed(session.shouldfail)
             if session.shouldstop:
                 raise session.Interrupted(session.shouldstop)
     if left:
-        raise session.Interrupted(f"{len(left)} tests have not ended, such as {min(left)}")
+        number = f"{len(left)} of {len(session.items)} tests"
+        raise session.Interrupted(f"{number} have not ended, such as {min(left)}")
     return True
 
 
@@ -72,8 +77,8 @@ class _Processes:
             if pid == 0:
                 status = 1
                 try:
-                    _separate(self._session, folder / f"process{number}", sender)
-                    _run(self._session, _taken(queue, self._files), sender)
+                    sending = _separate(self._session, folder / f"process{number}", sender)
+                    _run(self._session, _taken(queue, self._files), sending)
                     status = 0
                 except BaseException:
                     traceback.print_exc()
@@ -84,25 +89,20 @@ class _Processes:
         os.close(queue)
         return self
 
-    def reports(self) -> Iterator[pytest.TestReport]:
-        """Yield the reports of all processes, and a failure for a test that ends its process."""
-        config = self._session.config
-        begun: dict[Connection, tuple[str, tuple[str, int | None, str]]] = {}
+    def ended_tests(self) -> Iterator[tuple[str, list[_Data]]]:
+        """Yield each test that has ended, with its reports; a test that ends its process fails."""
+        begun: dict[Connection, str] = {}
         while self._pids:
             for receiver in wait(list(self._pids)):
                 assert isinstance(receiver, Connection)
+                test = begun.get(receiver, "")
                 try:
-                    message = receiver.recv()
+                    reports, begun[receiver] = receiver.recv()
                 except EOFError:
                     _, status = os.waitpid(self._pids.pop(receiver), 0)
-                    if status:
-                        text = f"its process ended: {_status_text(status)}"
-                        yield pytest.TestReport(*begun[receiver], {}, "failed", text, "call")
-                    continue
-                if isinstance(message, tuple):
-                    begun[receiver] = message
-                else:
-                    yield config.hook.pytest_report_from_serializable(config=config, data=message)
+                    reports = [f"its process ended: {_status_text(status)}"] if status else []
+                if test and reports:
+                    yield test, reports
 
     def __exit__(
         self,
@@ -113,6 +113,16 @@ class _Processes:
         for pid in self._pids.values():  # after an error
             os.kill(pid, signal.SIGTERM)
             os.waitpid(pid, 0)
+
+
+def _report(session: pytest.Session, nodeid: str, location: _Location, data: _Data) -> Any:
+    """Return a report that a process has sent."""
+    if isinstance(data, dict):
+        config = session.config
+        return config.hook.pytest_report_from_serializable(config=config, data=data)
+    if isinstance(data, str):
+        return pytest.TestReport(nodeid, location, {}, "failed", data, "call")
+    return pytest.TestReport(nodeid, location, {}, "passed", None, "call", duration=data)
 
 
 def _file(item: pytest.Item) -> object:
@@ -132,7 +142,7 @@ def _taken(queue: int, files: Sequence[list[pytest.Item]]) -> Iterator[pytest.It
         yield from files[int.from_bytes(number)]
 
 
-def _separate(session: pytest.Session, folder: os.PathLike[str], sender: Connection) -> None:
+def _separate(session: pytest.Session, folder: os.PathLike[str], sender: Connection) -> _Sender:
     """Give this process output and folders of its own, and have it send reports, not show them."""
     config, plugins = session.config, session.config.pluginmanager
     capture = plugins.getplugin("capturemanager")
@@ -143,27 +153,41 @@ def _separate(session: pytest.Session, folder: os.PathLike[str], sender: Connect
     for name in ("terminalreporter", "terminalprogress"):
         if plugins.has_plugin(name):
             plugins.unregister(name=name)
-    plugins.register(_Sender(config, sender))
+    sending = _Sender(config, sender)
+    plugins.register(sending)
+    return sending
 
 
-def _run(session: pytest.Session, items: Iterator[pytest.Item], sender: Connection) -> None:
+def _run(session: pytest.Session, items: Iterator[pytest.Item], sender: _Sender) -> None:
     """Run tests; what they share is kept as long as the next one needs it."""
     item = next(items, None)
     while item:
         following = next(items, None)
-        sender.send((item.nodeid, item.location))
+        sender.begin(item.nodeid)
         session.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
         item = following
+    sender.begin("")
 
 
 class _Sender:
-    """A plugin that sends the reports of tests."""
+    """A plugin that sends the reports of tests, those of a test in one message."""
 
     def __init__(self, config: pytest.Config, sender: Connection) -> None:
         self._config = config
         self._sender = sender
+        self._reports: list[_Data] = []
+
+    def begin(self, nodeid: str) -> None:
+        """Send the reports of the test that has ended, with the id of the next one, or ""."""
+        self._sender.send((self._reports, nodeid))
+        self._reports = []
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Send a report to the process that shows it."""
-        data = self._config.hook.pytest_report_to_serializable(config=self._config, report=report)
-        self._sender.send(data)
+        """Keep a report; of what passed, only how long the test took."""
+        if not report.passed or hasattr(report, "wasxfail"):
+            hook = self._config.hook
+            self._reports.append(
+                hook.pytest_report_to_serializable(config=self._config, report=report)
+            )
+        elif report.when == "call":
+            self._reports.append(report.duration)
