@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import os
-import shutil
 import signal
 import tempfile
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from hypothesis import HealthCheck, settings, strategies
 
 from sros_tool.pki import keys
 from tests.support.children import LONG
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.long_form import SEED
 
 POLICY = policy_text({"/a": publish("old_a"), "/b": publish("old_b")})
@@ -99,6 +98,41 @@ for each in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
         signal.signal(each, signal.SIG_DFL)
 
 
+_BEFORE = pytest.StashKey[tuple[dict[bytes, bytes], str]]()
+
+
+def _surroundings() -> tuple[dict[bytes, bytes], str]:
+    """Return the environment, in bytes because decoding them takes longer, and working folder."""
+    try:
+        folder = os.getcwd()
+    except FileNotFoundError:
+        folder = "a folder that was removed"
+    return os.environ._data.copy(), folder  # type: ignore[attr-defined]
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> Iterator[None]:
+    """Remember the environment and the working folder before anything is made for a test."""
+    item.stash[_BEFORE] = _surroundings()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
+    """Fail a test that leaves another environment or working folder to the tests after it."""
+    result = yield
+    variables, folder = item.stash[_BEFORE]
+    now, there = _surroundings()
+    if (now, there) == (variables, folder):
+        return result
+    changed = {name for name in variables.keys() | now if variables.get(name) != now.get(name)}
+    os.environ.clear()
+    os.environ.update({os.fsdecode(name): os.fsdecode(text) for name, text in variables.items()})
+    os.chdir(folder)
+    left = [*sorted(map(os.fsdecode, changed)), *({there} - {folder})]
+    pytest.fail(f"it leaves variables or a working folder of its own: {', '.join(left)}")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def decrypt_each_key_once() -> Iterator[None]:
     """A passphrase is slow to try, and most tests use copies of the same encrypted keys."""
@@ -137,7 +171,7 @@ def made_keystore(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def keystore(made_keystore: Path, tmp_path: Path) -> Path:
     """A keystore of one's own with the enclaves /a and /b, restricted by a policy."""
-    return Path(shutil.copytree(made_keystore, tmp_path / "ks", symlinks=True))
+    return copy_of(made_keystore, tmp_path / "ks")
 
 
 @pytest.fixture

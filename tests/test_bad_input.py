@@ -27,7 +27,16 @@ from sros_tool.pki.keys import generate_key, key_pem, load_key
 from sros_tool.runtime.environment import render_refusal
 from sros_tool.validity import Window
 from tests.support.children import LONG
-from tests.support.harness import Ended, forked, policy_text, publish, snapshot, sros, with_includes
+from tests.support.harness import (
+    Ended,
+    copy_of,
+    forked,
+    policy_text,
+    publish,
+    snapshot,
+    sros,
+    with_includes,
+)
 from tests.support.long_form import drawn, some, sometimes
 
 Words = list[object]
@@ -966,9 +975,9 @@ def test_folder_without_permission(line: str, mode: int, made_keystore: Path) ->
         if line.startswith("create_keystore"):  # a keystore cannot be in another one
             (folder / "dir").mkdir()
         else:
-            shutil.copytree(made_keystore, folder / "dir", symlinks=True)
+            copy_of(made_keystore, folder / "dir")
         (folder / "p.xml").write_text(GOOD)
-        twin = Path(shutil.copytree(folder, folder / "twin", symlinks=True))
+        twin = copy_of(folder, folder / "twin")
         sros(*line.replace("{}", str(twin)).split()).ok()  # imports what nobody cannot read
         for path in [folder / "dir", *(folder / "dir").rglob("*")]:
             os.chown(path, NOBODY, NOBODY, follow_symlinks=False)

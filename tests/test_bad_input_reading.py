@@ -22,7 +22,7 @@ from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import Style
 from sros_tool.terminal import visible, visible_json
 from tests.support.children import PATIENCE
-from tests.support.harness import policy_text, publish, snapshot, sros
+from tests.support.harness import copy_of, policy_text, publish, snapshot, sros
 from tests.support.long_form import some
 from tests.test_bad_input import NOT_FILES, check_refused, check_unchanged
 
@@ -253,7 +253,7 @@ ODD = "x\x1b]0;x\x07\x9b2J\u202e\nok: nothing found"
 def test_a_folder_with_escapes(line: str, keystore: Path, tmp_path: Path) -> None:
     """Enclaves and common names with escapes steer no terminal, also by way of a file."""
     odd = keystore / "enclaves" / ODD
-    shutil.copytree(keystore / "enclaves/a", odd, symlinks=True)
+    copy_of(keystore / "enclaves/a", odd)
     router = {
         "mode": "router",
         "access_control": {

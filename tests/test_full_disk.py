@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import POLICY
-from tests.support.harness import check_enclave_whole, forked, remains, snapshot, sros
+from tests.support.harness import check_enclave_whole, copy_of, forked, remains, snapshot, sros
 from tests.support.long_form import some
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="mounts small disks; needs root")
@@ -52,7 +52,7 @@ def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "policy.xml").write_text(POLICY)
     (folder / "new.xml").write_text(NEW_ENCLAVES)
     for name in ("ks", "rotated", "zenoh"):
-        shutil.copytree(made_keystore, folder / name, symlinks=True)
+        copy_of(made_keystore, folder / name)
     for verb in (
         "create_enclave ks /b",
         "create_enclave zenoh /b",

@@ -47,7 +47,7 @@ from sros_tool.keystore.transaction.stage import staged_name
 from sros_tool.xml import read_bytes
 from tests.conftest import MEMORY, POLICY
 from tests.support.children import run
-from tests.support.harness import snapshot, sros
+from tests.support.harness import copy_of, snapshot, sros
 
 NOW = datetime.now(UTC)
 OWNER, STRANGER = 65533, 65532
@@ -299,7 +299,7 @@ def reachable(made_keystore: Path) -> Iterator[Path]:
     """A keystore that every user can reach: pytest closes its own folders whenever it starts."""
     with TemporaryDirectory(dir=MEMORY if os.access(MEMORY, os.W_OK) else None) as folder:
         Path(folder).chmod(0o755)
-        yield Path(shutil.copytree(made_keystore, Path(folder, "ks"), symlinks=True))
+        yield copy_of(made_keystore, Path(folder, "ks"))
 
 
 # ── the lock ───────────────────────────────────────────────────────────────────────────────
@@ -626,7 +626,7 @@ def test_the_keystore_of_another_user_does_not_sign_with_a_key_of_root(
     lead: Callable[[Path, str, Path], None], role: str, keystore: Path, tmp_path: Path
 ) -> None:
     own = tmp_path / "of root"
-    shutil.copytree(keystore, own, symlinks=True)
+    copy_of(keystore, own)
     key = own / f"private/{role}_ca.key.pem"
     lead(keystore, role, key)
     give(keystore, OWNER)

@@ -20,7 +20,7 @@ from sros_tool.errors import KeystoreError
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
 from tests.conftest import POLICY
-from tests.support.harness import Ended, forked, snapshot, sros
+from tests.support.harness import Ended, copy_of, forked, snapshot, sros
 from tests.support.long_form import some
 from tests.test_hostile_folders import NOW, OWNER, as_root, give
 
@@ -69,7 +69,7 @@ def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a keystore with a namespace and a list, a policy and a request."""
     folder = tmp_path_factory.mktemp("whole")
     root = folder / "ks"
-    shutil.copytree(made_keystore, root, symlinks=True)
+    copy_of(made_keystore, root)
     sros("create_enclave", root, "/arm/camera", "/old").ok()
     sros("revoke", root, "/old").ok()
     sros("create_request", "/robot", folder / "made").ok()
@@ -94,7 +94,7 @@ def place(made: Path) -> Iterator[Path]:
 @pytest.fixture
 def spare(made: Path, tmp_path: Path) -> Path:
     """Another copy of ``made``, which can be read."""
-    return Path(shutil.copytree(made, tmp_path / "spare", symlinks=True))
+    return copy_of(made, tmp_path / "spare")
 
 
 def words(verb: str, folder: Path) -> list[str]:

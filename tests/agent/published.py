@@ -20,7 +20,7 @@ from sros_tool.keystore.issuing.authority import Authority, load_authority
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import PERMISSIONS
 from sros_tool.keystore.reader import Keystore
-from tests.support.harness import Ended, sros
+from tests.support.harness import Ended, copy_of, sros
 
 DAY = timedelta(days=1)
 LATER = timedelta(minutes=10)
@@ -43,7 +43,7 @@ class Home:
 
     def copy(self, folder: Path) -> Home:
         """Return a copy of this home in a new folder."""
-        shutil.copytree(self.folder, folder, symlinks=True)
+        copy_of(self.folder, folder)
         return Home(folder, self.now)
 
     def run(self, *words: object) -> Ended:

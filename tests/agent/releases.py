@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -16,7 +15,7 @@ from sros_tool.keystore.issuing.authority import Authority
 from sros_tool.keystore.layout import KEY_FILE, ca_certificate, ca_key
 from sros_tool.keystore.reader import read_certificate
 from sros_tool.pki.keys import load_key
-from tests.support.harness import sros
+from tests.support.harness import copy_of, sros
 
 NAMES = ("/r1/a", "/r1/b", "/r1/c")
 
@@ -70,7 +69,7 @@ class Home:
 
     def robot(self, folder: Path) -> Path:
         """Return a copy of the robot's folder as first delivered."""
-        shutil.copytree(self.delivered, folder / "robot", symlinks=True)
+        copy_of(self.delivered, folder / "robot")
         return folder / "robot"
 
 

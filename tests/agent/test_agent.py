@@ -52,7 +52,7 @@ from tests.agent.releases import NAMES, Home, files_of, moment, release_of
 from tests.agent.test_install import content, has
 from tests.keystore.test_transaction import DIED, in_child, run_out_of_space
 from tests.support.children import LONG
-from tests.support.harness import sros
+from tests.support.harness import copy_of, sros
 from tests.support.long_form import few_steps
 
 
@@ -302,7 +302,7 @@ def test_a_revocation_list_that_is_replaced_by_one_that_revokes_less_is_sent(
     r1.release = home.revoked
     r1.round()
     mine = (r1.folder / "enclaves/r1/a" / CRL_FILE).read_text()
-    root = Path(shutil.copytree(home.root, tmp_path / "home", symlinks=True))
+    root = copy_of(home.root, tmp_path / "home")
     sros("crl", root, "--refresh").ok()
     r1.release = release_of(files_of(root), 4, home.authority)
     r1.round()
@@ -330,12 +330,12 @@ def test_a_revocation_list_that_is_replaced_by_one_that_revokes_less_is_sent(
 def test_a_disk_of_yesterday_goes_on(home: Home, r1: Robot, tmp_path: Path) -> None:
     r1.round()
     yesterday = tmp_path / "yesterday"
-    shutil.copytree(r1.folder, yesterday, symlinks=True)
+    copy_of(r1.folder, yesterday)
     r1.release = home.revoked
     r1.round()
     last = r1.message().sequence
     shutil.rmtree(r1.folder)
-    shutil.copytree(yesterday, r1.folder, symlinks=True)
+    copy_of(yesterday, r1.folder)
     done = r1.round(moment() + timedelta(minutes=5))
     assert done.changed == NAMES and has(r1.folder, home.revoked)
     now = r1.message().sequence
@@ -619,14 +619,14 @@ def test_a_round_that_ends_anywhere_is_ended_by_the_next(
     r1.round()
     r1.started = {"/r1/a": moment() - timedelta(hours=1)}
     before, inbox = tmp_path / "before", tmp_path / "inbox-before"
-    shutil.copytree(r1.folder, before, symlinks=True)
+    copy_of(r1.folder, before)
     shutil.copytree(r1.inbox, inbox)
     r1.release = home.revoked
 
     def fresh() -> None:
         for place, kept in ((r1.folder, before), (r1.inbox, inbox)):
             shutil.rmtree(place)
-            shutil.copytree(kept, place, symlinks=True)
+            copy_of(kept, place)
 
     fresh()
     r1.signers += map(certificate_of, (home.first, home.renewed))

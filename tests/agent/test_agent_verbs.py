@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -16,7 +15,7 @@ import pytest
 from sros_tool.keystore.reader import read_certificate
 from sros_tool.pki.certificates import validity_of
 from tests.cli.test_json import Seen
-from tests.support.harness import Ended, policy_text, publish, snapshot, sros
+from tests.support.harness import Ended, copy_of, policy_text, publish, snapshot, sros
 
 FLEET = """
 [groups.renewing]
@@ -80,7 +79,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def world(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
-    shutil.copytree(prepared, tmp_path / "world", symlinks=True)
+    copy_of(prepared, tmp_path / "world")
     yield World(tmp_path / "world", monkeypatch)
 
 

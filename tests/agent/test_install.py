@@ -23,7 +23,7 @@ from tests.agent.releases import NAMES, Home, authority_of, files_of, moment, re
 from tests.keystore.test_transaction import DIED, in_child, run_out_of_space
 from tests.keystore.test_transaction import REFUSED as GIVEN_UP
 from tests.support.children import LONG, apart, some_steps
-from tests.support.harness import sros
+from tests.support.harness import copy_of, sros
 
 A, B, C = (f"enclaves{name}" for name in NAMES)
 
@@ -325,7 +325,7 @@ def test_a_new_enclave_with_a_key_of_this_robot_and_its_next_key(
 ) -> None:
     """A new key is installed together with its certificate only."""
     root, place = tmp_path / "home", robot / "enclaves/r1/d"
-    shutil.copytree(home.root, root, symlinks=True)
+    copy_of(home.root, root)
     names = (*NAMES, "/r1/d")
 
     def signed(request: Path, number: int, *options: str) -> Release:

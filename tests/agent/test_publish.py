@@ -40,7 +40,7 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction import transaction
 from sros_tool.pki.crl import load_crl
 from tests.agent.published import DAY, ROLES, Home, Thief
-from tests.support.harness import policy_text, snapshot, sros
+from tests.support.harness import copy_of, policy_text, snapshot, sros
 from tests.support.harness import publish as allow_publish
 from tests.support.long_form import few_steps
 
@@ -175,7 +175,7 @@ def test_what_else_changed_with_a_revocation_is_evaluated(
 def test_a_revoked_enclave_that_is_put_back_is_refused(publisher: Home) -> None:
     kept = publisher.copy(publisher.folder.with_name("kept")).root / "enclaves/r2"
     publisher.run("revoke", "ks", "--robot", "r2")
-    shutil.copytree(kept, publisher.root / "enclaves/r2", symlinks=True)
+    copy_of(kept, publisher.root / "enclaves/r2")
     (publisher.root / "enclaves/r2/base/crl.pem").symlink_to("../../../public/identity_ca.crl.pem")
     result = publisher.publish()
     assert (result.names("published"), result.names("refused")) == (["r1", "r5"], ["r2"])
@@ -227,7 +227,7 @@ NEXT_STEPS = (
 
 def test_next_steps_name_publishing_where_the_keystore_publishes(publisher: Home) -> None:
     exports = publisher.folder / "exports"
-    shutil.copytree(publisher.root, exports / "ks", symlinks=True)
+    copy_of(publisher.root, exports / "ks")
     (exports / "ks/fleet_root.json").unlink()
     shutil.copy(publisher.folder / "fleet.toml", exports)
     for folder in (publisher.folder, exports):
@@ -496,7 +496,7 @@ def test_what_is_about_to_expire_is_renewed(publisher: Home) -> None:
 
 def test_a_keystore_that_was_restored(publisher: Home) -> None:
     backup = publisher.folder / "backup"
-    shutil.copytree(publisher.root, backup, symlinks=True)
+    copy_of(publisher.root, backup)
     earlier = {path: path.read_bytes() for path in publisher.pub.glob("targets/robots/*")}
     publisher.run("revoke", "ks", "--robot", "r5")
     publisher.publish()
@@ -542,7 +542,7 @@ def test_revoking_after_a_restore_covers_certificates_of_after_the_backup(
     publisher: Home, revoked_first: bool
 ) -> None:
     """A thief keeps the files that the robot fetched after the backup."""
-    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    backup = copy_of(publisher.root, publisher.folder / "backup")
     publisher.run("renew", "ks", "--all")
     publisher.publish()
     stolen = Keystore(publisher.root).certificate_of("/r5/base")
@@ -573,7 +573,7 @@ def test_revoking_after_a_restore_covers_certificates_of_after_the_backup(
 
 def test_a_publishing_folder_teaches_nothing_that_the_cas_did_not_sign(publisher: Home) -> None:
     """A certificate of another CA, one that is recorded already, and files that are no archives."""
-    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    backup = copy_of(publisher.root, publisher.folder / "backup")
     publisher.run("renew", "ks", "/r1/base")
     publisher.publish()
     shutil.rmtree(publisher.root)
@@ -601,7 +601,7 @@ def test_a_publishing_folder_teaches_nothing_that_the_cas_did_not_sign(publisher
 
 def test_a_keystore_that_was_restored_from_before_its_keys_were_replaced(publisher: Home) -> None:
     """Robots know the new root, so what the keys in the backup sign would be refused by all."""
-    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    backup = copy_of(publisher.root, publisher.folder / "backup")
     robot = publisher.robot()
     publisher.publish(rotate=("timestamp",))
     robot.gets()
@@ -620,7 +620,7 @@ def test_a_keystore_that_was_restored_from_before_all_robots_were_revoked(
     publisher: Home,
 ) -> None:
     """Nothing is published any more, so no release has a later number."""
-    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    backup = copy_of(publisher.root, publisher.folder / "backup")
     for robot in ("r1", "r2", "r5"):
         publisher.run("revoke", "ks", "--robot", robot)
     publisher.publish()
@@ -642,7 +642,7 @@ def test_a_keystore_that_was_restored_from_before_a_robot_was_removed(
     """The other robots got nothing new: it left the fleet, or their releases were refused."""
     publisher.run("renew", "ks", "/r5/base")
     publisher.publish()
-    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    backup = copy_of(publisher.root, publisher.folder / "backup")
     fleet = publisher.folder / "fleet.toml"
     change = {
         False: "generate_artifacts -k ks -p policy.xml --fleet fleet.toml",
@@ -670,7 +670,7 @@ def test_a_keystore_that_was_restored_from_before_a_robot_was_removed(
 def test_a_robot_that_left_the_fleet_does_not_come_back_with_a_restored_keystore(
     publisher: Home,
 ) -> None:
-    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    backup = copy_of(publisher.root, publisher.folder / "backup")
     (publisher.folder / "fleet.toml").write_text("[robots.r1]\n[robots.r2]\n")
     change = ["generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml"]
     publisher.run(*change)
@@ -751,7 +751,7 @@ def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:
 
 def test_keystore_and_folder_that_were_lost(publisher: Home) -> None:
     """What home gave after the backup, and nobody there knows, is never given twice."""
-    backup = shutil.copytree(publisher.root, publisher.folder / "backup", symlinks=True)
+    backup = copy_of(publisher.root, publisher.folder / "backup")
     robot = publisher.robot()
     for _ in range(3):
         publisher.run("renew", "ks", "--all")
@@ -760,7 +760,7 @@ def test_keystore_and_folder_that_were_lost(publisher: Home) -> None:
     shutil.rmtree(publisher.pub)
     for again in (False, True):
         shutil.rmtree(publisher.root)
-        shutil.copytree(backup, publisher.root, symlinks=True)
+        copy_of(backup, publisher.root)
         if again:  # numbers would come to those of the first home
             (publisher.root / "published.json").unlink()
         publisher.run("revoke", "ks", "--robot", "r5")

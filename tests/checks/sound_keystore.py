@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 
 from tests.checks.bench import SECRET, Bench
 from tests.checks.policy_cases import BASICS
-from tests.support.harness import sros
+from tests.support.harness import copy_of, sros
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 
@@ -37,5 +36,5 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def bench(sound: Path, tmp_path: Path) -> Bench:
     """A copy of one's own."""
-    shutil.copytree(sound, tmp_path / "copy", symlinks=True)
+    copy_of(sound, tmp_path / "copy")
     return Bench(tmp_path / "copy/ks", NOW)

@@ -15,6 +15,7 @@ from sros_tool.files import policies_dir
 from sros_tool.keystore.reader import Keystore
 from tests.checks.bench import DAY, Bench
 from tests.support.children import LONG
+from tests.support.harness import copy_of
 from tests.support.long_form import some
 
 pytest_plugins = ["tests.checks.sound_keystore"]
@@ -53,7 +54,7 @@ def test_damaged_keystores(seed: int, bench: Bench, tmp_path: Path) -> None:
     told = 0
     for number in range(ROUNDS):
         copy = tmp_path / f"ks{number}"
-        shutil.copytree(bench.root, copy, symlinks=True)
+        copy_of(bench.root, copy)
         files = sorted(p for p in copy.rglob("*") if p.is_file() and not p.is_symlink())
         for path in chance.sample(files, chance.choice([1, 1, 2, 4])):
             damage(path, chance)

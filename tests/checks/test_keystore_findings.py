@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,7 +22,7 @@ from sros_tool.pki.keys import load_key
 from sros_tool.policy.document import read_policy
 from tests.checks.bench import SECRET, Bench
 from tests.checks.keystore_cases import CASES, STRANGER, give_away
-from tests.support.harness import sros
+from tests.support.harness import copy_of, sros
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
@@ -258,7 +257,7 @@ def test_a_secret_that_kubernetes_mounts_hides_no_enclave(bench: Bench, tmp_path
 
 
 def test_enclaves_in_hidden_folders_are_named_where_enclaves_are_listed(bench: Bench) -> None:
-    shutil.copytree(bench.path("enclaves/base"), bench.path("enclaves/.h"), symlinks=True)
+    copy_of(bench.path("enclaves/base"), bench.path("enclaves/.h"))
     ended = sros("list_enclaves", bench.root).ok()
     assert "/.h" not in ended.out.splitlines()
     assert "1 enclave in a hidden folder, which DDS loads and sros leaves out: /.h" in ended.err

@@ -29,7 +29,7 @@ from tests.checks.keystore_cases import CASES
 from tests.checks.sound_keystore import NOW
 from tests.checks.test_policy_findings import enclave
 from tests.checks.test_policy_findings import policy as policy_of
-from tests.support.harness import Ended, forked, sros
+from tests.support.harness import Ended, copy_of, forked, sros
 from tests.support.long_form import some
 
 pytest_plugins = ["tests.checks.sound_keystore"]
@@ -103,7 +103,7 @@ def test_no_remedy_names_a_command_that_refuses(
     at(options["now"], monkeypatch)
     policy = bench.root.with_name("policy.xml")
     root = Path(os.path.abspath(bench.root))
-    shutil.copytree(root, tmp_path / "broken", symlinks=True)
+    copy_of(root, tmp_path / "broken")
     if (root / "fleet.toml").exists():
         shutil.copy(root / "fleet.toml", tmp_path)
 
@@ -114,7 +114,7 @@ def test_no_remedy_names_a_command_that_refuses(
         ended = run(words)
         if ended.status > 1:  # perhaps the other choice was carried out before
             shutil.rmtree(root)
-            shutil.copytree(tmp_path / "broken", root, symlinks=True)
+            copy_of(tmp_path / "broken", root)
             ended = run(words)
         assert ended.status < 2, (words, ended.err)
 
@@ -177,7 +177,7 @@ STARTED, OTHERS = (
 def robot(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Bench, RuntimeState]:
     """A keystore with files for Zenoh, and a robot with an export; only to be read."""
     copy = tmp_path_factory.mktemp("robot") / "copy"
-    shutil.copytree(sound, copy, symlinks=True)
+    copy_of(sound, copy)
     bench = Bench(copy / "ks", NOW)
     return bench, runtime_cases.SOUND(runtime_cases.sound_state(bench), bench)
 

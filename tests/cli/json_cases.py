@@ -14,7 +14,7 @@ from sros_tool.files import templates_dir
 from sros_tool.keystore.confirmation import MESSAGE_FILE
 from sros_tool.pki.certificates import make_request
 from tests.keystore.test_confirmation import DDS
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.messages import key_of, said_by, signed_message
 from tests.support.zenoh_configurations import denying, self_limiting
 
@@ -94,7 +94,7 @@ def make_folder(folder: Path) -> None:
     ):
         sros(*line.split(), cwd=folder).ok()
     for copy in ("turned", "broken", "lost", "wrecked", "partial", "fleet"):
-        shutil.copytree(folder / "ks", folder / copy, symlinks=True)
+        copy_of(folder / "ks", folder / copy)
     sros("rotate_ca", "turned", "--next", cwd=folder).ok()
     shutil.copytree(folder / "out", folder / "token")
     (folder / "token/enclaves/a/key.pem").unlink()
@@ -110,9 +110,9 @@ def make_folder(folder: Path) -> None:
     slow = (folder / "a.json").read_text().replace('"time": "20', '"time": "19')
     (folder / "slow.json").write_text(slow)
     (folder / "partial/enclaves/a/permissions.p7s").unlink()
-    shutil.copytree(folder / "zenoh", folder / "closed", symlinks=True)
+    copy_of(folder / "zenoh", folder / "closed")
     sros("zenoh", "closed", cwd=folder).ok()
-    shutil.copytree(folder / "zenoh", folder / "lacking", symlinks=True)
+    copy_of(folder / "zenoh", folder / "lacking")
     (folder / "lacking/enclaves/b/permissions.p7s").unlink()
     (folder / "closed/enclaves/b/session.json5").unlink()
     (folder / "open.json5").write_text("{mode: 'router'}")
@@ -150,8 +150,8 @@ def make_inboxes(folder: Path) -> None:
     (folder / "good/a" / MESSAGE_FILE).write_bytes(message)
     (folder / "from_fresh/b" / MESSAGE_FILE).write_bytes(b"no message")
     (folder / "from_fresh/stranger").mkdir()
-    shutil.copytree(folder / "crew", folder / "unable", symlinks=True)
-    shutil.copytree(folder / "fresh", folder / "edited", symlinks=True)
+    copy_of(folder / "crew", folder / "unable")
+    copy_of(folder / "fresh", folder / "edited")
     (folder / "edited/enclaves/b/permissions.p7s").write_bytes(b"no message")
     for key in folder.glob("unable/private/*.key.pem"):
         key.unlink()

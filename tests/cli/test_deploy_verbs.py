@@ -18,6 +18,7 @@ from tests.support.children import run
 from tests.support.harness import (
     Ended,
     Running,
+    copy_of,
     policy_text,
     publish,
     remains,
@@ -232,7 +233,7 @@ def test_roots_from_the_environment(keystore: Path, tmp_path: Path) -> None:
 def test_a_dry_run_prints_what_the_command_does(line: str, keystore: Path, tmp_path: Path) -> None:
     request = asked(tmp_path)
     shutil.copy(request, tmp_path / "r.pem")
-    shutil.copytree(keystore, tmp_path / "twin", symlinks=True)
+    copy_of(keystore, tmp_path / "twin")
     sros("sign_request", tmp_path / "twin", request, "-o", tmp_path / "good.tgz").ok()
     before = snapshot(tmp_path)
     said = sros(*line.split(), "--dry-run", cwd=tmp_path).ok().out
@@ -280,7 +281,7 @@ def test_misuse_is_reported_in_one_paragraph(case: str, keystore: Path, tmp_path
     request = asked(tmp_path)
     shutil.copy(request, tmp_path / "r.pem")
     sros("distribute_key", keystore, "/a", tmp_path / "export.tgz").ok()
-    shutil.copytree(keystore, tmp_path / "twin", symlinks=True)
+    copy_of(keystore, tmp_path / "twin")
     sros("sign_request", tmp_path / "twin", request, "-o", tmp_path / "good.tgz").ok()
     before = snapshot(tmp_path)
     ended = sros(*(word.replace("''", "") for word in line.split()), cwd=tmp_path)

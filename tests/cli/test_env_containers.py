@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +12,7 @@ import pytest
 from sros_tool.runtime.environment import CONTAINER_FORMS, NO_CONFIGURATION, render_refusal
 from tests.runtime.test_containers import check
 from tests.support.children import importing
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 
 THERE = "/etc/sros/keystore"
 
@@ -29,7 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sros("create_request", "/born", "robot", cwd=folder).ok()
     request = "robot/enclaves/born/request.pem"
     sros("sign_request", "ks", request, "-o", "answer.tgz", cwd=folder).ok()
-    shutil.copytree(folder / "ks", folder / "zenoh", symlinks=True)
+    copy_of(folder / "ks", folder / "zenoh")
     sros("zenoh", "zenoh", "--mode", "peer", cwd=folder).ok()
     return folder
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "w", symlinks=True))
+    return copy_of(made, tmp_path / "w")
 
 
 def shown(folder: Path, path: str, status: int = 0) -> dict[str, Any]:

@@ -36,7 +36,7 @@ from tests.cli.json_cases import (
 from tests.cli.test_audit import FINE, LOUD, POLICY, SHORT
 from tests.demo.test_demo_result import CLOSED, OLD, OPEN, TWIN, result
 from tests.graph.fake_graph import Beside, graph
-from tests.support.harness import Ended, snapshot, sros
+from tests.support.harness import Ended, copy_of, snapshot, sros
 from tests.support.long_form import drawn, some
 from tests.support.verbs import COMMANDS
 from tools.json_page import SCHEMAS, SHARED, page
@@ -254,7 +254,7 @@ def test_what_a_verb_prints_beside_a_graph(
     seen = Seen()
     for case in CASES[verb]:
         seen.check(verb, both_ways(verb, case, made_folder, tmp_path))
-    shutil.copytree(made_folder / "broken", tmp_path / "ks", symlinks=True)
+    copy_of(made_folder / "broken", tmp_path / "ks")
     for words, there, status in WITH_A_GRAPH[verb]:
         (tmp_path / "robot.xml").write_text(POLICY)
         for file in ("new.xml", "add.xml"):
@@ -405,7 +405,7 @@ def test_a_path_that_no_json_holds_is_not_in_an_environment(
     made_folder: Path, tmp_path: Path
 ) -> None:
     root = tmp_path / os.fsdecode(b"k\xff")
-    shutil.copytree(made_folder / "ks", root, symlinks=True)
+    copy_of(made_folder / "ks", root)
     ended = sros("env", root, "/a", "--json")
     assert ended.status == 2
     assert json.loads(ended.out)["enclave"] is None
@@ -416,7 +416,7 @@ def test_a_path_that_no_json_holds_is_not_in_an_environment(
 
 @pytest.mark.parametrize("verb", some(sorted({*VERBS} - {*WITHOUT_JSON, "env"}), 15))
 def test_an_error_prints_no_json(verb: str, made_folder: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(made_folder, tmp_path / "made", symlinks=True))
+    folder = copy_of(made_folder, tmp_path / "made")
     text = sros(*verb.split(), *ERRORS[verb].split(), cwd=folder)
     shown = sros(*verb.split(), *ERRORS[verb].split(), "--json", cwd=folder)
     assert (shown.status, shown.out) == (text.status, "")

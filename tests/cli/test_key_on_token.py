@@ -21,7 +21,7 @@ from sros_tool.pki.token import (
     read_token_file,
     token_file,
 )
-from tests.support.harness import Ended, forked, sros
+from tests.support.harness import Ended, copy_of, forked, sros
 
 PIN = "98765432"
 URI = "pkcs11:token=robot;object=arm;type=private"
@@ -40,7 +40,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def root(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "ks", symlinks=True))
+    return copy_of(made, tmp_path / "ks")
 
 
 def place(root: Path, uri: str) -> None:

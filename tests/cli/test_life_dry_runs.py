@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 import stat
 import time
 from pathlib import Path
 
 import pytest
 
-from tests.support.harness import snapshot, sros
+from tests.support.harness import copy_of, snapshot, sros
 
 LINES = (
     "renew ks /a --new-key",
@@ -35,7 +34,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def home(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "home", symlinks=True))
+    return copy_of(made, tmp_path / "home")
 
 
 @pytest.mark.parametrize("line", LINES)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
 
 from sros_tool.files import templates_dir
 from sros_tool.proof import findings
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 
 LISTEN = '<topics subscribe="ALLOW"><topic>{}</topic></topics>'
 WILD = publish("/cmd_*")
@@ -244,7 +243,7 @@ def test_a_keystore_is_decided_as_it_is_signed(keystore: Path, tmp_path: Path) -
     assert "/mux: cannot start with its present files; `sros check` shows why" in ended.out
     # Of the public part of a keystore, the keys are elsewhere; of this one, a key is gone.
     copied = tmp_path / "public"
-    shutil.copytree(keystore, copied, symlinks=True)
+    copy_of(keystore, copied)
     (copied / "enclaves" / "mux" / "key.pem").unlink()
     again = ("check", copied, *ONLY[2:], "--requirements", tmp_path / "must.toml")
     ended = sros(*again)

@@ -18,7 +18,7 @@ import pytest
 
 from tests.conftest import POLICY
 from tests.keystore.test_confirmation import DDS
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.tables import for_every
 from tests.support.verbs import COMMANDS, module_of
 
@@ -89,7 +89,7 @@ def test_work_that_grows_with_the_keystore_shows_progress(verb: str) -> None:
 def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with all that the lines below name; only to be copied."""
     folder = tmp_path_factory.mktemp("table")
-    shutil.copytree(made_keystore, folder / "ks", symlinks=True)
+    copy_of(made_keystore, folder / "ks")
     (folder / "p.xml").write_text(POLICY)
     (folder / "wide.xml").write_text(policy_text({"/a": publish("*")}))
     (folder / "q.xml").write_text(policy_text({"/a": publish("new")}))
@@ -113,7 +113,7 @@ def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ):
         sros(*line.split(), cwd=folder).ok()
     (folder / "damaged/enclaves/a/cert.pem").write_text("damaged")
-    shutil.copytree(folder / "strict", folder / "fleet", symlinks=True)
+    copy_of(folder / "strict", folder / "fleet")
     (folder / "fleet/fleet.toml").write_text('enclaves = ["/{robot}"]\n[robots.a]\n[robots.b]\n')
     for name in ("a", "b"):
         said = sros("fleet", "report", "alone", "--robot", name, cwd=folder).ok()
@@ -189,7 +189,7 @@ def test_the_status_of_every_verb_is_tested() -> None:
 
 @pytest.mark.parametrize("verb", STATUS)
 def test_status(verb: str, made: Path, tmp_path: Path) -> None:
-    folder = shutil.copytree(made, tmp_path / "w", symlinks=True)
+    folder = copy_of(made, tmp_path / "w")
     for wanted in (2, 1, 0):  # what is done last may change the folder
         words = STATUS[verb][wanted]
         if words == NEVER and wanted == 1:

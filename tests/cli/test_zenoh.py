@@ -21,7 +21,7 @@ from sros_tool.policy.rights import NodeName
 from sros_tool.translate_zenoh.rights import StatedRight, remote_of
 from sros_tool.zenoh.access import AccessRule, Flow, Message, Remote, RemoteRights, in_order
 from sros_tool.zenoh.document import parse_configuration
-from tests.support.harness import policy_text, publish, snapshot, sros
+from tests.support.harness import copy_of, policy_text, publish, snapshot, sros
 
 TOKEN = (Message.LIVELINESS_TOKEN,)
 SESSION, ROUTER = "enclaves/a/session.json5", "enclaves/router/router.json5"
@@ -44,7 +44,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "w", symlinks=True))
+    return copy_of(made, tmp_path / "w")
 
 
 def control(folder: Path, path: str) -> Any:

@@ -15,7 +15,7 @@ from sros_tool.keystore.reader import OpenedEnclave
 from sros_tool.pki import smime
 from sros_tool.runtime.environment import NO_CONFIGURATION, REFUSING, render_refusal
 from tests.support.children import importing, run
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.zenoh_configurations import with_rmw_zenoh
 
 PROGRAM = [sys.executable, "-m", "sros_tool"]
@@ -35,7 +35,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def keystore(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "w", symlinks=True), "ks")
+    return Path(copy_of(made, tmp_path / "w"), "ks")
 
 
 def test_the_variables_of_a_session_and_of_a_router(keystore: Path) -> None:

@@ -22,6 +22,7 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.template import load_template
+from tests.support.harness import copy_of
 
 pytestmark = pytest.mark.skipif(not shutil.which("openssl"), reason="the program openssl is needed")
 
@@ -45,7 +46,7 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         export(name, "/a", "/b", keystore=name, at=moment)
     create_enclaves(folder / "ks", ["/c"], now=now)
     export("c", "/c")
-    shutil.copytree(folder / "ks", folder / "restored", symlinks=True)
+    copy_of(folder / "ks", folder / "restored")
     revoke(folder / "ks", ["/c"], now=now)
     export("revoked", "/a", "/b")
     create_enclaves(folder / "restored", ["/d"], now=now)

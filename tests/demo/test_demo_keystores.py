@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +19,7 @@ from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.keystore.layout import CRL_FILE, REQUIRED_FILES
 from tests.demo.test_demo_result import CLOSED, OPEN, TWIN, result
 from tests.demo.weak_robots import GIVEN, OTHERS, OWN_PART, WEAK, WIDEST, Place
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 
 HEARS = '<topics subscribe="ALLOW"><topic>/image</topic></topics>'
 SERVES = '<services reply="ALLOW"><service>/map</service></services>'
@@ -62,7 +61,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 @pytest.fixture
 def place(pair: tuple[Path, Path], tmp_path: Path) -> Place:
     root = tmp_path / "robot"
-    shutil.copytree(pair[0], root, symlinks=True)
+    copy_of(pair[0], root)
     return Place(root, pair[1], "/odd/victim", "/odd/other")
 
 

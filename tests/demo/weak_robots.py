@@ -31,6 +31,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.validity import Window
+from tests.support.harness import copy_of
 
 _DAY = timedelta(days=1)
 _NONE = ProtectionKind.NONE
@@ -152,10 +153,10 @@ def _without_lists(place: Place) -> None:
 def _revoked_and_back(place: Place) -> None:
     """What a thief kept of a revoked enclave is in its place again, and no list tells of it."""
     kept = place.root.parent / "kept"
-    shutil.copytree(place.folder, kept, symlinks=True)
+    copy_of(place.folder, kept)
     revoke(place.root, [place.victim], now=datetime.now(UTC))
     shutil.rmtree(place.folder, ignore_errors=True)
-    shutil.copytree(kept, place.folder, symlinks=True)
+    copy_of(kept, place.folder)
     for file in place.root.glob("enclaves/**/crl.pem"):
         file.unlink()
 

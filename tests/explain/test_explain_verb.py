@@ -18,7 +18,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
-from tests.support.harness import Ended, policy_text, publish, sros, with_includes
+from tests.support.harness import Ended, copy_of, policy_text, publish, sros, with_includes
 from tests.support.long_form import some
 
 POLICY = policies_dir() / "talker_listener.xml"
@@ -32,7 +32,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def keystore(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "ks", symlinks=True))
+    return copy_of(whole, tmp_path / "ks")
 
 
 def explain(*words: object, env: dict[str, str | None] | None = None) -> Ended:
@@ -343,7 +343,7 @@ def test_a_vendor_that_was_never_measured_is_marked(whole: Path) -> None:
 
 def test_faults_of_files_are_not_marked_as_documented(whole: Path, tmp_path: Path) -> None:
     root = tmp_path / "ks"
-    shutil.copytree(whole, root, symlinks=True)
+    copy_of(whole, root)
     asked = (root, ENCLAVE, "publish", "/chatter")
     marks = "(as documented)"
     assert explain(*asked, "--all-vendors").ok().out.count(marks) == 2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import random
-import shutil
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import Rules, policy_rights, unfolded
 from tests.explain.zenoh_policies import NAMES, OTHER_END, WORD, drawn_policy
 from tests.support.children import LONG
-from tests.support.harness import Ended, policy_text, publish, sros
+from tests.support.harness import Ended, copy_of, policy_text, publish, sros
 from tests.support.long_form import some
 
 HERE = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", "TZ": "UTC"}
@@ -51,7 +50,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def keystore(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made / "client", tmp_path / "ks", symlinks=True))
+    return copy_of(made / "client", tmp_path / "ks")
 
 
 def explain(*words: object, env: dict[str, str | None] | None = None) -> Ended:
@@ -183,7 +182,7 @@ def test_reach_follows_the_rules_of_zenoh(made: Path, tmp_path: Path, mode: str)
     assert found == dds
     assert [each["enclave"] for each in found["influences"]] == ["/recorder", "/server", "/wide"]
     if mode == "client":
-        changed = Path(shutil.copytree(made / mode, tmp_path / "ks", symlinks=True))
+        changed = copy_of(made / mode, tmp_path / "ks")
         router = changed / "enclaves/router/router.json5"
         router.write_text(router.read_text().replace("/go/_action/", "/went/_action/", 1))
         assert json.loads(explain(changed, *asked).ok().out) != found
@@ -256,7 +255,7 @@ def test_the_answer_is_by_the_file_as_it_is(keystore: Path) -> None:
 
 
 def test_a_peer_whose_file_is_not_signed_is_named(made: Path, tmp_path: Path) -> None:
-    changed = Path(shutil.copytree(made / "peer", tmp_path / "ks", symlinks=True))
+    changed = copy_of(made / "peer", tmp_path / "ks")
     (changed / "enclaves/listener/session.p7s").unlink()
     found = zenoh(changed, "/talker", "publish", "/chatter")
     assert found["out_of_date"] == ["enclaves/listener/session.p7s"]
@@ -264,7 +263,7 @@ def test_a_peer_whose_file_is_not_signed_is_named(made: Path, tmp_path: Path) ->
 
 def test_a_peer_with_other_rules_is_named(made: Path, tmp_path: Path) -> None:
     """Each peer decides by its own file: one that differs drops what the others let through."""
-    changed = Path(shutil.copytree(made / "peer", tmp_path / "ks", symlinks=True))
+    changed = copy_of(made / "peer", tmp_path / "ks")
     file = changed / "enclaves/listener/session.json5"
     file.write_text(file.read_text().replace("0/chatter/", "0/other/"))
     found = zenoh(changed, "/talker", "publish", "/chatter")
@@ -275,7 +274,7 @@ def test_a_peer_with_other_rules_is_named(made: Path, tmp_path: Path) -> None:
 def test_peers_that_let_through_what_the_router_denies_are_named(
     made: Path, tmp_path: Path
 ) -> None:
-    changed = Path(shutil.copytree(made / "peer", tmp_path / "ks", symlinks=True))
+    changed = copy_of(made / "peer", tmp_path / "ks")
     for name in ("talker", "listener"):
         file = changed / f"enclaves/{name}/session.json5"
         file.write_text(file.read_text().replace("0/chatter/", "0/other/"))
@@ -442,7 +441,7 @@ def test_files_of_other_rights_are_out_of_date_or_answer_the_same(
 def test_rules_of_others_that_do_not_concern_the_question_are_not_compared(
     made: Path, tmp_path: Path, mode: str
 ) -> None:
-    changed = Path(shutil.copytree(made / mode, tmp_path / "ks", symlinks=True))
+    changed = copy_of(made / mode, tmp_path / "ks")
     router = changed / "enclaves/router/router.json5"
     signed = router.with_suffix(".p7s")
     earlier = [(file, file.read_bytes()) for file in (router, signed)]

@@ -22,7 +22,7 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.certificates import identity_of, load_certificate
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.long_form import some
 
 LOGS = Path(__file__).with_name("logs")
@@ -86,7 +86,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def keystore(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "ks", symlinks=True))
+    return copy_of(whole, tmp_path / "ks")
 
 
 def log_of(vendor: str, breakage: str) -> Path:
@@ -865,7 +865,7 @@ def test_how_often_files_are_read_is_not_for_the_log_to_choose(
     keystore: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither by names that the keystore does not have, nor by many topics, nor by a path."""
-    shutil.copytree(keystore, tmp_path / "other", symlinks=True)
+    copy_of(keystore, tmp_path / "other")
     names = [ENCLAVE, *(f"/unknown{n}" for n in range(9)), f"/../../other/enclaves{ENCLAVE}"]
     lines = [
         f"[node-{number}] Found security directory: {keystore}/enclaves{name}\n"

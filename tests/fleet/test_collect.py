@@ -46,7 +46,7 @@ from sros_tool.pki.certificates import Issuer, key_digest, make_request, validit
 from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, load_key
 from sros_tool.validity import BACKDATE, iso
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.messages import key_of, said_by, signed_message
 
 ROBOTS = ("r1", "r2", "r3")
@@ -152,7 +152,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Home:
 
 @pytest.fixture
 def home(made: Home, tmp_path: Path) -> Home:
-    return Home(shutil.copytree(made.folder, tmp_path / "home", symlinks=True))
+    return Home(copy_of(made.folder, tmp_path / "home"))
 
 
 # ── messages ───────────────────────────────────────────────────────────────────────────────
@@ -370,7 +370,7 @@ def test_a_signed_message_that_is_none(home: Home, changed: dict[str, object], w
 
 def lose_revocations(home: Home) -> str:
     """Revoke r2 and an enclave of after the backup, restore the backup; return the list of r1."""
-    backup = shutil.copytree(home.root, home.folder / "backup", symlinks=True)
+    backup = copy_of(home.root, home.folder / "backup")
     home.run("create_enclave", "ks", "/r3/later")
     home.run("revoke", "ks", "/r3/later", "/r2/base", "--reason", "key_compromise")
     home.run("distribute_key", "ks", "--robot", "r1", "r1", "--force")
@@ -407,7 +407,7 @@ def test_what_only_robots_know_to_be_revoked_is_revoked_again(home: Home) -> Non
 
 def test_what_the_ca_signed_counts_in_a_message_that_does_not(home: Home) -> None:
     """Its certificate can be revoked then, and vouches for nothing; its list revokes."""
-    backup = shutil.copytree(home.root, home.folder / "backup", symlinks=True)
+    backup = copy_of(home.root, home.folder / "backup")
     home.run("revoke", "ks", "--robot", "r2")
     home.run("renew", "ks", "/r1/base")
     home.run("distribute_key", "ks", "--robot", "r1", "r1", "--force")
@@ -428,7 +428,7 @@ def test_what_the_ca_signed_counts_in_a_message_that_does_not(home: Home) -> Non
 
 
 def test_a_certificate_of_a_revoked_robot_is_revoked_when_it_becomes_known(home: Home) -> None:
-    backup = shutil.copytree(home.root, home.folder / "backup", symlinks=True)
+    backup = copy_of(home.root, home.folder / "backup")
     home.run("renew", "ks", "/r2/base")
     home.run("distribute_key", "ks", "--robot", "r2", "r2", "--force")
     later = home.certificate("/r2/base")
@@ -453,7 +453,7 @@ def test_a_weak_key_is_not_certified(home: Home) -> None:
 
 def test_a_certificate_that_was_replaced_after_the_backup(home: Home) -> None:
     """Its enclave stays, and gets another one."""
-    backup = shutil.copytree(home.root, home.folder / "backup", symlinks=True)
+    backup = copy_of(home.root, home.folder / "backup")
     home.run("renew", "ks", "/r1/base", "--revoke-old")
     home.run("distribute_key", "ks", "--robot", "r1", "r1", "--force")
     crl = (home.folder / "r1/enclaves/r1/base/crl.pem").read_text()

@@ -8,7 +8,6 @@ The policy that is compared with is made by this file's own text, with the names
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -21,7 +20,7 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
 from tests.support.children import LONG
-from tests.support.harness import snapshot, sros, topics_of
+from tests.support.harness import copy_of, snapshot, sros, topics_of
 
 ROBOTS = sorted(f"r{number}" for number in range(1, 51 if LONG else 17))
 CARRIERS = [name for name in ROBOTS if int(name[1:]) % 2]
@@ -161,7 +160,7 @@ def test_the_keystore_knows_whose_enclave_is_whose(made: Path) -> None:
 
 
 def copied(made: Path, folder: Path) -> Path:
-    return Path(shutil.copytree(made, folder / "w", symlinks=True))
+    return copy_of(made, folder / "w")
 
 
 @pytest.mark.parametrize("name", ["<r7/>", "r7/../r8", "{robot}", 'r7"><x a="', "r7*", "r 7"])

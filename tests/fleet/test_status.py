@@ -30,7 +30,7 @@ from sros_tool.keystore.reader import Keystore, read_certificate
 from sros_tool.pki.certificates import digest
 from sros_tool.validity import iso, parse_iso
 from tests.keystore.test_confirmation import DDS, LIBRARY, hostile
-from tests.support.harness import Ended, policy_text, publish, sros
+from tests.support.harness import Ended, copy_of, policy_text, publish, sros
 from tests.support.messages import said_by, signed_message
 
 ROBOTS = ("r1", "r2", "r3")
@@ -134,7 +134,7 @@ def delivered(tmp_path_factory: pytest.TempPathFactory) -> Field:
 
 @pytest.fixture
 def field(delivered: Field, tmp_path: Path) -> Field:
-    return Field(shutil.copytree(delivered.folder, tmp_path / "field", symlinks=True))
+    return Field(copy_of(delivered.folder, tmp_path / "field"))
 
 
 def test_a_fleet_that_has_all_it_should_have(field: Field) -> None:
@@ -659,7 +659,7 @@ def test_home_is_older_than_its_robots(field: Field) -> None:
     field.deliver(*ROBOTS, restart=[])
     field.run("fleet", "publish", "ks", "pub")
     assert in_force() == {True}
-    backup = shutil.copytree(field.root, field.folder / "backup", symlinks=True)
+    backup = copy_of(field.root, field.folder / "backup")
     assert "at the latest, unless revoked" in field.run("renew", "ks", "--all").err
     field.deliver(*ROBOTS)
     field.run("fleet", "publish", "ks", "pub")
@@ -667,7 +667,7 @@ def test_home_is_older_than_its_robots(field: Field) -> None:
     kept = field.folder / "kept"
     for away in (False, True):
         shutil.rmtree(field.root)
-        shutil.copytree(backup, field.root, symlinks=True)
+        copy_of(backup, field.root)
         if away:
             (field.folder / "pub").rename(kept)
             assert (

@@ -15,7 +15,7 @@ from unittest import mock
 
 from tests.fuzz.corpus import Corpus
 from tests.fuzz.mutations import Mutator
-from tests.support.harness import Ended, sros
+from tests.support.harness import Ended, copy_of, sros
 
 READING = (
     "list_enclaves {ks}",
@@ -196,7 +196,7 @@ class Folders:
         """Run a line; raise `UnexpectedError` for a defect."""
         root = self._place
         shutil.rmtree(root, ignore_errors=True)
-        shutil.copytree(self._corpus.root, root, symlinks=True)
+        copy_of(self._corpus.root, root)
         (root / "out").mkdir()
         for path, _, change in trial.changes:
             with suppress(OSError, ValueError):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -64,6 +63,7 @@ from sros_tool.translate_zenoh.rights import policy_of, rights_behind
 from sros_tool.validity import Window, iso
 from sros_tool.zenoh.document import parse_configuration
 from tests.fuzz.corpus import PASSPHRASE, Corpus
+from tests.support.harness import copy_of
 
 NOW = datetime(2026, 12, 1, tzinfo=UTC)
 WINDOW = Window(NOW, NOW + timedelta(days=1))
@@ -80,7 +80,7 @@ class Place:
     @cached_property
     def keystore(self) -> Path:
         """A copy of the keystore of the corpus."""
-        return shutil.copytree(self.corpus.keystore, self.folder / "ks", symlinks=True)
+        return copy_of(self.corpus.keystore, self.folder / "ks")
 
     @cached_property
     def authority(self) -> x509.Certificate:

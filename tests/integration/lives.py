@@ -29,7 +29,7 @@ from sros_tool.pki.keys import PrivateKey, key_pem
 from sros_tool.runtime.events import EventKind
 from tests.integration.converse import SILENCE, Node, Party
 from tests.support.children import LATE, PATIENCE, apart
-from tests.support.harness import Ended, sros
+from tests.support.harness import Ended, copy_of, sros
 
 LOST, A, B = "/lost", "/a", "/b"
 ENOUGH = 3
@@ -289,7 +289,7 @@ class Life:
         number = len(self.scenes)
         copy = self.folder / f"copy{number}"
         for part in ("enclaves", "public"):
-            shutil.copytree(self.root / part, copy / part, symlinks=True)
+            copy_of(self.root / part, copy / part)
         told = [(A, copy)]
         if others:
             told.append(("/robot", Path(shutil.copytree(self.robot, copy / "robot"))))

@@ -28,7 +28,7 @@ from tests.integration.vendor_oracle import (
     cyclone_vendor,
     with_patience,
 )
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 
 pytestmark = pytest.mark.dds
 
@@ -58,7 +58,7 @@ def broken(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, B
     made = {}
     for each in ALL:
         folder = tmp_path_factory.mktemp("broken")
-        shutil.copytree(sound, folder / "ks", symlinks=True)
+        copy_of(sound, folder / "ks")
         shutil.copy(sound.with_name("policy.xml"), folder)
         made[each.name] = Bench(folder / "ks", datetime.now(UTC).replace(microsecond=0))
         each.work(made[each.name])

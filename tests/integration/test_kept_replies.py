@@ -15,7 +15,7 @@ from sros_tool.pki.keys import load_key
 from tests.integration.kept import replies
 from tests.integration.kept.forms import form_of
 from tests.integration.kept.replies import AGAIN, answered
-from tests.support.harness import certificate, policy_text, publish, sros
+from tests.support.harness import certificate, copy_of, policy_text, publish, sros
 from tests.support.long_form import drawn
 
 NOW = datetime.now(UTC)
@@ -88,7 +88,7 @@ CHANGES: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_differs_has_another_form(change: str, first: Path, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(first, tmp_path / "ks", symlinks=True))
+    root = copy_of(first, tmp_path / "ks")
     assert form(root) == form(first)
     CHANGES[change](root)
     assert form(root) != form(first)

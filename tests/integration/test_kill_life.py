@@ -21,7 +21,7 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import Keystore, open_enclave
 from tests.integration.kills import Moments, Server, server
-from tests.support.harness import check_whole, remains
+from tests.support.harness import check_whole, copy_of, remains
 from tests.support.long_form import ONLY_LONG, few_steps
 
 __all__ = ["server"]
@@ -161,7 +161,7 @@ def in_child(verb: Callable[[], object], at: int = 0) -> tuple[int, int]:
 def copy(source: Path, target: Path) -> Path:
     if target.exists():
         shutil.rmtree(target)
-    return Path(shutil.copytree(source, target, symlinks=True))
+    return copy_of(source, target)
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -35,7 +35,7 @@ from tests.integration.kept.forms import form_of
 from tests.integration.kept.replies import answered
 from tests.integration.vendor_oracle import MATCH_SECONDS, cyclone_stack, cyclone_vendor
 from tests.support.children import LATE, run
-from tests.support.harness import certificate, policy_text, publish
+from tests.support.harness import certificate, copy_of, policy_text, publish
 from tests.support.long_form import ONLY_LONG
 
 pytestmark = pytest.mark.dds
@@ -178,7 +178,7 @@ def permit(root: Path, policies: dict[str, str]) -> None:
 
 
 def copy(root: Path, name: str) -> Path:
-    return Path(shutil.copytree(root, root.with_name(name), symlinks=True))
+    return copy_of(root, root.with_name(name))
 
 
 @pytest.mark.parametrize("template", [pytest.param("development", marks=ONLY_LONG), "production"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -19,6 +18,7 @@ from sros_tool.keystore.template import load_template
 from tests.integration.restarts import play
 from tests.integration.test_life_on_dds import HEARD, SILENT, Question, ask_fast, compare, probe
 from tests.support.children import apart
+from tests.support.harness import copy_of
 from tests.support.long_form import ONLY_LONG
 
 __all__ = ["probe"]
@@ -90,10 +90,10 @@ def moments(root: Path, steps: int) -> list[Path]:
     A process goes on with what it read when it was started, so whoever has not been restarted
     since is one that is started with the copy.
     """
-    copies = [Path(shutil.copytree(root, root.with_name("before"), symlinks=True))]
+    copies = [copy_of(root, root.with_name("before"))]
     for step in range(steps):
         rotate_ca(root, now=datetime.now(UTC))
-        copies.append(Path(shutil.copytree(root, root.with_name(f"after{step}"), symlinks=True)))
+        copies.append(copy_of(root, root.with_name(f"after{step}")))
     return copies
 
 
@@ -121,6 +121,6 @@ def test_the_stages_on_fast_dds(template: str, revoked: bool, probe: Path, tmp_p
 def test_a_ca_with_the_same_key_disturbs_nobody_on_fast_dds(probe: Path, tmp_path: Path) -> None:
     root = tmp_path / "ks"
     make(root, "production", revoked=True)
-    before = Path(shutil.copytree(root, tmp_path / "before", symlinks=True))
+    before = copy_of(root, tmp_path / "before")
     renew_identity_ca(root, now=datetime.now(UTC))
     talk(probe, HEARD, (before, root), (root, before), (root, root))

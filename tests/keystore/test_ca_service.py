@@ -40,7 +40,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.crl import Revoked, sign_crl
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.validity import Window, parse_iso
-from tests.support.harness import certificate, policy_text, publish, snapshot, sros
+from tests.support.harness import certificate, copy_of, policy_text, publish, snapshot, sros
 from tests.support.messages import key_of, said_by, signed_message
 
 DAY = timedelta(days=1)
@@ -110,7 +110,7 @@ def made_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def site(made_site: Path, tmp_path: Path, install: Install) -> Path:
     install(office(tmp_path))
     shutil.copy(made_site / "asked", tmp_path)
-    return Path(shutil.copytree(made_site / "site", tmp_path / "site", symlinks=True))
+    return copy_of(made_site / "site", tmp_path / "site")
 
 
 def test_the_service_issues_and_the_permissions_ca_signs(

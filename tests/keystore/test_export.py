@@ -27,7 +27,7 @@ from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
-from tests.support.harness import policy_text, publish, snapshot, sros
+from tests.support.harness import copy_of, policy_text, publish, snapshot, sros
 
 NOW = datetime.now(UTC)
 NAMES = ("/arm/camera", "/arm/gripper", "/armada", "/base")
@@ -49,7 +49,7 @@ def made_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def fleet(made_fleet: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made_fleet, tmp_path / "ks", symlinks=True))
+    return copy_of(made_fleet, tmp_path / "ks")
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
 from hashlib import sha256
 from pathlib import Path
@@ -15,7 +14,7 @@ from sros_tool.fleet import robots
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.fleet import left_enclaves
 from sros_tool.keystore.layout import list_enclaves
-from tests.support.harness import Ended, policy_text, publish, snapshot, sros
+from tests.support.harness import Ended, copy_of, policy_text, publish, snapshot, sros
 
 FLEET = "[robots]\na = {}\na_arm = {}\n"
 
@@ -38,7 +37,7 @@ def generate(folder: Path, path: str) -> Ended:
 def test_a_forged_record_does_not_hide_an_edit(made: Path, tmp_path: Path) -> None:
     """A line that fits into the chain, but that no head signs, says nothing of the fleet."""
     root = tmp_path / "ks"
-    shutil.copytree(made / "ks", root, symlinks=True)
+    copy_of(made / "ks", root)
     sros("distribute_key", root, "--robot", "a", tmp_path / "before").ok()
     file, ledger = root / "fleet.toml", root / "ledger.jsonl"
     file.write_text(file.read_text().replace('"/{robot}"', '"/{robot}", "/{robot}_arm"'))
@@ -118,7 +117,7 @@ def of_robot(root: Path, robot: str) -> dict[str, Any]:
 def test_what_lies_below_a_robot_is_revoked_with_it(unknown: Path, tmp_path: Path) -> None:
     """No enclave of a stolen robot goes on in silence because no policy of the fleet has it."""
     root = tmp_path / "ks"
-    shutil.copytree(unknown / "ks", root, symlinks=True)
+    copy_of(unknown / "ks", root)
     before = of_robot(root, "r3")
     assert before["enclaves"] == 1
     assert before["unrecorded"] == ["/r3", "/r3/deep/er"]
@@ -146,7 +145,7 @@ def test_what_lies_below_a_robot_is_revoked_with_it(unknown: Path, tmp_path: Pat
 def test_what_is_left_below_a_robot_is_revoked_later(unknown: Path, tmp_path: Path) -> None:
     """Also when all enclaves that the fleet records are revoked already."""
     root = tmp_path / "ks"
-    shutil.copytree(unknown / "ks", root, symlinks=True)
+    copy_of(unknown / "ks", root)
     sros("revoke", root, "/r3/a").ok()
     assert "revoked enclave /r3/deep/er" in sros("revoke", root, "--robot", "r3").ok().out
     ended = sros("revoke", root, "--robot", "r3")
@@ -159,7 +158,7 @@ def test_a_request_that_is_signed_for_a_fleet_is_recorded(
 ) -> None:
     """The enclave is that of its robot from then on, in its domain."""
     root = tmp_path / "ks"
-    shutil.copytree(made / "ks", root, symlinks=True)
+    copy_of(made / "ks", root)
     sros("create_request", "/cams/a", tmp_path / "robot").ok()
     (tmp_path / "fleet.toml").write_text(FLEET)
     (tmp_path / "policy.xml").write_text(policy_text({"/cams/{robot}": publish("x")}))
@@ -176,7 +175,7 @@ def test_a_request_that_is_signed_for_a_fleet_is_recorded(
 def test_a_request_for_robots_that_the_keystore_does_not_know(made: Path, tmp_path: Path) -> None:
     """It is signed, and the user hears that no `--robot` chooses the enclave."""
     root = tmp_path / "ks"
-    shutil.copytree(made / "ks", root, symlinks=True)
+    copy_of(made / "ks", root)
     sros("create_request", "/new", tmp_path / "robot").ok()
     (tmp_path / "fleet.toml").write_text("[robots.new]\n")
     (tmp_path / "policy.xml").write_text(policy_text({"/{robot}": publish("x")}))

@@ -18,7 +18,7 @@ from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.pki.certificates import make_request
 from sros_tool.pki.keys import load_key
-from tests.support.harness import certificate, snapshot
+from tests.support.harness import certificate, copy_of, snapshot
 
 NOW = datetime.now(UTC) + timedelta(hours=1)  # later than the keystore that is copied
 
@@ -96,12 +96,12 @@ def test_an_enclave_with_a_revoked_key_is_not_certified_again(
     verb: str, name: str, keystore: Path, tmp_path: Path
 ) -> None:
     """The enclave came back from a backup, or had the same key as the revoked one."""
-    shutil.copytree(keystore / "enclaves/a", tmp_path / "backup", symlinks=True)
+    copy_of(keystore / "enclaves/a", tmp_path / "backup")
     if name == "/b":
         share_key(keystore)
     revoke(keystore, ["/a"], now=NOW)
     if name == "/a":
-        shutil.copytree(tmp_path / "backup", keystore / "enclaves/a", symlinks=True)
+        copy_of(tmp_path / "backup", keystore / "enclaves/a")
         shutil.rmtree(keystore / "revoked")
     before = snapshot(keystore)
     with pytest.raises(KeystoreError, match=f"key of enclave {name} was revoked"):

@@ -25,7 +25,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, make_request
 from sros_tool.pki.keys import generate_key, load_key
 from tests.support.children import run
-from tests.support.harness import certificate, policy_text, publish, sros
+from tests.support.harness import certificate, copy_of, policy_text, publish, sros
 
 NOW = datetime.now(UTC)
 FIRST = 5  # before the first certificate: two CAs, governance, settings; it is the fifth
@@ -43,7 +43,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def root(made_once: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made_once, tmp_path / "ks", symlinks=True))
+    return copy_of(made_once, tmp_path / "ks")
 
 
 def lines_of(root: Path) -> list[bytes]:

@@ -27,7 +27,7 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.certificates import make_request
 from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import generate_key, load_key
-from tests.support.harness import certificate, remains
+from tests.support.harness import certificate, copy_of, remains
 from tests.support.long_form import some
 
 NOW = datetime.now(UTC) + timedelta(hours=1)
@@ -190,7 +190,7 @@ def test_an_index_of_an_earlier_state_is_not_believed(root: Path) -> None:
 
 
 def test_a_restored_keystore_has_its_own_index(root: Path, tmp_path: Path) -> None:
-    backup = Path(shutil.copytree(root, tmp_path / "backup", symlinks=True))
+    backup = copy_of(root, tmp_path / "backup")
     renew(root, ["/a"], now=NOW)
     shutil.copy(root / LEDGER_INDEX, backup / LEDGER_INDEX)
     assert not is_indexed(backup)

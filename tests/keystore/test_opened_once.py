@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import errno
 import re
-import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from cryptography import x509
 
 from sros_tool.pki import certificates, crl, smime
 from tests.support import opens
-from tests.support.harness import forked, sros
+from tests.support.harness import copy_of, forked, sros
 from tests.support.long_form import some
 from tests.support.opens import can_count, count_opens
 
@@ -82,7 +81,7 @@ def test_a_question_opens_each_file_once(words: tuple[str, ...], folder: Path) -
 @pytest.fixture
 def changed(folder: Path, tmp_path: Path) -> Path:
     """A folder with a copy of the keystore, to be changed."""
-    shutil.copytree(folder, tmp_path / "changed", symlinks=True)
+    copy_of(folder, tmp_path / "changed")
     (tmp_path / "changed/more.xml").write_text(POLICY.replace('path="/e', 'path="/more/e'))
     return tmp_path / "changed"
 

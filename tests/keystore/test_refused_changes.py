@@ -25,7 +25,7 @@ from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.wording import enumerated
 from tests.support.children import run
-from tests.support.harness import Ended, sros
+from tests.support.harness import Ended, copy_of, sros
 
 CA, SIGNS = "basicConstraints=critical,CA:TRUE", "keyCertSign,digitalSignature"
 PSS = ("-sigopt", "rsa_padding_mode:pss", "-sigopt", "rsa_pss_saltlen:-1")
@@ -263,7 +263,7 @@ def test_what_is_staged_is_evaluated(
     tmp_path: Path,
 ) -> None:
     root, other = tmp_path / "ks", tmp_path / "other"
-    shutil.copytree(sound, root, symlinks=True)
+    copy_of(sound, root)
     create_keystore(other, template=load_template("production"), now=now())
     create_enclaves(other, ["/a", "/b"], now=now())
     with Transaction(root, dry_run=dry_run) as transaction:
@@ -281,7 +281,7 @@ def test_what_is_staged_is_evaluated(
 def test_an_enclave_that_was_broken_before_hides_no_other_one(sound: Path, tmp_path: Path) -> None:
     """Enclaves of the same kind are evaluated by one of them: by one that starts today."""
     root, other = tmp_path / "ks", tmp_path / "other"
-    shutil.copytree(sound, root, symlinks=True)
+    copy_of(sound, root)
     create_keystore(other, template=load_template("production"), now=now())
     shutil.copy(enclave_path(root, "/b") / "permissions.p7s", enclave_path(root, "/a"))
     with Transaction(root) as transaction:
@@ -295,10 +295,10 @@ def test_a_revoked_enclave_that_is_put_back_keeps_nobody_from_signing_a_list(
 ) -> None:
     """Twin: enclaves that were not revoked stop a change that lets vendors refuse them."""
     root, kept = tmp_path / "ks", tmp_path / "kept"
-    shutil.copytree(sound, root, symlinks=True)
-    shutil.copytree(enclave_path(root, "/a"), kept, symlinks=True)
+    copy_of(sound, root)
+    copy_of(enclave_path(root, "/a"), kept)
     sros("revoke", root, "/a").ok()
-    shutil.copytree(kept, enclave_path(root, "/a"), symlinks=True)
+    copy_of(kept, enclave_path(root, "/a"))
     for file in root.glob("enclaves/**/crl.pem"):
         file.unlink()
     create_keystore(other := tmp_path / "other", template=load_template("production"), now=now())
@@ -315,8 +315,8 @@ def test_a_revoked_enclave_that_is_put_back_keeps_nobody_from_signing_a_list(
 def test_a_list_that_comes_back_from_a_robot_is_signed_again(sound: Path, tmp_path: Path) -> None:
     """A keystore from a backup knows of a revocation only by the list that a robot still has."""
     root, backup = tmp_path / "ks", tmp_path / "backup"
-    shutil.copytree(sound, backup, symlinks=True)
-    shutil.copytree(sound, root, symlinks=True)
+    copy_of(sound, backup)
+    copy_of(sound, root)
     sros("revoke", root, "/a").ok()
     shutil.copy(root / "enclaves/b/crl.pem", backup / CRL)
     ended = sros("crl", backup, "--refresh").ok()
@@ -331,7 +331,7 @@ def test_a_dry_run_says_what_it_did_not_keep(
 ) -> None:
     """Twin: without the limit, what it would do is refused."""
     root, other = tmp_path / "ks", tmp_path / "other"
-    shutil.copytree(sound, root, symlinks=True)
+    copy_of(sound, root)
     create_keystore(other, template=load_template("production"), now=now())
     with Transaction(root, dry_run=True) as transaction:
         _break_governance(transaction, other)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import io
 import os
-import shutil
 import stat
 import tarfile
 from collections.abc import Callable
@@ -41,7 +40,15 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.keys import generate_key
 from sros_tool.policy.document import read_policy
 from tests.support.children import run
-from tests.support.harness import certificate, policy_text, publish, remains, snapshot, topics_of
+from tests.support.harness import (
+    certificate,
+    copy_of,
+    policy_text,
+    publish,
+    remains,
+    snapshot,
+    topics_of,
+)
 from tests.support.long_form import some
 
 NOW = datetime.now(UTC)
@@ -64,7 +71,7 @@ def made_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def home(made_home: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made_home, tmp_path / "ks", symlinks=True))
+    return copy_of(made_home, tmp_path / "ks")
 
 
 @pytest.fixture
@@ -635,7 +642,7 @@ def test_an_earlier_governance_in_an_answer_is_refused(home: Path, robot: Path) 
     """An earlier governance has a valid signature; only the signed file list excludes it."""
     files = unpack(sign(home, robot).archive)
     earlier = home.parent / "earlier"
-    shutil.copytree(home, earlier, symlinks=True)
+    copy_of(home, earlier)
     again = unpack(sign(earlier, robot, renew=True).archive)
     path = f"{FOLDER}/governance.p7s"
     resigned = files[path].replace(b'micalg="sha-256"', b"micalg=sha-256")

@@ -29,6 +29,7 @@ from tests.support.children import run
 from tests.support.harness import (
     certificate,
     check_whole,
+    copy_of,
     made_once,
     policy_text,
     publish,
@@ -207,9 +208,9 @@ def test_a_policy_alone_makes_no_revoked_enclave_again(ledger: str, tmp_path: Pa
 
 def test_put_back_and_revoked_again(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a", "/b")
-    kept = Path(shutil.copytree(root / "enclaves/a", tmp_path / "kept", symlinks=True))
+    kept = copy_of(root / "enclaves/a", tmp_path / "kept")
     revoke(root, ["/a"], now=NOW)
-    shutil.copytree(kept, root / "enclaves/a", symlinks=True)
+    copy_of(kept, root / "enclaves/a")
     revoke(root, ["/a"], now=NOW + DAY)
     (entry,) = crl_of(root).revoked
     assert entry.date == NOW

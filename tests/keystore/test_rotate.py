@@ -34,6 +34,7 @@ from tests.keystore.test_transaction import DIED, in_child
 from tests.support import made_by_ros2
 from tests.support.harness import (
     check_enclave_whole,
+    copy_of,
     made_once,
     policy_text,
     publish,
@@ -190,7 +191,7 @@ def test_names_of_new_cas(separate: Path) -> None:
 
 def test_all_at_once_from_every_stage(root: Path, tmp_path: Path) -> None:
     for steps in range(3):
-        copy = Path(shutil.copytree(root, tmp_path / f"copy{steps}", symlinks=True))
+        copy = copy_of(root, tmp_path / f"copy{steps}")
         for _ in range(steps):
             rotate_ca(copy, now=NOW)
         step = rotate_ca(copy, finish=True, now=NOW)
@@ -532,7 +533,7 @@ def test_death_at_every_step(stage: RotationStage | None, tmp_path: Path) -> Non
 
     def fresh() -> Path:
         shutil.rmtree(work, ignore_errors=True)
-        return Path(shutil.copytree(base, work, symlinks=True))
+        return copy_of(base, work)
 
     def verb(root: Path) -> Callable[[], RotationStep]:
         return lambda: rotate_ca(root, stage, now=NOW, finish=stage is None)

@@ -30,7 +30,7 @@ from sros_tool.pki.certificates import make_request
 from sros_tool.pki.keys import generate_key, load_key
 from tests.keystore.test_ledger_index import check_answers, is_indexed
 from tests.keystore.test_transaction import DIED, in_child
-from tests.support.harness import check_whole, remains, snapshot, sros
+from tests.support.harness import check_whole, copy_of, remains, snapshot, sros
 from tests.support.long_form import few_steps, some
 
 NOW = datetime.now(UTC) + timedelta(hours=1)
@@ -48,7 +48,7 @@ def index_all(monkeypatch: pytest.MonkeyPatch) -> None:
 def sealed(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A keystore whose ledger has two sealed parts; the first one has all but a renewal."""
     root = tmp_path_factory.mktemp("sealed") / "ks"
-    shutil.copytree(made_keystore, root, symlinks=True)
+    copy_of(made_keystore, root)
     with pytest.MonkeyPatch.context() as patched:
         index_all(patched)
         for sealed_from in (1, 1 << 30, 1, 1 << 30):
@@ -61,7 +61,7 @@ def sealed(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 def root(sealed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of ``sealed``, to be changed."""
     index_all(monkeypatch)
-    return Path(shutil.copytree(sealed, tmp_path / "ks", symlinks=True))
+    return copy_of(sealed, tmp_path / "ks")
 
 
 def parts(root: Path) -> list[str]:
@@ -201,14 +201,14 @@ def test_death_at_every_step_of_sealing(
     work = tmp_path / "work"
     lines = Keystore(root).ledger.lines
     (root / LEDGER_INDEX).unlink()  # it is made again first; then saved with the new lines
-    shutil.copytree(root, work, symlinks=True)
+    copy_of(root, work)
     status, steps = in_child(lambda: change(work))
     assert status == 0
     assert len(parts(work)) == 4
     done = set()
     for step in few_steps(steps):
         shutil.rmtree(work)
-        shutil.copytree(root, work, symlinks=True)
+        copy_of(root, work)
         assert in_child(lambda: change(work), step)[0] in (DIED, 0)
         ledger = Keystore(work).ledger
         assert ledger.gaps == (), step
@@ -260,7 +260,7 @@ def test_a_damaged_index_is_made_again_at_once(
 
 
 def test_a_copy_without_the_link_goes_on(root: Path, tmp_path: Path) -> None:
-    copied = Path(shutil.copytree(root, tmp_path / "copied", symlinks=True))
+    copied = copy_of(root, tmp_path / "copied")
     (copied / LEDGER).unlink()
     shutil.copy(copied / ledger_part(3), copied / LEDGER)
     before = (copied / LEDGER_HEAD).read_bytes()
@@ -314,7 +314,7 @@ def test_what_an_earlier_ledger_lacks_is_not_forgotten(
 ) -> None:
     """The revocation list knows the certificate, and later parts are not written over."""
     key = load_key((root / "enclaves/b/key.pem").read_bytes(), "of the test")
-    earlier = Path(shutil.copytree(root, tmp_path / "earlier", symlinks=True))
+    earlier = copy_of(root, tmp_path / "earlier")
     revoke(root, ["/b"], now=NOW)
     put_ledger_back(root, earlier)
     with pytest.raises(KeystoreError, match="was revoked"):
@@ -323,7 +323,7 @@ def test_what_an_earlier_ledger_lacks_is_not_forgotten(
         sign_request(root, make_request(generate_key(), "/b"), now=NOW)
     sign_request(root, make_request(generate_key(), "/other"), now=NOW)
 
-    earlier = Path(shutil.copytree(root, tmp_path / "later", symlinks=True))
+    earlier = copy_of(root, tmp_path / "later")
     monkeypatch.setattr(ledger_module, "_SEALED_FROM", 1)
     create_enclaves(root, ["/c"], now=NOW)
     revoke(root, ["/c"], now=NOW)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.keystore.reader import Keystore
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.long_form import some
 from tests.support.made_by_ros2 import RELEASES, make
 
@@ -87,10 +87,10 @@ def test_the_first_write_takes_it_over_and_says_so(words: tuple[str, ...], tmp_p
 
 def test_an_enclave_that_ros2_adds_later_is_one_finding(tmp_path: Path) -> None:
     root = made_by_ros2(tmp_path / "ks")
-    shutil.copytree(root, tmp_path / "with", symlinks=True)
+    copy_of(root, tmp_path / "with")
     shutil.rmtree(root / "enclaves/b")
     sros("update_keystore", root, "--template", "sros2").ok()
-    shutil.copytree(tmp_path / "with/enclaves/b", root / "enclaves/b", symlinks=True)
+    copy_of(tmp_path / "with/enclaves/b", root / "enclaves/b")
     ended = sros("check", root, "--severity", "warning")
     assert paragraphs(ended.out) == 2, ended.out
     assert "an enclave that the keystore never issued" in " ".join(ended.out.split())

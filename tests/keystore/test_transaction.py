@@ -45,7 +45,15 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from tests.support.children import some_steps
-from tests.support.harness import check_whole, policy_text, publish, remains, snapshot, topics_of
+from tests.support.harness import (
+    check_whole,
+    copy_of,
+    policy_text,
+    publish,
+    remains,
+    snapshot,
+    topics_of,
+)
 from tests.support.long_form import some
 
 NOW = datetime.now(UTC)
@@ -343,7 +351,7 @@ class Stage:
     def __init__(self, scenario: Scenario, made_keystore: Path, folder: Path) -> None:
         self.prepared = folder / "prepared"
         self.prepared.mkdir()
-        shutil.copytree(made_keystore, self.prepared / "ks", symlinks=True)
+        copy_of(made_keystore, self.prepared / "ks")
         policy(self.prepared)
         scenario.prepare(self.prepared)
         self._work = folder / "work"
@@ -351,7 +359,7 @@ class Stage:
     def fresh(self) -> Path:
         if self._work.exists():
             shutil.rmtree(self._work)
-        return Path(shutil.copytree(self.prepared, self._work, symlinks=True))
+        return copy_of(self.prepared, self._work)
 
 
 @pytest.fixture
@@ -398,7 +406,7 @@ def test_death_while_recovering_from_death(name: str, stage: Stage) -> None:
         stopped = w.with_name("stopped")
         w.rename(stopped)
         for second in range(1, 36, 3):
-            shutil.copytree(stopped, w, symlinks=True)
+            copy_of(stopped, w)
             in_child(lambda w=w: again(scenario, w), second)  # type: ignore[misc]
             check_moment(scenario, w, stage.prepared)
             again(scenario, w)

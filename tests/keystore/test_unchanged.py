@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -24,7 +23,15 @@ from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
-from tests.support.harness import check_whole, policy_text, publish, snapshot, sros, topics_of
+from tests.support.harness import (
+    check_whole,
+    copy_of,
+    policy_text,
+    publish,
+    snapshot,
+    sros,
+    topics_of,
+)
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 DAY = timedelta(days=1)
@@ -46,7 +53,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "w", symlinks=True))
+    return copy_of(made, tmp_path / "w")
 
 
 def state(folder: Path, now: datetime = NOW, *, revoke_old: bool = False) -> Creation:
@@ -254,11 +261,11 @@ def test_whoever_asks_for_it_gets_everything_signed_again(folder: Path) -> None:
 
 def test_a_revoked_enclave_that_was_put_back_is_refused(folder: Path) -> None:
     root, backup = folder / "ks", folder / "backup"
-    shutil.copytree(root / "enclaves/a", backup, symlinks=True)
+    copy_of(root / "enclaves/a", backup)
     revoke(root, ["/a"], now=NOW)
     with pytest.raises(KeystoreError, match="a policy names /a, revoked"):
         state(folder)
-    shutil.copytree(backup, root / "enclaves/a", symlinks=True)
+    copy_of(backup, root / "enclaves/a")
     before = snapshot(root)
     with pytest.raises(KeystoreError, match="the key of enclave /a was revoked"):
         state(folder)

@@ -49,6 +49,7 @@ from tests.support.harness import (
     certificate,
     check_enclave_whole,
     check_whole,
+    copy_of,
     policy_text,
     publish,
     remains,
@@ -82,7 +83,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def root(made: Path, tmp_path: Path) -> Path:
     shutil.copy(made.with_name("policy.xml"), tmp_path)
-    return Path(shutil.copytree(made, tmp_path / "ks", symlinks=True))
+    return copy_of(made, tmp_path / "ks")
 
 
 def change(root: Path, *values: tuple[str, str], **options: object) -> KeystoreUpdate:

@@ -18,7 +18,7 @@ from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.layout import PERMISSIONS, SEAL
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki.keys import load_key
-from tests.support.harness import Ended, policy_text, publish, snapshot, sros
+from tests.support.harness import Ended, copy_of, policy_text, publish, snapshot, sros
 from tests.support.long_form import sometimes
 
 SESSION, SIGNED = "session.json5", "session.p7s"
@@ -40,7 +40,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "w", symlinks=True))
+    return copy_of(made, tmp_path / "w")
 
 
 def runs(folder: Path, root: str, name: str) -> Ended:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.zenoh_permissions import rights_in_domain
 from sros_tool.pki import smime
 from sros_tool.zenoh.configuration import ZenohNetwork
-from tests.support.harness import policy_text, publish, snapshot, sros
+from tests.support.harness import copy_of, policy_text, publish, snapshot, sros
 from tests.support.long_form import some
 
 FIRST = policy_text({"/a": publish("/x"), "/b": publish("/y")})
@@ -44,7 +43,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "w", symlinks=True))
+    return copy_of(made, tmp_path / "w")
 
 
 def in_step(root: Path) -> None:

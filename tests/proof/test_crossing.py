@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.proof.test_review import Change
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 
 OFFICE = publish("/fleet/state", "/r1/scan").replace("publish", "subscribe")
 POLICY = policy_text({"/r1/base": publish("/fleet/state", "/r1/scan"), "/office": OFFICE})
@@ -25,7 +25,7 @@ def routed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sros("create_keystore", "narrow", cwd=folder).ok()
     sros("generate_artifacts", "-k", "narrow", "-p", "robot.xml", cwd=folder).ok()
     sros("zenoh", "narrow", *ROUTERS, cwd=folder).ok()
-    shutil.copytree(folder / "narrow", folder / "wide", symlinks=True)
+    copy_of(folder / "narrow", folder / "wide")
     sros("zenoh", "narrow", "--cross", "/fleet/*", cwd=folder).ok()
     return folder
 
@@ -85,7 +85,7 @@ def test_what_crosses_in_a_keystore_is_compared(
     routed: Path, tmp_path: Path, change: Callable[[Path, Path], None], status: int, said: str
 ) -> None:
     keystore = tmp_path / "head"
-    shutil.copytree(routed / "narrow", keystore, symlinks=True)
+    copy_of(routed / "narrow", keystore)
     change(keystore, routed)
     ended = no_new_access(routed, "narrow", str(keystore))
     assert (ended[0], said in ended[1]) == (status, True), ended
@@ -95,7 +95,7 @@ def test_a_router_that_is_gone_lets_all_pass_only_where_that_was_limited(
     routed: Path, tmp_path: Path
 ) -> None:
     for name, cause in (("narrow", True), ("wide", False)):
-        shutil.copytree(routed / name, tmp_path / name, symlinks=True)
+        copy_of(routed / name, tmp_path / name)
         sros("zenoh", name, "--router", f"{NAME}=", cwd=tmp_path).ok()
         status, said = no_new_access(routed, name, str(tmp_path / name))
         assert status == 1
@@ -121,7 +121,7 @@ FOUND = frozenset({"requirement.not-crossing"})
 def test_requirements_and_pictures_know_of_routers(routed: Path, tmp_path: Path) -> None:
     """On DDS, and with all names crossing, the one influences the other; with none, it does not."""
     (tmp_path / "robot.toml").write_text(REQUIRED)
-    shutil.copytree(routed / "narrow", tmp_path / "none", symlinks=True)
+    copy_of(routed / "narrow", tmp_path / "none")
     sros("zenoh", "none", "--cross", "/nothing", cwd=tmp_path).ok()
     scan, state = (f"/r1/base -publish {name}-> /office" for name in ("/r1/scan", "/fleet/state"))
     kept = "/r1/scan does not pass between routers from /r1/base to /office"
@@ -146,7 +146,7 @@ def test_a_review_compares_what_crosses(routed: Path, tmp_path: Path) -> None:
     said = f"crossing of router {NAME}"
     for number, keystore in enumerate(("narrow", "narrow", "wide")):
         shutil.rmtree(reviewed, ignore_errors=True)
-        shutil.copytree(routed / keystore, reviewed, symlinks=True)
+        copy_of(routed / keystore, reviewed)
         for key in [*reviewed.glob("**/key.pem"), *reviewed.glob("**/*.key.pem")]:
             key.unlink()
         change.commit({"README": str(number)})

@@ -20,7 +20,7 @@ from sros_tool.pki.certificates import load_certificate, validity_of
 from sros_tool.pki.crl import load_crl, sign_crl
 from sros_tool.pki.keys import load_key
 from sros_tool.proof.worlds import Side, Topics, named
-from tests.support.harness import sros
+from tests.support.harness import copy_of, sros
 
 POLICY = """<policy version="0.2.0"><enclaves>
 <enclave path="/web"><profiles><profile ns="/" node="web">
@@ -229,7 +229,7 @@ def test_no_requirement_holds_that_does_not(
     sound: Path, change: Callable[[Path], None], said: str
 ) -> None:
     keystore = sound / f"req-{change.__name__}"
-    shutil.copytree(sound / "ks", keystore, symlinks=True)
+    copy_of(sound / "ks", keystore)
     change(keystore)
     status, text = required(sound, keystore.name)
     assert status == (1 if said.startswith("/") else 2), text
@@ -364,7 +364,7 @@ def a_certificate_of_another_name(keystore: Path) -> None:
 
 def in_a_dot_folder(keystore: Path) -> None:
     """DDS loads an enclave from any folder."""
-    shutil.copytree(keystore / "enclaves/web", keystore / "enclaves/.h", symlinks=True)
+    copy_of(keystore / "enclaves/web", keystore / "enclaves/.h")
     for each in (keystore / "enclaves/.h").glob("*.json5"):
         each.unlink()
 
@@ -422,7 +422,7 @@ OPEN_SETTINGS = [
 @pytest.mark.parametrize(("path", "value", "said"), OPEN_SETTINGS)
 def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, said: str) -> None:
     keystore = sound / f"set-{path.replace('/', '-')}"
-    shutil.copytree(sound / "ks", keystore, symlinks=True)
+    copy_of(sound / "ks", keystore)
     setting(path, value)(keystore)
     authority = load_certificate((keystore / "public/permissions_ca.cert.pem").read_bytes(), "")
     key = load_key((keystore / "private/permissions_ca.key.pem").read_bytes(), "")
@@ -492,7 +492,7 @@ def test_new_access_is_found_or_not_compared(
     sound: Path, change: Callable[[Path], None], status: int, said: str
 ) -> None:
     keystore = sound / f"new-{change.__name__}"
-    shutil.copytree(sound / "ks", keystore, symlinks=True)
+    copy_of(sound / "ks", keystore)
     change(keystore)
     ended = sros("diff_policy", "--no-new-access", "ks", keystore.name, cwd=sound)
     assert ended.status == status, ended
@@ -501,7 +501,7 @@ def test_new_access_is_found_or_not_compared(
 
 def test_an_enclave_that_does_not_start_is_not_able_to_do_anything(sound: Path) -> None:
     keystore = sound / "idle"
-    shutil.copytree(sound / "ks", keystore, symlinks=True)
+    copy_of(sound / "ks", keystore)
     (sound / "must.toml").write_text('[[must]]\npublish = ["/cmd_vel"]\nenclave = "/mux"\n')
     words = ("check", "idle", "--requirements", "must.toml", "--include", "requirement.*")
     assert sros(*words, cwd=sound).status == 0

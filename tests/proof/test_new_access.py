@@ -44,7 +44,7 @@ from tests.proof.drawn_sides import (
 )
 from tests.proof.drawn_sides import write as write_side
 from tests.support.children import LONG
-from tests.support.harness import policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.long_form import SEED as DRAWN
 from tests.support.long_form import some
 
@@ -680,7 +680,7 @@ def lent(tmp_path_factory: pytest.TempPathFactory) -> Bench:
 def test_a_certificate_that_fits_the_permissions_of_another_one(lent: Bench) -> None:
     """The subject of a grant cannot hide whose permissions fit the certificate."""
     head = Bench(lent.root.with_name("head"), lent.now)
-    shutil.copytree(lent.root, head.root, symlinks=True)
+    copy_of(lent.root, head.root)
     head.issue("mux", subject=name_of(("CN", "/mux")))
     head.permissions(("CN=/mux<", "CN=/mux,,x<"), name="mux")
     words = ("diff_policy", "--no-new-access", "base", "head")
@@ -696,7 +696,7 @@ def test_a_certificate_that_fits_the_permissions_of_another_one(lent: Bench) -> 
 
 def test_a_certificate_that_does_not_fit_its_own_permissions_is_said(lent: Bench) -> None:
     odd = Bench(lent.root.with_name("odd"), lent.now)
-    shutil.copytree(lent.root, odd.root, symlinks=True)
+    copy_of(lent.root, odd.root)
     odd.issue("mux", subject=name_of(("CN", "/mux")))
     odd.permissions(("CN=/mux<", "CN=/mux,OU=1<"), name="mux")
     for sides, status in ((("base", "odd"), 1), (("odd", "base"), 2)):

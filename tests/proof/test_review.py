@@ -18,7 +18,7 @@ from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.repository import Repository
 from tests.support.code_host import PROJECT
 from tests.support.code_host import policy as policy_text
-from tests.support.harness import Ended, publish, sros
+from tests.support.harness import Ended, copy_of, publish, sros
 from tests.support.long_form import some
 
 ROBOT = {"/a": publish("/x"), "/b": publish("/y")}
@@ -536,7 +536,7 @@ def test_the_access_of_a_keystore_is_compared(
     change: Change, made_keystores: Path, case: str
 ) -> None:
     public = change.folder / "ks"
-    shutil.copytree(made_keystores / "before", public, symlinks=True)
+    copy_of(made_keystores / "before", public)
     change.base = change.commit({})
     words = ("--policy", "robot.xml", "--keystore", "ks", "--requirements", "robot.toml")
     change.commit({"README": "x"})
@@ -544,7 +544,7 @@ def test_the_access_of_a_keystore_is_compared(
     assert "requirements ks: nothing found" in same.out
     assert "new-access ks: nobody gets more access" in same.out, same
     shutil.rmtree(public)
-    shutil.copytree(made_keystores / case, public, symlinks=True)
+    copy_of(made_keystores / case, public)
     change.commit({})
     ended = change.review(*words)
     assert ended.status > 0
@@ -557,7 +557,7 @@ def test_the_access_of_a_keystore_is_compared(
 def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(
     change: Change, made_keystores: Path
 ) -> None:
-    shutil.copytree(made_keystores / "before", change.folder / "ks", symlinks=True)
+    copy_of(made_keystores / "before", change.folder / "ks")
     change.base = change.commit({})
     change.commit({"README": "x"})
     words = ("--keystore", "ks", "--renew-within")
@@ -604,7 +604,7 @@ def made_keystores(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sros("create_keystore", "before", "--template", "production", cwd=folder).ok()
     sros("generate_artifacts", "-k", "before", "-p", "robot.xml", cwd=folder).ok()
     for case in ("rights", "ca", "governance", "default"):
-        shutil.copytree(folder / "before", folder / case, symlinks=True)
+        copy_of(folder / "before", folder / case)
     sros("generate_artifacts", "-k", "rights", "-p", "wider.xml", cwd=folder).ok()
     sros("rotate_ca", "ca", "--next", cwd=folder).ok()
     weaker = ("--set", "protection.rtps=NONE", "--allow-looser")

