@@ -825,7 +825,9 @@ class OpenRobot:
                 if _needs_enclave_argument(process):
                     words = (*process.command, ROS_ARGS, "--enclave", process.enclave)
                     text += f"ExecStart=\nExecStart={' '.join(unit_words(words))}\n"
-                files[f"units/{process.unit}.d/{_DROP_IN}"] = f"{self._mark()}[Service]\n{text}"
+                files[f"units/{process.unit}.d/{_DROP_IN}"] = (
+                    f"{self._drop_in_heading()}[Service]\n{text}"
+                )
             where = str(folder / "export/enclaves" / process.enclave.strip("/"))
             name = object_name(process.enclave)
             service = render_container(Container(process.enclave, name, of_enclave, where), COMPOSE)
@@ -890,7 +892,7 @@ class OpenRobot:
             self._shell.say(f"removed {path}: its enclave was revoked")
         return [FileChange("remove", str(path)) for path in paths]
 
-    def _mark(self) -> str:
+    def _drop_in_heading(self) -> str:
         """Return the first line of each drop-in that is made for this folder."""
         return f"# Made by `sros close {self.folder.absolute()}`; undone by its --undo.\n"
 
@@ -1002,7 +1004,7 @@ class OpenRobot:
         drop_ins = [
             path
             for path in sorted(_SYSTEMD.glob(f"*.d/{_DROP_IN}"))
-            if read_bytes(path, "unit").startswith(self._mark().encode())
+            if read_bytes(path, "unit").startswith(self._drop_in_heading().encode())
         ]
         for unit in sorted({*observed.units.values()}):
             path = _SYSTEMD / f"{unit}.d/{_DROP_IN}"

@@ -126,7 +126,7 @@ _UNSEEN = "processes that could not be looked at on"
 _SEEN = {Seen.PROCESS: "loaded by processes of", Seen.INSTALLED: "installed, but not loaded, on"}
 
 
-def is_mended_later(library: RobotLibrary, advisories: Sequence[Advisory] | None = None) -> bool:
+def is_fixed_later(library: RobotLibrary, advisories: Sequence[Advisory] | None = None) -> bool:
     """Return whether a later release of the same major version fixes a known vulnerability.
 
     False for packages of Debian and Ubuntu, whose version does not tell which fixes they have.
@@ -135,7 +135,7 @@ def is_mended_later(library: RobotLibrary, advisories: Sequence[Advisory] | None
     numbers = version_numbers(library.version)
     if known is None or numbers is None or _as_mapped(library).packaged:
         return False
-    return any(advisory.mended_in(numbers) for advisory in known.known)
+    return any(advisory.fixed_in(numbers) for advisory in known.known)
 
 
 def _as_mapped(library: RobotLibrary) -> MappedLibrary:
@@ -226,7 +226,7 @@ def _described(known: Sequence[Advisory], version: str) -> str:
     needs += [f"{secured} only those with DDS Security"] if secured else []
     numbers = version_numbers(version)
     major = numbers[0] if numbers else ""
-    releases = Counter(advisory.mended_in(numbers) if numbers else "" for advisory in known)
+    releases = Counter(advisory.fixed_in(numbers) if numbers else "" for advisory in known)
     fixes = [
         f"{number} in {release}" if release else f"{number} in no known release {major}.x"
         for release, number in sorted(releases.items(), reverse=True)

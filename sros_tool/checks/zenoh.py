@@ -295,7 +295,7 @@ def _links(document: ConfigurationDocument) -> Iterator[Finding]:
         if endpoint.is_encrypted() and not endpoint.option("enable_mtls", document.tls.mutual):
             text = f"it listens at {endpoint.text}, and enable_mtls is off"
             yield _finding_at(document, NO_MUTUAL_TLS, f"{_TLS}/enable_mtls", text)
-    yield from _names(document)
+    yield from _router_name_findings(document)
     closing = "close_link_on_expiration"
     for endpoint in (*document.listen, *document.connect):
         if endpoint.is_encrypted() and not endpoint.option(
@@ -306,7 +306,7 @@ def _links(document: ConfigurationDocument) -> Iterator[Finding]:
             break
 
 
-def _names(document: ConfigurationDocument) -> Iterator[Finding]:
+def _router_name_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     """Yield a finding if anybody with an accepted certificate can act as the router."""
     unverified = [
         endpoint

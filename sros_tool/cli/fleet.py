@@ -565,7 +565,7 @@ def _status(
     1 if a robot has a DDS with known vulnerabilities that a later release of the same major version
     fixes (with --no-advisories, this does not count).
     """
-    from sros_tool.checks.vulnerabilities import is_mended_later, robot_findings
+    from sros_tool.checks.vulnerabilities import is_fixed_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
     from sros_tool.keystore.reader import Keystore
     from sros_tool.validity import parse_duration
@@ -595,7 +595,7 @@ def _status(
     outdated = [
         robot
         for robot, dds in reported.items()
-        if dds and any(is_mended_later(library, known) for library in dds.libraries)
+        if dds and any(is_fixed_later(library, known) for library in dds.libraries)
     ]
     compared = ComparedFleet(moment, status, outdated, list(robot_findings(reported, known)))
     exit_status = 0 if status.complete and not outdated else 1

@@ -79,7 +79,7 @@ class Advisory(NamedTuple):
         """Return whether a release has the vulnerability."""
         return version in self.versions or any(part.has(version) for part in self.ranges)
 
-    def mended_in(self, version: Version) -> str:
+    def fixed_in(self, version: Version) -> str:
         """Return the first release with the fix, of the same major version; "" if there is none."""
         ends = {None if part.inclusive else part.end for part in self.ranges if part.has(version)}
         last = max((end for end in ends if end), default=None)

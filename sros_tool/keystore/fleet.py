@@ -338,7 +338,7 @@ def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
             yield Note(
                 "fleet.left-enclaves",
                 f"the robot {robot.name} {why}: {shown} stay valid. To take "
-                f"them back, run `sros revoke {quote(str(root))} {words_for(root, left)}`.",
+                f"them back, run `sros revoke {quote(str(root))} {arguments_for(root, left)}`.",
             )
 
 
@@ -350,7 +350,7 @@ def _lost_router(root: Path, robot: str, router: str) -> Note:
     return Note("fleet.left-router", text)
 
 
-def words_for(root: Path, names: Sequence[str]) -> str:
+def arguments_for(root: Path, names: Sequence[str]) -> str:
     """Return the command line arguments that select exactly the enclaves ``names``.
 
     These are ``--match 'PREFIX*'`` if that selects no others, else the names.

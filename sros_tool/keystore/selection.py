@@ -19,7 +19,7 @@ from sros_tool.fleet.robots import (
     robot_of,
     unrecorded_enclaves,
 )
-from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, load_fleet, words_for
+from sros_tool.keystore.fleet import arguments_for, checked_fleet, enclaves_of_robot, load_fleet
 from sros_tool.keystore.layout import (
     FLEET,
     PRIVATE,
@@ -150,7 +150,7 @@ def _unrecorded_notes(root: Path, below: list[str], left: list[str]) -> Iterator
             "fleet.unrecorded-enclaves",
             f"Still valid, because the fleet does not record whose it is: {_some(left)}, with the "
             "name of a robot that you revoke in the path. If the key was on that robot, run "
-            f"`sros revoke {quote(str(root))} {words_for(root, left)}`.",
+            f"`sros revoke {quote(str(root))} {arguments_for(root, left)}`.",
         )
 
 
@@ -188,7 +188,7 @@ def _robots_enclaves(
                 raise KeystoreError(
                     f"the fleet in keystore '{root}' gives no enclave to a robot {name}",
                     f"It has {_some(left)}: perhaps the robot left the fleet, or a group.",
-                    f"Name the enclaves themselves: {words_for(root, left)}.",
+                    f"Name the enclaves themselves: {arguments_for(root, left)}.",
                 )
             fleet.robot(name)
             raise KeystoreError(

@@ -428,7 +428,7 @@ def _keystore_system(
                 idle.append(name)
             # Those who read and write enforce rights by their governance, too.
             possible = (
-                _possible(enclave, grants.get(name, ()), document) for document in documents
+                _without_faults(enclave, grants.get(name, ()), document) for document in documents
             )
             accesses = (
                 Evaluator(vendor, loaded_enclave, JoinContext(number, moment, zone)).access
@@ -463,7 +463,9 @@ def _link_domains(worlds: Sequence[World]) -> None:
         world.elsewhere = tuple(other for other in worlds if other is not world)
 
 
-def _possible(enclave: LoadedEnclave, grants: Sequence[Grant], governance: bytes) -> LoadedEnclave:
+def _without_faults(
+    enclave: LoadedEnclave, grants: Sequence[Grant], governance: bytes
+) -> LoadedEnclave:
     """Return an enclave whose files have no fault, so that only its permissions decide."""
     subject = enclave.subject or next((grant.subject for grant in grants), "")
     return enclave._replace(subject=subject, governance=governance, state=None)

@@ -60,12 +60,12 @@ def test_each_release_has_the_vulnerabilities_that_are_known() -> None:
 
 def test_the_first_mended_release_is_that_of_the_line() -> None:
     (advisory,) = (each for each in shipped_advisories() if each.id == "CVE-2025-62599")
-    assert advisory.mended_in((2, 14, 5)) == "2.14.6"
-    assert advisory.mended_in((3, 2, 3)) == "3.2.4"
+    assert advisory.fixed_in((2, 14, 5)) == "2.14.6"
+    assert advisory.fixed_in((3, 2, 3)) == "3.2.4"
     assert not advisory.affects((2, 14, 6))
     (advisory,) = (each for each in shipped_advisories() if each.id == "CVE-2025-67108")
     assert advisory.affects((2, 14, 6))
-    assert advisory.mended_in((2, 14, 6)) == ""
+    assert advisory.fixed_in((2, 14, 6)) == ""
 
 
 def test_silence_about_a_line_is_not_a_mend() -> None:
@@ -110,8 +110,8 @@ def test_records_of_one_number_are_one_advisory() -> None:
     }
     (advisory,) = parse_advisories(json.dumps([RECORD, other]).encode(), "it")
     assert advisory.affects((3, 6, 4))
-    assert advisory.mended_in((3, 6, 2)) == "3.6.5"
-    assert advisory.mended_in((2, 14, 5)) == ""
+    assert advisory.fixed_in((3, 6, 2)) == "3.6.5"
+    assert advisory.fixed_in((2, 14, 5)) == ""
 
 
 def test_an_advisory_replaces_only_what_it_names(tmp_path: Path) -> None:

@@ -722,7 +722,7 @@ def _revoke_again(
     keyring: Keyring,
     dry_run: bool,
 ) -> tuple[str, list[Note], list[FileChange]]:
-    """Revoke the enclaves that only lists of robots revoke, and refuse requests that they signed.
+    """Revoke enclaves that only lists of robots revoke, and refuse the requests that they signed.
 
     ``telling`` are robots with such lists.  Certificates that the ledger lacks are recorded.  If
     the lists cannot be signed, nothing is signed; a note says it of the list of a CA service, which

@@ -380,7 +380,10 @@ class Composer:
         return Composed(self._files, self.versions, self._expires)
 
     def _roles(self, robots: int) -> SuccinctRoles:
-        """Return the bins (TUF); their number is a power of two that grows with the fleet."""
+        """Return the bins (TUF); their number is a power of two that grows with the fleet.
+
+        The present number stays until four times as many are wanted.
+        """
         bits = max(1, ceil(log2(max(1, robots / _ROBOTS_OF_A_BIN))))
         before = self._present.targets and self._present.targets.signed.delegations
         if before and before.succinct_roles:
