@@ -435,10 +435,10 @@ def _finding_line(finding: Finding) -> str:
 
 def _absolute_lines(change: RightsChange) -> Iterator[str]:
     """Yield a line for each name that does not move with the namespace of its node any more."""
-    for right, written, source, _, profile in change.absolute:
+    for right, _, source, _, _ in change.absolute:
         yield (
-            f"~ {right.enclave} {right.describe()} is written with a / at its beginning now: "
-            f"it stays {written} in other namespaces than {profile.ns}  ({source})"
+            f"~ {right.enclave} {right.describe()} has a / at its beginning now, so that it does "
+            f"not move with the namespace of its node any more  ({source})"
         )
 
 
@@ -525,11 +525,11 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
         case AccessChange(before=before, after=after, growth=growth):
             return access_markdown(before, after, growth)
         case RightsChange(before=before, after=after, compared=compared) as change:
-            text = rights_markdown(before, after, compared) if compared else ""
+            parts = [rights_markdown(before, after, compared)] if compared else []
             if lines := list(_absolute_lines(change)):
                 title = f"### {counted(len(lines), 'name')} made absolute"
-                text += f"{title}\n\n{bounded(map(code, lines), 6000, rest)}\n"
-            return text
+                parts += [title, bounded(map(code, lines), 6000, rest)]
+            return "\n\n".join(part.rstrip("\n") for part in parts)
         case DroppedRequirements(chosen=chosen):
             title = "### The requirements changed: these are checked as they were before"
             return f"{title}\n\n{findings(chosen)}"
