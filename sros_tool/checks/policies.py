@@ -967,11 +967,21 @@ _INCLUDES = tuple(f"{{http://www.w3.org/{year}/XInclude}}include" for year in (2
 _MANY = 1000
 
 
-def findings_in(policy: Policy, distribution: str = "") -> Iterator[Finding]:
-    """Yield all findings in a parsed policy, except the findings about its includes."""
-    checked = _CheckedPolicy(policy, distribution)
-    for check in (*_CHECKS, *_CHECKS_TOGETHER):
-        yield from check(checked)
+def findings_in(policies: Sequence[Policy], distribution: str = "") -> Iterator[Finding]:
+    """Yield all findings in the parsed policies of a robot, except the findings about includes.
+
+    The counterparts of names are looked for in all the policies together.
+    """
+    checked = [_CheckedPolicy(policy, distribution) for policy in policies]
+    for each in checked:
+        for check in _CHECKS:
+            yield from check(each)
+    if len(checked) > 1:
+        enclaves = tuple(enclave for policy in policies for enclave in policy.enclaves)
+        checked = [_CheckedPolicy(replace(policies[0], enclaves=enclaves), distribution)]
+    for each in checked:
+        for check in _CHECKS_TOGETHER:
+            yield from check(each)
 
 
 def policy_file_findings(
@@ -979,32 +989,24 @@ def policy_file_findings(
 ) -> Iterator[Finding]:
     """Yield all findings in policy files; a file that cannot be read is a finding too.
 
-    The counterparts of names are looked for in all the files together.
-
     Args:
-        paths: the files.
+        paths: the files, which are of one robot or fleet.
         distribution: the ROS 2 distribution of their nodes, such as ``humble``; "" is the latest.
         fleet: the robots that their placeholders stand for.
         policy: the policy in the only file, if it is parsed already.
     """
-    enclaves: list[Enclave] = []
+    read: list[Policy] = []
     for path in paths:
         try:
-            policy = policy if policy and len(paths) == 1 else read_policy_for(path, fleet)
+            known = policy if policy and len(paths) == 1 else read_policy_for(path, fleet)
         except SrosError as error:
             yield from _unreadable(path, error)
             continue
-        enclaves += policy.enclaves
-        checked = _CheckedPolicy(policy, distribution)
-        for check in _CHECKS:
-            yield from check(checked)
+        read.append(known)
         yield from _includes(path)
         if fleet and (shared := [*_shared_namespaces(fleet)]):
             yield SHARED_NAMESPACE.found(str(path), first_few(shared, 3, "; "), str(path))
-    if policy:
-        together = replace(policy, enclaves=tuple(enclaves))
-        for check in _CHECKS_TOGETHER:
-            yield from check(_CheckedPolicy(together, distribution))
+    yield from findings_in(read, distribution)
 
 
 def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
@@ -1240,14 +1242,14 @@ def signed_findings(
         enclaves: the enclaves whose permissions are to be signed; others are not checked.
         distribution: the ROS 2 distribution of the nodes; "" is the latest.
     """
-    findings: list[Finding] = []
+    parts: list[Policy] = []
     for each in policies:
         policy = each.for_one_robot() if isinstance(each, FleetPolicy) else each
         chosen = [enclave for enclave in policy.enclaves if enclave.path in enclaves][
             :_MOST_ENCLAVES
         ]
-        findings += findings_in(replace(policy, enclaves=tuple(chosen)), distribution)
-    shown = [finding for finding in findings if finding.severity >= WARNING]
+        parts.append(replace(policy, enclaves=tuple(chosen)))
+    shown = [finding for finding in findings_in(parts, distribution) if finding.severity >= WARNING]
     shown.sort(key=lambda finding: -finding.severity.weight)
     return list(by_cause(list(dict.fromkeys(shown))))
 

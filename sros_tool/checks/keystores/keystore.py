@@ -175,11 +175,16 @@ def keystore_findings(
     topics = {name: names for *_, share in outcomes for name, names in share.items()}
     found += check_capitals(topics)
     found += check_network(keystore, only)
-    for policy in policies:
+    if policies:
         from sros_tool.checks.policies import findings_in
 
-        chosen = tuple(each for each in policy.enclaves if only is None or each.path in only)
-        found += findings_in(replace(policy, enclaves=chosen), distribution)
+        parts = [
+            replace(policy, enclaves=tuple(each for each in policy.enclaves if each.path in only))
+            if only is not None
+            else policy
+            for policy in policies
+        ]
+        found += findings_in(parts, distribution)
     real_root = os.path.realpath(root)
     located = (_at_real_file(finding, root, real_root) for finding in found)
     found = with_causes(joined([_with_names(finding, root) for finding in located]))
