@@ -114,7 +114,7 @@ EQUIVALENT = {
 """Rules that make no difference to documents as the vendor reads them."""
 NOT_OF_DOCUMENTS = {
     "product",
-    "measured",
+    "tested",
     "reader",
     "signers",
     "reads_first_authority",
