@@ -659,7 +659,7 @@ DENY_BLOCKS = FindingKind(
     "Cyclone DDS 0.10 does not create a topic of which one direction is denied; Fast DDS and "
     "Cyclone DDS 11 create it.",
     "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c), Fast DDS 2.6 to 3.6; tested.",
-    "Remove the denial: everything that no rule allows is denied anyway.",
+    "Remove the deny rule: everything that no rule allows is denied anyway.",
     vendors=(Vendor.CYCLONE,),
 )
 CHARACTER_SET = FindingKind(
@@ -811,7 +811,7 @@ def _signed_bytes(enclave: Enclave) -> int:
 
 
 _ORDER = (
-    "sros signs the denials of an enclave before its permissions, as ros2/sros2 does, and the "
+    "sros signs the deny rules of an enclave before its allow rules, as ros2/sros2 does, and the "
     "first rule that matches decides (DDS-Security 1.1, 9.4.1.3)."
 )
 
@@ -819,28 +819,28 @@ CONTRADICTION = FindingKind(
     "policy.contradiction",
     WARNING,
     "the same name is allowed and denied",
-    "The denial wins, so the permission has no effect; one of them is a mistake.",
+    "The DENY wins, so the ALLOW has no effect; one of them is a mistake.",
     _ORDER,
-    "Remove the permission or the denial.",
+    "Remove the ALLOW or the DENY.",
 )
 UNREACHABLE = FindingKind(
     "policy.unreachable-rule",
     WARNING,
-    "a permission that a denial covers completely",
-    "A denial of the same enclave, perhaps of another node in it, covers every name of the rule, "
+    "an ALLOW that a DENY covers completely",
+    "A DENY of the same enclave, perhaps of another node in it, covers every name of the rule, "
     "so the permission never allows anything.",
     _ORDER,
-    "Remove the permission, or narrow the denial.",
+    "Remove the ALLOW, or narrow the DENY.",
 )
 NO_EFFECT = FindingKind(
     "policy.deny-without-effect",
     NOTE,
-    "a denial of something that no rule allows",
-    "Everything that no rule allows is denied anyway. The denial has an effect only in a policy "
-    "that others merge with theirs, such as that of a package: a denial wins over what they allow "
+    "a DENY of something that no rule allows",
+    "Everything that no rule allows is denied anyway. The DENY has an effect only in a policy "
+    "that others merge with theirs, such as that of a package: a DENY wins over what they allow "
     "the enclave.",
-    "DDS-Security 1.1, 9.4.1.3 (the default is DENY); sros: merge_policy never weakens a denial.",
-    "Keep the denial if this right must never be added to the enclave.",
+    "DDS-Security 1.1, 9.4.1.3 (the default is DENY); sros: merge_policy never weakens a DENY.",
+    "Keep the DENY if this right must never be added to the enclave.",
 )
 REDUNDANT_RULE = FindingKind(
     "policy.redundant-rule",

@@ -10,8 +10,8 @@ from sros_tool.checks.kind import ERROR, NOTE, WARNING, FindingKind
 _ENGINE = "sros: its decision engine, with the rules of the DDS that each distribution ships."
 _DECIDE_ALIKE = (
     "`sros explain KEYSTORE ENCLAVE ... --all-distros` shows the rule that decides for each "
-    "distribution. Remove denials of names that no rule allows, and sign the rights in the form "
-    "that sros writes: `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`."
+    "distribution. Remove deny rules for names that no rule allows, and sign the rights in the "
+    "form that sros writes: `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`."
 )
 
 OPENS = FindingKind(

@@ -76,8 +76,8 @@ DEFAULT_ALLOW = FindingKind(
     "zenoh.default-allow",
     ERROR,
     "access control that allows what no rule denies",
-    "A query or a put with a wildcard gets past a denial, and a process that matches two subjects "
-    "is denied only what both subjects deny.",
+    "A query or a put with a wildcard gets past a deny rule, and a process that matches two "
+    "subjects is denied only what both subjects deny.",
     _TESTED,
     'Write "default_permission": "deny", and rules that allow.',
 )
@@ -113,17 +113,17 @@ SELF_LIMITING = FindingKind(
 DENY_IN_WILDCARD = FindingKind(
     "zenoh.deny-in-wildcard",
     ERROR,
-    "a denial that a wildcard gets past",
+    "a deny rule that a wildcard gets past",
     "A rule applies to a message only if it covers the whole key expression of the message. A "
-    "put, a query or a subscription with a wildcard is wider than the denial, so it is allowed, "
+    "put, a query or a subscription with a wildcard is wider than the deny rule, so it is allowed, "
     "and reaches the denied names.",
     "Zenoh 1.5.1, 1.6.2 and 1.10.2, tested.",
-    "Allow the intended names, and remove the denial.",
+    "Allow the intended names, and remove the deny rule.",
 )
 DENY_OVERRULED = FindingKind(
     "zenoh.deny-overruled",
     ERROR,
-    "a denial without effect, because another subject of the access control allows the name",
+    "a deny rule without effect, because another subject of the access control allows the name",
     "If a process matches two subjects, one of them is enough to allow a message.",
     "Zenoh 1.6.2 and 1.10.2, tested.",
     "Use one subject for each name, and rules that allow.",

@@ -566,7 +566,7 @@ def _change_lines(answer: Answer) -> Iterator[str]:
         yield from (f"    remove: {right.qualifier} {right.describe()}" for right in change.lift)
     for right in change.lift:
         if is_expression(right.name):
-            yield f"    this also removes the denial of all other names in {right.name}"
+            yield f"    this also removes the DENY of all other names in {right.name}"
     if change.document:
         if answer.enclave.has_placeholders:
             place = f"at {_shown(policy.source)}" if policy else "to the fleet's policy"

@@ -342,7 +342,7 @@ _CONSEQUENCES = {
     "portable.long-name": f"; on Fast DDS no peer matches a topic of more than "
     f"{_LONGEST_TOPIC} bytes. Use shorter namespaces and names.",
     "portable.deny-blocks-topic": " on Cyclone DDS, which refuses the topic as a whole; Fast "
-    "DDS allows it. What no rule allows is denied anyway, so perhaps the denial can be removed.",
+    "DDS allows it. What no rule allows is denied anyway, so perhaps the deny rule can be removed.",
     "portable.character-set": ". Vendors read plain sets alike, but only * and ? are part of the "
     "portable profile.",
 }

@@ -291,8 +291,8 @@ def _refused(
     return PolicyError(
         f"{what}, because the order of its rules matters",
         f"On DDS {next(iter(reasons))}, and rule {denying[0]} comes too late to deny it. On Zenoh, "
-        "as in a policy, a denial wins wherever it stands.",
-        f"List the names to {verb} in a policy, without that denial, and sign it with `sros "
+        "as in a policy, a deny rule wins wherever it stands.",
+        f"List the names to {verb} in a policy, without that deny rule, and sign it with `sros "
         "create_permission`.",
     )
 

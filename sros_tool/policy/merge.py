@@ -371,7 +371,7 @@ class MergedPolicy(NamedTuple):
     added: Sequence[Right]
     """Rights that were added to the policy."""
     contradictions: Sequence[Contradiction]
-    """Rights that one policy allows and the other denies; the denial wins."""
+    """Rights that one policy allows and the other denies; the DENY wins."""
     output: Path | None
     """Path of the file that was written, or null."""
     document: str | None

@@ -577,7 +577,7 @@ class Enforcement:
             not rule.allows and set(rule.messages) != {Message.LIVELINESS_TOKEN}
             for rule in self.rules
         ):
-            return "it has denials, which do not apply to messages with wildcards"
+            return "it has deny rules, which do not apply to messages with wildcards"
         for subject in self.subjects:
             if key := self._only_history(subject.id):
                 return f"its subject {subject.id[:80]!r} gets only the history of {key[:80]!r}"

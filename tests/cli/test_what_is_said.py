@@ -117,7 +117,7 @@ def test_a_denial_takes_a_right_away(root: Path) -> None:
         policy_text({"/robot": publish("/scan", "/secret") + denied})
     )
     ended = sros("create_permission", "ks", "/robot", "denied.xml", cwd=root.parent).ok()
-    assert "/robot loses: publish topic /secret (by a denial)" in ended.err
+    assert "/robot loses: publish topic /secret (by a DENY)" in ended.err
 
 
 # ── templates ──────────────────────────────────────────────────────────────────────────────

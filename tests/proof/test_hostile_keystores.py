@@ -483,7 +483,7 @@ def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, s
         (no_certificate_asked_for, 2, "it asks for no certificate"),
         (a_subject_with_a_condition, 2, "conditions besides the name: interfaces"),
         (the_history_of_a_topic, 2, "gets only the history of '0/cmd_vel/*/*'"),
-        (a_denial, 2, "it has denials"),
+        (a_denial, 2, "it has deny rules"),
         (a_namespace, 2, "puts a namespace before the keys"),
         (a_second_router, 2, "has the files of several routers"),
     ],

@@ -181,7 +181,7 @@ NO_EFFECT = FindingKind(
     "permissions.deny-without-effect",
     ERROR,
     "a deny rule after an allow rule for the same topic",
-    "The first rule that matches decides, so the denial has no effect.",
+    "The first rule that matches decides, so the deny rule has no effect.",
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Put deny rules first, as sros does.",
 )

@@ -607,7 +607,7 @@ def _trespasses() -> tuple[Row, ...]:
                 "the rules allow it",
                 zenoh_forger.guest_may_use_the_topic,
                 "rule added",
-                "the denial",
+                "the deny rule",
             ),
         )
     return tuple(rows)
@@ -794,7 +794,7 @@ _WILDCARD_ROWS = (
                 f"{attack}, denied inside a wildcard",
                 party,
                 done,
-                "a denial of the name applies only to the name, not to a wider expression",
+                "a deny rule for the name applies only to the name, not to a wider expression",
                 zenoh_forger.denial_in_a_wildcard,
                 "denial in a wildcard",
                 "an exact list of the allowed names",

@@ -201,11 +201,10 @@ _RIGHTS_SHOWN = 6
 def rights_text(rights: Sequence[Right]) -> str:
     """Return lost or gained rights as text, such as ``publish topic /a, call action /b``.
 
-    An added or removed denial is marked with "(by a denial)".
+    An added or removed denial is marked with "(by a DENY)".
     """
     described = [
-        right.describe() + ("" if right.qualifier is ALLOW else " (by a denial)")
-        for right in rights
+        right.describe() + ("" if right.qualifier is ALLOW else " (by a DENY)") for right in rights
     ]
     return first_few(described, _RIGHTS_SHOWN)
 
