@@ -56,10 +56,15 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.reader import FilesReadOnce, Keystore, open_enclave
 from sros_tool.keystore.selection import revocation_of
+from sros_tool.keystore.template import load_template
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
+from sros_tool.policy.merge import merge_into
 from sros_tool.policy.model import RIGHTS, Policy
 from sros_tool.policy.rights import policy_rights
+from sros_tool.proof.findings import decide_all
+from sros_tool.proof.requirements import Requirement, read_requirements
+from sros_tool.proof.system import policy_system
 from sros_tool.runtime.environment import (
     COMPOSE,
     RMW_ZENOH,
@@ -94,6 +99,7 @@ _FAST_DDS = "010f"
 _NODE_PARTS = ("common/node.xml", "common/rclcpp_node.xml", "common/rclpy_node.xml")
 _MOST_LINES, _MOST_NAMES = 20, 3
 _SYSTEMD = Path("/etc/systemd/system")
+_REQUIREMENTS, _TEMPLATE = "requirements.toml", "production"
 _OBSERVER, _ROUTER = "/sros_observer", "/router"
 _DROP_IN, COMMANDS, _SERVICES = "sros-close.conf", "commands.txt", "compose.yaml"
 _RESTART_SECONDS, _START_SECONDS = 30.0, 3.0
@@ -512,6 +518,25 @@ def _users(of_name: Mapping[str, Sequence[str]], right: str) -> str:
     return first_few(of_name.get(right, ()), _MOST_NAMES) or "nobody"
 
 
+def forbidding(robot: Path, addition: str, at: datetime) -> list[Requirement]:
+    """Return the requirements in the folder of a closed robot that forbid to add rights.
+
+    None if the folder has no requirements, or its policy cannot be read with the ``addition``, the
+    document of a policy.
+    """
+    file, policy = robot / _REQUIREMENTS, robot / CLOSED_POLICY
+    if not file.exists():
+        return []
+    try:
+        merged = merge_into(policy, read_policy(policy, addition.encode())).document
+        template = load_template(_TEMPLATE)
+        system = policy_system(read_policy(policy, merged), at=at, template=template)
+        decided = decide_all(read_requirements(file), system)
+    except SrosError:
+        return []
+    return list(dict.fromkeys(violation.requirement for violation in decided.violations))
+
+
 # ── the steps ───────────────────────────────────────────────────────────────────────────────
 
 
@@ -541,7 +566,7 @@ class OpenRobot:
     def __init__(self, folder: Path, domain: int | None, shell: Shell) -> None:
         self.folder, self._shell = folder, shell
         self.policy, self.observer = folder / CLOSED_POLICY, folder / "observer.xml"
-        self.requirements = folder / "requirements.toml"
+        self.requirements = folder / _REQUIREMENTS
         self.keystore, self.export = folder / "keystore", folder / "export"
         self.start, self.page = folder / "start", folder / "rights.html"
         self.seen, self.processes = folder / "observed.json", folder / CLOSED_PROCESSES
@@ -584,7 +609,7 @@ class OpenRobot:
         learn += ["--watch", duration] if duration else []
         learn += ["--dry-run"] if self.policy.exists() else []  # it may have been edited
         only_errors = ("--fail-on", "error")
-        both, created = ("-p", policy, str(self.observer)), ("--template", "production")
+        both, created = ("-p", policy, str(self.observer)), ("--template", _TEMPLATE)
         on_zenoh = self._shell.environment.get(RMW) == RMW_ZENOH
         return [
             _Step((*learn, "--json"), None if duration else self.processes, self.seen),
@@ -610,6 +635,9 @@ class OpenRobot:
                 "A new keystore would have other CAs.",
                 "Bring it back to change the robot; --proof and --undo need only the export.",
             )
+        own = (self.seen, self.policy, self.keystore, self.export)
+        if self.folder.is_dir() and [*self.folder.iterdir()] and not any(map(Path.exists, own)):
+            self._shell.say(f"'{self.folder}' has files of yours: sros adds its own to them")
         denied_before: Sequence[str] = ()
         with suppress(SrosError):  # the steps say what is wrong
             denied_before = self._denied() if self.export.exists() and self.seen.exists() else ()
@@ -1064,7 +1092,8 @@ class OpenRobot:
         if dry_run:
             return closing
         proofs = self._proofs(closing, _START_SECONDS, partial=partial)
-        if changed := self._enclaves_changed() if self.policy.exists() else ():
+        fails = any(proof.fails for proof in proofs)
+        if not fails and self.policy.exists() and (changed := self._enclaves_changed()):
             where = "" if self.keystore.exists() else ", where the keystore is,"
             self._shell.say(
                 f"'{self.policy}' is not what is signed, for {first_few(changed, _MOST_NAMES)}: "

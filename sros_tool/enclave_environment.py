@@ -96,7 +96,6 @@ def loadable_environment(
     from sros_tool.runtime.environment import (
         REFUSING_ZENOH,
         RMW_ZENOH,
-        choose_domain,
         secured_environment,
     )
     from sros_tool.runtime.rmw import (
@@ -127,7 +126,7 @@ def loadable_environment(
     zenoh = _opened_zenoh(keystore, name, state, now) if with_zenoh and not state.token else None
     if zenoh and domains:
         wanted = _zenoh_domain(root, zenoh, wanted, domains)
-    domain = choose_domain(domains, wanted, root) if domains else 0
+    domain = _choose_domain(domains, wanted, root) if domains else 0
     state = keystore.enclave(name, now=now, domain=domain)
     if not with_zenoh:
         vendor = vendor_of(used) if target else shipped_vendor(used, environment)
@@ -400,6 +399,29 @@ def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
             "It contains rights of other enclaves that differ from their permissions.",
             f"Write it again: `sros zenoh {where}`, and restart the processes that it names.",
         )
+
+
+def _choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
+    """Return the ROS domain for a process that uses a keystore, which is for ``domains``.
+
+    Without a ``wanted`` domain from an option or ROS_DOMAIN_ID, this is 0, the default of ROS, if
+    the keystore is for it, else the keystore's first domain.
+
+    Raises:
+        KeystoreError: the keystore is not for the ``wanted`` domain.
+    """
+    from sros_tool.keystore.layout import adding_domains
+
+    if wanted is None:
+        return domains.preferred()
+    if wanted in domains:
+        return wanted
+    raise KeystoreError(
+        f"keystore '{root}' is for domain {domains}, not for {wanted}",
+        "DDS would refuse the node.",
+        f"Set ROS_DOMAIN_ID to {next(iter(domains))}, or "
+        f"{adding_domains(root, f'{domains},{wanted}')}.",
+    )
 
 
 def _zenoh_domain(

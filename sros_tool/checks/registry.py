@@ -93,8 +93,7 @@ class FindingFilter:
         return included and not any(_matches(kind, pattern) for pattern in self.exclude)
 
     def _shows(self, finding: Finding) -> bool:
-        level = WARNING if finding.kind.prominent else NOTE
-        return max(finding.severity, level) >= self.severity
+        return _prominence(finding) >= self.severity
 
     def choose(self, findings: Iterable[Finding]) -> ChosenFindings:
         """Return the findings to show, worst first, and the accepted findings that are hidden."""
@@ -102,12 +101,20 @@ class FindingFilter:
         if self.strict:
             wanted = [finding._replace(accepted="") for finding in wanted]
         shown = [finding for finding in wanted if self._shows(finding)]
-        shown.sort(key=lambda finding: (-finding.severity.weight, finding.file, finding.line or 0))
+        shown.sort(key=lambda finding: (-_prominence(finding).weight, *_place(finding)))
         hidden = [finding for finding in wanted if not self._shows(finding)]
         accepted = [
             finding for finding in hidden if finding.accepted and finding.kind.severity > NOTE
         ]
         return ChosenFindings(tuple(shown), tuple(accepted), len(hidden) - len(accepted))
+
+
+def _prominence(finding: Finding) -> Severity:
+    return max(finding.severity, WARNING if finding.kind.prominent else NOTE)
+
+
+def _place(finding: Finding) -> tuple[str, int]:
+    return finding.file, finding.line or 0
 
 
 class ChosenFindings(NamedTuple):
@@ -130,7 +137,8 @@ class ChosenFindings(NamedTuple):
         """Return a line with the numbers of findings, such as ``2 errors, 1 note``."""
         counts = [counted(number, word) for word, number in self.numbers().items() if number]
         hidden = self.hidden
-        unseen = f" (not shown: {counted(hidden, 'note')}, --severity note)" if hidden else ""
+        note = "more note" if any(finding.severity is NOTE for finding in self.shown) else "note"
+        unseen = f" (not shown: {counted(hidden, note)}, --severity note)" if hidden else ""
         if not self.accepted:
             return f"{', '.join(counts) or 'nothing found'}{unseen}"
         number = counted(len(self.accepted), "weakness", "weaknesses")

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.zenoh import CheckedLink, ZenohAnswer, ZenohExplanation
     from sros_tool.fleet.robots import Fleet
     from sros_tool.policy.model import Source
+    from sros_tool.proof.requirements import Requirement
     from sros_tool.zenoh.delivery import Check
 
 _WORDS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply", "join")
@@ -516,13 +517,36 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
 
 
 def _to_do_lines(answer: Answer) -> Iterator[str]:
-    """Yield the change of the policy, or the remedy, and the commands."""
+    """Yield the change of the policy, or the remedy, and the commands.
+
+    In their place, the requirements of a closed robot that forbid the change.
+    """
+    if forbidding := _forbidding(answer):
+        from sros_tool.proof.requirements import demand
+
+        for requirement in forbidding:
+            text = f"{_shown(requirement.source)} forbids this: {demand(requirement)}"
+            yield _row("required", text)
+        return
     if answer.change:
         yield from _change_lines(answer)
     if answer.remedy:
         yield _row("remedy", answer.remedy)
     for number, command in enumerate(answer.commands):
         yield _row("run" if not number else "", command)
+
+
+def _forbidding(answer: Answer) -> Sequence[Requirement]:
+    """Return the requirements next to the keystore of a closed robot that forbid the change."""
+    from sros_tool.keystore.layout import closed_robot
+
+    root, change = answer.enclave.root, answer.change
+    robot = closed_robot(root) if root else None
+    if not (robot and change and change.document) or answer.enclave.has_placeholders:
+        return ()
+    from sros_tool.closing import forbidding
+
+    return forbidding(robot, change.document, moment_of(None))
 
 
 def _shown(source: Source) -> str:

@@ -161,7 +161,9 @@ def _keystore(keystore: DescribedKeystore) -> Iterator[str]:
 
     template = keystore.template
     yield f"keystore {keystore.path}, " + (
-        f"template {template}" if template else "no template: not made by sros, or an export"
+        f"template {template}"
+        if template
+        else "no template: an export has none, nor what others made"
     )
     for role, authority in keystore.authorities.items():
         yield from _authority(role, authority)

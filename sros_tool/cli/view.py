@@ -247,8 +247,14 @@ def _on_terminal() -> bool:
 def _format(form: str | None, output: Path | None, graphviz: bool) -> str:
     ending = output.suffix.lower() if output else ""
     chosen = form or _ENDINGS.get(ending, ending.removeprefix("."))
-    if chosen not in _FORMATS:
-        chosen = "html"
+    if chosen not in _FORMATS and ending:
+        raise UsageError(
+            f"view writes no {ending} files",
+            "",
+            f"Let the name end with {', '.join(f'.{each}' for each in _FORMATS)}, or name the "
+            "format with --format.",
+        )
+    chosen = chosen or "html"
     if graphviz and chosen != "svg":
         raise UsageError("--graphviz is for SVG only", "", "Add --format svg, or leave it out.")
     return chosen

@@ -215,6 +215,18 @@ def closed_robot(root: Path) -> Path | None:
     return folder if made else None
 
 
+def adding_domains(root: Path, domains: str) -> str:
+    """Return how a keystore, or that of an export, is made for ``domains`` ("0,5"), in words."""
+    robot = closed_robot(root)
+    candidates = (root, robot / "keystore") if robot else (root,)
+    keystore = next(filter(has_authorities, candidates), None)
+    command = f"sros update_keystore {quote(str(keystore or 'KEYSTORE'))} --domain {domains}"
+    if keystore == root:
+        return f"add the domain with `{command} --allow-looser`"
+    where = "to its keystore" if keystore else "where its keystore is"
+    return f"add the domain {where}, with `{command} --allow-looser`, and export again"
+
+
 def is_enclave(folder: Path) -> bool:
     """Return whether ``folder`` has a certificate or a key of an enclave."""
     return any(os.path.lexists(f"{folder}/{file}") for file in _OF_ENCLAVE)

@@ -48,6 +48,7 @@ from sros_tool.keystore.layout import (
     ROLES,
     SETTINGS,
     STAGE,
+    adding_domains,
     ca_certificate,
     check_keystore,
     enclave_names,
@@ -546,8 +547,7 @@ def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
     raise KeystoreError(
         f"ROS_DOMAIN_ID is {domain}, but keystore '{root}' is for domain {domains} only",
         "In any other domain, DDS refuses a node with this keystore.",
-        f"Set ROS_DOMAIN_ID to {domains}, or add the domain with `sros update_keystore "
-        f"{quote(str(root))} --domain {domains},{domain} --allow-looser`.",
+        f"Set ROS_DOMAIN_ID to {domains}, or {adding_domains(root, f'{domains},{domain}')}.",
     )
 
 

@@ -180,6 +180,9 @@ def demand(requirement: Requirement) -> str:
     """Return a requirement's demand as a clause, such as ``nobody may publish /x``."""
     match requirement:
         case Only(rights=rights, enclaves=enclaves):
+            but = [name[len(EXCEPT) :] for name in enclaves if name.startswith(EXCEPT)]
+            if but and {*enclaves} == {"*", *(EXCEPT + name for name in but)}:
+                return f"{_listed(but)} may not {_rights_text(rights)}"
             return f"only {_enclaves_text(enclaves)} may {_rights_text(rights)}"
         case Nobody(rights=rights):
             return f"nobody may {_rights_text(rights)}"
@@ -188,6 +191,9 @@ def demand(requirement: Requirement) -> str:
         case AtMost(rights=rights, most=most):
             return f"at most {most} enclave{'' if most == 1 else 's'} may {_rights_text(rights)}"
         case Widest(rights=rights, enclaves=enclaves):
+            if not any(names for _, names in rights):
+                what = _rights_text(rights).replace(" nothing", "")
+                return f"no wildcard may let {_enclaves_text(enclaves)} {what}"
             return f"wildcards may let {_enclaves_text(enclaves)} only {_rights_text(rights)}"
         case NothingBut(rights=rights, enclaves=enclaves):
             return f"{_enclaves_text(enclaves)} may do nothing but {_rights_text(rights)}"

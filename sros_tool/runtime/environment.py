@@ -32,7 +32,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.runtime.rmw import RMW
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
@@ -69,31 +68,6 @@ class PrintedEnvironment(NamedTuple):
     variables: Mapping[str, str]
     """The environment variables and their values."""
     notes: Notes
-
-
-def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
-    """Return the ROS domain for a process that uses a keystore.
-
-    Args:
-        domains: the domains that the keystore is for.
-        wanted: the domain from an option or ROS_DOMAIN_ID; None if there is none: then the result
-            is 0, the default of ROS, if the keystore is for it, else the keystore's first domain.
-        root: the keystore, for errors.
-
-    Raises:
-        KeystoreError: the keystore is not for the ``wanted`` domain.
-    """
-    if wanted is not None:
-        if wanted not in domains:
-            raise KeystoreError(
-                f"keystore '{root}' is for domain {domains}, not for {wanted}",
-                "DDS would refuse the node.",
-                f"Set {DOMAIN} to {next(iter(domains))}, or add the domain with `sros "
-                f"update_keystore {shlex.quote(str(root))} --domain {domains},{wanted} "
-                "--allow-looser`.",
-            )
-        return wanted
-    return domains.preferred()
 
 
 def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:

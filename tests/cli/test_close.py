@@ -190,7 +190,12 @@ MADE = [
 
 def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
     robot.units = {"/talker": "talker.service"}
+    mine = robot.folder / "robot/base.py"
+    mine.parent.mkdir()
+    mine.touch()
     ended = robot.close()
+    mine.unlink()
+    assert ended.err.startswith("'robot' has files of yours: sros adds its own to them\n")
     assert made(robot.folder) == MADE
     export = robot.folder / "robot/export"
     assert list_enclaves(export) == ("/listener", "/sros_observer", "/talker")
@@ -333,6 +338,12 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
         denied = sros("explain", root, "/talker", "publish", "/x", cwd=robot.folder).out
         assert "merge_policy robot/policy.xml allow.xml --in-place\n" in denied
         assert denied.endswith("sros close robot\n")
+    elsewhere = sros("env", root, "/talker", "--domain", "5", cwd=robot.folder).err
+    add = "add the domain to its keystore, with `sros update_keystore robot/keystore --domain 0,5"
+    assert add in elsewhere
+    denied = sros("explain", root, "/listener", "publish", "/chatter", cwd=robot.folder).out
+    forbids = r"robot/requirements\.toml:\d+ forbids this: only /talker may publish /chatter\n$"
+    assert re.search(forbids, denied) and "allow.xml" not in denied
     robot.by_hand = {"/talker"}
     ended = robot.close()
     assert "/talker: process 4711: closed\n" in ended.out
@@ -479,16 +490,17 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     needed.write_text("[[only]]\n")
     assert "[[only]] names no right" in robot.close("--proof", status=2).err
     needed.write_text('[[only]]\npublish = ["/chatter"]\nenclaves = ["/listener"]\n')
-    policy = robot.folder / "robot/policy.xml"
-    policy.write_text(policy.read_text().replace("chatter", "gossip", 1))
     ended = robot.close("--proof", status=1)
-    assert "policy.xml' is not what is signed, for /listener: `sros close robot` signs" in ended.err
     assert "no: the requirements hold: one is violated: robot/requirements.toml\n" in ended.out
     assert "/talker: may publish /chatter" in ended.err
     needed.write_text(kept)
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
     assert "not asked: every process runs in its enclave" in robot.close("--proof", status=1).out
-    assert "closed, except for what was not asked" in robot.close("--proof", "--partial").err
+    policy = robot.folder / "robot/policy.xml"
+    policy.write_text(policy.read_text().replace("chatter", "gossip", 1))
+    ended = robot.close("--proof", "--partial")
+    assert "policy.xml' is not what is signed, for /listener: `sros close robot` signs" in ended.err
+    assert "closed, except for what was not asked" in ended.err
 
 
 # ── interrupted ────────────────────────────────────────────────────────────────────────────

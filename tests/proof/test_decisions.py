@@ -239,7 +239,7 @@ EXPRESSIBLE = {
     ),
     BOTH % 'publish = ["/trigger"]': "",
     '[[only]]\npublish = ["/image"]\nenclaves = ["*", "!/camera"]\n': (
-        "/camera: may publish /image, but only * (but not /camera) may publish /image"
+        "/camera: may publish /image, but /camera may not publish /image"
     ),
     '[[only]]\npublish = ["/image"]\nenclaves = ["*", "!/base"]\n': "",
     '[[apart]]\nfrom = ["*", "!/camera"]\nto = ["/base"]\n': (

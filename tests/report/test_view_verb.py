@@ -136,7 +136,7 @@ def test_the_ending_of_the_file_says_the_format(tmp_path: Path) -> None:
         ("a.dot", "digraph"),
         ("a.mmd", "---"),
         ("a.html", "<!doctype"),
-        ("a.txt", "<!doctype"),
+        ("page", "<!doctype"),
         ("a.json", "{"),
     ):
         ended = sros("view", policy, "-o", tmp_path / name).ok()
@@ -172,6 +172,7 @@ def test_open_shows_the_file_that_was_written(
         (("a.xml", "a.xml", "a.xml"), "at most two sources"),
         (("a.xml", "a.xml", "--observed", "a.xml"), "at most two sources"),
         (("a.xml", "--graphviz"), "--graphviz is for SVG only"),
+        (("a.xml", "-o", "who.txt"), "view writes no .txt files"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(
