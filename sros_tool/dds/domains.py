@@ -112,10 +112,10 @@ class DomainSet:
     def one_of_each_kind(
         cls, listed: Collection[DomainSet], others: Iterable[DomainSet]
     ) -> tuple[int, ...]:
-        """Return one domain for each combination of sets that domains can be in, sorted.
+        """Return one domain for each group of domains that are in the same sets, sorted.
 
-        Only domains in a ``listed`` set are returned, unless a range lacks one of its ends, which
-        vendors read differently.
+        Only domains in a ``listed`` set are returned, unless a range lacks one of its ends:
+        vendors read such ranges differently.
         """
         sets = dict.fromkeys((*listed, *others))
         borders = {0}

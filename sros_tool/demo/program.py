@@ -276,7 +276,7 @@ def _parted(scenarios: Sequence[Scenario], rows: Sequence[RowResult]) -> Iterato
 
 def _expected(row: Row, backend: Backend, template: Template, topic: str) -> Row:
     """Return the row with the outcome that a keystore from this template should give."""
-    return row.under(conditions(backend, template, _dds_topic(row, topic)))
+    return row.expected_under(conditions(backend, template, _dds_topic(row, topic)))
 
 
 def _gated(row: Row, strong: Row, options: DemoOptions) -> Row:

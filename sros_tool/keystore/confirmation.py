@@ -52,8 +52,8 @@ MAX_BYTES = 4 * 1024 * 1024
 """Largest size of a confirmation in bytes; enough for a robot with 4,000 enclaves."""
 _LONGEST_REASON = 400
 _MOST_REFUSALS = 64 * 1024 * 1024
-"""Largest size of the file of refused messages, in bytes: of 100,000 robots with the longest
-reasons."""
+"""Largest size of the file of refused messages, in bytes; enough for 100,000 robots, each with the
+longest reason."""
 MESSAGE_FILE = "confirmation.p7s"
 """Name of a robot's signed message, in the folder of the robot in an inbox."""
 CONFIRMED_FILES = (

@@ -264,28 +264,29 @@ class Names:
     def covering(self, name: str) -> Iterator[str]:
         """Yield the other expressions that cover ``name`` (see `covers`), in set order."""
         for wide in self._cover_candidates(name):
-            if wide != name and self._tried(covers(wide, name), wide, name):
+            if wide != name and self._count_if_not(covers(wide, name), wide, name):
                 yield wide
 
     def meets(self, name: str) -> bool:
         """Return whether an expression of the set overlaps with ``name``."""
         if is_expression(name):
             candidates = map(self._names.__getitem__, self._overlap_candidates(name))
-            return any(self._tried(overlap(e, name), e, name) for e in candidates)
+            return any(self._count_if_not(overlap(e, name), e, name) for e in candidates)
         return name in self._exact or (bool(self._wild) and any(self.covering(name)))
 
     def meeting(self, name: str) -> Iterator[str]:
         """Yield the expressions of the set that overlap with ``name``, in the order of the set."""
         if is_expression(name):
             for expression in map(self._names.__getitem__, sorted(self._overlap_candidates(name))):
-                if self._tried(overlap(expression, name), expression, name):
+                if self._count_if_not(overlap(expression, name), expression, name):
                     yield expression
             return
         if name in self._exact:
             yield name
         yield from self.covering(name)
 
-    def _tried(self, fits: bool, one: str, other: str) -> bool:
+    def _count_if_not(self, fits: bool, one: str, other: str) -> bool:
+        """Return ``fits``; a comparison without result counts against the limit."""
         if not fits:
             self._limit.spend(len(one) + len(other))
         return fits

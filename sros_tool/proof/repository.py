@@ -272,7 +272,7 @@ class Repository:
         if len(parents) < 2:
             raise DocumentError(
                 f"the commit {merge} is not a merge",
-                "The base follows only from the parents of a merge commit.",
+                "Only the parents of a merge commit show which base it has.",
                 "Name the base itself, or check out the merge commit of the code host.",
             )
         return parents[0]

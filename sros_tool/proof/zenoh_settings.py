@@ -101,7 +101,7 @@ _COMPARED = re.compile(
     r"|transport/link/tls/(?:enable_mtls|verify_name_on_connect|close_link_on_expiration)"
     r"|transport/shared_memory/enabled|scouting/(?:multicast|gossip)/enabled"
 )
-"""Paths of settings that `_OPEN`, the endpoints or the access-control rules compare."""
+"""Paths of settings that are compared: those of `_OPEN`, of endpoints and of access control."""
 _HARMLESS = re.compile(
     r"metadata(?:/.*)?|timestamping/.*|queries_default_timeout|open/.*|stats/.*"
     r"|transport/unicast/.*|transport/link/[tr]x/.*|transport/link/tls/so_(?:snd|rcv)buf"

@@ -82,7 +82,7 @@ def test_every_attack_ends_as_expected(
     assert not [row for row in result["rows"] if not row["as_expected"]]
     assert status == 0
     holding = conditions(backend, load_template("production"), "rt/chatter")
-    rows = [row.under(holding) for row in ATTACKS.rows if is_played(row)]
+    rows = [row.expected_under(holding) for row in ATTACKS.rows if is_played(row)]
     assert [row["name"] for row in result["rows"]] == [row.name for row in rows]
     skipped = {row["name"]: row["detail"] for row in result["rows"] if row["observed"] == "skipped"}
     if ISOLATION.isolated and os.geteuid() == 0:

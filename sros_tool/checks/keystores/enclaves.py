@@ -357,7 +357,7 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
     length = window.not_after - window.not_before
     if length > _LONG and not unique:
         accepted = keystore.accepts(
-            LONG_PERMISSIONS, lambda s: _is_as_long(s.permissions_validity, length)
+            LONG_PERMISSIONS, lambda s: _lasts_at_least(s.permissions_validity, length)
         )
         text = f"they are valid from {iso(window.not_before)} to {iso(window.not_after)}"
         yield LONG_PERMISSIONS.found(enclave.name, text, file, accepted=accepted)
@@ -374,7 +374,7 @@ def _denied_before_everything(grant: Grant) -> list[str]:
     return []
 
 
-def _is_as_long(chosen: Span, length: timedelta) -> bool:
+def _lasts_at_least(chosen: Span, length: timedelta) -> bool:
     """Return whether a chosen validity is at least ``length``; a fixed date of expiry always is."""
     return not isinstance(chosen, timedelta) or length <= chosen + BACKDATE
 
