@@ -92,6 +92,11 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     gc.enable()
 
 
+for variable in list(os.environ):
+    # Tests do not depend on the ROS environment of whoever runs them.
+    if variable.startswith(("ROS_SECURITY_", "ROS_DOMAIN_ID")):
+        del os.environ[variable]
+
 for each in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
     # Whoever starts the tests in the background may have had them ignored, and children inherit it.
     if signal.getsignal(each) is signal.SIG_IGN:
@@ -148,14 +153,6 @@ def decrypt_each_key_once() -> Iterator[None]:
         patch.setattr(keys, "_decrypted", decrypted)
         patch.setattr(keys, "_P", 1)  # of five, so that making an encrypted key is no slower either
         yield
-
-
-@pytest.fixture(autouse=True)
-def no_ros_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tests do not depend on the ROS environment of whoever runs them."""
-    for name in list(os.environ):
-        if name.startswith(("ROS_SECURITY_", "ROS_DOMAIN_ID")):
-            monkeypatch.delenv(name)
 
 
 @pytest.fixture(scope="session")

@@ -18,6 +18,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -424,8 +425,7 @@ def common_parts(folder: Path, shipped: Path) -> CommonParts:
     version of a file that the part needs, so that versions never mix.
     """
     rights, missing = {}, {}
-    for part in PARTS:
-        needed = _needed_files(shipped, part)
+    for part, (needed, shipped_rights) in _shipped_parts(shipped).items():
         if (folder / part).exists():
             known, copies = _part_rights(folder, part), dict[str, bytes]()
         else:
@@ -433,7 +433,7 @@ def common_parts(folder: Path, shipped: Path) -> CommonParts:
             other = [
                 path for path in needed if path not in copies and _differs(folder, path, needed)
             ]
-            known = None if other else _part_rights(shipped, part)
+            known = None if other else shipped_rights
         if known:
             rights[part], missing[part] = known, copies
     return CommonParts(rights, missing)
@@ -464,6 +464,14 @@ def _part_rights(root: Path, part: str) -> frozenset[NodeRight] | None:
     except DocumentError:
         return None
     return frozenset(rights)
+
+
+@lru_cache(maxsize=4)  # verbs such as close ask several times
+def _shipped_parts(
+    shipped: Path,
+) -> Mapping[str, tuple[Mapping[str, bytes], frozenset[NodeRight] | None]]:
+    """Map each common part to its files, as `_needed_files`, and to the rights that it allows."""
+    return {part: (_needed_files(shipped, part), _part_rights(shipped, part)) for part in PARTS}
 
 
 def _needed_files(root: Path, part: str) -> dict[str, bytes]:
