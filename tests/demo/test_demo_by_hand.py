@@ -9,9 +9,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from sros_tool.demo import ros_node
 from sros_tool.demo.backend import HandNode, backend_by_hand, security_of
 from sros_tool.demo.cyclone_node import CycloneNode
 from sros_tool.demo.nodes import ROLES, NodeOptions
@@ -23,6 +25,7 @@ from sros_tool.runtime.rmw import _RMW_INDEX
 from tests.support.children import LATE, PATIENCE, apart
 from tests.support.harness import sros
 
+_ANY_RELIABILITY = "qos_profile_sensor_data"
 TALKER = HandNode(Role.TALKER, "cyclone", "/chatter")
 
 
@@ -108,6 +111,33 @@ def test_a_node_by_hand_says_what_others_have_of_another_type(tmp_path: Path) ->
     assert heard == " message of nav_msgs/msg/Odometry"
     assert driven.startswith("/cmd_vel has 1 subscription of geometry_msgs/msg/Twist, which does")
     assert seen == "/odom has 1 publisher of nav_msgs/msg/Odometry"
+
+
+def test_an_rclpy_node_by_hand_gives_up_its_own_type_to_hear_another(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Fast DDS refuses a second type of a topic in a process (tried with rmw_fastrtps_cpp)."""
+    modules = {"std_msgs.msg": "String", "nav_msgs.msg": "Odometry", "rclpy.qos": _ANY_RELIABILITY}
+    for module, name in modules.items():
+        monkeypatch.setitem(sys.modules, module, Mock(**{name: name}))
+    node, types = Mock(), ["nav_msgs/msg/Odometry"]
+    node.get_publishers_info_by_topic = lambda _topic: [Mock(topic_type=kind) for kind in types]
+    options = NodeOptions("listener", "/odom", 1e-9, by_hand=True)
+    ros_node._listener(node, options, EventWriter(tmp_path / "report"))
+    ((_, look),) = (call.args for call in node.create_timer.call_args_list)
+    look()
+    made = [call for call in node.method_calls if "subscription" in call[0]]
+    assert [(call[0], call.args[0]) for call in made] == [
+        ("create_subscription", "String"),
+        ("destroy_subscription", node.create_subscription.return_value),
+        ("create_subscription", "Odometry"),
+    ]
+    made[2].args[2](b"raw")
+    types.append("lost_msgs/msg/Other")
+    look()
+    seen, heard = (event.text for event in read_events(tmp_path / "report")[1:])
+    assert heard == "1 message of nav_msgs/msg/Odometry"
+    assert "lost_msgs/msg/Other, which this listener cannot hear (No module named 'lost_" in seen
 
 
 @pytest.mark.parametrize("options", [["--json"], ["--scenario", "attacks"], ["--domain", "3"]])
