@@ -29,7 +29,7 @@ from sros_tool.demo.scenarios.model import Condition, Role
 from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.policy.patterns import matches
-from sros_tool.runtime.cyclone import INSTALL_ADVICE
+from sros_tool.runtime.cyclone import INSTALL_ADVICE, load_cyclone
 from sros_tool.runtime.events import Event, EventKind, ProcessStage, parse_event
 from sros_tool.runtime.netns import end_with_starter
 from sros_tool.runtime.rmw import (
@@ -353,8 +353,15 @@ def backend_by_hand(role: Role, environment: Mapping[str, str]) -> str:
         return ZENOH
     rmw = _rmw_here(environment)
     on_cyclone = vendor_of(rmw) is Vendor.CYCLONE or built_without_security(rmw, environment)
-    fits = environment.get(ENABLE) == "true" and vendor_of(rmw) and not on_cyclone
-    return RCLPY if fits and importlib.util.find_spec("rclpy") else CYCLONE
+    if importlib.util.find_spec("rclpy") is None:
+        return CYCLONE
+    if environment.get(ENABLE) == "true":
+        return RCLPY if vendor_of(rmw) and not on_cyclone else CYCLONE
+    try:
+        load_cyclone()
+    except UnavailableError:
+        return RCLPY
+    return CYCLONE
 
 
 def _rmw_here(environment: Mapping[str, str]) -> str:

@@ -13,7 +13,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from sros_tool.demo import ros_node
+from sros_tool.demo import backend, ros_node
 from sros_tool.demo.backend import HandNode, backend_by_hand, security_of
 from sros_tool.demo.cyclone_node import CycloneNode
 from sros_tool.demo.nodes import ROLES, NodeOptions
@@ -67,7 +67,11 @@ def test_a_secured_node_runs_on_what_the_robot_runs_on(
         path.touch()
     robot = {"AMENT_PREFIX_PATH": str(tmp_path), "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"}
     secured = {**robot, "ROS_SECURITY_ENABLE": "true"}
+    monkeypatch.setattr(backend, "load_cyclone", lambda: None)
     assert backend_by_hand(Role.LISTENER, robot) == "cyclone"
+    lacking = Mock(side_effect=UnavailableError("no libddsc"))
+    monkeypatch.setattr(backend, "load_cyclone", lacking)
+    assert backend_by_hand(Role.LISTENER, robot) == "rclpy"
     assert backend_by_hand(Role.LISTENER, secured) == "rclpy"
     on_cyclone = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
     assert backend_by_hand(Role.LISTENER, {**secured, **on_cyclone}) == "cyclone"
