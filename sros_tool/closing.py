@@ -519,22 +519,28 @@ def _users(of_name: Mapping[str, Sequence[str]], right: str) -> str:
 
 
 def forbidding(robot: Path, addition: str, at: datetime) -> list[Requirement]:
-    """Return the requirements in the folder of a closed robot that forbid to add rights.
+    """Return the requirements in the folder of a closed robot that more rights would break.
 
-    None if the folder has no requirements, or its policy cannot be read with the ``addition``, the
-    document of a policy.
+    ``addition`` is the policy document with these rights.  None if the folder has no requirements,
+    or the policy with the addition cannot be decided.
     """
-    file, policy = robot / _REQUIREMENTS, robot / CLOSED_POLICY
+    file, path = robot / _REQUIREMENTS, robot / CLOSED_POLICY
     if not file.exists():
         return []
     try:
-        merged = merge_into(policy, read_policy(policy, addition.encode())).document
-        template = load_template(_TEMPLATE)
-        system = policy_system(read_policy(policy, merged), at=at, template=template)
-        decided = decide_all(read_requirements(file), system)
+        needed, template = read_requirements(file), load_template(_TEMPLATE)
+        merged = merge_into(path, read_policy(path, addition.encode())).document
+
+        def broken(policy: Policy) -> dict[Requirement, None]:
+            decided = decide_all(needed, policy_system(policy, at=at, template=template))
+            return dict.fromkeys(violation.requirement for violation in decided.violations)
+
+        if after := broken(read_policy(path, merged)):
+            before = broken(read_policy(path))
+            return [requirement for requirement in after if requirement not in before]
     except SrosError:
-        return []
-    return list(dict.fromkeys(violation.requirement for violation in decided.violations))
+        pass
+    return []
 
 
 # ── the steps ───────────────────────────────────────────────────────────────────────────────
@@ -1097,7 +1103,7 @@ class OpenRobot:
             where = "" if self.keystore.exists() else ", where the keystore is,"
             self._shell.say(
                 f"'{self.policy}' is not what is signed, for {first_few(changed, _MOST_NAMES)}: "
-                f"`sros close {shlex.quote(str(self.folder))}`{where} signs it"
+                f"`sros close {shlex.quote(str(self.folder))}`{where} checks and signs it"
             )
         return closing._replace(proofs=proofs)
 

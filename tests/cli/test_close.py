@@ -499,7 +499,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     policy = robot.folder / "robot/policy.xml"
     policy.write_text(policy.read_text().replace("chatter", "gossip", 1))
     ended = robot.close("--proof", "--partial")
-    assert "policy.xml' is not what is signed, for /listener: `sros close robot` signs" in ended.err
+    assert (
+        "policy.xml' is not what is signed, for /listener: `sros close robot` checks" in ended.err
+    )
     assert "closed, except for what was not asked" in ended.err
 
 
