@@ -9,7 +9,6 @@ import shlex
 import shutil
 import signal
 import stat
-import subprocess
 import sys
 import time
 from datetime import UTC, datetime, timedelta
@@ -26,8 +25,9 @@ from sros_tool.pki.keys import generate_key
 from sros_tool.runtime.environment import REFUSING, render_refusal
 from sros_tool.runtime.variables import DOMAIN
 from sros_tool.validity import Window
-from tests.support.children import finish, run, wait_for
+from tests.support.children import run, wait_for
 from tests.support.harness import (
+    Ended,
     Running,
     check_whole,
     forked,
@@ -760,8 +760,7 @@ print(json.dumps([dict(os.environ), os.getcwd(), [i.name for i in ignored]]))
 
 
 def test_run_executes_in_exactly_that_environment(keystore: Path, tmp_path: Path) -> None:
-    command = [*PROGRAM, "run", "ks", "/a", "--", "env", "-i", "sh", "-c", "true"]
-    run(command, cwd=tmp_path)
+    forked("run", "ks", "/a", "--", "env", "-i", "sh", "-c", "true", cwd=tmp_path).ok()
     wrong = {"ROS_SECURITY_ENABLE": "false", "ROS_SECURITY_KEYSTORE": "/nowhere", "MINE": "1"}
     environment = {**os.environ, **wrong}
     command = [*PROGRAM, "run", "ks", "/a", "--", sys.executable, "-c", SHOW]
@@ -773,8 +772,8 @@ def test_run_executes_in_exactly_that_environment(keystore: Path, tmp_path: Path
     assert folder == str(tmp_path)
     # Those that the new Python itself ignores; a command without Python sees none.
     assert set(ignored) <= {"SIGPIPE", "SIGXFSZ"}
-    command = [*PROGRAM, "run", "ks", "/a", "--", "grep", "SigIgn", "/proc/self/status"]
-    said = run(command, cwd=tmp_path).stdout
+    words = ("run", "ks", "/a", "--", "grep", "SigIgn", "/proc/self/status")
+    said = forked(*words, cwd=tmp_path).ok().out
     assert int(said.split()[1], 16) == 0
 
 
@@ -784,13 +783,11 @@ def test_run_names_the_enclave_of_a_ros_node(keystore: Path, tmp_path: Path) -> 
         path.parent.mkdir(parents=True)
         path.write_text(f"#!/bin/sh\n{text}\n")
     node.chmod(0o755)
-    command = [*PROGRAM, "run", str(keystore), "/a", "--", str(node), "--fast"]
-    done = run(command)
-    assert done.stdout == "--fast --ros-args --enclave /a\n"
-    assert done.stderr.startswith("added --ros-args --enclave /a, so that the ROS graph shows")
-    command = [*PROGRAM, "run", "--no-ros-args", str(keystore), "/a", "--", str(node), "--fast"]
-    done = run(command)
-    assert (done.stdout, done.stderr) == ("--fast\n", "")
+    done = forked("run", keystore, "/a", "--", node, "--fast").ok()
+    assert done.out == "--fast --ros-args --enclave /a\n"
+    assert done.err.startswith("added --ros-args --enclave /a, so that the ROS graph shows")
+    done = forked("run", "--no-ros-args", keystore, "/a", "--", node, "--fast")
+    assert done == Ended(0, "--fast\n", "")
 
 
 @pytest.mark.parametrize(
@@ -826,13 +823,12 @@ def test_a_reader_that_goes_away_is_no_trouble(keystore: Path) -> None:
 def test_a_polite_end_leaves_nothing(number: signal.Signals, keystore: Path) -> None:
     before = snapshot(keystore.parent)
     names = [f"/n{index}" for index in range(400)]
-    process = subprocess.Popen(
-        [*PROGRAM, "create_enclave", str(keystore), *names], stderr=subprocess.PIPE, text=True
-    )
-    wait_for(lambda: remains(keystore), "the stage of a transaction", process)
+    process = Running("create_enclave", keystore, *names)
+    wait_for(lambda: remains(keystore), "the stage of a transaction")
     process.send_signal(number)
-    ended = finish(process, status=143 if number == signal.SIGTERM else 130)
-    assert "Traceback" not in ended.stderr
+    ended = process.end()
+    assert ended.status == (143 if number == signal.SIGTERM else 130)
+    assert "Traceback" not in ended.err
     assert snapshot(keystore.parent) == before
 
 

@@ -75,21 +75,19 @@ def test_two_hosts_of_one_robot_are_named() -> None:
 
 @needs_ansible
 def test_the_documentation_of_each_part(tmp_path: Path) -> None:
-    modules = sorted(path.stem for path in (COLLECTION / "plugins/modules").glob("*.py"))
-    names = [f"sros.fleet.{each}" for each in modules]
-    found = json.loads(ansible("ansible-doc", "--json", *names, folder=tmp_path))
-    for name, parts in found.items():
+    dump = ansible("ansible-doc", "--metadata-dump", "sros.fleet", folder=tmp_path)
+    found = json.loads(dump)["all"]
+    for kind, files in (("module", "modules/*.*"), ("filter", "filter/*.*")):
+        stems = {path.stem for path in (COLLECTION / "plugins").glob(files)}
+        assert found[kind].keys() == {f"sros.fleet.{stem}" for stem in stems}
+    for name, parts in found["module"].items():
         assert parts["examples"].strip(), name
         assert parts["return"], name
         assert all(each.get("description") for each in parts["doc"]["options"].values()), name
         source = (COLLECTION / f"plugins/modules/{name.rpartition('.')[2]}.py").read_text()
         given = set(re.findall(r'^\s+"(\w+)": \{"type"', source, re.MULTILINE))
         assert given == set(parts["doc"]["options"]), name
-    filters = ("due_units", "without_unit", "stage_is_due")
-    words = ("--json", "-t", "filter", *(f"sros.fleet.{each}" for each in filters))
-    assert len(json.loads(ansible("ansible-doc", *words, folder=tmp_path))) == 3
-    words = ("--json", "-t", "role", "sros.fleet.robot")
-    (role,) = json.loads(ansible("ansible-doc", *words, folder=tmp_path)).values()
+    (role,) = found["role"].values()
     defaults = (COLLECTION / "roles/robot/defaults/main.yml").read_text()
     known = set(re.findall(r"^(\w+):", defaults, re.MULTILINE)) | {"sros_keystore"}
     assert known == set(role["entry_points"]["main"]["options"])
