@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import base64
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from sros_tool.runtime.environment import CONTAINER_FORMS, NO_CONFIGURATION, render_refusal
 from tests.runtime.test_containers import check
-from tests.support.children import importing
-from tests.support.harness import copy_of, policy_text, publish, sros
+from tests.support.harness import Running, copy_of, policy_text, publish, sros
 
 THERE = "/etc/sros/keystore"
 
@@ -94,13 +91,9 @@ def test_a_secret_goes_to_no_file_that_others_can_read(
     output = tmp_path / "secret.yaml"
     output.touch()
     output.chmod(mode)
-    command = (sys.executable, "-m", "sros_tool", "env", made / "ks", "/arm")
-    with output.open("wb") as file:
-        ended = subprocess.run(
-            [*command, "--format", "kubernetes-secret"],
-            stdout=file, stderr=subprocess.PIPE, env=importing(), check=False,
-        )  # fmt: skip
-    assert ended.returncode == status, ended.stderr
+    words = ("env", made / "ks", "/arm", "--format", "kubernetes-secret")
+    ended = Running(*words, write_to=output).end()
+    assert ended.status == status, ended
     assert (output.read_text() == render_refusal("kubernetes-secret")) == bool(status)
     assert ("key.pem" in output.read_text()) == (not status)
 

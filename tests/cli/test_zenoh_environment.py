@@ -14,11 +14,10 @@ from sros_tool.keystore import zenoh_files
 from sros_tool.keystore.reader import OpenedEnclave
 from sros_tool.pki import smime
 from sros_tool.runtime.environment import NO_CONFIGURATION, REFUSING, render_refusal
-from tests.support.children import importing, run
-from tests.support.harness import copy_of, policy_text, publish, sros
+from tests.support.children import importing
+from tests.support.harness import Ended, copy_of, forked, policy_text, publish, sros
 from tests.support.zenoh_configurations import with_rmw_zenoh
 
-PROGRAM = [sys.executable, "-m", "sros_tool"]
 ZENOH = ("--rmw", "rmw_zenoh_cpp")
 
 
@@ -276,12 +275,12 @@ def test_run_replaces_what_was_inherited_and_says_so(keystore: Path) -> None:
     wanted = json.loads(sros("env", keystore, "/a", *ZENOH, "--json").ok().out)["variables"]
     environment = importing(ZENOH_CONFIG_OVERRIDE=OPENING, ZENOH_ROUTER_CONFIG_URI="/etc/r.json5")
     words = ("run", keystore, "/a", *ZENOH, "--", sys.executable, "-c", SHOW)
-    done = run([*PROGRAM, *words], env=environment)
-    seen, _ = json.loads(done.stdout)
+    done = forked(*words, env=environment).ok()
+    seen, _ = json.loads(done.out)
     assert {name: seen[name] for name in wanted} == wanted
-    assert "note [zenoh.replaced]: ZENOH_ROUTER_CONFIG_URI was '/etc/r.json5'" in done.stderr
-    assert "WARNING: the replaced ZENOH_CONFIG_OVERRIDE changed access_control" in done.stderr
-    assert "note [zenoh.enclave-argument]" in done.stderr
+    assert "note [zenoh.replaced]: ZENOH_ROUTER_CONFIG_URI was '/etc/r.json5'" in done.err
+    assert "WARNING: the replaced ZENOH_CONFIG_OVERRIDE changed access_control" in done.err
+    assert "note [zenoh.enclave-argument]" in done.err
 
 
 def test_run_says_nothing_of_the_enclave_where_the_command_names_it(
@@ -296,14 +295,14 @@ def test_run_says_nothing_of_the_enclave_where_the_command_names_it(
         program.parent.mkdir(parents=True)
         program.write_text("#!/bin/sh\necho $*\n")
         program.chmod(0o755)
-    done = run([*PROGRAM, "run", keystore, "/a", *ZENOH, "--", node])
-    assert done.stdout == "--ros-args --enclave /a\n"
-    assert "enclave-argument" not in done.stderr
-    named = ["--", node, "--ros-args", "-e", "/b"]
-    done = run([*PROGRAM, "run", keystore, "/a", *ZENOH, *named], status=2)
-    assert "the command names the enclave /b" in done.stderr
-    done = run([*PROGRAM, "run", keystore, "/router", *ZENOH, "--", router])
-    assert (done.stdout, done.stderr) == ("\n", "")
+    done = forked("run", keystore, "/a", *ZENOH, "--", node).ok()
+    assert done.out == "--ros-args --enclave /a\n"
+    assert "enclave-argument" not in done.err
+    refused = forked("run", keystore, "/a", *ZENOH, "--", node, "--ros-args", "-e", "/b")
+    assert refused.status == 2
+    assert "the command names the enclave /b" in refused.err
+    done = forked("run", keystore, "/router", *ZENOH, "--", router)
+    assert done == Ended(0, "\n", "")
 
 
 def test_completion_of_rmw(keystore: Path) -> None:
