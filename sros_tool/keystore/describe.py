@@ -44,7 +44,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import GAP, RESTORED, SEALED, Entry
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
-from sros_tool.keystore.reader import FilesReadOnce, Keystore, open_enclave
+from sros_tool.keystore.reader import FilesReadOnce, Keystore, OpenedEnclave, open_enclave
 from sros_tool.keystore.zenoh_files import OpenedZenoh, ZenohFault, open_zenoh
 from sros_tool.pki.certificates import (
     common_name_of,
@@ -549,9 +549,8 @@ def describe(
         if any((path / name).exists() for name in of_enclave):
             state = open_enclave(path, now=now, files=files)
             evaluation = evaluated("", path, state, at=now)
-            facts = (
-                _facts_in_keystore(evaluation) if state.key_on_robot else _enclave_facts(evaluation)
-            )
+            at_home = state.key_on_robot
+            facts = _facts_in_keystore(evaluation, state) if at_home else _enclave_facts(evaluation)
             return DescribedEnclave(path, state.key_on_robot, facts, _zenoh(path, now))
         refuse_earlier(path)
         raise DocumentError(
@@ -694,12 +693,15 @@ def _enclave(keystore: Keystore, name: str, now: datetime) -> KeystoreEnclave:
     """Describe an enclave of a keystore."""
     state = keystore.enclave(name, now=now)
     evaluation = evaluated(name, keystore.folder(name), state, at=now)
-    return KeystoreEnclave(name, state.key_on_robot, _facts_in_keystore(evaluation))
+    return KeystoreEnclave(name, state.key_on_robot, _facts_in_keystore(evaluation, state))
 
 
-def _facts_in_keystore(evaluation: EvaluatedEnclave) -> EnclaveFacts:
-    """Describe the files of an enclave; a key that is only on its robot is no problem there."""
-    problems = [*evaluation.problems, *evaluation.for_some(evaluation.state.problems)]
+def _facts_in_keystore(evaluation: EvaluatedEnclave, state: OpenedEnclave) -> EnclaveFacts:
+    """Describe the files of an enclave; a key that is only on its robot is no problem there.
+
+    ``state`` also has the problems that some vendors accept.
+    """
+    problems = [*evaluation.problems, *evaluation.for_some(state.problems)]
     return _enclave_facts(evaluation)._replace(problems=problems)
 
 
