@@ -6,7 +6,6 @@ import inspect
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -16,6 +15,7 @@ import pytest
 import sros_tool
 from sros_tool import DocumentError, KeystoreError, PolicyError, UsageError
 from sros_tool.files import policies_dir
+from tests.support.children import apart
 from tests.support.harness import policy_text, publish
 from tests.support.long_form import sometimes
 
@@ -56,24 +56,15 @@ def test_the_first_script_prints_what_the_document_says(tmp_path: Path) -> None:
     assert (tmp_path / "robot.tar.gz").is_file()
 
 
-@pytest.fixture
-def same_recursion_limit() -> Iterator[None]:
-    """Put back the limit of the tests' process, which mypy raises for good."""
-    limit = sys.getrecursionlimit()
-    yield
-    sys.setrecursionlimit(limit)
-
-
-@pytest.mark.usefixtures("same_recursion_limit")
 @sometimes("a type checker")
 def test_a_type_checker_knows_the_names_and_finds_a_wrong_call(tmp_path: Path) -> None:
     api = pytest.importorskip("mypy.api")
     script = tmp_path / "script.py"
     wrong = 'sros_tool.generate("ks", 7)\nsros_tool.gnerate("ks")\n'
     script.write_text(first_script()[0] + wrong, encoding="utf-8")
-    out, _, status = api.run(
-        ["--strict", "--config-file", str(PROJECT / "pyproject.toml"), str(script)]
-    )
+    words = ["--strict", "--config-file", str(PROJECT / "pyproject.toml"), str(script)]
+    # In a fork: mypy changes the environment and the recursion limit of its process.
+    out, _, status = apart(lambda: api.run(words))
     errors = [line for line in out.splitlines() if "error:" in line]
     assert status == 1
     assert len(errors) == 2
