@@ -234,7 +234,7 @@ def generate(
     """
     from sros_tool.keystore.lifecycle import create
 
-    names = tuple(_several("enclaves", enclaves))
+    names = tuple(_no_string("enclaves", enclaves))
     if not (policies or names):
         text = "no policy and no enclave is given"
         raise UsageError(text, "", "Pass at least one policy or enclave.")
@@ -339,7 +339,7 @@ def renew(
     from sros_tool.keystore.expiry import Threshold
     from sros_tool.keystore.lifecycle import renew as lifecycle
 
-    names = tuple(_several("enclaves", enclaves))
+    names = tuple(_no_string("enclaves", enclaves))
     if not names and expiring is None:
         raise UsageError("nothing is given to renew", "", "Pass enclaves, or a time as expiring.")
     return lifecycle.renew(
@@ -393,7 +393,7 @@ def revoke(
     """
     from sros_tool.keystore.lifecycle import revoke as lifecycle
 
-    names = tuple(_several("enclaves", enclaves))
+    names = tuple(_no_string("enclaves", enclaves))
     if not names:
         raise UsageError("no enclave is given to revoke", "", "Pass at least one enclave name.")
     return lifecycle.revoke(
@@ -440,7 +440,7 @@ def fleet_status(
     from sros_tool.keystore import fleet_status as status
     from sros_tool.keystore.reader import Keystore as OpenedKeystore
 
-    fleet = status.fleet_status(OpenedKeystore(Path(keystore)), tuple(_several("robots", robots)))
+    fleet = status.fleet_status(OpenedKeystore(Path(keystore)), tuple(_no_string("robots", robots)))
     return fleet.with_overdue(_moment(now), max_age)
 
 
@@ -471,7 +471,7 @@ def export_enclaves(
     """
     from sros_tool.keystore.delivery.export import distribute
 
-    names = tuple(_several("enclaves", enclaves))
+    names = tuple(_no_string("enclaves", enclaves))
     if not names:
         raise UsageError("no enclave is given to export", "", "Pass at least one enclave name.")
     return distribute(Path(keystore), names, Path(target), now=_moment(now), force=force).target
@@ -607,7 +607,7 @@ def check(
         read_policy_for(Path(policy), robots)
         if robots and isinstance(policy, str | PathLike)
         else _policy(policy)
-        for policy in _several("policies", policies)
+        for policy in _no_string("policies", policies)
     )
     at = Circumstances(_moment(now), zone, _domain(domain), read, fleet=robots)
     findings = path_findings(map(Path, paths), at)
@@ -779,7 +779,7 @@ def _content(path: AnyPath) -> bytes:
     return read_bytes(Path(path), "file")
 
 
-def _several(parameter: str, given: Iterable[Item]) -> Iterable[Item]:
+def _no_string(parameter: str, given: Iterable[Item]) -> Iterable[Item]:
     """Return ``given``; refuse a single string, which would be iterated letter by letter."""
     if isinstance(given, str):
         raise UsageError(f"{parameter} is one string", "", f"Pass a list: [{given!r}].")

@@ -429,14 +429,14 @@ def _is_named(process: Process, node: ObservedNode, _told: object) -> bool:
     return node_argument(process.command) == (node.ns, node.name)
 
 
-def _is_its_program(process: Process, node: ObservedNode, _told: object) -> bool:
+def _has_program_named_alike(process: Process, node: ObservedNode, _told: object) -> bool:
     return program_of(process.command).removesuffix(".py") == node.name
 
 
 _KNOWN_BY: dict[str, Callable[[Process, ObservedNode, Mapping[str, int]], bool]] = {
     "process id": _shows_its_id,
     "node name": _is_named,
-    "program": _is_its_program,
+    "program": _has_program_named_alike,
     "elimination": lambda _process, _node, _told: True,
 }
 

@@ -38,7 +38,7 @@ _IN_EXPORT = {
     "has the CA keys, first replace the file there: `rm {path} && sros create_enclave {root} "
     "{enclave}`.",
 }
-"""Remedies on a robot, whose export has no CA keys, where they differ from the keystore's."""
+"""Remedies for an export, which has no CA keys, that differ from the remedies for a keystore."""
 _GOVERNANCE = (
     "Every enclave depends on it: restore {root}/enclaves/governance.p7s from a backup, or read "
     "{root}/enclaves/governance.xml and sign it again: `openssl smime -sign -text -in "

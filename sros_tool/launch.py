@@ -140,8 +140,10 @@ def _of_launch(keystore: Path, policy: Path, enclave: str) -> EnclaveEnvironment
 
 
 class SecuredOption:
-    """The option ``--secured`` of ``ros2 launch``, which needs nothing else of an extension
-    (ros2launch 0.26, ``ros2launch/option/__init__.py``).
+    """The option ``--secured`` of ``ros2 launch``.
+
+    ros2launch calls only these methods of an option, and needs no base class (ros2launch 0.26,
+    ``ros2launch/option/__init__.py``).
     """
 
     NAME = "secured"

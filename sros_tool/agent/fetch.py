@@ -80,13 +80,13 @@ class ClientCertificate(NamedTuple):
     key: Path
 
 
-def pin_root(state: Path, data: bytes, *, now: datetime) -> str:
+def pin_root(agent_folder: Path, data: bytes, *, now: datetime) -> str:
     """Trust the root metadata ``data`` (of ``N.root.json``) from now on; return its SHA-256.
 
     Metadata that was trusted before is forgotten.
 
     Args:
-        state: the agent's folder, ``FOLDER/.agent``, which exists.
+        agent_folder: the agent's folder, ``FOLDER/.agent``, which exists.
         data: the content of the file.
         now: the present time.
 
@@ -117,10 +117,10 @@ def pin_root(state: Path, data: bytes, *, now: datetime) -> str:
             "",
             "Use the present root.json of the publishing folder; or set the clock of this robot.",
         )
-    with Folder(state) as folder:
+    with Folder(agent_folder) as folder:
         if folder.is_folder(_METADATA):
             folder.remove_tree(_METADATA)
-    replace_file(state / _PINNED_ROOT, data)
+    replace_file(agent_folder / _PINNED_ROOT, data)
     return hashlib.sha256(data).hexdigest()
 
 

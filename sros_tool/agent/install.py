@@ -106,14 +106,14 @@ def install_release(
 
     Args:
         folder: the security folder of this robot.
-        release: the release, of which nothing was verified but that its files fit its seal.
+        release: the release; so far, its files were only compared with its seal.
         robot: the name of this robot.
-        now: the present time, or a later one that is known to have passed.
+        now: the time of the clock, or a later one that verified documents prove has passed.
         installed: the highest number of a release that was accepted before.
         pinned: SHA-256 of permissions CAs that count as trusted, too.
         new_keys: keys that wait for their certificate, by enclave.
-        before: is called before the change with the enclaves whose processes will have earlier
-            files.
+        before: is called before the change with the enclaves whose processes have to be restarted
+            for it.
 
     Raises:
         KeystoreError: the release as a whole is not for this folder, or is older than what is here;

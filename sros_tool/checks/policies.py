@@ -70,7 +70,7 @@ from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_pr
 from sros_tool.policy.rights import WHOLE, Right, Rules, parts, placed_rights, policy_rights
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 from sros_tool.xml import parse, read_bytes
 
 
@@ -440,7 +440,7 @@ def _broad_right(statement: _Statement) -> Iterator[Finding]:
         kind = READS_EVERYTHING if right == "subscribe" else WIDE
         yield statement.found(
             kind,
-            f"{text} does not begin with a whole namespace, and does not end with a whole name",
+            f"{text} has a wildcard in the first part and in the last part of the name",
         )
     elif right == "request" and covers(name, "/*/set_parameters"):
         yield statement.found(SETS_PARAMETERS, f"{text} matches every node")
@@ -586,7 +586,7 @@ def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
     kinds = Counter(gap.finding.kind for gap in lacking)
     plural = len(nodes) > 1
     what = [
-        verb if kinds[kind] == len(nodes) else f"{verb} ({_nodes(kinds[kind])})"
+        verb if kinds[kind] == len(nodes) else f"{verb} ({counted(kinds[kind], 'node')})"
         for kind, verb in _STARTING.items()
         if kinds[kind]
     ]
@@ -596,16 +596,14 @@ def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
     place = "the <profile> of every node" if plural else "its <profile>"
     at = f"line{'s' * (len(lines) > 1)} {some_names([str(line) for line in lines])}"
     return Cause(
-        f"{_nodes(len(nodes))} lack the common part" if plural else "a node lacks the common part",
+        f"{counted(len(nodes), 'node')} lack the common part"
+        if plural
+        else "a node lacks the common part",
         f"{some_names(nodes)} may not {'; '.join(what)}. A node exits at its start if this is "
         "denied.",
         f"{first} this line into {place} ({at}): {_INCLUDE}",
         len(lacking),
     )
-
-
-def _nodes(count: int) -> str:
-    return "1 node" if count == 1 else f"{count} nodes"
 
 
 def _basics(checked: _CheckedPolicy, enclave: Enclave, profile: Profile) -> Iterator[_Lacking]:

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 @verb("audit", cls=Watching)
 @click.argument("sources", metavar="[POLICY...|KEYSTORE]", type=PATH, nargs=-1)
-@observing_options("Observe a robot that is secured already, in this enclave.")
+@observing_options("Run the observer in this enclave, if the robot is already secured.")
 @click.option(
     "--vendor",
     type=click.Choice([vendor.value for vendor in Vendor]),

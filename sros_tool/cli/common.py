@@ -130,8 +130,8 @@ def allow_refusal_option(function: Decorated) -> Decorated:
         type=_MeasuredVendors(),
         metavar="VENDOR",
         callback=_as_vendors,
-        help="Make the change even if this DDS vendor, such as fastdds-2.6, or all-fastdds, will "
-        "then refuse enclaves that it accepts now.  Can be repeated.",
+        help="Make the change even if this DDS vendor (fastdds-2.6, ...; all-fastdds for all of "
+        "Fast DDS) will then refuse enclaves that it accepts now.  Can be repeated.",
     )(function)
 
 

@@ -541,13 +541,13 @@ def _status(
     missing; or unknown (never issued by this keystore). Processes use new files only after a
     restart: confirmations by the Ansible collection and `sros agent` say which restarts are due,
     confirmations by `sros fleet report` do not. A robot without a recent confirmation is offline.
-    A robot that claims a release that was never published is always named. Robots with the same
-    state share a line. The last line counts known vulnerabilities of the robots' DDS,
-    by the advisories of sros; --robot and --advisories name them.
+    Robots with the same state share a line, except a robot that says it has a release that was
+    never published: it is always named. The last line counts known vulnerabilities of the robots'
+    DDS, by the advisories of sros; --robot and --advisories name them.
 
-    The revocation list is in force on a robot that has it and says that no restart is due. Robots
-    do not say which earlier files a process has: after any change of files, the list is in force
-    again only after the processes were restarted.
+    The revocation list is in force on a robot that has it and says that no restart is due. A robot
+    does not say which of its earlier files a process has loaded: after any change of files, the
+    list counts as in force again only after the processes were restarted.
 
     Example:
       $ sros fleet status keystore

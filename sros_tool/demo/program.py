@@ -267,7 +267,7 @@ def _result_of(
 
 
 def _parted(scenarios: Sequence[Scenario], rows: Sequence[RowResult]) -> Iterator[ScenarioResult]:
-    """Yield the result of each scenario in order; the rows of several scenarios ran together."""
+    """Yield the result of each scenario in order, with its part of the rows of all scenarios."""
     left = iter(rows)
     for scenario in scenarios:
         own = itertools.islice(left, len(scenario.rows))

@@ -216,7 +216,10 @@ def closed_robot(root: Path) -> Path | None:
 
 
 def adding_domains(root: Path, domains: str) -> str:
-    """Return how a keystore, or that of an export, is made for ``domains`` ("0,5"), in words."""
+    """Return advice, as a clause, on how to add a domain to a keystore, or to that of an export.
+
+    ``domains`` ("0,5") are all its domains afterwards.
+    """
     robot = closed_robot(root)
     candidates = (root, robot / "keystore") if robot else (root,)
     keystore = next(filter(has_authorities, candidates), None)

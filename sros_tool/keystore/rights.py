@@ -707,7 +707,7 @@ class _OfLedger:
 
 
 class RecordedRights:
-    """The rights that were last signed for each enclave, by the ledger.
+    """The rights that were last signed for each enclave, according to the ledger.
 
     The signature of older permissions stays valid, so whoever puts them back could otherwise have
     their rights signed again, with a new date.

@@ -303,7 +303,7 @@ CHANGING_NODES = (
     "_sros_observer_",
 )
 """Beginnings of node names that end in an address or a process id, and change with every start."""
-_SHOWING = frozenset(f"~/{service}" for service in OWN_SERVICES)
+_NODE_SERVICES = frozenset(f"~/{service}" for service in OWN_SERVICES)
 
 
 class NodeName(NamedTuple):
@@ -339,7 +339,7 @@ def nodes_not_shown(enclave: Enclave) -> tuple[NodeName, ...]:
         dict.fromkeys(
             node
             for profile, node in ((each, _node_of(each)) for each in profiles)
-            if not any(map(_shows, profile.groups)) or any(map(node.is_within, gone))
+            if not any(map(_offers_node_services, profile.groups)) or any(map(node.is_within, gone))
         )
     )
 
@@ -350,8 +350,8 @@ def _node_of(profile: Profile) -> NodeName:
     return NodeName(ns if ns.startswith("*") else f"/{ns}", profile.node)
 
 
-def _shows(group: Group) -> bool:
-    return ("reply", ALLOW) in group.rights and not _SHOWING.isdisjoint(group.names)
+def _offers_node_services(group: Group) -> bool:
+    return ("reply", ALLOW) in group.rights and not _NODE_SERVICES.isdisjoint(group.names)
 
 
 def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:

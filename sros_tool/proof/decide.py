@@ -739,8 +739,8 @@ class _Flow:
     ) -> Iterator[tuple[str, str]]:
         """Yield pairs of a topic and a reader to which information goes from an enclave.
 
-        Only readers for which ``is_new`` returns True are considered.  Exact topics come first, and
-        only those for which ``is_unused`` returns True.
+        Only readers for which ``is_new`` returns True are considered.  Exact topics come first,
+        without those for which ``is_unused`` returns False; matches of wildcards follow.
         """
         written, around, exact = self._world.written_by(enclave, _IGNORED)
         for topic in sorted(exact, key=_plain_first):

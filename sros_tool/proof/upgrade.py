@@ -245,7 +245,7 @@ def _present(
     here: Distribution | None,
     later: Distribution,
 ) -> Mapping[Distribution, list[str]]:
-    """Map each distribution before the update to the enclaves that are for it."""
+    """Return the enclaves for each distribution that is in use before the update."""
     by_distribution: dict[Distribution, list[str]] = {}
     unknown: list[str] = []
     for name in files.enclaves:

@@ -183,7 +183,7 @@ class AccessControl:
         return frozenset(self._by_name)
 
     def rules_for(self, common_name: str) -> int:
-        """Return the number of rules that name a remote process."""
+        """Return how many rules are for the remote process with this common name."""
         remote = self._by_name.get(common_name)
         return len(remote.rules) if remote else 0
 
@@ -522,7 +522,7 @@ class MessageFilter(Protocol):
         """Return the key expressions that rules allow; denials are not subtracted."""
 
     def rules_for(self, common_name: str) -> int:
-        """Return the number of rules that name a remote process."""
+        """Return how many rules are for the remote process with this common name."""
 
     def names(self) -> frozenset[str]:
         """Return the common names that rules are for."""

@@ -458,9 +458,10 @@ UNAUTHENTICATED = FindingKind(
     "governance.unauthenticated",
     ERROR,
     "participants without an identity may join",
-    "On Fast DDS they can read and write every topic without access control and protection; on "
-    "Cyclone DDS, every topic without protection, even with access control. If RTPS messages are "
-    "protected too, Fast DDS refuses the document; only Fast DDS 2.9 ignores the attribute.",
+    "On Fast DDS, they can read and write each topic that has neither access control nor "
+    "protection; on Cyclone DDS, each topic that has no protection, even if it has access control. "
+    "If the governance also protects RTPS messages, Fast DDS refuses it; only Fast DDS 2.9 accepts "
+    "it, and ignores allow_unauthenticated_participants.",
     f"{_GOVERNANCE} (allow_unauthenticated_participants); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS "
     "0.10 and 11.0; tested.",
     "Run `sros update_keystore KEYSTORE --set "

@@ -126,8 +126,8 @@ def ros_name_problem(text: str) -> str:
     name = text.strip()
     if not name or _ROS_NAME.match(name) or _OF_DDS.match(name):
         return ""
-    if has_foreign_letters(name):
-        return _foreign_problem(name)
+    if has_invalid_characters(name):
+        return _character_problem(name)
     if is_expression(name):
         possible = "//" not in name and any(overlap(name, known) for known in _OF_ROS)
         return "" if possible else f"{name!r} matches no valid ROS name{_meant(name)}"
@@ -136,12 +136,12 @@ def ros_name_problem(text: str) -> str:
     return f"{name!r} is not a valid ROS name{_meant(name)}"
 
 
-def has_foreign_letters(name: str) -> bool:
+def has_invalid_characters(name: str) -> bool:
     """Return whether an expression has characters outside [sets] that no ROS name can have."""
     return bool(_FOREIGN.search(_WILDCARD.sub("", name.strip())))
 
 
-def _foreign_problem(name: str) -> str:
+def _character_problem(name: str) -> str:
     letters = dict.fromkeys(_FOREIGN.findall(_WILDCARD.sub("", name)))
     shown = " ".join("a blank" if letter.isspace() else letter for letter in letters)
     advice = ""

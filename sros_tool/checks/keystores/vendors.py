@@ -14,7 +14,7 @@ from typing import NamedTuple
 from sros_tool.checks.keystores.documents import PARTITIONS, UNREACHABLE
 from sros_tool.checks.keystores.enclaves import fault_remedy, grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave
-from sros_tool.checks.keystores.topic_names import NO_ROS_NAME, has_foreign_letters, is_for_ros
+from sros_tool.checks.keystores.topic_names import NO_ROS_NAME, has_invalid_characters, is_for_ros
 from sros_tool.checks.kind import ERROR, WARNING, Cause, Finding, FindingKind, some_names
 from sros_tool.dds.decision.access import Access, AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import TESTED, Vendor, together
@@ -359,7 +359,7 @@ def _topics_to_ask(enclave: CheckedEnclave, known: Collection[str]) -> list[str]
         for criteria in (*rule.publish, *rule.subscribe):
             for topic in criteria.topics:
                 if not (_BLANKS in known and topic != topic.strip()) and not (
-                    NO_ROS_NAME.id in known and has_foreign_letters(topic)
+                    NO_ROS_NAME.id in known and has_invalid_characters(topic)
                 ):
                     named[_example(topic)] = None
     return [*named, _UNNAMED_TOPIC]

@@ -165,7 +165,7 @@ class VendorTraits:
     filters_own_domain: bool = True
     """The participant itself ignores its rules for other domains, as peers always do."""
     relays_count_for_readers: bool = False
-    """Peers also check a reader by ``<relay>``, after ``<subscribe>`` of the same rule."""
+    """For peers, ``<relay>`` of a rule also counts for a reader, after its ``<subscribe>``."""
     topic_decides: bool = False
     """The first rule with the topic decides, even if its partitions do not match."""
     deny_partitions: DenyPartitions = DenyPartitions.ANY_OR_ALL

@@ -1070,7 +1070,8 @@ _OPEN_ROWS = (
             (*_topic_pair(), _attacker("guest that looks around", Role.OBSERVER, OWN)),
             world=_PEERS,
         ),
-        "a node of rmw_zenoh asks for the whole graph: a denied node would see none of it",
+        "a node of rmw_zenoh asks for the whole graph in one query: a node that is denied the "
+        "query sees no names at all",
         "give an identity only to those who may see all names of the robot",
     ),
 )

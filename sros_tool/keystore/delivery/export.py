@@ -235,8 +235,8 @@ class ReleasedEnclave(NamedTuple):
 def released_enclave(root: Path, name: str, now: datetime) -> ReleasedEnclave:
     """Return the files of an enclave for its robot, after evaluating them.
 
-    An enclave that cannot run only because of the time is still released: its robot may have
-    another that can, and has to get the revocation list.
+    If the only reason why an enclave cannot run is a date (expired, or not valid yet), it is still
+    released: its robot may have other enclaves that can run, and needs the revocation list.
 
     Raises:
         KeystoreError: the enclave cannot run for another reason.
