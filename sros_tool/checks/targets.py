@@ -110,7 +110,6 @@ def _policies_at(path: Path) -> list[Path]:
 
     if not path.is_dir():
         read_bytes(path, "file")
-        return [path]
     if policies := list(policy_files(path)):
         return policies
     refuse_earlier(path)

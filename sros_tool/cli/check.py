@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -54,7 +54,7 @@ from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines, visible, visible_json
 from sros_tool.values import file_change, shows, versioned
-from sros_tool.wording import counted
+from sros_tool.wording import counted, first_few
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
@@ -671,7 +671,7 @@ def _fleet_of(at: Circumstances, paths: Sequence[Path]) -> Fleet | None:
     """
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.fleet import load_fleet
-    from sros_tool.policy.document import read_policy
+    from sros_tool.policy.document import policy_files, read_policy
 
     if at.fleet is None:
         opened = [at.opened[path] for path in paths if path in at.opened]
@@ -680,37 +680,40 @@ def _fleet_of(at: Circumstances, paths: Sequence[Path]) -> Fleet | None:
         return None
     patterns: list[str] = []
     for path in paths:
+        if path in at.opened:
+            continue
         with suppress(SrosError):  # what is wrong with it is a finding
-            patterns += FleetPolicy(read_policy(path, placeholders=True), at.fleet).patterns
+            for file in policy_files(path):
+                patterns += FleetPolicy(read_policy(file, placeholders=True), at.fleet).patterns
     return at.fleet.with_enclaves(patterns)
 
 
 def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Finding, str]]:
-    """Merge findings that differ only in the robot; yield the first of each group.
+    """Merge findings that differ only in one robot; yield the first of each group.
 
-    The text that comes with it names the other robots; it is "" if there are none.
-    Two findings are merged if they are about the same line of a policy, in enclaves of two robots,
-    or in one enclave about names of two robots.
+    The text that comes with it names the other robots; it is "" if there are none.  A finding that
+    names several robots is merged with those that differ in the robot in which most others do.
     """
-    from sros_tool.fleet.robots import name_of_robots, path_of_robots
+    from sros_tool.fleet.robots import for_any_robot, named_robots
 
-    groups: dict[object, list[tuple[Finding, str]]] = {}
-    number: Counter[object] = Counter()
+    kinds: list[tuple[Finding, dict[str, Hashable]]] = []
     for finding in findings:
-        path, robot = path_of_robots(fleet, finding.subject)
-        if not robot:
-            path, robot = name_of_robots(fleet, f"{path} {finding.text}")
-        # The documents of robots are in folders with their names.
-        file = name_of_robots(fleet, finding.file)[0] if robot else finding.file
-        place = (finding.id, file, finding.line, finding.accepted, finding.remedy)
-        number[path, robot, place] += 1  # of several that an enclave has there
-        groups.setdefault((place, path, number[path, robot, place]), []).append((finding, robot))
+        texts = (finding.subject, finding.text, finding.file, finding.remedy)
+        same = (finding.id, finding.line, finding.accepted)
+        robots = named_robots(fleet, finding.subject, finding.text)
+        of_robot: dict[str, Hashable] = {
+            robot.name: (*same, *(for_any_robot(text, robot) for text in texts)) for robot in robots
+        }
+        kinds.append((finding, of_robot))
+    sizes = Counter(kind for _, of_robot in kinds for kind in of_robot.values())
+    groups: dict[Hashable, list[tuple[Finding, str]]] = {}
+    for finding, of_robot in kinds:
+        robot, kind = max(of_robot.items(), key=lambda one: sizes[one[1]], default=("", finding))
+        groups.setdefault(kind, []).append((finding, robot))
     for (first, _), *others in groups.values():
-        robots = [robot for _, robot in others]
-        more = ", ..." if len(robots) > _MOST_ROBOTS else ""
-        count = counted(len(robots), "more robot")
-        named = f"the same for {count}: {', '.join(robots[:_MOST_ROBOTS])}{more}"
-        yield first, named if robots else ""
+        robots_text = first_few([robot for _, robot in others], _MOST_ROBOTS, joint=", and ")
+        count = counted(len(others), "more robot")
+        yield first, f"the same for {count}: {robots_text}" if others else ""
 
 
 _MOST_ROBOTS = 10

@@ -216,11 +216,17 @@ def _invalid_name(name: str, problem: str, source: Source) -> PolicyError:
 
 
 def _twice(path: str, enclave: Enclave, other: Enclave) -> PolicyError:
+    remedy = "Write paths that differ, for example with {robot} in front."
+    if other is not enclave and has_placeholder(enclave.path) and has_placeholder(other.path):
+        remedy = (
+            "If robots differ, put them into groups, and write one enclave for each group, with "
+            "the group in its path: {robot:GROUP}."
+        )
     return PolicyError(
         f"{enclave.source}: the enclave {path} is defined twice",
         f"It is also the enclave of {other.source}"
         f"{', for another robot' if other is enclave else ''}.",
-        "Write paths that differ, for example with {robot} in front.",
+        remedy,
     )
 
 

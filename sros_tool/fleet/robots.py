@@ -475,23 +475,23 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
             yield f"{kind}  ({_named(fleet, names)})"
 
 
-def path_of_robots(fleet: Fleet, enclave: str) -> tuple[str, str]:
-    """Return the path of an enclave with a placeholder for its robot, and the robot's name.
+def named_robots(fleet: Fleet, enclave: str, text: str) -> tuple[Robot, ...]:
+    """Return the robot of an enclave, if it has one, and the robots whose names a text has."""
+    owner = robot_of(fleet, enclave)
+    words = dict.fromkeys(re.findall(r"\w+", f"{enclave} {text}", re.A))
+    named = (fleet.robots[word] for word in words if word in fleet.robots)
+    return tuple(dict.fromkeys((*([owner] if owner else []), *named)))
 
-    For an enclave of no robot, the path stays as it is and the name is "".
+
+def for_any_robot(text: str, robot: Robot) -> str:
+    """Return a text with ``{robot}`` in place of a robot's namespace, and of its name.
+
+    The name can also be a part of a name, as in ``r1_lift``.
     """
-    robot = robot_of(fleet, enclave)
-    return (_with_placeholders(enclave, enclave, robot), robot.name) if robot else (enclave, "")
-
-
-def name_of_robots(fleet: Fleet, text: str) -> tuple[str, str]:
-    """Return a text with a placeholder for the robot that it names first, and the robot's name.
-
-    A text that names no robot stays as it is, and the name is "".
-    """
-    name = next(filter(fleet.robots.__contains__, re.findall(r"\w+", text, re.A)), "")
-    of_robot = "{robot}"
-    return (_whole(name).sub(of_robot, text), name) if name else (text, "")
+    any_robot = str(Placeholder("robot"))
+    if robot.namespace != "/":
+        text = _whole(robot.namespace).sub(f"/{any_robot}", text)
+    return re.sub(rf"(?<![A-Za-z0-9]){robot.name}(?![A-Za-z0-9])", any_robot, text)
 
 
 def _with_placeholders(text: str, enclave: str, robot: Robot) -> str:

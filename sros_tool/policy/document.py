@@ -1156,7 +1156,7 @@ def join_policies(policies: Sequence[Policy]) -> Policy:
 
 
 def policy_files(folder: Path) -> Iterator[Path]:
-    """Yield the paths of the policies in a folder and below it, sorted.
+    """Yield the paths of the policies in a folder and below it, sorted; for a file, its own path.
 
     Fragments that are only included are left out.
 
@@ -1164,6 +1164,9 @@ def policy_files(folder: Path) -> Iterator[Path]:
         DocumentError: a file that may be a policy cannot be read, is no XML, or has a name that
             does not end with ``.xml``; a link leads to a folder; or there are too many files.
     """
+    if not folder.is_dir():
+        yield folder
+        return
     for count, path in enumerate(_files_below(folder)):
         if count >= _MOST_FILES:
             raise DocumentError(

@@ -137,7 +137,12 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
                 f"one.{instead if several else ''}"
             )
         elif placeholder.group not in ("", of_path[0].group):
-            raise ValueError(f"{placeholder} is not the robot of the enclave: leave out the group.")
+            only = str(placeholder._replace(value="robot"))
+            raise ValueError(
+                f"{placeholder} stands for a robot of a group, and the path of this enclave is not "
+                f"for this group alone: leave out the group, or write another enclave for it, with "
+                f"{only} in its path."
+            )
 
 
 def fill(parts: Parts, robot: str, namespace: str, *, plural: bool = False) -> Parts:

@@ -25,6 +25,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -519,7 +520,11 @@ def _filled(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
         return
     for robot in members[groups[0] if groups else ""]:
         own = table.with_names(partial(_filled_names, several=members, robot=robot))
-        words = {key: _filled_words(own.values[key], robot) for key in _WORDS if key in own.values}
+        words = {
+            key: _filled_words(own.values[key], singular, robot)
+            for key in _WORDS
+            if key in own.values
+        }
         yield replace(own, values={**own.values, **words}, robot=robot.name)
 
 
@@ -601,12 +606,18 @@ def _filled_names(
     return [begin + "".join(map(str, each)) for each in filled]
 
 
-def _filled_words(text: object, robot: Robot) -> object:
-    """Return the name or reason of a requirement with the values of a robot."""
+def _filled_words(text: object, used: Iterable[Placeholder], robot: Robot) -> object:
+    """Return the name or reason of a requirement with the values of a robot.
+
+    ``used`` are the placeholders in the names of the requirement, which tell the group.
+    """
     if not isinstance(text, str):
         return text
-    for placeholder, own in (("robot", robot.name), ("namespace", robot.namespace)):
-        text = text.replace(str(Placeholder(placeholder)), own)
+    groups = {"", *(placeholder.group for placeholder in used)}
+    for (value, own), group in product(
+        (("robot", robot.name), ("namespace", robot.namespace)), groups
+    ):
+        text = text.replace(str(Placeholder(value, group=group)), own)
     return text
 
 

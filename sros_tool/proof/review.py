@@ -752,6 +752,8 @@ class _Review:
         if self.request.policies:
             named = " ".join(self.request.policies)
             systems[named] = lambda: load_system(policies, at=at, fleet=fleet)
+        if not systems:
+            yield from _read(files, lambda: fleet)
         for subject, load in systems.items():
             try:
                 system = load()

@@ -143,7 +143,7 @@ def load_system(
                 "Leave --template out, or check the policy.",
             )
         return _keystore_system(opened or Keystore(paths[0]), at, zone, domain, only)
-    files = [file for each in paths for file in (policy_files(each) if each.is_dir() else [each])]
+    files = [file for each in paths for file in policy_files(each)]
     if not files:
         raise PolicyError(
             "requirements need a policy, and there is no policy", "", "Name a policy."

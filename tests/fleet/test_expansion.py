@@ -120,7 +120,10 @@ def test_a_policy_without_placeholders_is_the_same() -> None:
         (enclave("/{robot}", "/x", "{namespaces}"), "only one can be here"),
         (enclave("/{robot}", "/x", node="{robots}"), "only one can be here"),
         (enclave("/{robot}", "/x", node="{namespace}"), "not a valid node name"),
-        (enclave("/{robot}", "{robot:carriers}/x"), "not the robot of the enclave"),
+        (
+            enclave("/{robot}", "{robot:carriers}/x"),
+            "write another enclave for it, with {robot:carriers} in",
+        ),
         (enclave("/{robot}", "{robots}/{robots:carriers}"), "several groups"),
         (enclave("/{robot}", "/{robot}*"), "same part"),
         (enclave("/{robot}", "/*{robot}/x"), "same part"),
@@ -147,7 +150,10 @@ def test_a_policy_without_placeholders_is_the_same() -> None:
         (enclave("/d", "{robots:none}"), "no group 'none'"),
         (enclave("/{robot}", "{namespace}"), "It is a namespace"),
         (enclave("/{robot}", "/x") + enclave("/r1", "/x"), "defined twice"),
-        (enclave("/{robot}", "/x") + enclave("/{robot:carriers}", "/x"), "defined twice"),
+        (
+            enclave("/{robot}", "/x") + enclave("/{robot:carriers}", "/x"),
+            "one enclave for each group",
+        ),
         (enclave(f"/{{robot}}/{'a' * 60}", "/x"), "for the robot arm"),
     ],
 )

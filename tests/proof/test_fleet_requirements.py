@@ -74,6 +74,16 @@ def test_a_table_with_a_robot_is_a_requirement_for_each() -> None:
     assert demand(read(BOTH)[-1]) == "/r2/mux has to be able to call action /hall/r2/b"
 
 
+def test_words_have_the_values_of_the_group_that_the_names_have() -> None:
+    text = EACH.replace("{robot}", "{robot:carriers}").replace(
+        "{namespace}", "{namespace:carriers}"
+    )
+    assert [(one.name, one.why) for one in read(text)] == [
+        ("r1 drives alone", "in /hall/r1"),
+        ("r2 drives alone", "in /hall/r2"),
+    ]
+
+
 def test_names_of_several_robots_are_in_one_requirement() -> None:
     (one,) = read(ONE_LIST)
     names = "/stop, /hall/r1/stop, /hall/r2/stop, /r1/*/stop, /r2/*/stop, /plain"
@@ -172,6 +182,28 @@ def test_a_finding_for_all_robots_is_shown_once(folder: Path) -> None:
     edited.write_text(edited.read_text().replace("r4 =", "r2 ="))
     one = sros("check", "ks", *words, "--json", cwd=folder)
     assert one.out.count('"requirement.violated"') == 2
+
+
+CHAINS = """\
+[[apart]]
+from = ["/*/mux", "!/{robot}/*"]
+to = ["/{robot}/base"]
+"""
+
+
+def test_findings_about_two_robots_name_the_one_that_differs(folder: Path) -> None:
+    wide = POLICY.replace("<topic>{namespace}/cmd_vel</topic></topics>", "<topic>/*/cmd_vel</topic>"
+                          "</topics>")  # fmt: skip
+    (folder / "robot.xml").write_text(wide)
+    (folder / "r.toml").write_text(CHAINS)
+    words = ("--requirements", "r.toml", "--include", "requirement.violated")
+    ended = sros("check", "robot.xml", "--fleet", "fleet.toml", *words, cwd=folder)
+    said = [line.strip() for line in ended.out.splitlines()]
+    first, second = (line for line in said if ": influences " in line)
+    assert first.startswith("/r2/mux: influences /r1/base: "), first
+    assert second.startswith("/r1/mux: influences /r2/base: "), second
+    assert [line for line in said if "the same" in line] == ["the same for 1 more robot: r3"]
+    assert said.index("the same for 1 more robot: r3") > said.index(second)
 
 
 def test_a_review_fills_in_the_fleet_of_each_commit(tmp_path: Path) -> None:
