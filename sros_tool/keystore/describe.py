@@ -549,8 +549,10 @@ def describe(
         if any((path / name).exists() for name in of_enclave):
             state = open_enclave(path, now=now, files=files)
             evaluation = evaluated("", path, state, at=now)
-            at_home = state.key_on_robot
-            facts = _facts_in_keystore(evaluation, state) if at_home else _enclave_facts(evaluation)
+            elsewhere = state.key_on_robot
+            facts = (
+                _facts_in_keystore(evaluation, state) if elsewhere else _enclave_facts(evaluation)
+            )
             return DescribedEnclave(path, state.key_on_robot, facts, _zenoh(path, now))
         refuse_earlier(path)
         raise DocumentError(

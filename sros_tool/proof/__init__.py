@@ -1,1 +1,1 @@
-"""Proofs about policies and keystores, for all names: what a change adds."""
+"""Proofs about policies and keystores, for all names: requirements, and what a change adds."""

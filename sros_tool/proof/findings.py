@@ -1,4 +1,4 @@
-"""Findings about requirements, with policy lines and worlds; and proposals for requirements."""
+"""Findings about requirements, with policy lines and worlds."""
 
 from __future__ import annotations
 
