@@ -561,9 +561,10 @@ def _status(
       $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
 
     The exit status is 0 if every robot that is not revoked confirmed that it has the files that an
-    export would give it now, and that no restart is due. Otherwise it is 1. The exit status is also
-    1 if a robot has a DDS with known vulnerabilities that a later release of the same major version
-    fixes (with --no-advisories, this does not count).
+    export would give it now, and that no restart is due, its agent reports no problem, and robots
+    still accept what was published. Otherwise it is 1. The exit status is also 1 if a robot has a
+    DDS with known vulnerabilities that a later release of the same major version fixes (with
+    --no-advisories, this does not count).
     """
     from sros_tool.checks.vulnerabilities import is_fixed_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
@@ -667,15 +668,22 @@ def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) ->
 
 def _facts(compared: ComparedFleet) -> Iterator[str]:
     """Yield sentences about the fleet as a whole."""
+    from sros_tool.validity import elapsed
+
     status = compared.status
-    command = (
-        f"`sros fleet publish {quote(str(status.keystore))} {quote(status.folder or 'PUB')} "
-        "--restored`; docs/howto/keystore_is_lost.md says what else"
-    )
+    publication = status.publication
+    folder = publication.folder if publication else ""
+    publish = f"sros fleet publish {quote(str(status.keystore))} {quote(folder or 'PUB')}"
+    restored = f"`{publish} --restored`; docs/howto/keystore_is_lost.md says what else"
     if status.older:
-        yield f"the keystore is older than its robots: {status.older}. Publish with {command}"
+        yield f"the keystore is older than its robots: {status.older}. Publish with {restored}"
     elif any(robot.state == "later" for robot in status.robots):
-        yield f"the keystore may be older than its robots: if it was restored, {command}"
+        yield f"the keystore may be older than its robots: if it was restored, {restored}"
+    elif publication and publication.accepted is False and publication.expires:
+        ago = elapsed(compared.at - publication.expires)
+        yield f"what was published expired {ago} ago, so robots get no new files: `{publish}`"
+    elif publication and publication.accepted is None:
+        yield f"it is not known until when robots accept what was published: `{publish}`"
     if status.stage != "complete":
         behind = sum(robot.stage != status.stage for robot in status.robots if robot.enclaves)
         yield f"CA rotation: {status.stage}; {counted(behind, 'robot')} not there yet"

@@ -268,13 +268,14 @@ class RobotStatus:
 
     @property
     def settled(self) -> bool:
-        """Whether nothing is to be done: the robot's files are current, or it has no enclaves.
+        """Whether nothing is to be done: the robot's files are current and its agent reports no
+        problem, or it has no enclaves.
 
         All enclaves of a revoked robot are gone: the others need the revocation list.
         """
         if self.state is State.REVOKED:
             return not self.enclaves
-        return self.state in (State.CURRENT, State.NONE)
+        return self.state is State.NONE or (self.state is State.CURRENT and not self.problems)
 
     @property
     def heard(self) -> datetime | None:
@@ -300,7 +301,7 @@ class RobotStatus:
     def _to_do(self, now: datetime) -> str:
         if self.state is State.REVOKED and not self.enclaves:
             return "take it out of the fleet file"
-        if self.settled:
+        if self.state in (State.CURRENT, State.NONE):
             return "look into it" if self.problems else ""
         if self.state in _TO_DO:
             return _TO_DO[self.state]
@@ -312,8 +313,27 @@ class RobotStatus:
         return "check whether it is on" if is_silent else "wait: it fetches"
 
 
+@shows("folder", "expires", "accepted", null_if_empty=("folder",))
+@dataclass(frozen=True, slots=True)
+class PublishedMetadata:
+    """What was published last for the robots that fetch."""
+
+    folder: str
+    """Absolute path of the publishing folder; null if it is not known."""
+    expires: datetime | None
+    """The first expiry of the published metadata, in UTC: from then on, robots refuse it, and get
+    no new files. Null if a release of sros published last that did not record it."""
+    accepted: bool | None = None
+    """Whether robots still accept it; null if that is not known, because ``expires`` is null."""
+
+    def at(self, now: datetime) -> PublishedMetadata:
+        """Return the publication as robots see it at ``now``."""
+        return replace(self, accepted=now < self.expires if self.expires else None)
+
+
 @shows(
-    *("keystore", "complete", "stage", "counts", "unassigned", "overdue", "older", "robots"),
+    *("keystore", "complete", "stage", "counts", "unassigned", "overdue", "older"),
+    *("publication", "robots"),
     null_if_empty=("older",),
 )
 @dataclass(frozen=True, slots=True)
@@ -335,7 +355,8 @@ class FleetStatus:
     """Why the keystore is older than its robots, as a clause: it was restored from a backup, or is
     a copy, and has not published with ``--restored`` since. Null if nothing shows that it is older.
     """
-    folder: str = ""
+    publication: PublishedMetadata | None = None
+    """What robots fetch; null if nothing was published for a robot."""
     is_any_revoked: bool = False
     """Whether the revocation list revokes a certificate."""
     groups: Mapping[str, Sequence[str]] = field(default_factory=dict)
@@ -354,11 +375,14 @@ class FleetStatus:
 
     @property
     def complete(self) -> bool:
-        """Whether every robot that has enclaves confirmed the present files in time, and no restart
-        that is due; if not, the exit status is 1. Robots of which all enclaves were revoked do not
+        """Whether every robot that has enclaves confirmed the present files in time, says that no
+        restart is due and that its agent has no problem, and robots still accept what was
+        published; if not, the exit status is 1. Robots of which all enclaves were revoked do not
         count.
         """
-        return not (self.overdue or self.older) and all(robot.settled for robot in self.robots)
+        if self.overdue or self.older or (self.publication and not self.publication.accepted):
+            return False
+        return all(robot.settled for robot in self.robots)
 
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
         """Return a copy with what is to be done, in which robots not heard of for long are offline.
@@ -377,7 +401,8 @@ class FleetStatus:
         )
         robots = (robot.offline() if robot.robot in late else robot for robot in self.robots)
         to_do = tuple(robot.with_to_do(now) for robot in robots)
-        return replace(self, robots=to_do, overdue=late)
+        publication = self.publication and self.publication.at(now)
+        return replace(self, robots=to_do, overdue=late, publication=publication)
 
 
 def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
@@ -406,7 +431,7 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
         statuses,
         unassigned,
         older=older,
-        folder=known.folder,
+        publication=known.publication,
         is_any_revoked=known.is_any_revoked(),
         groups=fleet.groups,
     )
@@ -616,7 +641,9 @@ class _Known:
         published = read_published(keystore)
         self.published = {name: robot.release.number for name, robot in published.robots.items()}
         """Robots with the numbers of their releases that were published last."""
-        self.folder = published.folder
+        self.publication = (
+            PublishedMetadata(published.folder, published.until) if published.robots else None
+        )
         self.refusals = refusals(keystore.root)
         """Why the last messages of robots were refused, by robot."""
         self._fleet = fleet
@@ -876,6 +903,7 @@ def fleet_metrics(
     """
     place = {"keystore": str(status.keystore.absolute())}
     robots = [({**place, "robot": robot.robot}, robot) for robot in status.robots]
+    ends = status.publication.expires if status.publication else None
 
     def per_robot(value: Callable[[RobotStatus], int | None]) -> tuple[Sample, ...]:
         values = ((value(robot), labels) for labels, robot in robots)
@@ -937,6 +965,16 @@ def fleet_metrics(
             "sros_fleet_published_release",
             "Number of the release that was published last for a robot.",
             per_robot(lambda robot: robot.published),
+        ),
+        Metric(
+            "sros_fleet_publication_expiry_timestamp_seconds",
+            "When robots begin to refuse what was published last, in seconds since 1970.",
+            (Sample(int(ends.timestamp()), place),) if ends else (),
+        ),
+        Metric(
+            "sros_fleet_agent_problems",
+            "Number of things that the agent of a robot could not do, for robots that say it.",
+            per_robot(lambda robot: None if robot.problems is None else len(robot.problems)),
         ),
         Metric(
             "sros_fleet_clock_ahead_seconds",

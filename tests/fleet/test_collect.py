@@ -38,14 +38,14 @@ from sros_tool.keystore.delivery.collect import (
 from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.fleet import recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
-from sros_tool.keystore.layout import key_on_robot
+from sros_tool.keystore.layout import PUBLISHED, key_on_robot
 from sros_tool.keystore.reader import Keystore, read_certificate
 from sros_tool.keystore.transaction import transaction
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
 from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, load_key
-from sros_tool.validity import BACKDATE, iso
+from sros_tool.validity import BACKDATE, iso, parse_iso
 from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.messages import key_of, said_by, signed_message
 
@@ -795,3 +795,30 @@ def test_what_was_renewed_is_published_at_once(home: Home) -> None:
     ended = sros("fleet", "collect", "ks", "inbox", "--publish", "file/pub", cwd=home.folder)
     assert ended.status == 2 and "1 unchanged" in ended.out
     assert "not published yet" in sros("fleet", "status", "ks", cwd=home.folder).out
+
+
+def test_what_was_published_expires(home: Home) -> None:
+    """Robots then refuse it: a fleet whose files are all current is not in order."""
+    status = ("fleet", "status", "ks")
+    home.run("fleet", "publish", "ks", "pub", "--root-validity", "2d", "--timestamp-validity", "3d")
+    number = read_published(Keystore(home.root)).number
+    for robot in ROBOTS:
+        home.send(robot, datetime.now(UTC), release=number)
+    home.run("fleet", "collect", "ks", "inbox")
+    ended = sros(*status, "--json", cwd=home.folder).ok()
+    published = json.loads(ended.out)["publication"]
+    left = parse_iso(published["expires"]) - datetime.now(UTC)
+    assert published["accepted"] and timedelta(days=1.9) < left < timedelta(days=2), "the root's"
+    file = home.root / PUBLISHED
+    recorded = json.loads(file.read_text())
+    for until, said in (
+        (iso(datetime.now(UTC) - timedelta(days=3)), "what was published expired 3 d ago"),
+        (None, "it is not known until when robots accept what was published"),
+    ):
+        file.write_text(json.dumps({**recorded, "until": until}))
+        ended = sros(*status, cwd=home.folder)
+        assert ended.status == 1 and "3 robots: 3 current" in ended.out
+        assert said in ended.out and f"`sros fleet publish ks {home.folder}/pub`" in ended.out
+        text = sros(*status, "--prometheus", cwd=home.folder).out
+        sample = "sros_fleet_publication_expiry_timestamp_seconds{"
+        assert (sample in text) == bool(until)

@@ -140,7 +140,7 @@ class PublishedFleet(NamedTuple):
     versions: Mapping[str, int]
     """Versions of the metadata by name; the bins are ``robots-0`` and so on."""
     expires: Mapping[str, datetime]
-    """MetadataExpiry of the metadata that was written, by name, in UTC."""
+    """Expiry of the metadata by name, in UTC."""
     root: Path
     """The root metadata that robots are to pin, in the publishing folder."""
     root_sha256: str
@@ -869,6 +869,7 @@ class _Run:
         releases = {name: robot.release for name, robot in self.list.robots.items()}
         self._composed = composer.compose(releases)
         self.list.versions = dict(self._composed.versions)
+        self.list.until = min(*self._composed.expires.values(), keys.roots.last.expires)
         needed = {release.path(robot) for robot, release in releases.items()}
         needed |= {f"{_METADATA}/{version}.{n}.json" for n, version in self.list.versions.items()}
         superseded = (path for path in self._paths() if path not in needed)

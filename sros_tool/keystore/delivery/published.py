@@ -99,12 +99,15 @@ class Published:
 
     ``superseded`` maps paths in the publishing folder that nothing names any more to the time when
     that was first seen.  ``folder`` is the absolute path of the publishing folder, "" if unknown.
+    ``until`` is the first expiry of the metadata: from then on, robots refuse it.  It is None if
+    nothing was published, or by a release of sros that did not record it.
     """
 
     robots: dict[str, PublishedRobot] = field(default_factory=dict)
     versions: dict[str, int] = field(default_factory=dict)
     superseded: dict[str, datetime] = field(default_factory=dict)
     folder: str = ""
+    until: datetime | None = None
 
     @property
     def number(self) -> int:
@@ -119,6 +122,7 @@ class Published:
             "format": _FORMAT,
             "time": iso(now),
             "folder": self.folder,
+            "until": iso(self.until) if self.until else None,
             "versions": dict(sorted(self.versions.items())),
         }
         return json.dumps({**value, "superseded": superseded, "robots": robots}).encode()
@@ -140,6 +144,7 @@ def read_published(keystore: Keystore) -> Published:
             {name: check_count(version) for name, version in value["versions"].items()},
             {path: parse_iso(time) for path, time in value["superseded"].items()},
             str(value.get("folder", "")),
+            parse_iso(until) if (until := value.get("until")) else None,
         )
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise damaged_list(keystore) from error

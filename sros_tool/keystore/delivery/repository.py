@@ -310,7 +310,10 @@ def _read(
 
 
 class Composed(NamedTuple):
-    """New metadata: the files in the order in which they have to be written, and all versions."""
+    """New metadata: the files in the order in which they have to be written.
+
+    ``versions`` and ``expires`` are those of all metadata, also of what stays, by name.
+    """
 
     files: Sequence[tuple[str, bytes]]
     versions: Mapping[str, int]
@@ -371,10 +374,14 @@ class Composer:
         for name, content in targets.items():
             old = self._present.bins.get(name)
             same_key = old is not None and key.keyid in old.signatures
-            if not (same_key and old and old.signed.targets == content and self._lasts(old)):
+            if same_key and old and old.signed.targets == content and self._lasts(old):
+                self._expires[name] = old.signed.expires
+            else:
                 self._add(name, Targets(targets=content), self._signers[_TARGETS][:1])
         delegations = Delegations({key.keyid: key}, succinct_roles=roles)
-        if not (before and before.signed.delegations == delegations and self._kept(before)):
+        if before and before.signed.delegations == delegations and self._kept(before):
+            self._expires[_TARGETS] = before.signed.expires
+        else:
             self._add(_TARGETS, Targets(delegations=delegations), self._signers[_TARGETS])
         self._add_snapshot()
         return Composed(self._files, self.versions, self._expires)
