@@ -441,7 +441,13 @@ class Fault(Enum):
             return text
         if text in _IN_EXPORT:
             return _IN_EXPORT[text]
-        return f"In the {ORIGINAL_KEYSTORE}: {text} Then export the enclave again."
+        return in_original_keystore(text)
+
+
+def in_original_keystore(remedy: str) -> str:
+    """Return a remedy that needs CA keys as the remedy for an export, which has none."""
+    then = "" if remedy.endswith("export the enclave again.") else " Then export the enclave again."
+    return f"In the {ORIGINAL_KEYSTORE}: {remedy}{then}"
 
 
 FAULTS = {fault.id: fault for fault in Fault}

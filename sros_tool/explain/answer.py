@@ -487,6 +487,11 @@ class Answer(NamedTuple):
         )
 
     @property
+    def is_of_export(self) -> bool:
+        """Whether the enclave was exported, so that its keystore may have later permissions."""
+        return self.enclave.root is not None and not has_authorities(self.enclave.root)
+
+    @property
     def commands(self) -> list[str]:
         """The commands that apply the change of the policy."""
         if not self.change and not self.sign:
@@ -494,7 +499,7 @@ class Answer(NamedTuple):
         keystore = self.enclave.root
         robot = closed_robot(keystore) if keystore else None
         file = str(self.enclave.policy_file or (robot / CLOSED_POLICY if robot else "POLICY"))
-        root = str(keystore if keystore and has_authorities(keystore) else "KEYSTORE")
+        root = str(keystore if keystore and not self.is_of_export else "KEYSTORE")
         if self.enclave.has_placeholders:
             recorded = keystore and (keystore / FLEET).exists()
             robots = f"{root}/{FLEET}" if recorded else "FLEET_FILE"
@@ -502,8 +507,12 @@ class Answer(NamedTuple):
         commands = []
         if self.change and self.change.document:
             commands.append(f"sros merge_policy {file} {ADDITION} --in-place")
-        sign = f"sros create_permission {root} {self.enclave.name} {file}"
-        return [*commands, f"sros close {robot}" if robot else sign]
+        if robot:
+            return [*commands, f"sros close {robot}"]
+        commands.append(f"sros create_permission {root} {self.enclave.name} {file}")
+        if self.is_of_export:
+            commands.append(f"sros distribute_key {root} {self.enclave.name} TARGET --force")
+        return commands
 
 
 _CREATED = {

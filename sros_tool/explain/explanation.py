@@ -31,7 +31,7 @@ from sros_tool.explain.answer import (
     lines_of_right,
     recorded_policy,
 )
-from sros_tool.faults import FAULTS, ORIGINAL_KEYSTORE, REPLACE, Fault
+from sros_tool.faults import FAULTS, REPLACE, Fault, in_original_keystore
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     GOVERNANCE_P7S,
@@ -190,8 +190,7 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
             return _filled(text, root, enclave, file)
         if fault:
             return _filled(fault.remedy_in_export(file), "KEYSTORE", enclave, file)
-        remedy = _filled(text, "KEYSTORE", enclave, file)
-        return f"In the {ORIGINAL_KEYSTORE}: {remedy} Then export the enclave again."
+        return in_original_keystore(_filled(text, "KEYSTORE", enclave, file))
     if keystore and fault:
         wrong_issuer = fault is Fault.CERTIFICATE_ISSUER
         if wrong_issuer and _is_own_copy(keystore, enclave, IDENTITY_CA_FILE):

@@ -173,6 +173,7 @@ def explain_on_dds(
     notes = (
         *taken,
         *_provenance_notes(answer),
+        *_exported(answer),
         *_other_type(evaluator, answer, kind),
         *_no_topic(answer, asked),
         *_other_name(answer),
@@ -230,6 +231,16 @@ def _provenance_notes(answer: Answer) -> Iterator[Note]:
         case _:
             return
     yield Note(f"explain.policy-{answer.provenance}", text)
+
+
+def _exported(answer: Answer) -> Iterator[Note]:
+    """Yield a note if an export denies what its keystore may allow by now."""
+    if answer.change and answer.is_of_export:
+        text = (
+            "these files were exported. If the policy of the keystore already allows this, they "
+            "are older: the last command alone mends it."
+        )
+        yield Note("explain.exported", text)
 
 
 def _other_type(evaluator: Evaluator, answer: Answer, kind: str | None) -> Iterator[Note]:

@@ -67,6 +67,23 @@ def test_exported_enclaves_of_two_keystores(bench: Bench) -> None:
     assert "keystore.authorities-differ" in ids(bench)
 
 
+def test_a_remedy_that_needs_ca_keys_is_for_the_original_keystore(bench: Bench) -> None:
+    CASES["enclave.stale-permissions"](bench)
+
+    def remedy() -> str:
+        options = {"now": bench.now, **bench.options}
+        found = keystore_findings(Keystore(bench.checked), **options)
+        return next(each.remedy for each in found if each.id == "enclave.stale-permissions")
+
+    assert f"`sros generate_artifacts -k {bench.root} " in remedy()
+    bench.export()
+    told = remedy()
+    assert told.startswith(
+        "In the keystore that has the CA keys: Run `sros generate_artifacts -k K"
+    )
+    assert told.endswith("Then export the enclave again.")
+
+
 @pytest.mark.parametrize("expected", CASES)
 def test_found(expected: str, bench: Bench) -> None:
     """Twin: `test_nothing_in_a_sound_keystore`."""

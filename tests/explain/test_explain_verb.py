@@ -418,6 +418,11 @@ def test_by_environment_option_and_folder(whole: Path, tmp_path: Path) -> None:
     assert explain(OTHER, *words, "--keystore", folder).status == 2
     sros("distribute_key", whole, ENCLAVE, tmp_path / "robot").ok()
     assert explain(tmp_path / "robot", ENCLAVE, *words).status == 0
+    denied = (ENCLAVE, "publish", "/denied")
+    found = explain(tmp_path / "robot", *denied)
+    assert found.out.rstrip().endswith(f"sros distribute_key KEYSTORE {ENCLAVE} TARGET --force")
+    assert "note [explain.exported]" in found.err, "the keystore may allow it by now"
+    assert "note [explain.exported]" not in explain(whole, *denied).err
 
 
 def test_domains(whole: Path) -> None:

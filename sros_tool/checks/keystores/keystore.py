@@ -56,7 +56,7 @@ from sros_tool.dds.decision.vendors import TESTED, Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
-from sros_tool.faults import ORIGINAL_KEYSTORE
+from sros_tool.faults import ORIGINAL_KEYSTORE, in_original_keystore
 from sros_tool.keystore.fleet import publish_command, stated_distributions
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
@@ -187,7 +187,7 @@ def keystore_findings(
         found += findings_in(parts, distribution)
     real_root = os.path.realpath(root)
     located = (_at_real_file(finding, root, real_root) for finding in found)
-    found = with_causes(joined([_with_names(finding, root) for finding in located]))
+    found = with_causes(joined([_with_names(finding, keystore) for finding in located]))
     if not keystore.is_original:
         return found
     return _with_cause_of_expiry(_with_cause_of_ros2(found, opened), root)
@@ -281,12 +281,22 @@ def _at_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
     return finding._replace(file=str(root / real.relative_to(real_root)))
 
 
-def _with_names(finding: Finding, root: Path) -> Finding:
-    """Return the finding with KEYSTORE and ENCLAVE in its remedy replaced by keystore and "
-    "enclave."""
+_NEEDS_CA_KEYS = re.compile(
+    r"`sros (create_\w+|generate_artifacts|update_keystore|renew|revoke|rotate_ca|distribute_key"
+    r"|crl KEYSTORE --refresh|zenoh) "
+)
+
+
+def _with_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
+    """Return the finding with KEYSTORE and ENCLAVE in its remedy replaced by their names.
+
+    The remedy for an export says that commands which sign have to run in the original keystore.
+    """
     remedy = finding.remedy
+    if not keystore.is_original and _NEEDS_CA_KEYS.search(remedy):
+        remedy = remedy if ORIGINAL_KEYSTORE in remedy else in_original_keystore(remedy)
     if ORIGINAL_KEYSTORE not in remedy:
-        remedy = re.sub(r"\bKEYSTORE\b", lambda _: quote(str(root)), remedy)
+        remedy = re.sub(r"\bKEYSTORE\b", lambda _: quote(str(keystore.root)), remedy)
     if finding.subject.startswith("/") and "," not in finding.subject:
         remedy = re.sub(r"\bENCLAVE\b", lambda _: quote(finding.subject), remedy)
     return finding if remedy == finding.remedy else finding._replace(own_remedy=remedy)
