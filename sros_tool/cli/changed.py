@@ -142,16 +142,16 @@ def rights_lines(root: Path, replaced: Sequence[ReplacedRights], *, dry_run: boo
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.reader import Keystore
 
+    fleet = load_fleet(Keystore(root)) if replaced else None
     together: dict[tuple[str, str], list[str]] = {}
     for rights in replaced:
-        for verb, text in (("lose", rights.loses()), ("gain", rights.gains())):
+        for verb, text in (("lose", rights.loses(fleet)), ("gain", rights.gains(fleet))):
             if text:
                 together.setdefault((verb, text), []).append(rights.enclave)
     lines = []
     for (verb, text), names in together.items():
         word = f"would {verb}" if dry_run else verb if len(names) > 1 else f"{verb}s"
         lines.append((names[0], f"{shown_names(names)} {word}: {text}"))
-    fleet = load_fleet(Keystore(root)) if len(lines) > 1 else None
     yield from folded(fleet, lines)
 
 

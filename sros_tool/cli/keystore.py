@@ -304,13 +304,12 @@ def _show(
 
         notes = [as_note(finding) for finding in findings]
         shown = json_form(result, "MadeEnclaves", notes=notes)
-    lasting = (lasting_text(result.root, rights) for rights in result.rights)
     print_changed(
         result,
         shown,
         _created_lines(result),
         told=_hints(result, as_json),
-        after=filter(None, lasting),
+        after=filter(None, (lasting_text(result.root, result.rights),)),
     )
     if findings and not as_json:
         print_signed(findings, [policy.file for policy in policies])

@@ -245,7 +245,8 @@ def diff_policy(
         echo_lines(rights_markdown(first, second, compared))
     else:
         lines = difference_lines(difference, first.fleet, second.fleet)
-        for line in (*lines, *_protection_lines(protections), *unanswered_lines(compared)):
+        unanswered = unanswered_lines(compared, second.fleet)
+        for line in (*lines, *_protection_lines(protections), *unanswered):
             echo(line)
         count = len(difference.only_first) + len(difference.only_second)
         of = f" of {', '.join(sorted(compared.scope))}" if compared.scope else ""
@@ -281,7 +282,7 @@ def rights_markdown(first: RightsSource, second: RightsSource, compared: Sources
         if signed:
             parts.append(f"**{len(signed)} {title}**")
             parts.append(bounded(map(code, signed), _MOST_LINES, rest))
-    if unanswered := list(unanswered_lines(compared)):
+    if unanswered := list(unanswered_lines(compared, second.fleet)):
         parts += ["**Nobody answers any more**", bounded(map(code, unanswered), _MOST_LINES, rest)]
     notes = [f"{note.id}: {note.text}" for note in (*first.notes, *second.notes)]
     if notes:
@@ -297,14 +298,20 @@ def rights_markdown(first: RightsSource, second: RightsSource, compared: Sources
     return "\n\n".join((title, *parts)) + "\n"
 
 
-def unanswered_lines(compared: SourcesDifference) -> Iterator[str]:
-    """Yield a line for each right that the change leaves without a counterpart."""
+def unanswered_lines(compared: SourcesDifference, fleet: Fleet | None) -> Iterator[str]:
+    """Yield a line for each right that the change leaves without a counterpart.
+
+    Lines that differ only in the robot are merged.
+    """
+    from sros_tool.fleet.robots import folded
     from sros_tool.policy.model import OTHER_SIDE
 
+    lines = []
     for right in compared.unanswered:
         other = OTHER_SIDE[right.right].replace("reply", "serve")
         text = f"{right.enclave} may {right.right} {right.name}, but no enclave may {other} it"
-        yield f"! {text} any more"
+        lines.append((right.enclave, f"! {text} any more"))
+    yield from folded(fleet, lines)
 
 
 def _protection_lines(protections: Iterable[tuple[str, StatedProtection]]) -> list[str]:

@@ -456,6 +456,8 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
     """Yield lines about enclaves; lines that differ only in the robot become one line.
 
     That line has placeholders for the robot's name and namespace, and lists the robots at its end.
+    The robot of a line is that of the enclave; if the enclave has none, the only one that the text
+    names.
 
     Args:
         fleet: the robots; None leaves every line as it is.
@@ -463,7 +465,7 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
     """
     kinds: dict[str, list[tuple[str, str]]] = {}
     for enclave, text in lines:
-        robot = robot_of(fleet, enclave) if fleet else None
+        robot = _robot_of_line(fleet, enclave, text) if fleet else None
         # Another text that has such words of its own is not mixed up with a folded one.
         kind = _with_placeholders(text, enclave, robot) if robot else f"\0{text}"
         kinds.setdefault(kind, []).append((robot.name if robot else "", text))
@@ -473,6 +475,13 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
             yield from (text for _, text in same)
         else:
             yield f"{kind}  ({_named(fleet, names)})"
+
+
+def _robot_of_line(fleet: Fleet, enclave: str, text: str) -> Robot | None:
+    if robot := robot_of(fleet, enclave):
+        return robot
+    named = named_robots(fleet, "", text)
+    return named[0] if len(named) == 1 else None
 
 
 def named_robots(fleet: Fleet, enclave: str, text: str) -> tuple[Robot, ...]:

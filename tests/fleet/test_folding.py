@@ -50,6 +50,15 @@ def test_the_name_of_another_robot_is_no_placeholder() -> None:
     assert list(folded(FLEET, found)) == [text for _, text in found]
 
 
+def test_an_enclave_of_no_robot_has_the_only_robot_that_its_line_names() -> None:
+    one = [("/d", f"/d may publish {names}/go") for names in ("/hall/r1", "/hall/r10", "/r2")]
+    assert list(folded(FLEET, one)) == [
+        "/d may publish {namespace}/go  (3 robots: r1, r10, r2)",
+    ]
+    several = [("/d", f"/d may move {names}") for names in ("/r1 to /r2", "/r2 to /r1")]
+    assert list(folded(FLEET, several)) == [text for _, text in several]
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("folding")
@@ -73,6 +82,21 @@ def test_two_fleets_are_compared(made: Path) -> None:
         "- /{robot}/base ALLOW publish topic {namespace}/odom  (2 robots: r2, r3)",
         "+ /r2/base ALLOW publish topic /b/odom",
     ]
+
+
+def test_what_a_change_takes_away_is_folded(made: Path) -> None:
+    text = (made / "p.xml").read_text()
+    (made / "less.xml").write_text(text.replace("/go<", "/gone<").replace("/odom<", "/odometry<"))
+    words = ("generate_artifacts", "-k", "ks", "-p", "less.xml", "--fleet", "f.toml", "--dry-run")
+    said = sros(*words, cwd=made).ok().err.splitlines()
+    assert set(said[:4]) == {
+        "/d would lose: publish topic {namespace}/go  (all 3 robots)",
+        "/d would gain: publish topic {namespace}/gone  (all 3 robots)",
+        "/{robot}/base would lose: publish topic {namespace}/odom  (all 3 robots)",
+        "/{robot}/base would gain: publish topic {namespace}/odometry  (all 3 robots)",
+    }
+    assert "base and 1 more: the rights that they lost still" in said[4]
+    assert "`sros renew ks ENCLAVE... --revoke-old`" in said[4]
 
 
 def test_who_and_reach_are_folded(made: Path) -> None:

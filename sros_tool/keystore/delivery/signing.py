@@ -572,7 +572,7 @@ def _lost_rights(change: KeystoreChange, earlier: EarlierPermissions, issued: Is
     (grant,) = issued.permissions.grants
     replaced = replaced_rights(issued.issuance.name, earlier, grant, change.now)
     (replaced,) = with_ledger(change.keystore, (replaced,), change.now)
-    text = lasting_text(change.root, replaced)
+    text = lasting_text(change.root, (replaced,))
     if not text:
         return []
     lost = f"{replaced.enclave} loses: {replaced.loses()}."

@@ -18,6 +18,7 @@ from cryptography import x509
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
+from sros_tool.fleet.robots import Fleet, folded
 from sros_tool.keystore.delivery.published import may_be_later
 from sros_tool.keystore.known_keys import restored_at, revoked_serials
 from sros_tool.keystore.ledger import Entry, certificate_entry
@@ -66,13 +67,24 @@ class ReplacedRights:
         """Return a copy for an enclave whose earlier certificate is revoked."""
         return replace(self, works_until=None)
 
-    def loses(self) -> str:
-        """Return the rights and domains that are lost, as text; "" for none."""
-        return _both_text(self.lost, self.lost_domains)
+    def loses(self, fleet: Fleet | None = None) -> str:
+        """Return the rights and domains that are lost, as text; "" for none.
 
-    def gains(self) -> str:
-        """Return the rights and domains that are gained, as text; "" for none."""
-        return _both_text(self.gained, self.gained_domains)
+        Rights to names that differ only in the robot of ``fleet`` are one.
+        """
+        return self._text(self.lost, self.lost_domains, fleet)
+
+    def gains(self, fleet: Fleet | None = None) -> str:
+        """Return the rights and domains that are gained, as text, like `loses`; "" for none."""
+        return self._text(self.gained, self.gained_domains, fleet)
+
+    def _text(self, rights: Sequence[Right], domains: str, fleet: Fleet | None) -> str:
+        described = folded(fleet, ((self.enclave, text) for text in _described(rights)))
+        texts = (
+            first_few(list(described), _RIGHTS_SHOWN),
+            f"domain {domains}" if domains else "",
+        )
+        return ", ".join(filter(None, texts))
 
 
 def earlier_permissions(
@@ -196,6 +208,7 @@ class Superseded:
 
 
 _RIGHTS_SHOWN = 6
+_ENCLAVES_SHOWN = 3
 
 
 def rights_text(rights: Sequence[Right]) -> str:
@@ -203,29 +216,38 @@ def rights_text(rights: Sequence[Right]) -> str:
 
     An added or removed denial is marked with "(by a DENY)".
     """
-    described = [
+    return first_few(_described(rights), _RIGHTS_SHOWN)
+
+
+def _described(rights: Sequence[Right]) -> list[str]:
+    return [
         right.describe() + ("" if right.qualifier is ALLOW else " (by a DENY)") for right in rights
     ]
-    return first_few(described, _RIGHTS_SHOWN)
 
 
-def _both_text(rights: Sequence[Right], domains: str) -> str:
-    texts = (rights_text(rights), f"domain {domains}" if domains else "")
-    return ", ".join(filter(None, texts))
-
-
-def lasting_text(root: Path, replaced: ReplacedRights) -> str:
+def lasting_text(root: Path, replaced: Sequence[ReplacedRights]) -> str:
     """Return sentences on lost rights that still work, and how to end that; "" if none work."""
-    longer = replaced.may_work_longer
-    if not (replaced.loses() and (replaced.works_until or longer)):
+    lasting = [
+        rights
+        for rights in replaced
+        if rights.loses() and (rights.works_until or rights.may_work_longer)
+    ]
+    if not lasting:
         return ""
-    if replaced.works_until:
-        work = f"still work {'at least ' if longer else ''}until {iso(replaced.works_until)}"
+    ends = [rights.works_until for rights in lasting if rights.works_until]
+    at_least = "at least " if any(rights.may_work_longer for rights in lasting) else ""
+    work = f"still work {at_least}until {iso(max(ends))}" if ends else "may still work"
+    names = [rights.enclave for rights in lasting]
+    if len(names) == 1:
+        lost, kept = f"{names[0]}: the rights that it lost", "its earlier permissions and its key"
+        processes, these = "its processes", "this enclave"
     else:
-        work = "may still work"
-    command = f"`sros renew {quote(str(root))} {quote(replaced.enclave)} --revoke-old`"
+        lost = f"{first_few(names, _ENCLAVES_SHOWN)}: the rights that they lost"
+        kept, processes, these = "earlier permissions and keys", "their processes", "these enclaves"
+    which = " ".join(map(quote, names)) if len(names) <= _ENCLAVES_SHOWN else "ENCLAVE..."
+    others = "" if len(names) <= _ENCLAVES_SHOWN else " (or with --robot NAME, or --all)"
     return (
-        f"{replaced.enclave}: the rights that it lost {work} for whoever "
-        "kept its earlier permissions and its key, and in its processes until they are restarted. "
-        f"To end that, run {command}, and restart all processes, first those of this enclave."
+        f"{lost} {work} for whoever kept {kept}, and in {processes} until they are restarted. To "
+        f"end that, run `sros renew {quote(str(root))} {which} --revoke-old`{others}, and restart "
+        f"all processes, first those of {these}."
     )
