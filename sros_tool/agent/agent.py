@@ -53,6 +53,7 @@ from sros_tool.keystore.confirmation import (
 )
 from sros_tool.keystore.delivery.archive import listed_digests
 from sros_tool.keystore.delivery.release import Release, sealed_robot
+from sros_tool.keystore.delivery.robot import OF_ANOTHER_KEY
 from sros_tool.keystore.issuing.tokens import place_in
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -84,6 +85,10 @@ _REPLACED_FOR = timedelta(days=30)
 """How long the agent sends a revocation list that a release replaced by a list that revokes
 less.
 """
+_BRING_KEY = (
+    " A release has no keys: bring the new key as for the first time, with `sros distribute_key "
+    "KEYSTORE --robot {} DIR --force` in the keystore."
+)
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -334,7 +339,8 @@ class _Round:
             self._problems.append(self._refused(error))
             return Installation()
         for name, why in installation.kept.items():
-            self._problems.append(f"{name} keeps its files: {why}.")
+            remedy = _BRING_KEY.format(settings.robot) if OF_ANOTHER_KEY in why else ""
+            self._problems.append(f"{name} keeps its files: {why}.{remedy}")
         for name in installation.removed:
             self._problems.append(
                 f"{name} was removed: release {release.number} does not have it. Stop its "

@@ -204,7 +204,11 @@ def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None
     shutil.rmtree(r1.folder / "enclaves/r1/b")
     done = r1.round()
     assert done.changed == ("/r1/a",), "the key of /r1/b is gone, and only here"
-    assert any("/r1/b keeps its files" in problem for problem in done.problems)
+    (problem,) = (problem for problem in done.problems if "/r1/b keeps its files" in problem)
+    assert "sros distribute_key" not in problem
+    shutil.copytree(r1.folder / "enclaves/r1/a", r1.folder / "enclaves/r1/b")
+    (problem,) = (each for each in r1.round().problems if "/r1/b keeps its files" in each)
+    assert "`sros distribute_key KEYSTORE --robot r1 DIR --force`" in problem, "it has another key"
     assert r1.message().release == 1
     assert has(r1.folder, home.first, ("/r1/a", "/r1/c"))
     assert sros("agent", "status", r1.folder).status == 1

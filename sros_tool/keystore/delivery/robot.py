@@ -373,6 +373,10 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
     return state
 
 
+OF_ANOTHER_KEY = "it does not belong to the enclave's key"
+"""What is wrong with a certificate for another key than the one on the robot, as a clause."""
+
+
 def evaluate_delivered(
     name: str, files: Mapping[str, bytes], key: PublicKey, *, now: datetime
 ) -> tuple[OpenedEnclave, list[str]]:
@@ -396,7 +400,7 @@ def evaluate_delivered(
         problems += [str(fault) for fault in zenoh.problems if fault.file != CERTIFICATE_FILE]
     certificate = state.certificate
     if certificate and certificate.public_key() != key:
-        problems.insert(0, "cert.pem: it does not belong to the enclave's key")
+        problems.insert(0, f"{CERTIFICATE_FILE}: {OF_ANOTHER_KEY}")
     if certificate and common_name_of(certificate.subject) != name:
         problems.insert(0, f"cert.pem: it is for {subject_text(certificate.subject)}")
     return state, problems
