@@ -11,8 +11,16 @@ This module reads no files.
 from __future__ import annotations
 
 import fnmatch
-from collections import Counter, deque
-from collections.abc import Callable, Collection, Container, Iterable, Iterator, Sequence
+from collections import Counter, defaultdict, deque
+from collections.abc import (
+    Callable,
+    Collection,
+    Container,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import product
@@ -69,11 +77,12 @@ class Witness:
     """The reason why a requirement does not hold: a shortest list of forbidden or missing uses.
 
     For influence, the uses are a chain: after each use that writes comes the use that reads.
-    ``others`` are further enclaves that break the requirement as well.
+    ``others`` are the uses of each further enclave that breaks the requirement as well: the same
+    uses if it has them, else others.
     """
 
     uses: tuple[Use, ...]
-    others: tuple[str, ...] = ()
+    others: tuple[tuple[Use, ...], ...] = ()
 
     @property
     def enclaves(self) -> tuple[str, ...]:
@@ -272,30 +281,35 @@ def _better(use: Use) -> tuple[int, str, str]:
 
 def _not_alone(requirement: Only | Nobody, world: World, limit: SearchLimit) -> Witness | None:
     allowed = requirement.enclaves if isinstance(requirement, Only) else ()
-    return _first_of(_first_uses(requirement.rights, world, limit, allowed).values())
+    return _first_of(_uses_of_rights(requirement.rights, world, limit, allowed))
 
 
-def _first_uses(
+def _uses_of_rights(
     rights: RightNames, world: World, limit: SearchLimit, without: Sequence[str] = ()
-) -> dict[str, Use]:
-    """Map enclaves with one of the rights to their shortest use; leave out ``without``."""
+) -> Mapping[str, Sequence[Use]]:
+    """Map enclaves with some of the rights to a use of each; leave out ``without``."""
     left_out = _matching(without, world.enclaves)
-    uses: dict[str, Use] = {}
+    uses: defaultdict[str, list[Use]] = defaultdict(list)
     for right, part, topics in _topics_of_rights(rights):
         for met in world.side(part.writes).meeting(topics, limit):
             if met.enclave in left_out:
                 continue
             if topic := world.use(met, topics, limit):
-                use = _use(met.enclave, right, part, topics, topic)
-                uses[met.enclave] = min(use, uses.get(met.enclave, use), key=_better)
+                uses[met.enclave].append(_use(met.enclave, right, part, topics, topic))
     return uses
 
 
-def _first_of(uses: Collection[Use]) -> Witness | None:
+def _first_of(uses: Mapping[str, Sequence[Use]]) -> Witness | None:
+    """Return the shortest use as a witness, with a use of each other enclave."""
     if not uses:
         return None
-    best = min(uses, key=_better)
-    return Witness((best,), tuple(sorted({use.enclave for use in uses} - {best.enclave})))
+    best = min((use for own in uses.values() for use in own), key=_better)
+    others = (
+        min(own, key=lambda use: ((use.right, use.name) != (best.right, best.name), _better(use)))
+        for enclave, own in sorted(uses.items())
+        if enclave != best.enclave
+    )
+    return Witness((best,), tuple((use,) for use in others))
 
 
 def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | None:
@@ -368,7 +382,7 @@ def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness 
     """
     most = requirement.most
     best: tuple[Use, ...] = ()
-    others: tuple[str, ...] = ()
+    others: tuple[Use, ...] = ()
     for right, names in requirement.rights:
         for expression in names:
             holders: dict[str, list[tuple[_Part, TopicUser]]] = {}
@@ -386,8 +400,8 @@ def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness 
                 if (use := next(_uses_of(name, enclave, right, parts), None))
             ]
             if not best or _better(uses[0]) < _better(best[0]):
-                best, others = tuple(uses[: most + 1]), tuple(e.enclave for e in uses[most + 1 :])
-    return Witness(best, others) if best else None
+                best, others = tuple(uses[: most + 1]), tuple(uses[most + 1 :])
+    return Witness(best, tuple((use,) for use in others)) if best else None
 
 
 def _uses_of(
@@ -446,7 +460,7 @@ def _shared_by(
 def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with the shortest name that a wildcard allows beyond the requirement."""
     enclaves = sorted(_matching(requirement.enclaves, world.enclaves))
-    uses: dict[str, Use] = {}
+    uses: defaultdict[str, list[Use]] = defaultdict(list)
     for right, names in requirement.rights:
         for part in _sufficient_parts(right):
             side, every = world.side(part.writes), part.topics("*")
@@ -459,9 +473,8 @@ def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness 
                 access = world.stated[enclave]
                 exact = access.writes if part.writes else access.reads
                 if topic := world.example(own - exact - within, every, limit):
-                    use = _use(enclave, right, part, every, topic)
-                    uses[enclave] = min(use, uses.get(enclave, use), key=_better)
-    return _first_of(uses.values())
+                    uses[enclave].append(_use(enclave, right, part, every, topic))
+    return _first_of(uses)
 
 
 _WRITTEN_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/rosout", "rt/parameter_events"))
@@ -471,7 +484,7 @@ _READ_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/parameter_events"))
 def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with the shortest name for which an enclave has another right."""
     enclaves = sorted(_matching(requirement.enclaves, world.enclaves))
-    uses: dict[str, Use] = {}
+    uses: defaultdict[str, list[Use]] = defaultdict(list)
     for writes, ordinary in ((True, _WRITTEN_BY_EVERY_NODE), (False, _READ_BY_EVERY_NODE)):
         allowed = NameSet.union(
             part.topics(name).every()
@@ -484,21 +497,23 @@ def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Wit
             more = world.side(writes).of[enclave] - allowed - ordinary
             if topic := world.any_example(more, limit):
                 right, name = right_to_use(topic, writes=writes)
-                use = Use(enclave, right, name, topic, writes)
-                uses[enclave] = min(use, uses.get(enclave, use), key=_better)
-    return _first_of(uses.values())
+                uses[enclave].append(Use(enclave, right, name, topic, writes))
+    return _first_of(uses)
 
 
 def _with_both(requirement: NotBoth, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with an enclave that has rights of both sets: its shortest use of each."""
-    sides = [
-        _first_uses(rights, world, limit) for rights in (requirement.first, requirement.second)
+    first, second = (
+        _uses_of_rights(rights, world, limit) for rights in (requirement.first, requirement.second)
+    )
+    pairs = [
+        (min(first[enclave], key=_better), min(second[enclave], key=_better))
+        for enclave in sorted(first.keys() & second.keys())
     ]
-    pairs = {name: (use, sides[1][name]) for name, use in sides[0].items() if name in sides[1]}
     if not pairs:
         return None
-    best = min(pairs, key=lambda each: [_better(use) for use in pairs[each]])
-    return Witness(pairs[best], tuple(sorted(pairs.keys() - {best})))
+    best = min(pairs, key=lambda pair: [_better(use) for use in pair])
+    return Witness(best, tuple(pair for pair in pairs if pair is not best))
 
 
 def _unprotected(requirement: Protected, world: World, limit: SearchLimit) -> Witness | None:

@@ -84,7 +84,8 @@ class Violation:
 
     ``worlds`` is empty if it holds in no decided world.  ``missing`` is an enclave in the witness
     that does not exist, or "".  With ``idle``, no process could start with the enclave's files,
-    whatever rights it has.
+    whatever rights it has.  ``others`` are the steps of further enclaves that break the
+    requirement: at most five that do the same, and five that do something else.
     """
 
     requirement: Requirement
@@ -93,6 +94,23 @@ class Violation:
     worlds: tuple[str, ...]
     missing: str = ""
     idle: bool = False
+    others: tuple[tuple[Step, ...], ...] = ()
+
+    @property
+    def alike(self) -> list[str]:
+        """Further enclaves that break the requirement by the same uses."""
+        return [uses[0].enclave for uses in self.witness.others if _are_alike(uses, self.witness)]
+
+    @property
+    def differing(self) -> list[tuple[Step, ...]]:
+        """The steps of ``others`` that break the requirement by other uses."""
+        alike = {*self.alike}
+        return [steps for steps in self.others if steps[0].use.enclave not in alike]
+
+
+def _are_alike(uses: Sequence[Use], witness: Witness) -> bool:
+    pairs = zip(uses, witness.uses, strict=False)
+    return all((use.right, use.name) == (other.right, other.name) for use, other in pairs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +150,13 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
                 (enclave for enclave in witness.enclaves if enclave and enclave not in known), ""
             )
             idle = isinstance(requirement, Must) and requirement.enclave in world.idle
-            violations.append(Violation(requirement, witness, steps, titles, missing, idle))
+            alike = [uses for uses in witness.others if _are_alike(uses, witness)]
+            differing = [uses for uses in witness.others if not _are_alike(uses, witness)]
+            others = tuple(
+                tuple(_step(use, world, system) for use in uses)
+                for uses in (*alike[:_SHOWN], *differing[:_SHOWN])
+            )
+            violations.append(Violation(requirement, witness, steps, titles, missing, idle, others))
         if reasons := tuple(_never_fails([verdict for _, verdict in verdicts])):
             vacuous.append((requirement, reasons))
         if not broken and (
@@ -206,10 +230,12 @@ def _subject(violation: Violation) -> str:
 def _violated(violation: Violation) -> Finding:
     requirement, steps = violation.requirement, violation.steps
     first = next((step.source for step in steps if step.source), None) or requirement.source
+    others = [step for other in violation.others for step in other]
+    named = [*steps, *others] if len(steps) > 1 else others
     related = [
         RelatedPlace(step.text(), step.source.file, step.source.line or None)
-        for step in steps
-        if step.source and len(steps) > 1
+        for step in named
+        if step.source
     ]
     own = requirement.source
     related.append(RelatedPlace(f"required: {_titled(requirement)}", own.file, own.line or None))
@@ -265,8 +291,13 @@ def _together(steps: Sequence[Step]) -> str:
 
 
 def _others(violation: Violation) -> str:
-    others = violation.witness.others
-    return f", and so may {_listed(others)}" if others else ""
+    """Return clauses on the further enclaves that break a requirement; "" for none."""
+    alike, differing = violation.alike, violation.differing
+    text = f", and so may {_listed(alike)}" if alike else ""
+    for steps in differing:
+        text += f"; {steps[0].use.enclave} may {' and '.join(step.does() for step in steps)}"
+    more = len(violation.witness.others) - len(alike) - len(differing)
+    return text + (f"; {more} more break it in their own ways" if more else "")
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -96,6 +96,35 @@ def test_whoever_has_a_part_of_an_action_holds_the_right_to_it(case: str) -> Non
     assert texts(rights, required) == ([text] if text else [])
 
 
+def test_of_each_enclave_the_finding_says_what_it_may() -> None:
+    """An enclave that breaks a requirement by another name is not said to use the first one."""
+    rights = {
+        "/a": may("publish", "/out"),
+        "/b": may("publish", "/speed"),
+        "/c": may("publish", "/out", "/a"),
+        "/d": may("publish", "/in"),
+    }
+    required = '[[nothing_but]]\nenclaves = ["/*"]\npublish = ["/in"]'
+    assert texts(rights, required) == [
+        "/c: may publish /a; /a may publish /out; /b may publish /speed, "
+        "but /* may do nothing but publish /in"
+    ]
+    rights["/c"] = may("publish", "/out", "/speed")
+    assert texts(rights, required) == [
+        "/a: may publish /out, and so may /c; /b may publish /speed, "
+        "but /* may do nothing but publish /in"
+    ]
+    many = {f"/e{number}": may("publish", f"/topic{number}") for number in range(8)}
+    (text,) = texts(many, required)
+    assert "; /e5 may publish /topic5; 2 more break it in their own ways, but /* may" in text
+    both = {f"/e{number}": may("publish", f"/x{number}", "/y") for number in range(2)}
+    required = '[[not_both]]\nfirst.publish = ["/x*"]\nsecond.publish = ["/y"]'
+    assert texts(both, required) == [
+        "/e0: may publish /x0 and publish /y; /e1 may publish /x1 and publish /y, "
+        "but nobody may both publish /x* and publish /y"
+    ]
+
+
 ROBOT = {
     "/r/a": may("publish", "/x", "/y*"),
     "/r/b": may("subscribe", "/x"),
