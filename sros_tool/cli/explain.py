@@ -123,7 +123,7 @@ def _complete_enclave(
 
 _IGNORED = {
     "": ("infrastructure", "patterns", "robots"),
-    "--who": ("infrastructure", "policy", "fleet_file", "all_vendors", "all_distros"),
+    "--who": ("infrastructure", "all_vendors", "all_distros"),
     "--reach": (
         *("patterns", "robots", "kind", "all_vendors", "distro", "all_distros"),
         *("moment", "time_zone"),
@@ -155,7 +155,7 @@ def _refuse_ignored(mode: str) -> None:
 @verb("explain")
 @click.argument(
     "words",
-    metavar="[KEYSTORE] [ENCLAVE] [publish|subscribe|call|serve|execute|join [NAME]]",
+    metavar="[KEYSTORE|POLICY] [ENCLAVE] [publish|subscribe|call|serve|execute|join [NAME]]",
     nargs=-1,
     shell_complete=_complete_words,
 )
@@ -172,8 +172,7 @@ def _refuse_ignored(mode: str) -> None:
     "--policy",
     type=PATH,
     metavar="FILE",
-    help="Policy that the permissions were made from, to show its lines; without a "
-    "keystore, explain this policy.",
+    help="Policy that the permissions were made from, to show its lines.",
 )
 @fleet_option("The robots that placeholders of --policy stand for. [default: the keystore's]")
 @click.option(
@@ -206,9 +205,7 @@ def _refuse_ignored(mode: str) -> None:
     help="Time zone of the robot, in which Fast DDS reads dates: Asia/Tokyo. "
     "[default: this machine's]",
 )
-@click.option(
-    "--who", is_flag=True, help="Show which enclaves of the keystore may do the operation on NAME."
-)
+@click.option("--who", is_flag=True, help="Show which enclaves may do the operation on NAME.")
 @only_enclaves("With --who: only")
 @click.option(
     "--reach",
@@ -255,7 +252,7 @@ def explain(
 
     call and serve are about services, execute is about actions. If the rights name an action NAME
     but no service NAME, call and serve are about the action; use --type to choose. KEYSTORE is a
-    keystore, here or on a robot; ENCLAVE can also be an enclave's folder. With --policy and no
+    keystore, here or on a robot; ENCLAVE can also be an enclave's folder. With a policy and no
     keystore, sros decides by the policy alone, as it would be signed.
 
     The exit status is 0 if the operation is allowed (with --who: to at least one enclave), and 1 if
@@ -273,6 +270,7 @@ def explain(
       $ sros explain keystore /talker publish /chatter --vendor zenoh
       $ sros explain keystore /talker publish /chatter --all-distros
       $ sros explain keystore --who publish /cmd_vel
+      $ sros explain robot.xml --who publish /cmd_vel
       $ sros explain keystore --reach /mobile_robot/teleop
       $ ros2 run demo_nodes_cpp talker 2>&1 | \
             sros explain keystore /talker --log -
@@ -286,9 +284,11 @@ def explain(
     mode = "--who" if who else "--reach" if reach else "--log" if logs else ""
     _refuse_ignored(mode)
     check_one_decider()
-    if fleet_file and not policy:
-        raise UsageError("--fleet goes with --policy only", "", "Leave it out.")
     root, rest = _split(words, keystore, verb=0 if who else 1)
+    if root and root.is_file() and not (policy or logs):
+        policy, root = root, None
+    if fleet_file and not policy:
+        raise UsageError("--fleet goes with a policy only", "", "Leave it out.")
     if reach:
         if vendor not in (None, _ZENOH):
             text = "It follows the rights, which are the same for all DDS vendors."
@@ -312,6 +312,8 @@ def explain(
         asking = asking._replace(domain=domain_of(domain))  # all domains, unless asked
         chosen = None if why_zenoh else chosen_vendor(vendor, distro, os.environ)
         only = patterns, robots
+        if policy:
+            return _show_who_in_policy(policy, root, rest, kind, chosen, asking, only, as_json)
         return _show_who(root, rest, kind, chosen, why_zenoh, asking, only, as_json)
     question = _question(root, rest, kind)
     asked = _open(root, rest[0], policy, asking)
@@ -353,7 +355,7 @@ def _split(
         )
     if keystore is not None or not words or _is_word(words, verb):
         return keystore, words
-    if _is_word(words, verb + 1) or Path(words[0]).is_dir():
+    if _is_word(words, verb + 1) or Path(words[0]).exists():
         return Path(words[0]), words[1:]
     return None, words
 
@@ -723,17 +725,12 @@ def _show_who(
 
     ``chosen`` is the vendor that decides, None for Zenoh; ``only`` are --match and --robot.
     """
-    from sros_tool.explain.answer import ask
-    from sros_tool.explain.who import ask_everybody, callable_action, names_meant
     from sros_tool.keystore.fleet import load_fleet
+    from sros_tool.keystore.layout import has_authorities
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.selection import select_enclaves
 
-    if not 1 <= len(rest) <= 2:
-        raise UsageError(
-            "--who takes an operation and a name", "", "Write for example publish /cmd_vel."
-        )
-    question = ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
+    question = _question_to_all(rest, kind)
     keystore = Keystore(root or keystore_from_environment())
     keystore.check()
     patterns, robots = only
@@ -747,15 +744,75 @@ def _show_who(
         from sros_tool.explain.zenoh import ZenohOfKeystore
 
         decider = ZenohOfKeystore(keystore, why_zenoh, asking, names)
+    fleet = load_fleet(keystore) if chosen else None
+    domains = keystore.domains if has_authorities(keystore.root) else None
+    return _print_everybody(decider, question, kind, (fleet, asking.domain, domains), as_json)
+
+
+def _show_who_in_policy(
+    policy: Path,
+    root: Path | None,
+    rest: tuple[str, ...],
+    kind: str | None,
+    chosen: tuple[Vendor, str] | None,
+    asking: AskingContext,
+    only: tuple[tuple[str, ...], tuple[str, ...]],
+    as_json: bool,
+) -> int:
+    """Print which enclaves of a policy may do something, like `_show_who`."""
+    from sros_tool.explain.asking import fleet_of, policy_to_ask
+    from sros_tool.explain.vendors import VendorOfPolicy
+
+    patterns, robots = only
+    if root:
+        text = "A keystore is asked about what it has signed."
+        raise UsageError("--who takes a keystore or a policy", text, "Leave one of them out.")
+    if chosen is None:
+        text = "A policy has no Zenoh files; `sros zenoh KEYSTORE` writes them."
+        raise UsageError("--who on Zenoh takes no policy", text, "Name the keystore.")
+    if robots:
+        raise UsageError(
+            "--robot takes a keystore", "", f"Add --match '/{robots[0]}/*' in place of it."
+        )
+    question = _question_to_all(rest, kind)
+    fleet = fleet_of(asking.fleet_file, None)
+    _, stated = policy_to_ask(policy, fleet)
+    decider = VendorOfPolicy(stated, *chosen, asking, patterns or ("*",))
+    return _print_everybody(decider, question, kind, (fleet, asking.domain, None), as_json)
+
+
+def _question_to_all(rest: tuple[str, ...], kind: str | None) -> Question:
+    """Return the question in the words after the keystore: operation and name."""
+    from sros_tool.explain.answer import ask
+
+    if not 1 <= len(rest) <= 2:
+        raise UsageError(
+            "--who takes an operation and a name", "", "Write for example publish /cmd_vel."
+        )
+    return ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
+
+
+def _print_everybody(
+    decider: Decider,
+    question: Question,
+    kind: str | None,
+    where: tuple[Fleet | None, int | None, DomainSet | None],
+    as_json: bool,
+) -> int:
+    """Print the decisions on all enclaves; return 0 if any enclave may do it, else 1.
+
+    ``where`` has the fleet that groups enclaves, and the domains as `_who_lines` takes them.
+    """
+    from sros_tool.explain.who import ask_everybody, callable_action, names_meant
+
     with progress("asking"):
         everybody = ask_everybody(decider, question, kind)
     if as_json:
         print_json(decider.printed(everybody.question, everybody.outcomes))
     else:
-        fleet = load_fleet(keystore) if chosen else None
-        _echo(_who_lines(everybody, fleet, asking.domain, keystore.domains))
+        _echo(_who_lines(everybody, *where))
         echo(f"decided by {decider.title}", err=True)
-        if chosen and not kind and not everybody.allowed:
+        if not kind and not everybody.allowed:
             enclaves = {outcome.enclave for outcome in everybody.outcomes}
             hint = callable_action(decider, everybody.question) or names_meant(
                 decider, everybody.question, enclaves
@@ -766,19 +823,21 @@ def _show_who(
 
 
 def _who_lines(
-    everybody: Everybody, fleet: Fleet | None, domain: int | None, domains: DomainSet
+    everybody: Everybody, fleet: Fleet | None, domain: int | None, domains: DomainSet | None
 ) -> Iterator[str]:
     """Yield the allowed enclaves, the enclaves whose participant does not start now, and counts.
 
     The enclaves of a fleet are grouped by robot.  ``domain`` is that of --domain, ``domains`` are
-    those of the keystore: where some of them alone allow it, they are named.
+    those of the keystore, None for an export or a policy: where some of them alone allow it, they
+    are named.
     """
     from sros_tool.fleet.robots import folded
 
     able = [outcome for outcome in everybody.outcomes if outcome.allowed]
     lines = []
     by_domains = Counter(outcome.domains for outcome in able)
-    if domain is not None or not by_domains.keys() - {str(domains)}:
+    everywhere = str(domains) if domains else next(iter(by_domains), "")
+    if domain is not None or not by_domains.keys() - {everywhere}:
         by_domains.clear()
     for outcome in able:
         wildcard = f"  by the wildcard {outcome.wildcard}" if outcome.wildcard else ""

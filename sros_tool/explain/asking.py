@@ -137,19 +137,14 @@ def open_to_ask(
     policy = own = stated = None
     keystore = Keystore(root) if root else None
     if policy_file:
-        from sros_tool.fleet.expansion import FleetPolicy
-        from sros_tool.policy.document import read_policy
-
-        fleet = fleet_of(asking.fleet_file, keystore)
-        stated = read_policy(policy_file, placeholders=fleet is not None)
-        policy = FleetPolicy(stated, fleet).policy() if fleet else stated
+        stated, policy = policy_to_ask(policy_file, fleet_of(asking.fleet_file, keystore))
         own = policy.enclave(name)
         if own is None and not is_enclave(Path(name)):
             raise _not_in_policy(policy, name, policy_file)
     enclave = signed_enclave(keystore, name, asking.at, planned=own is not None)
     if enclave is None:
         assert own is not None
-        enclave = _planned_enclave(own, keystore, asking)
+        enclave = planned_enclave(own, keystore, asking)
     elif own is None and policy_file and policy:
         own = policy.enclave(enclave.name)
         if own is None and not is_enclave(Path(enclave.name)):
@@ -162,6 +157,15 @@ def open_to_ask(
         or (policy_file is None and keystore is not None and _is_of_robot(keystore, enclave.name)),
     )
     return AskedEnclave(enclave, policy)
+
+
+def policy_to_ask(file: Path, fleet: Fleet | None) -> tuple[Policy, Policy]:
+    """Return a policy as it is stated, and with the robots of a fleet for its placeholders."""
+    from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.policy.document import read_policy
+
+    stated = read_policy(file, placeholders=fleet is not None)
+    return stated, FleetPolicy(stated, fleet).policy() if fleet else stated
 
 
 def _is_of_robot(keystore: Keystore, enclave: str) -> bool:
@@ -221,7 +225,7 @@ def _in_folder(folder: Path, at: datetime) -> LoadedEnclave:
     return loaded_enclave(name, folder, state, at=at)
 
 
-def _planned_enclave(
+def planned_enclave(
     policy: Enclave, keystore: Keystore | None, asking: AskingContext
 ) -> LoadedEnclave:
     """Return the enclave as the policy would create it, with the keystore's governance.

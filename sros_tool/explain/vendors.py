@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from enum import Enum, auto
+from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 from sros_tool.dds.decision.access import Outcome, OutcomeWord, ReasonWord
@@ -17,7 +18,9 @@ from sros_tool.explain.asking import (
     AskedEnclave,
     AskingContext,
     ZenohInBrief,
+    planned_enclave,
     question_meant,
+    rights_naming,
 )
 from sros_tool.explain.explanation import explain, likely_names
 from sros_tool.keystore.layout import (
@@ -29,6 +32,8 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave_of
 from sros_tool.keystore.reader import Keystore
 from sros_tool.names import is_expression
+from sros_tool.policy.model import Policy
+from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.values import shows
 
 
@@ -382,6 +387,57 @@ def _parts(enclave: LoadedEnclave, domain: int | None) -> Sequence[DomainSet]:
     return [part for part in DomainSet.parts((joined, *sets)) if (part & joined).ranges]
 
 
+def _title(vendor: Vendor, why: str) -> str:
+    documented = ", as documented" if vendor.documented_only else ""
+    return f"{vendor.title} ({why}{documented})"
+
+
+def _outcome(name: str, answer: Answer) -> VendorOutcome:
+    expression = answer.decision.expression or ""
+    return VendorOutcome(name, answer.outcome, answer.reason, answer.text, expression)
+
+
+class VendorOfPolicy(NamedTuple):
+    """The decisions of a vendor on the enclaves of a policy, as it would be signed.
+
+    Only enclaves that match one of the ``patterns`` are asked about; without patterns, all are.
+    """
+
+    policy: Policy
+    vendor: Vendor
+    why: str
+    asking: AskingContext
+    patterns: Sequence[str] = ("*",)
+
+    @property
+    def title(self) -> str:
+        """Name of the vendor, and the reason to choose it."""
+        return _title(self.vendor, self.why)
+
+    def rights_naming(self, name: str) -> Iterator[Right]:
+        """Return the rights of the policy to a ROS name."""
+        return (right for right in policy_rights(self.policy) if name in right.name)
+
+    def outcomes(self, question: Question) -> tuple[VendorOutcome, ...]:
+        """Return the outcome for each enclave, sorted by name."""
+        outcomes = []
+        for own in self.policy.enclaves:
+            if any(fnmatchcase(own.path, pattern) for pattern in self.patterns):
+                enclave = planned_enclave(own, None, self.asking)
+                context = self.asking.context(enclave.joined_domains)
+                answer = Evaluator(self.vendor, enclave, context).answer(question)
+                outcomes.append(_outcome(own.path, answer))
+        return tuple(sorted(outcomes, key=lambda outcome: outcome.enclave))
+
+    def printed(self, question: Question, outcomes: Sequence[VendorOutcome]) -> WhoByVendor:
+        """Return the outcomes in the form that ``--json`` prints."""
+        return WhoByVendor(str(question), self.vendor, self.why, self.asking.domain, outcomes)
+
+    def notes(self, _outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
+        """Yield no notes: DDS needs none."""
+        return iter(())
+
+
 class VendorOfKeystore(NamedTuple):
     """The decisions of a vendor on the enclaves ``names`` of a keystore; without names, on all."""
 
@@ -394,8 +450,11 @@ class VendorOfKeystore(NamedTuple):
     @property
     def title(self) -> str:
         """Name of the vendor, and the reason to choose it."""
-        documented = ", as documented" if self.vendor.documented_only else ""
-        return f"{self.vendor.title} ({self.why}{documented})"
+        return _title(self.vendor, self.why)
+
+    def rights_naming(self, name: str) -> Iterator[Right]:
+        """Return the rights to a ROS name in the permissions of all enclaves."""
+        return rights_naming(self.keystore, name)
 
     def outcomes(self, question: Question) -> tuple[VendorOutcome, ...]:
         """Return the outcome for each enclave, sorted by name."""
@@ -407,9 +466,7 @@ class VendorOfKeystore(NamedTuple):
 
             def decided(domain: int) -> VendorOutcome:
                 context = self.asking._replace(domain=domain).context(None)
-                answer = Evaluator(self.vendor, enclave, context).answer(question)
-                expression = answer.decision.expression or ""
-                return VendorOutcome(name, answer.outcome, answer.reason, answer.text, expression)
+                return _outcome(name, Evaluator(self.vendor, enclave, context).answer(question))
 
             decision, domains = first_allowing_domain(_parts(enclave, self.asking.domain), decided)
             return decision._replace(domains=domains)

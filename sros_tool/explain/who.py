@@ -10,9 +10,9 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note
 from sros_tool.explain.answer import Question, about_action, ask
-from sros_tool.explain.asking import rights_naming, taken_for_action
+from sros_tool.explain.asking import taken_for_action
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.layout import enclave_names
+from sros_tool.keystore.layout import enclave_names, has_authorities
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, rights_by_domains
 from sros_tool.keystore.selection import likely_names, no_such_enclave
@@ -60,11 +60,7 @@ _Outcome = TypeVar("_Outcome", bound=EnclaveOutcome)
 
 
 class Decider(Protocol):
-    """A DDS vendor, or Zenoh, and the keystore on whose enclaves it decides."""
-
-    @property
-    def keystore(self) -> Keystore:
-        """The keystore on whose enclaves it decides."""
+    """A DDS vendor, or Zenoh, and the keystore or policy on whose enclaves it decides."""
 
     @property
     def title(self) -> str:
@@ -72,6 +68,9 @@ class Decider(Protocol):
 
     def outcomes(self, question: Question) -> Sequence[EnclaveOutcome]:
         """Return the decision for each enclave, sorted by name."""
+
+    def rights_naming(self, name: str) -> Iterable[Right]:
+        """Return at least all rights to a ROS name."""
 
     def printed(self, question: Question, outcomes: Sequence[Any], /) -> NamedTuple:
         """Return the outcomes in the form that ``--json`` prints."""
@@ -104,7 +103,7 @@ def ask_everybody(decider: Decider, question: Question, kind: str | None) -> Eve
     # A name that an enclave has as a service is one; a wildcard shows nothing about it.
     unclear = all(outcome.wildcard for outcome in outcomes if outcome.allowed)
     if not kind and unclear and question.type == "service":
-        rights = rights_naming(decider.keystore, question.name)
+        rights = decider.rights_naming(question.name)
         if action := about_action(question, rights):
             taken = taken_for_action(question, action)
             question, outcomes = action, decider.outcomes(action)
@@ -126,7 +125,7 @@ def names_meant(decider: Decider, question: Question, enclaves: Container[str]) 
     names = sorted(
         {
             right.name
-            for right in rights_naming(decider.keystore, "/")
+            for right in decider.rights_naming("/")
             if right.right == question.right and right.enclave in enclaves
         }
     )
@@ -247,6 +246,12 @@ def follow_reach(
         KeystoreError: the keystore does not have the enclave, or the enclave has no rights.
     """
     of_keystore = source.kind == "keystore"
+    if of_keystore and not has_authorities(source.path):
+        raise KeystoreError(
+            f"'{source.path}' is an export, which may lack enclaves",
+            "Information can also flow through enclaves that it does not have.",
+            "Ask the keystore that it comes from.",
+        )
     names = enclave_names(source.path) if of_keystore or source.kind == "zenoh" else ()
     without, questions = ((), ()) if infrastructure else (OF_EVERY_NODE, QUESTIONS)
     rights = {

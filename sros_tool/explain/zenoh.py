@@ -27,6 +27,7 @@ from sros_tool.explain.asking import (
     AskingContext,
     ZenohInBrief,
     question_meant,
+    rights_naming,
 )
 from sros_tool.explain.explanation import explain
 from sros_tool.keystore.layout import (
@@ -787,7 +788,7 @@ class ZenohOfKeystore:
         asking: AskingContext,
         names: Sequence[str] | None = None,
     ) -> None:
-        self.keystore = keystore
+        self._keystore = keystore
         self._why = why
         self._domain = asking.domain
         first = asking.context(keystore.domains).domain
@@ -819,6 +820,10 @@ class ZenohOfKeystore:
             return replace(decision, domains=domains)
 
         return decide_each(self._names, answer)
+
+    def rights_naming(self, name: str) -> Iterator[Right]:
+        """Return the rights to a ROS name in the permissions of all enclaves."""
+        return rights_naming(self._keystore, name)
 
     def printed(self, question: Question, outcomes: Sequence[ZenohAnswer]) -> WhoOnZenoh:
         """Return what ``--json`` prints for these answers."""

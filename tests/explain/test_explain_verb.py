@@ -425,6 +425,29 @@ def test_by_environment_option_and_folder(whole: Path, tmp_path: Path) -> None:
     assert "note [explain.exported]" not in explain(whole, *denied).err
 
 
+@pytest.mark.parametrize("words", [("publish", "/chatter"), ("subscribe", "/chatter"), ("join",)])
+def test_who_may_by_a_policy_alone_is_who_may_once_it_is_signed(
+    words: tuple[str, ...], whole: Path, tmp_path: Path
+) -> None:
+    for vendor in ("fastdds", "cyclonedds"):
+        asked = ("--who", *words, "--vendor", vendor)
+        of_keystore, of_policy = explain(whole, *asked), explain(POLICY, *asked)
+        assert of_policy.out == of_keystore.out and of_policy.status == of_keystore.status
+        assert explain("--policy", POLICY, *asked).out == of_policy.out
+    one = explain(POLICY, "--who", *words, "--match", ENCLAVE)
+    assert "of 1 enclave may" in one.out
+    assert explain(POLICY, ENCLAVE, *words).status == explain(whole, ENCLAVE, *words).status
+
+
+def test_who_may_in_an_export(whole: Path, tmp_path: Path) -> None:
+    sros("distribute_key", whole, ENCLAVE, tmp_path / "robot").ok()
+    words = ("publish", "/chatter")
+    found = explain(tmp_path / "robot", "--who", *words)
+    assert found.out == f"{ENCLAVE}\n1 of 1 enclave may publish topic /chatter\n"
+    refused = explain(tmp_path / "robot", "--reach", ENCLAVE)
+    assert refused.status == 2 and "is an export, which may lack enclaves" in refused.err
+
+
 def test_domains(whole: Path) -> None:
     for vendor in ("fastdds", "cyclonedds"):
         asked = (whole, ENCLAVE, "publish", "/chatter", "--vendor", vendor)
@@ -477,7 +500,10 @@ def test_access_control_that_is_off_is_told(tmp_path: Path) -> None:
         (["--reach", "/a", "--vendor", "fastdds"], "--reach takes only --vendor zenoh"),
         (["--reach", "/a", "--at", "90d"], "--reach takes no --at"),
         (["--who", "publish", "/x", "--all-vendors"], "--who takes no --all-vendors"),
-        (["--who", "publish", "/x", "--policy", "p.xml"], "--who takes no --policy"),
+        (["--who", "publish", "/x", "--policy", "p.xml"], "p.xml' does not exist"),
+        (["ks", "--who", "publish", "/x", "--policy", "p.xml"], "takes a keystore or a policy"),
+        (["--who", "join", "--policy", "p.xml", "--vendor", "zenoh"], "on Zenoh takes no policy"),
+        (["--who", "join", "--policy", "p.xml", "--robot", "r1"], "--robot takes a keystore"),
         (["--log", "-", "--policy", "p.xml"], "--log takes no --policy"),
         (["/a", "publish", "/x", "--infrastructure"], "goes with --reach only"),
         ([], "no keystore is named"),

@@ -206,7 +206,7 @@ def test_a_policy_with_placeholders_explains_the_enclaves_of_its_keystore(made: 
     assert "from      robot.xml:9: ALLOW execute raise" in planned.out
     assert "Name the fleet's file with --fleet FILE" in sros("explain", *asked, cwd=made).err
     other = sros("explain", "ks", *asked[:3], "--fleet", "fleet.toml", cwd=made)
-    assert "--fleet goes with --policy only" in other.err
+    assert "--fleet goes with a policy only" in other.err
 
 
 def test_the_rights_of_every_node_are_not_next_to_the_policy(made: Path, tmp_path: Path) -> None:
