@@ -698,8 +698,9 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
             f"the command '{command[0]}' names no node",
             "The policy assigns enclaves to node names, and `--ros-args -r __node:=NAME` sets "
             "the name.",
-            "Give the node a name in the launch file, or start this command in an enclave of its "
-            "own: `sros run KEYSTORE ENCLAVE -- COMMAND`.",
+            "Start a launch file with `ros2 launch --secured KEYSTORE POLICY ...`, which finds the "
+            "enclave of each of its nodes, and this command in an enclave of its own: `sros run "
+            "KEYSTORE ENCLAVE -- COMMAND`.",
         )
     ns, name = node
     full = f"/{ns.strip('/')}/{name}".replace("//", "/")

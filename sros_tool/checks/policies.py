@@ -653,11 +653,13 @@ LONG_NAME = FindingKind(
 DENY_BLOCKS = FindingKind(
     "portable.deny-blocks-topic",
     WARNING,
-    "a topic that is denied in one direction and allowed in the other",
+    "a topic that is denied in one direction and allowed in the other: Cyclone DDS 0.10 denies "
+    "both",
     "Cyclone DDS 0.10 does not create a topic of which one direction is denied; Fast DDS and "
     "Cyclone DDS 11 create it.",
     "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c), Fast DDS 2.6 to 3.6; tested.",
-    "Remove the deny rule: everything that no rule allows is denied anyway.",
+    "Remove the deny rule (everything that no rule allows is denied anyway), or deny only names "
+    "whose other direction the node does not use; every node serves its parameters.",
     vendors=(Vendor.CYCLONE,),
 )
 CHARACTER_SET = FindingKind(

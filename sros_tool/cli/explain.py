@@ -949,7 +949,9 @@ def _show_log(
         lines = text.count("\n") + (not text.endswith("\n")) if text else 0
         nothing = "looks like a message of DDS Security, or of a denial by Zenoh"
         echo(
-            f"none of {counted(lines, 'line')} {nothing}" if lines else "the log is empty",
+            f"none of {counted(lines, 'line')} {nothing}: {_OTHER_END}"
+            if lines
+            else "the log is empty",
             err=True,
         )
         if _ZENOH_TESTS in text:
@@ -957,6 +959,10 @@ def _show_log(
     return 1 if explained.findings else 0
 
 
+_OTHER_END = (
+    "a node whose peers refuse it often logs nothing. Explain the log of the other node, too, and "
+    "compare the identity CA and the domains in `sros inspect KEYSTORE ENCLAVE` of both."
+)
 _ZENOH_TESTS = "caching permissions for `"
 _ONLY_TESTS = (
     "the log only has Zenoh's tests of declared keys, which do not show which message was "

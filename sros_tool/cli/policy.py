@@ -322,22 +322,28 @@ def _protection_lines(protections: Iterable[tuple[str, StatedProtection]]) -> li
 
 
 def difference_lines(
-    difference: RightsDifference, first: Fleet | None, second: Fleet | None
+    difference: RightsDifference,
+    first: Fleet | None,
+    second: Fleet | None,
+    sides: tuple[str, str] = ("A", "B"),
 ) -> list[str]:
-    """Return the lines for a difference; lines that differ only in the robot are merged."""
+    """Return the lines for a difference; lines that differ only in the robot are merged.
+
+    ``first`` and ``second`` are the fleets of the two sides, which are called ``sides``.
+    """
     from sros_tool.fleet.robots import folded
 
     lines: list[tuple[str, str, str]] = []
     for sign, right in difference.lines():
         by = ", ".join(cover.describe() for cover in difference.covered.get(right, ()))
-        remark = f"  ({'B' if sign == '-' else 'A'} has it by {by})" if by else ""
+        remark = f"  ({sides[sign == '-']} has it by {by})" if by else ""
         lines.append((sign, right.enclave, f"{sign} {right}{remark}"))
     if first is None and second is None:
         return [text for _, _, text in lines]
-    sides = (("-", first or second), ("+", second or first))
+    fleets = (("-", first or second), ("+", second or first))
     return [
         text
-        for side, fleet in sides
+        for side, fleet in fleets
         for text in folded(fleet, [(name, text) for sign, name, text in lines if sign == side])
     ]
 

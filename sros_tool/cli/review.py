@@ -415,7 +415,9 @@ def _reasons(step: ReviewStep) -> list[str]:
             return added_lines(after, growth)
         case RightsChange(before=before, after=after, compared=compared):
             unanswered = unanswered_lines(compared, after.fleet)
-            differing = difference_lines(compared.rights, before.fleet, after.fleet)
+            differing = difference_lines(
+                compared.rights, before.fleet, after.fleet, ("BASE", "HEAD")
+            )
             return [*unanswered, *_absolute_lines(step.content), *differing]
         case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen) if (
             step.status or step.allowed

@@ -151,7 +151,7 @@ def test_permissions_that_were_replaced_and_put_back(tmp_path: Path) -> None:
     assert ids(root) == ["enclave.old-permissions"]
     shown = sros("check", root, "--policy", policy).out
     assert "enclave.stale-permissions" in shown
-    assert "+ ALLOW publish topic /wide" in shown
+    assert "- ALLOW publish topic /wide" in shown
 
 
 def test_permissions_that_an_enclave_signed_for_itself(tmp_path: Path) -> None:

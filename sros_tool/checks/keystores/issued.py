@@ -387,13 +387,13 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
         return
     if grant is None:
         return
-    difference = compare(wanted[name], grant_rights(name, grant))
+    difference = compare(grant_rights(name, grant), wanted[name])
     if difference:
         shown = [
             f"{sign} {right.qualifier} {right.describe()}" for sign, right in difference.lines()
         ]
         rights = first_few(shown, _RIGHTS_SHOWN, "; ")
-        text = f"policy (-) and permissions (+) differ: {rights}"
+        text = f"permissions (-) and policy (+) differ: {rights}"
         yield STALE.found(name, text, enclave.file("permissions.p7s"))
 
 

@@ -293,7 +293,7 @@ def _with_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
     The remedy for an export says that commands which sign have to run in the original keystore.
     """
     remedy = finding.remedy
-    if not keystore.is_original and _NEEDS_CA_KEYS.search(remedy):
+    if not keystore.looks_like_original and _NEEDS_CA_KEYS.search(remedy):
         remedy = remedy if ORIGINAL_KEYSTORE in remedy else in_original_keystore(remedy)
     if ORIGINAL_KEYSTORE not in remedy:
         remedy = re.sub(r"\bKEYSTORE\b", lambda _: quote(str(keystore.root)), remedy)
