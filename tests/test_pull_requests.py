@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from pydantic_sarif.model import StaticAnalysisResultsFormatSarifVersion210JsonSchema as Sarif
 
 from tests.support.code_host import (
     BEFORE,
@@ -35,6 +34,12 @@ from tests.support.long_form import some, sometimes
 ALL = {"policy": POLICY, "requirements": REQUIRED}
 MARKS_OF_JOBS: list[str] = []
 """What ended the part of each job in which the runner takes no commands."""
+
+
+def check_sarif(log: object) -> None:
+    from pydantic_sarif.model import StaticAnalysisResultsFormatSarifVersion210JsonSchema as Sarif
+
+    Sarif.model_validate(log)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +93,7 @@ def test_the_action_on_pull_requests(origin: Origin, tmp_path: Path) -> None:
     assert "```mermaid" in said
     assert "requirement.violated" in said
     log = json.loads(Path(outputs["sarif"]).read_text())
-    Sarif.model_validate(log)
+    check_sarif(log)
     results = log["runs"][0]["results"]
     places = [e["physicalLocation"] for each in results for e in each.get("locations", [])]
     assert POLICY in {e["artifactLocation"]["uri"] for e in places}
@@ -246,7 +251,7 @@ def test_the_job_of_gitlab(origin: Origin, tmp_path: Path) -> None:
     assert job.run().returncode == 1
     (folder,) = gitlab()[1]["artifacts"]["paths"]
     assert "requirement.violated" in (clone / folder / "review.md").read_text()
-    Sarif.model_validate(json.loads((clone / folder / "review.sarif").read_text()))
+    check_sarif(json.loads((clone / folder / "review.sarif").read_text()))
     assert sorted(each.name for each in (clone / folder).iterdir()) == ["review.md", "review.sarif"]
     assert not origin.git("worktree", "list", cwd=clone).partition("\n")[2]
 

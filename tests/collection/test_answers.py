@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import json
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 pytest.importorskip("ansible")
 
-from ansible_collections.sros.fleet.plugins.action.enclaves import ActionModule
 from ansible_collections.sros.fleet.plugins.module_utils.home import harmless
 from ansible_collections.sros.fleet.plugins.plugin_utils.answers import read_answer
-from ansible_collections.sros.fleet.plugins.plugin_utils.robot_action import RobotAction
 from tests.support.children import run
+
+if TYPE_CHECKING:
+    from ansible_collections.sros.fleet.plugins.action.enclaves import ActionModule
 
 
 def answered(**answer: object) -> dict[str, Any]:
+    from ansible_collections.sros.fleet.plugins.action.enclaves import ActionModule
+
     return read_answer(json.dumps(answer), "", ActionModule.readers)
 
 
 def action(*, diff: bool) -> ActionModule:
+    from ansible_collections.sros.fleet.plugins.action.enclaves import ActionModule
+
     made = ActionModule.__new__(ActionModule)
     made._task = SimpleNamespace(diff=diff)
     return made
@@ -54,6 +59,8 @@ def test_differences_are_compared_before_the_task_ends() -> None:
 
 def test_nothing_is_forwarded_to_a_robot() -> None:
     """Ansible puts ``ssh_args``, which are first here, before ``ssh_extra_args``."""
+    from ansible_collections.sros.fleet.plugins.plugin_utils.robot_action import RobotAction
+
     options = {"ssh_extra_args": "-o ForwardAgent=yes"}
     made = RobotAction.__new__(RobotAction)
     made._connection = SimpleNamespace(

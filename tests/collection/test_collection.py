@@ -14,7 +14,6 @@ import pytest
 import yaml
 
 from ansible_collections.sros.fleet.plugins.filter.due_units import due_units, without_unit
-from ansible_collections.sros.fleet.plugins.filter.sharing import sharing
 from ansible_collections.sros.fleet.plugins.module_utils.exports import RefusedError
 from sros_tool import __version__
 from tests.integration.robots import CHECKOUT
@@ -67,6 +66,8 @@ def test_each_play_looks_at_the_names_first() -> None:
 
 def test_two_hosts_of_one_robot_are_named() -> None:
     """Those with patterns get what these say, whatever their robot is called."""
+    from ansible_collections.sros.fleet.plugins.filter.sharing import sharing
+
     hosts: dict[str, dict[str, object]] = {"r1": {}, "r2": {"sros_robot": "r1"}, "r4": {}}
     hosts["r3"] = {"sros_robot": "r1", "sros_patterns": ["/r3/*"]}
     assert sharing(hosts, [*hosts]) == ["r1 (r1, r2)"]

@@ -74,22 +74,21 @@ def test_lines() -> None:
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("before", "repeated", "after"),
     [
-        "[" * 10**6,
-        "{a:" * 10**6,
-        "/*" * 10**6,
-        " " * 10**6 + "!",
-        "'" + "\\" * 10**6,
-        '"' + "a" * 10**6,
-        "9" * 10**6 + "x",
-        "a" * 10**6,
+        ("", "[", ""),
+        ("", "{a:", ""),
+        ("", "/*", ""),
+        ("", " ", "!"),
+        ("'", "\\", ""),
+        ('"', "a", ""),
+        ("", "9", "x"),
+        ("", "a", ""),
     ],
-    ids=range(8),
 )
-def test_hostile_texts_are_refused_in_linear_time(text: str) -> None:
+def test_hostile_texts_are_refused_in_linear_time(before: str, repeated: str, after: str) -> None:
     with pytest.raises(Json5Error) as caught:
-        parse_json5(text)
+        parse_json5(before + repeated * 10**6 + after)
     assert len(caught.value.problem) < 200
 
 
