@@ -101,17 +101,21 @@ def _rmw(state: RuntimeState) -> Iterator[Finding]:
 
 
 def _clock(state: RuntimeState) -> Iterator[Finding]:
-    root = state.environment.get(KEYSTORE, "")
-    if not root or not Path(root).is_dir():
-        return
-    files = [path for name in ("ledger.jsonl", "enclaves/*.p7s", "enclaves/**/cert.pem")
-             for path in Path(root).glob(name)]  # fmt: skip
-    newest = max((file.stat().st_mtime for file in files if file.exists()), default=0.0)
-    written = time_of_file(newest)
+    """Yield a finding if a keystore of this shell, or of a process, is newer than the clock."""
     clock = state.clock or state.now
-    if written > clock + _TOLERANCE:
-        text = f"the clock shows {iso(clock)}, but '{root}' was written at {iso(written)}"
-        yield CLOCK_BEHIND.found("clock", text)
+    enclaves = (process.enclave for process in state.running.processes)
+    used = (str(enclave.here) for enclave in enclaves if enclave and enclave.here)
+    for root in dict.fromkeys((state.environment.get(KEYSTORE, ""), *used)):
+        if not root or not Path(root).is_dir():
+            continue
+        files = [path for name in ("ledger.jsonl", "enclaves/*.p7s", "enclaves/**/cert.pem")
+                 for path in Path(root).glob(name)]  # fmt: skip
+        newest = max((file.stat().st_mtime for file in files if file.exists()), default=0.0)
+        written = time_of_file(newest)
+        if written > clock + _TOLERANCE:
+            text = f"the clock shows {iso(clock)}, but '{root}' was written at {iso(written)}"
+            yield CLOCK_BEHIND.found("clock", text)
+            return
 
 
 class ChangeKind(StrEnum):

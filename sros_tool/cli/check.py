@@ -342,13 +342,23 @@ def check(
         every = [*_findings(family, paths, at), *_stated_differences(paths, at)]
         if decide:
             every += decide(lambda paths: _system(paths, at, template))
-        findings = [_shown(finding) for finding in every]
+        findings = [_shown(finding) for finding in every if not _is_mended_by(template, finding)]
     chosen = selection.choose(findings)
     if form == "text":
         _print_text(chosen, _fleet_of(at, paths))
     else:
         _SHOW[form](chosen, selection)
     return _status(chosen, fail_on)
+
+
+def _is_mended_by(template: str | None, finding: Finding) -> bool:
+    """Return whether keystores of a template do not have a weakness of a policy."""
+    from sros_tool.checks.policies import ENCLAVE_NAMES
+    from sros_tool.keystore.template import load_template
+
+    if template is None or finding.kind is not ENCLAVE_NAMES:
+        return False
+    return load_template(template).unique_subject
 
 
 def _requirements(

@@ -421,7 +421,16 @@ def _policy_alone(root: Path | None, asked: AskedEnclave, policy: Path | None) -
 def _question(root: Path | None, rest: tuple[str, ...], kind: str | None) -> Question:
     """Return the question in the words after the keystore: enclave, operation and name."""
     from sros_tool.explain.answer import ask
+    from sros_tool.keystore.layout import is_keystore
 
+    if root is None and len(rest) > 1 and rest[1] in _WORDS and is_keystore(Path(rest[0])):
+        asked = " ".join(map(quote, rest[1:]))
+        raise UsageError(
+            "no enclave is named",
+            "",
+            f"Write `sros explain {quote(rest[0])} ENCLAVE {asked}`, or ask for all enclaves: "
+            f"`sros explain {quote(rest[0])} --who {asked}`.",
+        )
     if not 2 <= len(rest) <= 3:
         remedy = "Write for example `sros explain /talker publish /chatter`."
         if root and len(rest) == 1 and rest[0].startswith("/"):
@@ -949,7 +958,7 @@ def _show_log(
         lines = text.count("\n") + (not text.endswith("\n")) if text else 0
         nothing = "looks like a message of DDS Security, or of a denial by Zenoh"
         echo(
-            f"none of {counted(lines, 'line')} {nothing}: {_OTHER_END}"
+            f"none of {counted(lines, 'line')} {nothing}: {_silence(text)}"
             if lines
             else "the log is empty",
             err=True,
@@ -959,10 +968,23 @@ def _show_log(
     return 1 if explained.findings else 0
 
 
-_OTHER_END = (
-    "a node whose peers refuse it often logs nothing. Explain the log of the other node, too, and "
-    "compare the identity CA and the domains in `sros inspect KEYSTORE ENCLAVE` of both."
-)
+def _silence(log: str) -> str:
+    """Return what a log without a message of security shows, and what to do next."""
+    from sros_tool.runtime.vendor_log import SECURITY_DIRECTORY
+
+    found = SECURITY_DIRECTORY.search(log)
+    if found is None:
+        return (
+            "no line says 'Found security directory', so its nodes ran open, or it is not the "
+            "whole log. `sros check runtime` on that machine says how its processes run"
+        )
+    return (
+        f"a node ran in '{found['folder']}'. Where its peers refuse it, it often logs nothing: "
+        "explain the log of the other node, too, and compare the identity CA and the domains in "
+        "`sros inspect KEYSTORE ENCLAVE` of both"
+    )
+
+
 _ZENOH_TESTS = "caching permissions for `"
 _ONLY_TESTS = (
     "the log only has Zenoh's tests of declared keys, which do not show which message was "

@@ -131,9 +131,10 @@ def names_meant(decider: Decider, question: Question, enclaves: Container[str]) 
     )
     last = question.name.rpartition("/")[2]
     same = [name for name in names if name.rpartition("/")[2] == last and not is_expression(name)]
-    if not same:
+    meant = same or likely_names(question.name, [name for name in names if not is_expression(name)])
+    if not meant:
         return None
-    text = f"they may {question.word} {first_few(same, 3)}: perhaps that is meant."
+    text = f"they may {question.word} {first_few(meant, 3)}: perhaps that is meant."
     return Note("explain.likely-name", text)
 
 

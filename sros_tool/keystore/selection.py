@@ -6,6 +6,7 @@ The error for a missing enclave says whether it was revoked, or its name may be 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
 from shlex import quote
@@ -22,6 +23,7 @@ from sros_tool.fleet.robots import (
 from sros_tool.keystore.fleet import arguments_for, checked_fleet, enclaves_of_robot, load_fleet
 from sros_tool.keystore.layout import (
     FLEET,
+    PERMISSIONS_FILE,
     PRIVATE,
     REVOKED,
     SETTINGS,
@@ -231,6 +233,12 @@ def no_such_enclave(
             f"It is the namespace of {counted(len(below), 'enclave')}, such as {below[0]}.",
             f"Name one of them; a verb that takes several also has --match '{name}/*'.",
         )
+    if of_node := _enclaves_of_node(keystore, name, names):
+        return KeystoreError(
+            what,
+            f"{name} is a node of {first_few(of_node, _SHOWN)}.",
+            f"Name the enclave: {of_node[0]}.",
+        )
     meant = likely_names(name, there)
     if meant:
         return KeystoreError(what, "", f"Perhaps you mean {' or '.join(meant)}.")
@@ -246,6 +254,17 @@ def no_such_enclave(
         return KeystoreError(what, why, f"See `sros list_enclaves {quote(str(root))}`.")
     create = f"`sros create_enclave {quote(str(root))} {name}`"
     return KeystoreError(what, why, f"If it is not a typo, create it with {create}.")
+
+
+def _enclaves_of_node(keystore: Keystore, node: str, names: Sequence[str]) -> list[str]:
+    """Return the enclaves whose permissions let a node of this full name serve its parameters."""
+    topic = f">rr{node}/get_parametersReply<".encode()
+    found = []
+    for name in names:
+        with suppress(SrosError, OSError):
+            if topic in keystore.read(keystore.folder(name) / PERMISSIONS_FILE, "permissions"):
+                found.append(name)
+    return found
 
 
 def revocation_of(keystore: Keystore, name: str) -> Entry | None:

@@ -227,6 +227,9 @@ def test_the_domain_is_told_whatever_the_enclave(bench: Bench) -> None:
 def test_a_robot_whose_clock_is_behind(sound_one: RuntimeState) -> None:
     behind = replace(sound_one, now=sound_one.now - 400 * DAY)
     assert "enclave.certificate-not-yet-valid" in ids(behind)
+    assert "runtime.clock-behind" in ids(behind)
+    plain = replace(behind, environment={})
+    assert "runtime.clock-behind" in ids(plain), "the processes name the keystore"
 
 
 @pytest.mark.parametrize(("zone", "found"), [("America/Los_Angeles", True), ("UTC", False)])

@@ -347,3 +347,17 @@ def test_nothing_is_decided_that_depends_on_a_file_that_is_absent(tmp_path: Path
     assert sros("diff_policy", "--no-new-access", policy, before).status == 2
     (tmp_path / "site.xml").write_text(f"<profile ns='/' node='n'>{publish('/cmd_vel')}</profile>")
     assert [sros(*asked).status for asked in (compared, decided)] == [1, 1]
+
+
+def test_a_template_mends_names_that_it_makes_unique(tmp_path: Path) -> None:
+    """Cyclone DDS mistakes ``/arm`` for ``/left/arm`` unless their subjects are unique."""
+    names = policy_text({"/arm": publish("/x"), "/left/arm": publish("/y")})
+    (tmp_path / "robot.xml").write_text(names)
+    (tmp_path / "required.toml").write_text('[[nobody]]\npublish = ["/z"]\n')
+    asked = ("check", "robot.xml", "--requirements", "required.toml")
+    found = {
+        template: "[portable.enclave-names]"
+        in sros(*asked, "--template", template, cwd=tmp_path).out
+        for template in ("development", "production")
+    }
+    assert found == {"development": True, "production": False}

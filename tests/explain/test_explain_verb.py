@@ -439,6 +439,15 @@ def test_who_may_by_a_policy_alone_is_who_may_once_it_is_signed(
     assert explain(POLICY, ENCLAVE, *words).status == explain(whole, ENCLAVE, *words).status
 
 
+def test_a_node_or_nothing_in_place_of_an_enclave(whole: Path, tmp_path: Path) -> None:
+    node = read_policy(POLICY).enclaves[0].all_profiles()[0]
+    name = f"{node.ns.rstrip('/')}/{node.node}"
+    found = explain(whole, name, "publish", "/chatter")
+    assert f"{name} is a node of {ENCLAVE}. Name the enclave: {ENCLAVE}." in found.err
+    found = explain(whole, "publish", "/chatter")
+    assert f"`sros explain {whole} --who publish /chatter`" in found.err and found.status == 2
+
+
 def test_who_may_in_an_export(whole: Path, tmp_path: Path) -> None:
     sros("distribute_key", whole, ENCLAVE, tmp_path / "robot").ok()
     words = ("publish", "/chatter")
@@ -641,6 +650,7 @@ def test_a_change_is_for_the_node_that_the_permissions_are_for(whole: Path) -> N
     meant = explain(whole, ENCLAVE, "serve", "/elsewhere/get_parameters")
     assert f"note [explain.likely-name]: the enclave may serve {own}" in meant.err
     assert "may publish /chatter: " in explain(whole, ENCLAVE, "publish", "/chater").err
+    assert "may publish /chatter: " in explain(whole, "--who", "publish", "/chater").err
     assert "likely-name" not in explain(whole, ENCLAVE, "publish", "/nothing").err
 
 
