@@ -217,8 +217,7 @@ class ObservedProcesses(NamedTuple):
     unknown: Sequence[str] = ()
     """Processes on this machine whose nodes are not known; they are not closed."""
     elsewhere: Sequence[str] = ()
-    """Enclaves with nodes that no process of this machine is known to have: also if another process
-    has nodes of the same names."""
+    """Enclaves with nodes whose process sros did not find on this machine."""
 
     @property
     def units(self) -> dict[str, str]:
@@ -272,8 +271,8 @@ class CloseStep(NamedTuple):
     command: str
     """The command line that does the same."""
     state: Annotated[str, Words(("done", "kept", "findings", "open"))]
-    """Whether the step was done, its result was there and kept, it found something, or it is not
-    done."""
+    """Whether the step was done now, was kept because its result existed, found something, or
+    is not done."""
 
 
 class Proof(NamedTuple):
@@ -553,7 +552,7 @@ class _Step(NamedTuple):
     made: Path | None = None
     into: Path | None = None
     guards: bool = False
-    """Whether no later step is done if this one finds something."""
+    """Whether the later steps are left out if this step finds something."""
 
     @property
     def command(self) -> str:
@@ -772,7 +771,7 @@ class OpenRobot:
         for process in running.processes:
             if process.is_zenoh and named.get(RMW) != RMW_ZENOH and self._is_neighbour(process):
                 raise UsageError(
-                    f"{process.label} speaks Zenoh, and this shell does not",
+                    f"{process.label} speaks Zenoh, but this shell is set up for DDS",
                     "",
                     f"Run `export {RMW}={RMW_ZENOH}`, and this command again.",
                 )
@@ -987,7 +986,7 @@ class OpenRobot:
             )
         if observed.elsewhere:
             named = first_few(observed.elsewhere, _MOST_NAMES)
-            yield f"nodes of {named} are of no known process of this machine; {silent}"
+            yield f"sros knows no process of this machine for nodes of {named}; {silent}"
 
     # ── applying ────────────────────────────────────────────────────────────────────────────
 
@@ -1046,7 +1045,7 @@ class OpenRobot:
                 raise SrosError(
                     f"'{path}' is not the drop-in of this folder",
                     "Its first line names another folder, or was changed. Nothing was changed.",
-                    "Use the folder that it names, as it was written, or remove the drop-in.",
+                    "Use the folder that it names, spelled as there, or remove the drop-in.",
                 )
         return drop_ins
 
@@ -1102,8 +1101,9 @@ class OpenRobot:
         if not fails and self.policy.exists() and (changed := self._enclaves_changed()):
             where = "" if self.keystore.exists() else ", where the keystore is,"
             self._shell.say(
-                f"'{self.policy}' is not what is signed, for {first_few(changed, _MOST_NAMES)}: "
-                f"`sros close {shlex.quote(str(self.folder))}`{where} checks and signs it"
+                f"'{self.policy}' differs from the signed permissions of "
+                f"{first_few(changed, _MOST_NAMES)}: `sros close "
+                f"{shlex.quote(str(self.folder))}`{where} checks and signs it"
             )
         return closing._replace(proofs=proofs)
 

@@ -332,7 +332,8 @@ class Fault(Enum):
         "With Fast DDS the node starts, and every peer refuses it; with Cyclone DDS it does not "
         "start.",
         "DDS-Security 1.1, 9.4.1.3; tested.",
-        f"Set ROS_DOMAIN_ID to a domain that the permissions name, or add this domain. {_SIGN}",
+        "Set ROS_DOMAIN_ID to a domain that the permissions name, or sign them for this domain. "
+        f"{_SIGN}",
     )
     CERTIFICATE_FILE = (
         "certificate-file",
@@ -393,8 +394,8 @@ class Fault(Enum):
         "a key on a token, which only Fast DDS uses",
         "Only rmw_fastrtps of ROS 2 Jazzy and later reads key.p11; without key.pem, no node "
         "of another RMW, or of ROS 2 Humble or Iron, starts.",
-        "rmw_fastrtps_shared_cpp 8.4 (participant.cpp), rmw_cyclonedds 2.2 and rmw_connextdds 0.22 "
-        "(they ask rmw_dds_common for files alone); Fast DDS 2.9.1, tested.",
+        "rmw_fastrtps_shared_cpp 8.4 (participant.cpp), rmw_cyclonedds 2.2 and rmw_connextdds "
+        "0.22 (they ask rmw_dds_common only for files); Fast DDS 2.9.1, tested.",
         "Use rmw_fastrtps_cpp, or a key in a file.",
     )
     DOCUMENT_SIZE = (

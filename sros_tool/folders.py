@@ -32,7 +32,7 @@ _MOST_OPEN = 64
 _MOST_BYTES = 128 * 1024 * 1024
 _RENAME_EXCHANGE = 2
 _SIMPLE_LINK = re.compile(r"(?:\.\./)*(?:[^/.][^/]*/)*[^/.][^/]*")
-"""Targets of links that mean the same after a text replacement of their leading ``..``."""
+"""Targets of links whose leading ``..`` can be resolved as text, without following other links."""
 _NOT_SUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
 
 

@@ -154,7 +154,8 @@ class _Round:
         self._problems: list[str] = []
         self._state = read_state(folder)
         self._is_in_step = False
-        """Whether the last release has the files that are here, and so this revocation list."""
+        """Whether the installed files, with their revocation list, are those of the last
+        release."""
         self._began = time.clock_gettime(time.CLOCK_BOOTTIME)
 
     def run(self) -> Round:

@@ -54,7 +54,7 @@ class FetchProblem(StrEnum):
     EXPIRED = "expired"
     """The metadata expired: none is published, somebody withholds it, or a clock is wrong."""
     ROLLED_BACK = "rolled_back"
-    """The metadata is older than what this robot has seen, or parts of it are."""
+    """The metadata, or a part of it, is older than what this robot has seen."""
     NOT_SIGNED = "not_signed"
     """Metadata or release are not what the trusted keys signed, or are damaged."""
     TOO_LARGE = "too_large"

@@ -48,7 +48,7 @@ class EnclaveProcesses(NamedTuple):
     complete: bool
     """Whether every process of the machine could be looked at."""
     problems: tuple[str, ...]
-    """What `sros check runtime` finds of these processes, but for due restarts."""
+    """The findings of `sros check runtime` on these processes, except due restarts."""
     dds: RobotDds
     """The DDS of the robot."""
 

@@ -50,7 +50,7 @@ from sros_tool.zenoh.document import (
 )
 from sros_tool.zenoh.releases import too_old_because, version_text
 
-_RCL = "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy."
+_RCL = "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy."
 _NAME_IT = (
     "Start each process with `sros run KEYSTORE ENCLAVE -- COMMAND...`, or set its enclave in the "
     "launch file."

@@ -947,7 +947,7 @@ SHARED_NAMESPACE = FindingKind(
     "robots with the same namespace, or with one namespace inside the other",
     "Both robots publish and subscribe to the same names; and a wildcard in the outer namespace "
     "also matches the names in the inner one.",
-    "rcl (names are the namespace and the rest); sros (placeholder {namespace}).",
+    "rcl (puts the node's namespace before relative names); sros (placeholder {namespace}).",
     "Give each robot a namespace of its own in the fleet file, or a ROS domain of its own.",
 )
 

@@ -70,7 +70,7 @@ PROCESS_OUTDATED = FindingKind(
     WARNING,
     "a process that started before its enclave's files changed",
     "A running participant does not notice changed certificates, permissions or revocation lists.",
-    "Fast DDS 2.14.5, Cyclone DDS 0.10.2 (read at the start).",
+    "Fast DDS 2.14.5, Cyclone DDS 0.10.2 (they read the files when they start).",
     "Restart the process.",
 )
 PROCESS_REVOKED = FindingKind(
@@ -79,7 +79,7 @@ PROCESS_REVOKED = FindingKind(
     "a process of a revoked enclave",
     "It keeps its certificate until it ends. Processes that started before the revocation list "
     "changed still communicate with it.",
-    "Fast DDS 2.14.5, Cyclone DDS 0.10.2 (read at the start).",
+    "Fast DDS 2.14.5, Cyclone DDS 0.10.2 (they read the files when they start).",
     "Stop it, and restart the processes that started before the revocation.",
 )
 PROCESS_WITHOUT_FILES = FindingKind(
@@ -88,7 +88,7 @@ PROCESS_WITHOUT_FILES = FindingKind(
     "a process whose enclave is not there any more",
     "It runs with files that were removed since it started, and does not start again. Without the "
     "ledger, as on a robot, sros cannot tell whether the enclave was revoked.",
-    "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy.",
+    "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",
     "Stop it if its enclave was revoked; otherwise bring the enclave back, and restart it.",
 )
 PROCESS_EXPIRED = FindingKind(
@@ -96,8 +96,8 @@ PROCESS_EXPIRED = FindingKind(
     ERROR,
     "a process whose certificate, permissions or CA has expired",
     "Processes that start, or discover this process, from now on refuse it.",
-    "DDS-Security 1.1, 8.3.2.8 and 9.4.1.3.2.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2 (read at the "
-    "start).",
+    "DDS-Security 1.1, 8.3.2.8 and 9.4.1.3.2.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2 (they read "
+    "the files when they start).",
     "Renew the enclave (`sros renew KEYSTORE ENCLAVE`), bring it here, and restart the process.",
 )
 PROCESS_LOCAL_TIME = FindingKind(
@@ -125,11 +125,11 @@ PROCESS_NOT_SEEN = FindingKind(
     "processes that could not be looked at",
     "They may be nodes, even open or revoked ones. The other findings do not cover them.",
     "proc(5), ptrace(2) (PTRACE_MODE_READ_FSCREDS).",
-    "Run it as root, and not in a container: `sudo sros check runtime`.",
+    "Run the check as root, outside of containers: `sudo sros check runtime`.",
 )
 _ROOT_MAY_NOT = (
     "Being root is not enough here: the processes are in another container or user namespace, or "
-    "this one lacks the capability CAP_SYS_PTRACE. Look from the host, outside containers."
+    "sros lacks the capability CAP_SYS_PTRACE. Run the check on the host, outside of containers."
 )
 
 _NEW_AUTHORITY = Fault.CA_EXPIRED.remedy_in_export("").format(root="KEYSTORE")
@@ -190,7 +190,7 @@ def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
     yield from (f"{file} (removed)" for file in gone)
     if not newer and not gone:
         moved = [path for path, moment in enclave.moved.items() if moment > process.started]
-        yield from (f"'{_plain_path(file)}' (moved, or its mode)" for file in moved[:1])
+        yield from (f"'{_plain_path(file)}' (its place or mode)" for file in moved[:1])
 
 
 def _unread_files(process: Process, enclave: ProcessEnclave) -> Iterator[Finding]:
@@ -420,7 +420,7 @@ PROCESS_RUNS_UNSECURED = FindingKind(
     "Its ROS_SECURITY_STRATEGY is not exactly `Enforce`, so rcl starts it unsecured if its "
     "enclave, or a file of the enclave, is missing: everybody on the network hears it and can send "
     "to it.",
-    "rcl 9 (rcl/src/rcl/security.c), rmw_dds_common (security.cpp); ran with ROS 2 Jazzy.",
+    "rcl 9 (rcl/src/rcl/security.c), rmw_dds_common (security.cpp); tested with ROS 2 Jazzy.",
     "Stop it, and start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
 MIXED_VENDORS = FindingKind(
@@ -439,7 +439,7 @@ PROCESS_PERMISSIVE = FindingKind(
     "a process that is secured now, and would start without security",
     "Its ROS_SECURITY_STRATEGY is not exactly `Enforce`: if its enclave, or a file of the enclave, "
     "is missing, the process starts unsecured.",
-    "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy.",
+    "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",
     "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
 PROCESS_OTHER_KEYSTORE = FindingKind(
@@ -487,7 +487,7 @@ NOT_SECURED = FindingKind(
     "security is not enabled here: nodes start open",
     "Everybody on the network hears these nodes and can send to them. The absence of other "
     "findings says nothing about their security.",
-    "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy.",
+    "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",
     "Start nodes with `sros run KEYSTORE ENCLAVE -- COMMAND...`, or set the variables with "
     '`eval "$(sros env KEYSTORE ENCLAVE)"`.',
     prominent=True,
@@ -497,7 +497,7 @@ NODE_OPEN = FindingKind(
     WARNING,
     "a node that runs open in a domain without secured nodes",
     "Everybody on the network hears it and can send to it.",
-    "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy.",
+    "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",
     "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`, or end it if nobody needs it.",
 )
 

@@ -129,7 +129,7 @@ def _print_closed(root: Path, changes: Sequence[Change]) -> None:
         echo(
             "closed to other users, who could open them until now: "
             f"{first_few(closed, _CLOSED_SHOWN)}. Run the nodes as the owner of the keystore, or "
-            "from an export of that user (`sros distribute_key`). Replace keys that somebody may "
+            "give other users exports (`sros distribute_key`). Replace keys that somebody may "
             f"have copied: keys of enclaves with `sros renew {where} ENCLAVE --new-key "
             f"--revoke-old`, keys of CAs with `sros rotate_ca {where} --next`.",
             err=True,

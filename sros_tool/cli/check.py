@@ -321,7 +321,7 @@ def check(
             )
         chosen = selection.choose(map(_shown, changed.findings))
         others = changed.enclaves - changed.compared
-        rest = f"; {others} of {upgrade_to.title} already" if others else ""
+        rest = f"; {others} already for {upgrade_to.title}" if others else ""
         echo(f"compared {counted(changed.compared, 'enclave')}{rest}", err=True)
         _SHOW[form](chosen, selection)
         return _status(chosen, fail_on)

@@ -64,7 +64,9 @@ def _run(words: Sequence[str], live: bool) -> tuple[int, str, str]:
     "--apply", "applies", is_flag=True, help="Restart the robot's systemd units with security."
 )
 @click.option("--proof", "proves", is_flag=True, help="Prove that the robot is closed.")
-@click.option("--undo", "undoes", is_flag=True, help="Restart these units open again.")
+@click.option(
+    "--undo", "undoes", is_flag=True, help="Restart the robot's systemd units open again."
+)
 @click.option(
     "--partial",
     is_flag=True,
@@ -175,7 +177,10 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
     for right in closed.newly_denied:
         echo(f"used when sros watched, and denied now: {right}")
     if closed.newly_denied:
-        echo("  if this is not meant, change the policy; if it is, the node may end when it starts")
+        echo(
+            "  if this is not intended, change the policy; if it is intended, the node may end "
+            "when it starts"
+        )
     if stays := len(closed.denied) - len(closed.newly_denied):
         rights = counted(stays, "right")
         echo(f"{rights} used when sros watched: denied as before (--json has all)")

@@ -72,7 +72,10 @@ def _complete_scenario(
     "--keystore",
     type=PATH,
     metavar="KEYSTORE",
-    help="Attack a copy of this keystore (with --scenario attacks); it is only read.",
+    help=(
+        "Attack a copy of this keystore (with --scenario attacks); the keystore itself is only "
+        "read."
+    ),
 )
 @click.option(
     "--accept-open",
@@ -160,8 +163,8 @@ def demo(
     variables, so that you can see who hears whom. The node runs on Cyclone DDS, rclpy, or Zenoh,
     which also needs a router. The node says at once whether it is secured. In an enclave, it needs
     only the right for its topic, whatever its nodes are called. A listener reads
-    std_msgs/msg/String, and counts the messages of any other type that the topic has; a talker says
-    if nobody can take its type. Of the options, only --backend and --topic apply.
+    std_msgs/msg/String, and counts the messages of any other type that the topic has; a talker
+    reports if no node can read its type. Of the options, only --backend and --topic apply.
 
     Example:
       $ sros demo --topic /camera/image

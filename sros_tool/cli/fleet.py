@@ -156,7 +156,7 @@ def _dds_here(moment: datetime) -> RobotDds:
 @dry_run_option
 @json_option
 def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -> None:
-    """Store a robot's report of its files in KEYSTORE.
+    """Store in KEYSTORE what a robot reports about its files.
 
     FILE is what `sros fleet report` or the Ansible collection made on the robot; - is standard
     input. FILE replaces the last report of the robot. A report is no proof; `sros fleet status`
@@ -385,9 +385,8 @@ _VALIDITIES = {
 @click.option(
     "--restored",
     is_flag=True,
-    help="Publish although PUB has later releases than the keystore, because the keystore was "
-    "restored; enclaves that these releases revoke are revoked again, and new releases get numbers "
-    "that were never used.",
+    help="After the keystore was restored: publish although PUB has later releases. Enclaves that "
+    "these releases revoke are revoked again; new releases get numbers that were never used.",
 )
 @click.option(
     "--new-folder",
@@ -519,7 +518,7 @@ class ComparedFleet(NamedTuple):
     is_flag=True,
     help="Leave known vulnerabilities of the robots' DDS out of the output and the exit status.",
 )
-@output_option("Replace FILE at once instead of printing.")
+@output_option("Replace FILE atomically instead of printing.")
 @dry_run_option
 @json_option
 def _status(
@@ -936,9 +935,11 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     if len(groups) > _MOST_GROUPS:
         yield f"more, see --robot {robot.robot}"
     if robot.fetches and (robot.published or 0) != (robot.release or 0):
-        yield f"release {robot.release or 'none'}, published is {robot.published or 'none'}"
+        yield (
+            f"release {robot.release or 'none'}; the published one is {robot.published or 'none'}"
+        )
     elif robot.fetches and robot.pending:
-        other = f"not the files of release {robot.release}, which is published"
+        other = f"not the files of the published release {robot.release}"
         yield other if robot.is_published else "not published yet"
     if robot.restart:
         yield f"processes of {first_few(robot.restart, _MOST_GROUPS)} may run with earlier files"

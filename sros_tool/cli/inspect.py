@@ -163,7 +163,7 @@ def _keystore(keystore: DescribedKeystore) -> Iterator[str]:
     yield f"keystore {keystore.path}, " + (
         f"template {template}"
         if template
-        else "no template: an export has none, nor what others made"
+        else "no template: exports, and keystores made by other programs, have none"
     )
     for role, authority in keystore.authorities.items():
         yield from _authority(role, authority)
@@ -324,7 +324,7 @@ def _configuration(described: DescribedConfiguration) -> Iterator[str]:
     for problem in described.problems:
         yield f"  {problem}"
     if not described.made_by_sros:
-        yield "  not as sros writes it: see `sros check` of the file"
+        yield "  differs from what sros writes: run `sros check` on the file"
     places = [
         f"{word} {', '.join(endpoints)}"
         for word, endpoints in (

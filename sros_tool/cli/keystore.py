@@ -742,10 +742,10 @@ def update_keystore(
         again = f"sros update_keystore {quote(str(root))} --template production --next"
         raise UsageError(
             "no change is named",
-            "The keystore does not record the settings that the next stage will make."
+            "The keystore does not record which settings the next stage has to make."
             if next_stage
             else "",
-            f"Name the goal again, with the same options as for that stage, for example `{again}`."
+            f"Repeat the options of the first stage, for example `{again}`."
             if next_stage
             else "Name one with --template, --set, --rule or --domain.",
         )

@@ -204,12 +204,12 @@ def diff_policy(
     The exit status is 1 if they differ, or if DDS would refuse A or B.
 
     With --no-new-access, A and B can also be folders of policies, and policies at a git revision,
-    as git:REVISION:PATH. The exit status is 0 only if B gives no enclave any access that A does not
-    give, with no vendor, in no domain and for no name, and protects nothing less; it is 2 if that
-    cannot be decided. sros assumes that a policy is signed with access control of everything. If A
-    is a policy, a keystore B with less protection than the template production gives more access; a
-    policy B lowers no protection. The last line says what is assumed and what is left out, such as
-    dates.
+    as git:REVISION:PATH. The exit status is 0 only if B gives no enclave any access that A does
+    not give, with no vendor, in no domain and for no name, and protects nothing less; it is 2 if
+    that cannot be decided. sros assumes that a policy is signed with access control of everything.
+    If A is a policy, a keystore B that protects less than the template production counts as giving
+    more access; a policy B never lowers the protection. The last line says what is assumed and
+    what is left out, such as dates.
 
     Example:
       $ sros diff_policy robot.xml keystore

@@ -67,7 +67,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "import": VerbEntry(
             "deployment", "Install a signed answer on the robot.", attribute="import_verb"
         ),
-        "fleet": VerbEntry("fleet", "Which robots have what? Publish it to them."),
+        "fleet": VerbEntry("fleet", "Which files do robots have? Publish files to them."),
         "agent": VerbEntry("agent", "On a robot: fetch published releases, install them, confirm."),
         "zenoh": VerbEntry("zenoh", "Write the files that make Zenoh enforce policies."),
     },

@@ -445,8 +445,8 @@ class _WithCommandAfterDashes(_WithCommand):
     "--sros",
     "program",
     metavar="FILE",
-    help="Path of sros on the machine of the units, which verifies an enclave before its node"
-    " starts. [default: none for nodes, this program for jobs]",
+    help="Path of sros on the machine of the units; sros then verifies each enclave before its "
+    "node starts. [default: none for nodes, this program for jobs]",
 )
 @click.option(
     "--passphrase-file",

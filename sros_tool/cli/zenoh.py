@@ -177,7 +177,7 @@ def zenoh(
     given = {f"zenoh.{key}": text for key, text in chosen.items() if text}
     further = [name.partition("=")[::2] for name in routers if "=" in name]
     if off and (given or further or crossing):
-        raise UsageError("--off takes no other choice of the network", "", "Leave one of them out.")
+        raise UsageError("--off takes no options of the network", "", "Leave one of them out.")
     network = None if off else _network(settings, given, further, crossing)
     with progress("writing the Zenoh files"):
         work = of_one_state(set_zenoh) if only_check else set_zenoh
@@ -219,7 +219,7 @@ def zenoh(
 def _refuse_with_from(*given: object) -> None:
     if any(given):
         raise UsageError(
-            "--from takes no keystore and no choice of the network",
+            "--from takes no keystore and no options of the network",
             "It reads one configuration, and changes nothing.",
             "Leave them out.",
         )

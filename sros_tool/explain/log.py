@@ -63,7 +63,8 @@ from sros_tool.translate_zenoh.rights import name_of_key
 from sros_tool.values import shows
 
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
-"""Patterns that split a log line into words: without punctuation, or with that of topics."""
+"""Patterns that split a log line into words: without punctuation, or with the punctuation of
+topics."""
 _NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
 _LONGEST = 8000
 """Number of characters of a line that are read, because a line may have many megabytes."""

@@ -501,7 +501,7 @@ class _Inventory:
     def _step(self) -> None:
         self._steps += 1
         if self._steps > _MOST_STEPS:
-            raise self._error(f"it names more than {_MOST_STEPS} hosts and groups in groups")
+            raise self._error(f"its groups have more than {_MOST_STEPS} hosts and groups in all")
 
     def _host(self, host: object, own: Any, groups: tuple[str, ...], variables: _Variables) -> None:
         self._step()

@@ -316,7 +316,8 @@ _CHANGING = (
 )
 _TOOLS = re.compile(r"_ros2cli(_.*)?\Z|(?P<observer>_sros_observer)(_.*)?\Z")
 _OF_OBSERVER = frozenset({Endpoint("rt/parameter_events", PUBLISH)})
-"""The endpoints of an observer of sros.  A node with the same name and others is no observer."""
+"""The endpoints of an observer of sros. A node with its name but other endpoints is no
+observer."""
 _ABSOLUTE = frozenset(
     ("/bond", "/clock", "/diagnostics", "/parameter_events", "/rosout", "/tf", "/tf_static")
 )

@@ -278,7 +278,7 @@ class Includer:
             raise PolicyError(
                 f"{where}: the xpointer {_short(pointer)} is not accepted",
                 "It can be a path of elements, each a name or *, with [@attribute] or "
-                "[@attribute='value'] behind it.",
+                "[@attribute='value'] after it.",
                 "Write for example xpointer(/profile/*), xpointer(/policy/enclaves/*) or "
                 "xpointer(/policy/enclaves/enclave[@path='/talker']).",
             )
@@ -446,7 +446,7 @@ class _Reader:
                 else f"sros reads version {VERSION} of the SROS2 policy format.",
                 self._how_to_convert()
                 if version == "0.1.0"
-                else f'If it is that format, write version="{VERSION}".',
+                else f'If the policy has that format, write version="{VERSION}".',
             )
         blocks = self._children(root, place)
         if len(blocks) == 1 and blocks[0][0].tag in _EARLIER_BLOCKS:

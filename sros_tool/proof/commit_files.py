@@ -132,7 +132,7 @@ def find_revision(text: str) -> Revision:
     name, colon, path = text.removeprefix(PREFIX).partition(":")
     if not name or not colon or not path or any(ord(each) < 32 for each in text):
         raise UsageError(
-            f"'{text}' is not a policy in a revision",
+            f"'{text}' does not name a policy at a git revision",
             "",
             "Write git:REVISION:PATH, such as git:main:policies/robot.xml.",
         )

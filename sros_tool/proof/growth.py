@@ -80,8 +80,8 @@ class Gain:
     action: Annotated[str, Words((*KIND_OF, "write", "read", "join"))]
     """The operation; ``write`` and ``read`` are for a DDS topic that no right states."""
     right: Right | None
-    """The right that gives the access, or null if no right states it; it belongs to another enclave
-    if a vendor accepts the permissions of that enclave for ``enclaves``, too."""
+    """The right that gives the access, or null if no right states it. If a vendor accepts the
+    permissions of another enclave for ``enclaves``, too, it is a right of that other enclave."""
     name: str
     """Example of a ROS name with the access; empty for ``join``."""
     topic: str

@@ -451,7 +451,11 @@ class _Table:
             if problem:
                 raise self.error(key, f"{_short(enclave)} is not an enclave in {key}", problem)
         if all(enclave.startswith(EXCEPT) for enclave in enclaves):
-            raise self.error(key, f"{key} only excepts enclaves", 'Write "*" before them for all.')
+            raise self.error(
+                key,
+                f"{key} only excludes enclaves",
+                'Begin the list with "*", for all other enclaves.',
+            )
         return enclaves
 
     def rights(self, *, least: int = 1) -> RightNames:

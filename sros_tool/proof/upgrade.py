@@ -505,7 +505,7 @@ def _not_tested(before: Shipped, after: Shipped) -> Iterator[Finding]:
     for shipped in dict.fromkeys((before, after)):
         if not shipped.tested:
             same = before.vendor is after.vendor
-            blind = ", so that no difference between both can be seen" if same else ""
+            blind = ", so sros sees no difference between the two releases" if same else ""
             text = f"{shipped}{blind}"
             yield NOT_MEASURED.found(f"ROS 2 {shipped.distribution.title}", text)
 

@@ -67,7 +67,12 @@ _OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...
         True,
         "it looks for others, and answers them, unencrypted",
     ),
-    ("scouting/gossip/enabled", lambda each: each.gossip, True, "it tells processes of each other"),
+    (
+        "scouting/gossip/enabled",
+        lambda each: each.gossip,
+        True,
+        "it tells processes about each other",
+    ),
     (
         "adminspace/permissions/read",
         lambda each: each.adminspace and each.adminspace_readable,

@@ -300,7 +300,9 @@ class _System:
         domains = {self._domains.get(user, "") for user in senders | receivers} - {""}
         if len(domains) > 1:
             sentence += "; they are in different ROS domains ("
-            sentence += f"{enumerated(sorted(domains))}), and reach only those of their own"
+            sentence += (
+                f"{enumerated(sorted(domains))}), and reach only enclaves of their own domain"
+            )
         return Focus(
             kind, name, sentence, tuple(sorted(senders)), tuple(sorted(receivers)), influencing
         )

@@ -121,8 +121,8 @@ _CHECK_OR_FILE = f"{_CHECK} {_FILE}"
 _RENEW = "Renew it: `sros renew KEYSTORE ENCLAVE`."
 _SIGN = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
 _SIGN_ONE = (
-    f"`sros explain KEYSTORE ENCLAVE --log LOG` finds which one it is. {_SIGN} "
-    "Restore a governance from a backup: every enclave depends on it."
+    f"`sros explain KEYSTORE ENCLAVE --log LOG` names the document. {_SIGN} Restore a governance "
+    "from a backup: every enclave depends on it."
 )
 _READABLE = (
     "Allow the user that runs the node to read it, and to enter the folders above it: `ls -lL "
@@ -287,8 +287,8 @@ LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "revoked", _CYCLONE, r"Certificate not valid: error: certificate revoked",
         "the certificate of the enclave is revoked",
-        "Revoked enclaves are refused on purpose. To use it again, create it with a new key: `sros "
-        "create_enclave KEYSTORE ENCLAVE`.",
+        "Revoked enclaves are refused on purpose. To use the enclave again, create it with a new "
+        "key: `sros create_enclave KEYSTORE ENCLAVE`.",
         (Fault.REVOKED,),
     ),
     _text(

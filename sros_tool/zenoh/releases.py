@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 _LEAST_ZENOH = "1.3"
-"""The first Zenoh that accepts all settings of the files; 0.2.3 has a state shortly before it."""
+"""The first Zenoh that accepts all settings of the files; rmw_zenoh 0.2.3 has one from shortly
+before."""
 
 Version = tuple[int, int, int]
 

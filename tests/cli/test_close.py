@@ -500,7 +500,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     policy.write_text(policy.read_text().replace("chatter", "gossip", 1))
     ended = robot.close("--proof", "--partial")
     assert (
-        "policy.xml' is not what is signed, for /listener: `sros close robot` checks" in ended.err
+        "policy.xml' differs from the signed permissions of /listener: `sros close robot` checks"
+        in ended.err
     )
     assert "closed, except for what was not asked" in ended.err
 

@@ -183,7 +183,7 @@ def test_the_enclave_of_the_router_is_made_with_what_every_node_needs(folder: Pa
         (("ks", "--endpoint", "tcp/localhost:1"), "is not HOST:PORT"),
         (("ks", "--endpoint", "localhost:70000"), "is not HOST:PORT"),
         (("ks", "--domain", "7"), "the Zenoh network has domain 7, and keystore 'ks' only 0"),
-        (("ks", "--off", "--mode", "peer"), "--off takes no other choice"),
+        (("ks", "--off", "--mode", "peer"), "--off takes no options of the network"),
         (("nothing",), "is not a valid keystore"),
         ((), "ROS_SECURITY_KEYSTORE"),
     ],

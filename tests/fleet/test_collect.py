@@ -284,7 +284,10 @@ def test_a_certificate_that_proves_nothing(home: Home) -> None:
     issuer = Issuer(authority, of_authority)
     forged = issuer.issue(own.subject, key.public_key(), validity_of(own))
     home.put("r1", smime.sign(document, forged, key))
-    assert "is not in the ledger of the keystore, though its identity CA" in home.of("r1").why
+    assert (
+        "is not in the ledger of the keystore, though the keystore's identity CA"
+        in home.of("r1").why
+    )
     home.run("create_keystore", "other")
     home.run("create_enclave", "other", "/r1/base")
     foreign = home.folder / "other/enclaves/r1/base"
@@ -786,7 +789,7 @@ def test_what_was_renewed_is_published_at_once(home: Home) -> None:
     found = {robot["robot"]: (robot["release"], robot["published"]) for robot in status["robots"]}
     assert found["r1"] == (number - 1, number) and found["r3"][0] is None
     text = sros("fleet", "status", "ks", cwd=home.folder).out
-    assert f"release {number - 1}, published is {number}" in text
+    assert f"release {number - 1}; the published one is {number}" in text
     home.run("renew", "ks", "/r1/base")
     home.send("r1", datetime.now(UTC), release=number)
     ended = sros("fleet", "collect", "ks", "inbox", "--publish", "ks", cwd=home.folder)

@@ -175,8 +175,8 @@ ONE_AUTHORITY = FindingKind(
     "Cyclone DDS 0.10.2 and Fast DDS 2.9.1 accept every signer whose certificate chain ends at "
     "the permissions CA. With one CA this includes every enclave, so an enclave can sign "
     "permissions for itself.",
-    "CVE-2023-24011 class; reproduced on Cyclone DDS 0.10.2, where readers received data of such "
-    "an enclave.",
+    "CVE-2023-24011; reproduced on Cyclone DDS 0.10.2, where readers received data of such an "
+    "enclave.",
     "Run `sros update_keystore KEYSTORE --set authorities.layout=separate`, and then `sros "
     "rotate_ca KEYSTORE --permissions --next`.",
 )
@@ -253,7 +253,7 @@ SETTINGS_EDITED = FindingKind(
 FLEET_EDITED = FindingKind(
     "keystore.fleet-edited",
     WARNING,
-    "robots of the fleet that were edited by hand",
+    "a keystore's copy of the fleet file that was edited by hand",
     "The file decides which enclaves belong to a robot, and which domains they may join. Verbs "
     "that use the file to issue, revoke or export refuse it after such an edit.",
     "sros: the ledger has the SHA-256 of the file as sros wrote it.",

@@ -86,7 +86,7 @@ DEFAULT_FIRST = FindingKind(
     "Fast DDS ends a grant at its <default>, and ignores the rules that follow; Cyclone DDS reads "
     "them.",
     "omg_shared_ca_permissions.xsd; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
-    "Put <default> behind the rules.",
+    "Put <default> after the rules.",
     vendors=FAST_DDS,
 )
 DOMAIN_RANGE = FindingKind(

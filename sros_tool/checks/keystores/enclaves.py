@@ -119,7 +119,7 @@ OUTLIVES_CA = FindingKind(
     "a certificate that is valid for longer than its CA",
     "Once the CA expires, DDS refuses the certificate, whatever its own dates are.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
-    "Take the CA's expiry as the certificate's, or renew the enclave after `sros rotate_ca`.",
+    "Let the certificate expire no later than the CA, or renew the enclave after `sros rotate_ca`.",
 )
 PERMISSIONS_OUTLIVE = FindingKind(
     "enclave.permissions-outlive",

@@ -331,7 +331,10 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                 Variant(
                     (Condition.UNAUTHENTICATED, Condition.FAST),
                     RowStatus.NOT_HEARD_AGAIN,
-                    mechanism="the packets show an identity: Fast DDS waits until it authenticates",
+                    mechanism=(
+                        "the packets show an identity: Fast DDS waits until their sender "
+                        "authenticates"
+                    ),
                 ),
                 *_open_to(RowStatus.HEARD_AGAIN, RowStatus.NOT_HEARD_AGAIN),
             ),

@@ -282,7 +282,7 @@ def _tapped(attack: str, wire: Wire, *, readable: bool) -> tuple[Row, ...]:
     row = Row(
         f"{attack}, without TLS" if readable else attack,
         RowStatus.READABLE if readable else RowStatus.NOT_READABLE,
-        "TCP sends it as it is" if readable else hidden,
+        "TCP sends it unencrypted" if readable else hidden,
         _topic_pair(zenoh_forger.in_the_clear if readable else OWN),
         (Claim(Relation.READABLE, "talker", holds=readable, wire=wire),),
         _CHATTER,
@@ -312,7 +312,7 @@ def _shared(name: str, keystore: KeystoreChoice, *, readable: bool) -> Row:
     return Row(
         name,
         RowStatus.READABLE if readable else RowStatus.NOT_READABLE,
-        "a large message lies in shared memory as it is"
+        "a large message lies in shared memory unencrypted"
         if readable
         else "the files switch shared memory off: TLS carries large messages, too",
         (wide, replace(talker, size=_LARGE), listener),
@@ -1031,7 +1031,7 @@ _OPEN_ROWS = (
             "the rules know only the name, which the old certificate has, too",
         ),
         "Zenoh has no revocation list (zenoh#2749)",
-        "give the enclave another name, or `sros rotate_ca`; short validity",
+        "give the enclave another name, or run `sros rotate_ca`; use a short validity",
     ),
     replace(
         _open(

@@ -113,9 +113,9 @@ class CollectedMessage(NamedTuple):
     robot: str
     """Name of the robot."""
     outcome: Annotated[str, Words(MESSAGE_OUTCOMES)]
-    """``kept``: a new message, which is the robot's last confirmation now; ``unchanged``: the same
-    message as last time; ``missing``: the inbox has none; ``revoked``: all enclaves of the robot
-    were revoked, so that what is in the inbox is not read; ``refused``: it proves nothing."""
+    """``kept``: a new message, which is the robot's last confirmation now; ``unchanged``: the
+    same message as last time; ``missing``: the inbox has none; ``revoked``: all enclaves of the
+    robot were revoked, so its message is not read; ``refused``: the message proves nothing."""
     why: str
     """Why the message was refused or not read, as a clause; else empty."""
     enclave: str
@@ -531,8 +531,8 @@ class _Verifier:
         issued = self._issued(digest(signer))
         if issued is None:
             raise _RefusedError(
-                "its certificate is not in the ledger of the keystore, though its identity CA "
-                "issued it: the keystore may be older than its robots"
+                "its certificate is not in the ledger of the keystore, though the keystore's "
+                "identity CA issued it: the keystore may be older than its robots"
             )
         owner = robot_of(self._fleet, issued.enclave)
         if owner != robot:

@@ -38,7 +38,8 @@ from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
 
 RELEASE_FILES = frozenset({*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES} - {KEY_FILE})
-"""Names of the files of an enclave that a release can have: no key, and no place of a key."""
+"""The files of an enclave that a release can have: neither the key nor the file that names its
+token."""
 _SEALED = re.compile(rb"sros release 1\nrobot ([^\n]{1,255})\nnumber ([1-9][0-9]{0,11})\n")
 
 
