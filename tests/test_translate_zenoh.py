@@ -14,14 +14,13 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Permissions
 from sros_tool.errors import PolicyError
 from sros_tool.files import policies_dir
-from sros_tool.names import dds_names, expression_problem
+from sros_tool.names import NODE_SERVICES, dds_names, expression_problem
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, Enclave, Group, Profile, Profiles, Qualifier, Source
 from sros_tool.policy.model import DENY as DENY_
 from sros_tool.policy.model import RIGHTS as RIGHTS_OF
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import (
-    OWN_SERVICES,
     NodeName,
     Right,
     Rules,
@@ -489,7 +488,7 @@ def test_services_of_a_node_show_its_name(
 
 
 OWN = {
-    node: [f"{node}/{service}" for service in OWN_SERVICES]
+    node: [f"{node}/{service}" for service in NODE_SERVICES]
     for node in ("/n", "/n1", "/m", "/robot/arm")
 }
 EVERY = OWN["/robot/arm"]

@@ -12,7 +12,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
-from sros_tool.names import ACTION_PARTS, GOAL, DdsNames, dds_names, expand, is_expression
+from sros_tool.names import (
+    ACTION_PARTS,
+    GOAL,
+    NODE_SERVICES,
+    DdsNames,
+    dds_names,
+    expand,
+    is_expression,
+)
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
@@ -284,16 +292,6 @@ def compare(
 
 # ── the nodes of an enclave ────────────────────────────────────────────────────────────────
 
-OWN_SERVICES = (
-    "describe_parameters",
-    "get_parameter_types",
-    "get_parameters",
-    "get_type_description",
-    "list_parameters",
-    "set_parameters",
-    "set_parameters_atomically",
-)
-"""Services that every node offers under its own name (rclcpp and rclpy of ROS 2 Jazzy)."""
 CHANGING_NODES = (
     "transform_listener_impl_",
     "launch_ros_",
@@ -303,7 +301,7 @@ CHANGING_NODES = (
     "_sros_observer_",
 )
 """Beginnings of node names that end in an address or a process id, and change with every start."""
-_NODE_SERVICES = frozenset(f"~/{service}" for service in OWN_SERVICES)
+_SERVED_BY_EVERY_NODE = frozenset(f"~/{service}" for service in NODE_SERVICES)
 
 
 class NodeName(NamedTuple):
@@ -351,7 +349,7 @@ def _node_of(profile: Profile) -> NodeName:
 
 
 def _offers_node_services(group: Group) -> bool:
-    return ("reply", ALLOW) in group.rights and not _NODE_SERVICES.isdisjoint(group.names)
+    return ("reply", ALLOW) in group.rights and not _SERVED_BY_EVERY_NODE.isdisjoint(group.names)
 
 
 def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
@@ -384,7 +382,7 @@ def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
         return ()
     offering = {
         service: Names(node for name in allowed for node in _full_names(name, service))
-        for service in OWN_SERVICES
+        for service in NODE_SERVICES
     }
     never = Names(denied)
 
@@ -412,7 +410,7 @@ def _full_names(name: str, service: str = "") -> Iterator[str]:
     With ``service``, only nodes that offer this service by that name.
     """
     node, _, last = name.rpartition("/")
-    if last in OWN_SERVICES and service in ("", last):
+    if last in NODE_SERVICES and service in ("", last):
         yield node
     if name.endswith("*"):
         yield name

@@ -38,7 +38,12 @@ from sros_tool.errors import DocumentError, Note
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.comparison import Effect, SettingChange
 from sros_tool.keystore.rights import SourceKind, by_domains
-from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
+from sros_tool.names import (
+    ROS_DISCOVERY_TOPIC,
+    is_expression,
+    node_of_service,
+    service_of,
+)
 from sros_tool.policy.model import ALLOW, Source
 from sros_tool.policy.patterns import literal_prefix
 from sros_tool.policy.rights import KIND_OF, Right
@@ -827,12 +832,18 @@ class _Stated:
         return example
 
     def _likely_topics(self, expression: str) -> Iterator[str]:
-        """Yield some exact topics of the new rights that begin as the expression does."""
+        """Yield some exact topics of the new rights that begin as the expression does.
+
+        Topics of the services that every node has come last.
+        """
         prefix = literal_prefix(expression)
         if prefix != expression:
             first = bisect_left(self._exact, prefix)
             near = islice(self._exact, first, first + _MOST_NEAR)
-            yield from takewhile(lambda topic: topic.startswith(prefix), near)
+            fitting = takewhile(lambda topic: topic.startswith(prefix), near)
+            yield from sorted(
+                fitting, key=lambda topic: bool(node_of_service(service_of(topic)[0]))
+            )
 
     def _gain(
         self,

@@ -18,12 +18,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from string import ascii_lowercase
 from typing import NamedTuple
 
-from sros_tool.names import is_expression
+from sros_tool.names import NODE_SERVICES, is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.patterns import Names, TooManyNames, covers, listed, overlap
 from sros_tool.policy.rights import (
     CHANGING_NODES,
-    OWN_SERVICES,
     NodeName,
     Right,
     denied_nodes,
@@ -185,7 +184,7 @@ class _Tokens:
     def _owner(self, right: str, part: str) -> str:
         """Return the node that a service such as set_parameters belongs to; "" for other names."""
         node, _, service = part.rpartition("%")
-        return self._of_names.get(node, "") if right == "reply" and service in OWN_SERVICES else ""
+        return self._of_names.get(node, "") if right == "reply" and service in NODE_SERVICES else ""
 
     def _key(self, kind: str, node: str, *rest: str) -> str:
         return "/".join((self._begin, kind, self._enclave, node, *rest))

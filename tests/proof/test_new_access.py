@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from collections import Counter
@@ -215,6 +216,16 @@ def test_a_wildcard_that_differs_only_in_names_that_nobody_uses(tmp_path: Path) 
     back = sros("diff_policy", "--no-new-access", "head.xml", "base.xml", cwd=tmp_path)
     assert back.status == 0
     assert "- /web publish topic /log_[a-z]*  (head.xml:5): such as /log_z" in back.out
+
+
+def test_the_example_is_a_service_that_not_every_node_has(tmp_path: Path) -> None:
+    served = '<services reply="ALLOW"><service>~/home</service></services>'
+    served += '<services reply="ALLOW"><service>~/describe_parameters</service></services>'
+    asked = '<services request="ALLOW"><service>*</service></services>'
+    for name, right in (("base.xml", publish("/x")), ("head.xml", asked)):
+        (tmp_path / name).write_text(policy_text({"/arm": served, "/web": right}))
+    out = sros("diff_policy", "--no-new-access", "base.xml", "head.xml", cwd=tmp_path).out
+    assert re.search(r"/web request service /\*  \(head.xml:\d+\): such as /\w+/home\n", out), out
 
 
 def test_a_denial_that_is_gone_and_whom_it_lets_be_influenced(tmp_path: Path) -> None:
