@@ -19,6 +19,7 @@ from sros_tool.errors import Note, PolicyError, UsageError
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
+    from sros_tool.explain.asking import AskedEnclave, AskingContext
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.fleet_status import FleetStatus
     from sros_tool.keystore.issuing.keyring import Keyring
@@ -478,7 +479,7 @@ def export_enclaves(
 
 
 def explain_access(
-    keystore: AnyPath,
+    keystore: AnyPath | Policy,
     enclave: str,
     action: str,
     name: str = "",
@@ -494,7 +495,8 @@ def explain_access(
     """Return how a DDS vendor decides on an access, by the signed documents of the enclave.
 
     Args:
-        keystore: The keystore, or its path.
+        keystore: The keystore, or its path; or a policy, or its file, by which sros decides as it
+            would be signed.
         enclave: The name of the enclave, such as "/talker".
         action: "publish", "subscribe", "call", "serve", "execute" or "join"; "request" and "reply",
             the words of policies, mean "call" and "serve" for a service.
@@ -512,6 +514,7 @@ def explain_access(
 
     Raises:
         KeystoreError: The keystore or the enclave does not exist.
+        PolicyError: The policy does not have the enclave.
         UsageError: The action is unknown or does not fit ``kind``, or the name, vendor,
             distribution or domain is not valid.
 
@@ -522,9 +525,8 @@ def explain_access(
     """
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.explain.answer import Evaluator, ask
-    from sros_tool.explain.asking import AskedEnclave, AskingContext, question_meant, signed_enclave
+    from sros_tool.explain.asking import AskingContext, question_meant
     from sros_tool.explain.explanation import explain
-    from sros_tool.keystore.reader import Keystore as OpenedOnce
 
     question = ask(action, name, kind)
     domain = _domain(domain)
@@ -532,15 +534,9 @@ def explain_access(
     if vendor not in vendors:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
     (vendor,) = _vendors(vendor, distribution)
-    opened = OpenedOnce(Path(keystore))
-    opened.check()
     asking = AskingContext(_moment(now), zone, domain)
-    stated = _policy(policy) if policy is not None else None
-    own = stated.enclave(enclave) if stated else None
-    signed = signed_enclave(opened, enclave, asking.at)
-    assert signed
-    asked = AskedEnclave(signed._replace(keystore=opened, policy=own), stated)
-    context = asking.context(signed.joined_domains)
+    asked = _asked(keystore, enclave, policy, asking)
+    context = asking.context(asked.enclave.joined_domains)
     evaluator = Evaluator(Vendor(vendor), asked.enclave, context)
     question, _ = question_meant(evaluator, asked, question, kind)
     answer = explain(evaluator, question)
@@ -555,6 +551,38 @@ def explain_access(
         answer.until,
         answer.remedy,
     )
+
+
+def _asked(
+    keystore: AnyPath | Policy,
+    name: str,
+    policy: AnyPath | Policy | None,
+    asking: AskingContext,
+) -> AskedEnclave:
+    """Return an enclave of a keystore, or of a policy as it would be signed."""
+    from sros_tool.explain.asking import (
+        AskedEnclave,
+        not_in_policy,
+        planned_enclave,
+        signed_enclave,
+    )
+    from sros_tool.keystore.reader import Keystore as OpenedOnce
+
+    if not isinstance(keystore, str | PathLike) or Path(keystore).is_file():
+        if policy is not None:
+            raise UsageError("two policies are named", "", "Leave policy= out.")
+        alone = _policy(keystore)
+        own = alone.enclave(name)
+        if own is None:
+            raise not_in_policy(alone, name, Path(alone.file))
+        return AskedEnclave(planned_enclave(own, None, asking)._replace(policy=own), alone)
+    opened = OpenedOnce(Path(keystore))
+    opened.check()
+    signed = signed_enclave(opened, name, asking.at)
+    assert signed
+    stated = _policy(policy) if policy is not None else None
+    own = stated.enclave(name) if stated else None
+    return AskedEnclave(signed._replace(keystore=opened, policy=own), stated)
 
 
 def check(

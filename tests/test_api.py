@@ -148,6 +148,14 @@ def test_an_action_is_found_out_as_on_the_command_line(tmp_path: Path) -> None:
     assert sros_tool.explain_access(made, "/arm", "serve", "/pick", policy=file)
     assert not sros_tool.explain_access(made, "/arm", "call", "/pick")
     assert not sros_tool.explain_access(made, "/planner", "call", "/pick", kind="service")
+    for policy in (file, sros_tool.read_policy(file)):  # as it would be signed
+        answer = sros_tool.explain_access(policy, "/planner", "call", "/pick")
+        assert answer and answer.policy_lines == (f"{file}:1",)
+        assert not sros_tool.explain_access(policy, "/arm", "call", "/pick")
+        with pytest.raises(PolicyError, match="unable to find enclave /web"):
+            sros_tool.explain_access(policy, "/web", "call", "/pick")
+        with pytest.raises(UsageError, match="two policies are named"):
+            sros_tool.explain_access(policy, "/arm", "call", "/pick", policy=file)
 
 
 def test_a_fleet_has_one_policy_and_one_status(tmp_path: Path) -> None:
