@@ -720,7 +720,7 @@ def new_access(
     fleet: AnyPath | None = None,
     base_fleet: AnyPath | None = None,
 ) -> Growth:
-    """Return what ``head`` lets enclaves do that ``base`` does not, decided for all names.
+    """Return the access that ``head`` gives enclaves and ``base`` does not, decided for all names.
 
     Args:
         base: The state before the change: a policy, a folder of policies, a keystore, an exported

@@ -248,7 +248,7 @@ class ObservedProcesses(NamedTuple):
         )
 
     def by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
-        """Map the shell commands for what no systemd unit starts alone to its processes.
+        """Map shell commands to the processes that they start and that no unit starts alone.
 
         A Zenoh router comes first: nodes wait for it.
         """
@@ -935,11 +935,11 @@ class OpenRobot:
         return self.keystore if self.keystore.exists() else self.policy
 
     def _denied(self) -> list[str]:
-        """Return what the keystore denies to the nodes as they were observed, as sentences."""
+        """Return, as sentences, what the keystore denies to the observed nodes."""
         return [str(right) for right in self._denied_rights()]
 
     def _denied_rights(self) -> Sequence[DeniedRight]:
-        """Return what the keystore denies to the nodes as they were observed."""
+        """Return the rights that the observed nodes need and the keystore denies."""
         context = JoinContext(self.domain, self._shell.now(), self._shell.zone)
         vendor = chosen_vendor(None, None, self._shell.environment)[0]
         enclaves = audited_enclaves([self._rights], vendor, context)
@@ -1033,7 +1033,7 @@ class OpenRobot:
                 )
 
     def _own_drop_ins(self, observed: ObservedProcesses) -> list[Path]:
-        """Return the drop-ins of this folder; raise `SrosError` if a unit has that of another."""
+        """Return the drop-ins of this folder; raise `SrosError` at one of another folder."""
         drop_ins = [
             path
             for path in sorted(_SYSTEMD.glob(f"*.d/{_DROP_IN}"))
@@ -1108,7 +1108,7 @@ class OpenRobot:
         return closing._replace(proofs=proofs)
 
     def _enclaves_changed(self) -> list[str]:
-        """Return the enclaves whose signed rights are not those of the policy."""
+        """Return the enclaves whose signed rights differ from the policy."""
         only = ("--include", STALE.id, "--json")
         words = ("check", str(self.export), "--policy", str(self.policy), *only)
         _, output, _ = self._shell.run(words, False)
@@ -1255,7 +1255,7 @@ class OpenRobot:
         return Proof(claim, False, reason)
 
     def _proof_of_silence(self, before: Observation) -> Proof:
-        """Look for nodes as an open listener, who saw them before."""
+        """Look for nodes as an open listener; before, the same listener saw all nodes."""
         claim = "an open listener finds nothing"
         words = ("generate_policy", str(self.folder / "open.xml"), "--domain", str(self.domain))
         try:

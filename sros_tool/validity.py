@@ -30,7 +30,7 @@ _LONGEST = 100 * _SECONDS["y"]
 
 
 def time_of_file(seconds: float) -> datetime:
-    """Return the time in the state of a file, which its writer can set, also to one of no year."""
+    """Return a file's time, limited to valid years: its writer can set any number."""
     try:
         return datetime.fromtimestamp(seconds, UTC)
     except (ValueError, OverflowError, OSError):

@@ -387,7 +387,7 @@ def _weak(state: OpenedEnclave) -> list[str]:
 
 
 def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> PublicKey:
-    """Return the public key of an enclave: of its key file, or as its request or certificate says.
+    """Return the public key of an enclave, from its key file, its request or its certificate.
 
     A key on a token has no file.  Its request was signed by it; without one, the enclave's present
     certificate tells the key.
@@ -443,7 +443,7 @@ def _content(folder: Folder, path: str) -> bytes | None:
 
 
 def _list_alone(folder: Folder, name: str, files: Mapping[str, bytes], now: datetime) -> _Change:
-    """Return the change that gives an enclave only its new revocation list, if that fits it.
+    """Return the change that gives an enclave only its new revocation list, if the list fits it.
 
     The enclave must trust the same identity CAs as before, and have a certificate; the list must be
     signed by one of them and valid.

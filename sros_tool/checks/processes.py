@@ -217,7 +217,7 @@ class _Loaded:
 
 
 def _loaded(enclave: ProcessEnclave, newer: Sequence[str], started: datetime) -> _Loaded:
-    """Return what a process loaded; what its changed files were is taken from the ledger."""
+    """Return the files that a process loaded; the ledger has those that changed since."""
     windows: dict[str, Window] = {}
     changed = {file.split()[0] for file in newer}
     certificate = next(iter(_certificates_in(enclave, CERTIFICATE_FILE)), None)

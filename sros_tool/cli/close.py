@@ -187,7 +187,7 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
 
 
 def _nodes(policy: Policy, enclave: str) -> str:
-    """Return the nodes of a process that has several: its one enclave has the name of one."""
+    """Return a clause on the nodes of an enclave, if it has several; "" otherwise."""
     own = policy.enclave(enclave)
     nodes = [f"{node.ns.rstrip('/')}/{node.node}" for node in own.all_profiles()] if own else []
     return f", with the nodes {enumerated(sorted(nodes))}" if len(nodes) > 1 else ""

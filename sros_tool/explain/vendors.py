@@ -212,7 +212,7 @@ def _vendor_differences(answers: Sequence[Answer]) -> str:
 
 
 def _differences(who: str, decided: Sequence[tuple[str, Outcome]]) -> str:
-    """Return a sentence on those whose outcome differs from the first one's, by their titles."""
+    """Return a sentence with the titles whose outcome differs from the first outcome."""
     title, first = decided[0]
     others = [f"{other} ({outcome})" for other, outcome in decided if outcome != first]
     if not others:

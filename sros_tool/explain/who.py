@@ -121,7 +121,7 @@ def callable_action(decider: Decider, question: Question) -> Note | None:
 
 
 def names_meant(decider: Decider, question: Question, enclaves: Container[str]) -> Note | None:
-    """Return a note on names that some of the ``enclaves`` have, and that may be meant instead."""
+    """Return a note on similar names in the rights of ``enclaves``, in case of a typing error."""
     names = sorted(
         {
             right.name
@@ -285,7 +285,7 @@ def follow_reach(
 
 
 def _in_domain(opened: Iterable[Unguarded], domain: int) -> Iterator[Unguarded]:
-    """Yield what the governance leaves open in a domain, there alone."""
+    """Yield, as rights in one domain, the access that its governance leaves open."""
     only = DomainSet.of((domain, domain))
     for topics in opened:
         if topics.domains is None or domain in topics.domains:

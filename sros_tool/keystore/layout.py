@@ -551,7 +551,7 @@ def check_keystore(root: Path) -> None:
 
 
 def _instead_of(root: Path) -> str:
-    """Return what to do where ``root``, which is no keystore, was named as one."""
+    """Return the remedy if ``root``, which is no keystore, was named as a keystore."""
     if around := keystore_around(root):
         return f"It is a folder in the keystore '{around}': name that keystore."
     if similar := similar_keystores(root):

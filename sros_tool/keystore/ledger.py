@@ -1080,7 +1080,7 @@ class _Links:
         self._index = index
 
     def add(self, entry: Entry) -> None:
-        """Add an entry after all others, whose lines were taken."""
+        """Add an entry at the end; the lines of all earlier entries must have been read."""
         self._entries = iter((entry,))
 
     def __iter__(self) -> Iterator[bytes]:

@@ -240,7 +240,7 @@ class LedgerIndex:
             raise IndexDamagedError(f"'{self._path}' cannot be read") from error
 
     def _checked(self, data: Any, number: int) -> bytes:
-        """Return what was read of a bucket, if its digest is the one with this number."""
+        """Return the content of the bucket ``number``, if its digest is as recorded."""
         digest = self._digests[number * _DIGEST : (number + 1) * _DIGEST]
         if type(data) is not bytes or hashlib.sha256(data).digest() != digest:
             raise IndexDamagedError(f"'{self._path}' does not match the head of the ledger")

@@ -287,10 +287,11 @@ class ZenohDocuments:
     """The configurations that a keystore should have.
 
     ``files`` maps the paths of configurations to their content, ``enclaves`` maps the paths to the
-    enclaves.  ``left_out`` maps enclaves that get no configuration, and no rights elsewhere, to the
-    reason, a clause.  ``nodes`` maps all other enclaves to the nodes that they may announce in the
-    graph. ``existing`` are the enclaves of the keystore, ``ledger`` is its ledger.  ``unread`` are
-    enclaves whose rights were not read, so that the files have no rules for them.
+    enclaves. ``left_out`` maps enclaves without a configuration, and without rights in other
+    configurations, to the reason (a clause). ``nodes`` maps all other enclaves to the nodes that
+    they may announce in the graph. ``existing`` are the enclaves of the keystore, ``ledger`` is
+    its ledger. ``unread`` are enclaves whose rights were not read, so that the files have no rules
+    for them.
     """
 
     files: Mapping[str, bytes]
@@ -729,7 +730,7 @@ class _RightsReader:
         return rules
 
     def _read_some(self, names: Sequence[str]) -> dict[str, _RulesOfEnclave | str]:
-        """Return what `read` does, doing each step for all enclaves before the next step."""
+        """Return the results of `read`, doing each step for all enclaves before the next step."""
         left_out: dict[str, str] = {}
 
         def for_each(some: Iterable[str], step: Callable[[str], Result]) -> dict[str, Result]:

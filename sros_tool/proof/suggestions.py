@@ -212,7 +212,7 @@ def _with_placeholder(name: str, robot: Robot, placeholder: Placeholder) -> str:
 
 
 def _joined_names(names: Names, value: str, fleet: Fleet) -> Names:
-    """Return names with a placeholder for those that are there for each robot of a group."""
+    """Return names; names that exist for each robot of a group become one with a placeholder."""
     alike: dict[str, dict[str, str]] = {}
     for name in names:
         robots = _robots_in(name, fleet)

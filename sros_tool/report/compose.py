@@ -87,7 +87,7 @@ class PictureSource:
     in_domains: DomainRights = field(default_factory=dict)
 
     def in_enclaves(self, homes: Mapping[str, str]) -> PictureSource:
-        """Return a copy whose rights and nodes are in other enclaves, by the present ones."""
+        """Return a copy with rights and nodes moved from enclaves to their ``homes``."""
         nodes: dict[str, set[str]] = defaultdict(set)
         for path, names in self.nodes.items():
             nodes[homes.get(path, path)].update(names)

@@ -1,4 +1,4 @@
-"""Networks for the demo: one for the process, and one for each row, apart from the host's.
+"""Networks for the demo, separate from the host's: one for the process, and one for each row.
 
 The network namespace has only a loopback interface, and disappears with the last process in it.
 Creating it needs CAP_SYS_ADMIN or a user namespace, which also grants the right to capture packets

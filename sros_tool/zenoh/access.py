@@ -247,7 +247,7 @@ def _search(expressions: tuple[str, ...]) -> KeyExpressions:
 
 
 def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
-    """Return rules with the same meaning, sorted, of which each use has only one.
+    """Return rules with the same meaning, sorted, with only one rule for each use.
 
     Rules of the same direction and messages become one rule, without key expressions that others of
     the rule include.

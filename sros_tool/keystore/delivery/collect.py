@@ -300,7 +300,7 @@ class _ReceivedMessage:
     requests: list[_DecidedRequest] = field(default_factory=list)
 
     def without_confirmation(self) -> _ReceivedMessage:
-        """Return the message without what was kept of it: there are thousands of robots."""
+        """Return the message without its verified content, to save memory."""
         if self.verified is None:
             return replace(self, crl=None, stranger=None)
         return replace(
@@ -469,7 +469,7 @@ class _Verifier:
         )
 
     def _arrival(self, file: _File, last: Received | None) -> datetime:
-        """Return when a message arrived: when its file was written, but after the one before.
+        """Return when a message arrived: when its file was written, but after the last message.
 
         Messages may lie in the inbox for long before somebody takes them in.
         """

@@ -338,7 +338,7 @@ class _Keys:
         return self._root / fleet_key(role)
 
     def _online(self, role: str, *, new: bool) -> list[CryptoSigner]:
-        """Return the signer of a role, and the one before while robots may still ask for it."""
+        """Return the signer of a role, and the previous signer while robots may still need it."""
         from sros_tool.keystore.delivery.repository import load_signer, new_key, replaced_key
 
         path, before = self._path(role), self._path(f"{role}.{_BEFORE}")
@@ -523,7 +523,7 @@ def _without_lists(files: Mapping[str, bytes]) -> str:
 
 
 class _Run:
-    """One run of `publish`: what is there, what is to be, and the writing."""
+    """One run of `publish`: the published state, the intended state, and the writing."""
 
     def __init__(
         self, keystore: Keystore, folder: Path, now: datetime, expiry: MetadataExpiry, dry_run: bool
@@ -814,7 +814,7 @@ class _Run:
     def _release_all(
         self, robots: Sequence[_Changed], number: int, authority: Authority | None
     ) -> Iterator[_ReleaseOutcome]:
-        """Yield what came of each robot; without ``authority`` nothing is sealed and written."""
+        """Yield the outcome for each robot; without ``authority`` nothing is written."""
         evaluator = _Evaluator(self.keystore.root, self._now)
         new: list[tuple[_Changed, _RobotFiles, str]] = []
         for robot in robots:
@@ -899,7 +899,7 @@ class _Run:
         change.transaction.write(PUBLISHED, self.list.document(self._now))
 
     def keep_list(self) -> None:
-        """Write the list of what is published, where nothing else of the keystore changes."""
+        """Write the list of what is published, and change nothing else in the keystore."""
         path = self.keystore.root / PUBLISHED
         self._changes = file_change(path, existed=True)
         if not self._dry_run:

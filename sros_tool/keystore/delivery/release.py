@@ -1,4 +1,4 @@
-"""The release of a robot: what its security folder is to have, sealed by the permissions CA.
+"""The release of a robot: the files for its security folder, sealed by the permissions CA.
 
 A release is an archive (``.tar.gz``) with all files of the robot's enclaves except their keys, and
 with the seal ``release.p7s``: a signed message of the lines ::
@@ -45,7 +45,7 @@ _SEALED = re.compile(rb"sros release 1\nrobot ([^\n]{1,255})\nnumber ([1-9][0-9]
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """What the security folder of ``robot`` is to have.
+    """What the security folder of ``robot`` has to contain.
 
     ``number`` is higher than those of all earlier releases of the robot.  ``files`` maps paths
     (``enclaves/r1/base/cert.pem``) to contents, without private keys; an enclave of which it has no

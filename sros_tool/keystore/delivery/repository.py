@@ -321,7 +321,7 @@ class Composed(NamedTuple):
 
 
 class Composer:
-    """Makes the metadata for releases, and keeps what is there and still fits.
+    """Makes the metadata for releases, and keeps existing metadata that still fits.
 
     ``signers`` has the signers of each role: the present one, and during its rotation also the one
     before, whose signature robots ask for that do not know the new root yet.

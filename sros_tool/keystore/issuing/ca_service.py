@@ -65,7 +65,7 @@ class CaServiceError(KeystoreError):
 
 @dataclass(frozen=True, slots=True)
 class CertificateRequest:
-    """What a CA service is asked for: the ``request`` (PEM), and what its certificate has to be.
+    """A request to a CA service: the ``request`` (PEM), and what the certificate has to have.
 
     The ``subject`` may have more than the one in the request, if the request is from a robot.
     """

@@ -136,7 +136,7 @@ def restore_revocations(
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> Changed:
-    """Revoke again what lists of the keystore revoke that it does not know any more.
+    """Revoke again all certificates on revocation lists that the keystore signed and lost.
 
     The next list has a higher number than these.  Enclaves that they revoke are moved to
     ``revoked``, as they were before, also if they were renewed since; those of which only an
