@@ -90,6 +90,12 @@ def _complete_scenario(
     "messages of other types.  [default: /chatter]",
 )
 @click.option(
+    "--type",
+    "message_type",
+    metavar="TYPE",
+    help="A talker on rclpy sends default messages of this type, such as geometry_msgs/msg/Twist.",
+)
+@click.option(
     "--domain",
     type=int,
     default=80,
@@ -141,6 +147,7 @@ def demo(
     keystore: Path | None,
     accept_open: tuple[str, ...],
     topic: str | None,
+    message_type: str | None,
     domain: int,
     template: str,
     network: str,
@@ -164,7 +171,8 @@ def demo(
     which also needs a router. The node says at once whether it is secured. In an enclave, it needs
     only the right for its topic, whatever its nodes are called. A listener reads
     std_msgs/msg/String, and counts the messages of any other type that the topic has; a talker
-    reports if no node can read its type. Of the options, only --backend and --topic apply.
+    reports if no node can read its type, and sends another one with --type. Of the options, only
+    --backend, --topic and --type apply.
 
     Example:
       $ sros demo --topic /camera/image
@@ -192,7 +200,9 @@ def demo(
     row. With --keystore, the exit status is 2 if an attack that has to fail could not be tried.
     """
     if role is not None:
-        _run_by_hand(ctx, role, backend, topic)
+        _run_by_hand(ctx, role, backend, topic, message_type)
+    if message_type is not None:
+        raise UsageError("--type is for `sros demo talker`", "", "Leave it out.")
     from sros_tool.demo.program import DemoOptions, run_demo
     from sros_tool.demo.result import demo_table
     from sros_tool.demo.scenarios import choose_scenarios
@@ -237,20 +247,25 @@ def demo(
     sys.exit(result.exit_status)
 
 
-def _run_by_hand(ctx: click.Context, role: str, backend: str, topic: str | None) -> NoReturn:
+def _run_by_hand(
+    ctx: click.Context, role: str, backend: str, topic: str | None, message_type: str | None
+) -> NoReturn:
     """Run a node until it is stopped, and end with its exit status."""
-    from sros_tool.demo.backend import HandNode, backend_by_hand, run_by_hand
+    from sros_tool.demo.backend import RCLPY, HandNode, backend_by_hand, run_by_hand
+    from sros_tool.demo.nodes import STRING
     from sros_tool.demo.scenarios.model import DEFAULT_TOPIC, Role, check_topic
 
     for parameter in ctx.command.params:
         chosen = ctx.get_parameter_source(parameter.name or "")
-        takes = parameter.name in ("role", "backend", "topic") or not parameter.expose_value
+        own = ("role", "backend", "topic", "message_type")
+        takes = parameter.name in own or not parameter.expose_value
         if not takes and chosen is not ParameterSource.DEFAULT:
             option = parameter.opts[0]
             raise UsageError(f"a {role} takes no {option}", "", "Leave it out.")
     if backend == "auto":
-        backend = backend_by_hand(Role(role), os.environ)
-    node = HandNode(Role(role), backend, check_topic(DEFAULT_TOPIC if topic is None else topic))
+        backend = RCLPY if message_type else backend_by_hand(Role(role), os.environ)
+    asked = check_topic(DEFAULT_TOPIC if topic is None else topic)
+    node = HandNode(Role(role), backend, asked, STRING if message_type is None else message_type)
     sys.exit(run_by_hand(node, echo))
 
 

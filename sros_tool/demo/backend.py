@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import select
 import shlex
 import signal
@@ -307,16 +308,29 @@ _LONGEST_LINE = 1 << 20
 
 @dataclass(frozen=True)
 class HandNode:
-    """A node to run by hand; ``topic`` is an absolute ROS name."""
+    """A node to run by hand; ``topic`` is an absolute ROS name, ``type`` the ROS type it sends."""
 
     role: Role
     backend: str
     topic: str
+    type: str = STRING
 
     def __post_init__(self) -> None:
         if self.role is Role.ROUTER and self.backend != ZENOH:
             raise UsageError(
                 "only Zenoh has routers", "Nodes on DDS find each other.", "Add --backend zenoh."
+            )
+        if self.type != STRING and (self.role is not Role.TALKER or self.backend != RCLPY):
+            raise UsageError(
+                "only a talker on rclpy takes a type",
+                "A listener hears all types, and rclpy has the types of your ROS packages.",
+                "Use `sros demo talker --backend rclpy` in an environment of ROS 2.",
+            )
+        if re.fullmatch(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", self.type, re.ASCII) is None:
+            raise UsageError(
+                f"{self.type!r} is no type of messages",
+                "",
+                "Write for example geometry_msgs/msg/Twist.",
             )
         if self.backend == ZENOH:
             zenoh_backend()
@@ -396,7 +410,7 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
     module = f"sros_tool.demo.{_MODULES[node.backend]}_node"
     command = [sys.executable, "-P", "-m", module, node.role.value, "--period", "1"]
     if node.role is not Role.ROUTER:
-        command += ["--topic", node.topic, "--by-hand"]
+        command += ["--topic", node.topic, "--by-hand", "--type", node.type]
     if node.backend == ZENOH and os.environ.get(ENCLAVE):
         command += ["--ros-args", "--enclave", os.environ[ENCLAVE], "--"]
     if node.backend == RCLPY:  # what it logs of its messages is said here already
@@ -448,12 +462,12 @@ def _tell(node: HandNode, pipe: int, say: Callable[[str], None]) -> Event | None
             event = parse_event(line, Path("the node's report"))
             connected = connected or event.kind is EventKind.READY
             seen = event.text if event.kind is EventKind.SEEN else seen
-            if text := _line(event):
+            if text := _line(event, node.type):
                 say(text)
     raise SrosError("a node reported too long a message", f"It is over {_LONGEST_LINE} bytes long.")
 
 
-def _line(event: Event) -> str:
+def _line(event: Event, own_type: str) -> str:
     match event.kind:
         case EventKind.SENT:
             return f"sent   {event.text}"
@@ -463,7 +477,7 @@ def _line(event: Event) -> str:
             return f"{event.kind}: {' '.join(event.text.split())}"
         case EventKind.READY:
             return "ready"
-        case EventKind.SEEN if not event.text.endswith(f"of {STRING}"):
+        case EventKind.SEEN if not event.text.endswith(f"of {own_type}"):
             return event.text
         case _:
             return ""

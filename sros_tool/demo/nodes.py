@@ -36,7 +36,8 @@ class NodeOptions:
     server that an action client uses ("": unknown).  ``also`` are further topics for an observer.
     On Zenoh, messages of a talker have ``size`` bytes or more, and ``patience`` is how long a
     process waits for its connection, in seconds.  A talker or listener ``by_hand`` needs no right
-    but that of its topic, and reports what others have on the topic (`OtherTypes`).
+    but that of its topic, and reports what others have on the topic (`OtherTypes`).  A talker on
+    rclpy publishes messages of the ROS type ``type`` with default values, if it is not `STRING`.
     """
 
     role: str
@@ -49,6 +50,7 @@ class NodeOptions:
     size: int = 0
     patience: float = 60.0
     by_hand: bool = False
+    type: str = "std_msgs/msg/String"
 
     @property
     def service(self) -> str:
@@ -106,6 +108,11 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
     )
     parser.add_argument(
         "--by-hand", action="store_true", help="report what others have on the topic, of any type"
+    )
+    parser.add_argument(
+        "--type",
+        default=NodeOptions.type,
+        help="ROS type of a talker on rclpy (default: %(default)s)",
     )
     parser.add_argument(
         "--report", type=Path, metavar="FILE", help="append the events to FILE as JSON lines"
@@ -237,7 +244,7 @@ class NodeRole:
 
 
 class OtherTypes:
-    """What others have on the topic of a talker or listener by hand, which itself has strings.
+    """What others have on the topic of a talker or listener by hand.
 
     ``types`` returns the ROS type of each publisher, or for a talker of each subscription; a
     listener gets ``count``, as `Node.count` with a topic.
@@ -250,7 +257,7 @@ class OtherTypes:
         types: Callable[[], Sequence[str]],
         count: Callable[[str, Callable[[int], None]], str] | None = None,
     ) -> None:
-        self._topic, self._period = options.topic, options.period
+        self._topic, self._period, self._own = options.topic, options.period, options.type
         self._events, self._types, self._count = events, types, count
         self._seen: Mapping[str, int] = {}
         self._why_not: dict[str, str] = {}
@@ -273,10 +280,10 @@ class OtherTypes:
     def _described(self, kind: str) -> str:
         what = "publisher" if self._count else "subscription"
         text = f"{self._topic} has {counted(self._seen[kind], what)} of {kind}"
-        if kind == STRING:
+        if kind == self._own:
             return text
         if self._count is None:
-            return f"{text}, which does not take this talker's {STRING}"
+            return f"{text}, which does not take this talker's {self._own}: add --type {kind}"
         if kind not in self._why_not:
             self._heard[kind] = 0
             self._why_not[kind] = self._count(kind, partial(self._keep, kind))
@@ -286,8 +293,8 @@ class OtherTypes:
         self._heard[kind] += number
 
 
-STRING = "std_msgs/msg/String"
-"""The type of what talkers publish, and listeners read."""
+STRING = NodeOptions.type
+"""The type of what talkers publish by default, and listeners read."""
 
 
 def ros_type(of_dds: str) -> str:

@@ -17,6 +17,7 @@ from typing import Any
 
 from sros_tool.demo.nodes import (
     FIBONACCI_ORDER,
+    STRING,
     NodeOptions,
     OtherTypes,
     fibonacci,
@@ -132,24 +133,37 @@ def _fail(name: str, error: Exception, stage: ProcessStage, events: EventWriter)
 
 
 def _talker(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Publish the text with a running number, periodically."""
-    from std_msgs.msg import String
-
-    publisher = node.create_publisher(String, options.topic, _QUEUE_DEPTH)
+    """Publish the text with a running number, or a message of another type, periodically."""
+    message = _message_class(options.type)
+    publisher = node.create_publisher(message, options.topic, _QUEUE_DEPTH)
     sent = 0
 
     def speak() -> None:
         nonlocal sent
         sent += 1
-        text = f"{options.text}: {sent}"
+        is_text = options.type == STRING
+        text = f"{options.text}: {sent}" if is_text else f"{options.type}: {sent}"
         node.get_logger().info(f"Publishing: '{text}'")
-        publisher.publish(String(data=text))
+        publisher.publish(message(data=text) if is_text else message())
         events.report(EventKind.SENT, text, count=sent)
 
     node.create_timer(options.period, speak)
     if options.by_hand:
         types = partial(_types_of, node.get_subscriptions_info_by_topic, options.topic)
         node.create_timer(options.period, OtherTypes(options, events, types).step)
+
+
+def _message_class(kind: str) -> Any:
+    """Return the class of a ROS type such as ``geometry_msgs/msg/Twist``.
+
+    Raises:
+        ImportError: its package is not installed, or does not have it.
+    """
+    package, _, name = kind.replace("/", ".").rpartition(".")
+    try:
+        return getattr(importlib.import_module(package), name)
+    except AttributeError as error:
+        raise ImportError(str(error)) from error
 
 
 def _types_of(infos: Callable[[str], Sequence[Any]], topic: str) -> Sequence[str]:
@@ -178,10 +192,9 @@ def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
     types = partial(_types_of, node.get_publishers_info_by_topic, options.topic)
 
     def count(kind: str, heard: Callable[[int], None]) -> str:
-        package, _, name = kind.replace("/", ".").rpartition(".")
         try:
-            message = getattr(importlib.import_module(package), name)
-        except (ImportError, AttributeError) as error:
+            message = _message_class(kind)
+        except ImportError as error:
             return f", which this listener cannot hear ({error}): add --backend cyclone"
         if {*types()} != {kind}:
             return ", which this listener cannot hear next to another type: add --backend cyclone"

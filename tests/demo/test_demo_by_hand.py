@@ -57,6 +57,17 @@ def test_a_node_on_zenoh_says_its_configuration() -> None:
         HandNode(Role.ROUTER, "rclpy", "/chatter")
 
 
+def test_a_talker_on_rclpy_takes_a_type() -> None:
+    assert HandNode(Role.TALKER, "rclpy", "/cmd_vel", "geometry_msgs/msg/Twist").type
+    for role, on, kind, said in (
+        (Role.LISTENER, "rclpy", "geometry_msgs/msg/Twist", "only a talker on rclpy takes a type"),
+        (Role.TALKER, "cyclone", "geometry_msgs/msg/Twist", "only a talker on rclpy takes a type"),
+        (Role.TALKER, "rclpy", "Twist", "is no type of messages"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            HandNode(role, on, "/cmd_vel", kind)
+
+
 def test_a_secured_node_runs_on_what_the_robot_runs_on(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
