@@ -28,6 +28,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+from sros_tool.checks.environment import secured_by
 from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, newer_files, process_findings
@@ -89,7 +90,7 @@ from sros_tool.runtime.processes import (
 )
 from sros_tool.runtime.rmw import RMW, chosen_vendor
 from sros_tool.runtime.units import unit_changes, unit_instance, unit_words, write_units
-from sros_tool.runtime.variables import ENABLE, ENCLAVE, KEYSTORE, domain_of
+from sros_tool.runtime.variables import ENCLAVE, KEYSTORE, domain_of
 from sros_tool.values import DryRun, FileChange, FileChanges, Words, as_plain, shows
 from sros_tool.wording import counted, first_few
 from sros_tool.xml import read_bytes
@@ -751,15 +752,20 @@ class OpenRobot:
             replace_file(step.into, output.encode())
         return "done", self._keep_processes(output) if watches else ""
 
+    def _check_shell(self) -> None:
+        """Raise `UsageError` if an observer that this shell starts may not be an open one."""
+        if secured := [*secured_by(self._shell.environment, Path.cwd())]:
+            raise UsageError(
+                f"{' and '.join(secured)}, so this shell does not see an open robot",
+                "sros looks for open nodes with an observer that is open itself.",
+                "Unset the variables that are named, for example with `env -u NAME sros close "
+                "...`, or run it in a folder without such a file.",
+            )
+
     def _check_open(self) -> None:
         """Raise `SrosError` if the robot cannot be watched as an open one."""
+        self._check_shell()
         named = self._shell.environment
-        if named.get(ENABLE) == "true":
-            raise UsageError(
-                f"{ENABLE} is set, so this shell does not see an open robot",
-                "",
-                f"Unset {ENABLE}.",
-            )
         running = ProcessTable().look(self._shell.now())
         if secured := [process.label for process, _ in self._secured(running)]:
             raise UsageError(
@@ -995,6 +1001,7 @@ class OpenRobot:
 
         Proves that the robot is closed, if nothing is left to do by hand.
         """
+        self._check_shell()
         observed = prepared.observed
         paths = [f"{unit}.d/{_DROP_IN}" for unit in sorted(observed.units.values())]
         files = {path: read_bytes(self.start / "units" / path, "unit").decode() for path in paths}
@@ -1093,6 +1100,7 @@ class OpenRobot:
 
     def prove(self, *, partial: bool, dry_run: bool) -> Closing:
         """Prove that the robot is closed; ``partial`` accepts processes that do not run."""
+        self._check_shell()
         closing = self._closing()._replace(dry_run=dry_run)
         if dry_run:
             return closing

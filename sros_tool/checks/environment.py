@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -402,6 +403,68 @@ _NEEDED = {
     "listen": ("listen_private_key", "listen_certificate"),
     "connect": ("connect_private_key", "connect_certificate"),
 }
+
+
+def secured_by(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
+    """Yield, as clauses, what secures the nodes that are started in an environment and a folder.
+
+    Also what may secure them, because sros cannot read it.
+    """
+    if environment.get(ENABLE) == "true":
+        yield f"{ENABLE} is set"
+    if is_zenoh(environment):
+        yield from _secured_by_zenoh(environment, folder)
+        return
+    value = environment.get("CYCLONEDDS_URI", "")
+    inline = value.lstrip().startswith("<") and "$" not in value
+    for part in [value] if inline else filter(None, value.split(",")):
+        path = folder / part.strip().removeprefix("file://")
+        yield from _said_in(_CYCLONE_SECURITY, "CYCLONEDDS_URI", part.encode() if inline else path)
+    for name in (*_PROFILES, "FASTDDS_ENVIRONMENT_FILE"):
+        if text := environment.get(name, ""):
+            sought = rb"dds\.sec\." if name in _PROFILES else rb"_PROFILES_FILE"
+            yield from _said_in(sought, name, folder / text)
+    for path in map(folder.joinpath, _DEFAULT_PROFILES):
+        if path.exists():
+            yield from _said_in(rb"dds\.sec\.", f"'{path.name}' in this folder", path)
+
+
+def _secured_by_zenoh(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
+    """Yield which variables give a session of rmw_zenoh certificates, rules or a password."""
+    uri, override = environment.get(SESSION_URI, ""), environment.get(OVERRIDE, "")
+    named = " with ".join(name for name in (SESSION_URI, OVERRIDE) if environment.get(name))
+    try:
+        data = read_bytes(folder / uri, "Zenoh configuration") if uri else b"{}"
+        document = parse_configuration(data, uri or OVERRIDE, override_pairs(override), lines=False)
+    except SrosError as error:
+        yield f"{named} is set, and sros cannot read it ({error.what})"
+        return
+    has_password = any(
+        name.startswith("transport/auth/") and value not in ("null", "{}")
+        for name, value in document.settings.items()
+    )
+    options = [endpoint for endpoint in document.connect if endpoint.options]
+    if document.tls.named or document.access.enabled or has_password or options:
+        yield f"{named} has security"
+
+
+def _said_in(sought: bytes, name: str, place: bytes | Path) -> Iterator[str]:
+    """Yield that a configuration has security, or cannot be read."""
+    try:
+        data = place if isinstance(place, bytes) else read_bytes(place, "configuration")
+    except SrosError as error:
+        yield f"{name} is set, and sros cannot read it ({error.what})"
+        return
+    if re.search(sought, data):
+        yield f"{name} has security"
+
+
+_CYCLONE_SECURITY = rb"(?i)<(?:\w+:)?(?:dds)?security\b"
+"""The element that secures every participant (Cyclone DDS 0.10, ``cfgelems.h``)."""
+_PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+_DEFAULT_PROFILES = ("DEFAULT_FASTRTPS_PROFILES.xml", "DEFAULT_FASTDDS_PROFILES.xml")
+"""The files that Fast DDS reads from its working directory (Fast DDS 2.14, ``XMLProfileManager``).
+Properties of security in a default profile are those of every participant of rmw_fastrtps."""
 
 
 def is_zenoh(environment: Mapping[str, str]) -> bool:

@@ -126,7 +126,6 @@ def observe(
     spin_time: float | None,
     report: Callable[[Observation], None],
     *,
-    secured: bool,
     then: str,
 ) -> tuple[Snapshot, str]:
     """Observe the ROS graph; return the result and the RMW in use.
@@ -144,10 +143,12 @@ def observe(
         look_for,
         settle,
     )
+    from sros_tool.runtime.variables import ENABLE
     from sros_tool.validity import parse_duration
 
     seconds = None
-    enclaves = _enclaves_by_identity({**os.environ, **environment})
+    everything = {**os.environ, **environment}
+    enclaves = _enclaves_by_identity(everything)
 
     def identify(observation: Observation) -> Observation:
         return identified(observation, enclaves)
@@ -161,7 +162,7 @@ def observe(
             elif spin_time is not None:
                 snapshot = look_for(graph, spin_time, time.monotonic)
             else:
-                settling = SECURED if secured else Settling()
+                settling = SECURED if everything.get(ENABLE) == "true" else Settling()
                 snapshot = settle(graph, settling, time.monotonic)
             return replace(
                 snapshot,
@@ -218,7 +219,7 @@ def _until_signalled() -> Iterator[Callable[[], bool]]:
 
 def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
     """Return an error for the observer's failure, with the cause that its DDS output shows."""
-    from sros_tool.runtime.variables import ENCLAVE
+    from sros_tool.runtime.variables import ENABLE, ENCLAVE
     from sros_tool.runtime.vendor_log import (
         endpoint_refusal,
         missing_security,
@@ -237,9 +238,11 @@ def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
             "which DDS here enforces security.",
         )
     name = environment.get(ENCLAVE) or os.environ.get(ENCLAVE) or "/"
+    is_by_shell = ENABLE not in environment and os.environ.get(ENABLE) == "true"
+    by_shell = f", in which it runs because {ENABLE} is set" if is_by_shell else ""
     if line := endpoint_refusal(said):
         return SrosError(
-            f"the enclave {name} does not permit an observer",
+            f"the enclave {name} does not permit an observer{by_shell}",
             f"DDS says: {line}",
             "The rights that an observer needs are in policies/observer.xml (see `sros "
             "policies`), for an "
@@ -247,9 +250,9 @@ def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
         )
     if line := participant_refusal(said):
         return SrosError(
-            f"DDS refuses the enclave {name}",
+            f"DDS refuses the enclave {name}{by_shell}",
             f"DDS says: {line}",
-            "Run `sros inspect` on the enclave.",
+            f"Run `sros inspect` on the enclave{', or unset ' + ENABLE if by_shell else ''}.",
         )
     last = [line for line in plain_text(error.output).splitlines() if line.strip()][-1:]
     why = error.reason + (f" Its last message: {last[0].strip()}" if last else "")
@@ -260,7 +263,8 @@ def why_no_node_was_observed(
     environment: Mapping[str, str], seconds: float, rmw: str, enclave: str | None
 ) -> str:
     """Return the likely reasons why no node was observed, and a remedy."""
-    from sros_tool.runtime.variables import DOMAIN, ENABLE, KEYSTORE
+    from sros_tool.checks.environment import secured_by
+    from sros_tool.runtime.variables import DOMAIN, KEYSTORE
 
     merged = {**os.environ, **environment}
     looked = f"Observed domain {merged.get(DOMAIN) or 0} for {seconds:.0f} s with {rmw}. "
@@ -269,7 +273,13 @@ def why_no_node_was_observed(
             f"The observer ran secured, in enclave {enclave}: it does not see nodes that are "
             "unsecured, have a certificate of another CA, or use another DDS."
         )
-    if merged.get(KEYSTORE) and merged.get(ENABLE) != "true":
+    if secured := [*secured_by(merged, Path.cwd())]:
+        return looked + (
+            f"The observer does not see open nodes, because {' and '.join(secured)} in this shell: "
+            "unset it to observe an open robot, and give --keystore and --enclave for a secured "
+            "one."
+        )
+    if merged.get(KEYSTORE):
         return looked + (
             f"{KEYSTORE} is set, so the robot may be secured, and secured nodes are invisible to "
             "an observer without an enclave. Observe with --enclave /sros_observer, made from "
@@ -450,7 +460,6 @@ def generate_policy(
         watch,
         spin_time,
         report,
-        secured=enclave is not None,
         then="the result is shown" if dry_run else "the policy is written",
     )
     seen = named(snapshot.observation)

@@ -15,6 +15,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from sros_tool.checks import runtime
+from sros_tool.checks.environment import secured_by
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding
 from sros_tool.checks.registry import FindingFilter
 from sros_tool.checks.runtime import RuntimeState
@@ -380,3 +381,55 @@ def test_what_no_enclave_leads_to_is_of_a_severity_that_is_shown(sound_one: Runt
     assert found["Enforce"]["runtime.enclave-unset"] is WARNING
     assert found["Permissive"]["runtime.unsecured-without-enclave"] is ERROR
     assert "runtime.unsecured-without-enclave" not in found["Enforce"]
+
+
+CYCLONE, PROFILES = "CYCLONEDDS_URI", "FASTRTPS_DEFAULT_PROFILES_FILE"
+ON_ZENOH = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
+WITH_KEY = 'transport/link/tls/connect_private_key="/key.pem"'
+
+
+@pytest.mark.parametrize(
+    ("variables", "said"),
+    [
+        ({}, ""),
+        ({"ROS_SECURITY_KEYSTORE": "/ks", "ROS_SECURITY_ENABLE": "True"}, ""),
+        ({"ROS_SECURITY_ENABLE": "true"}, "ROS_SECURITY_ENABLE is set"),
+        ({CYCLONE: "<General><Tracing/></General>"}, ""),
+        ({CYCLONE: "<CycloneDDS><Domain><DDSSecurity>"}, f"{CYCLONE} has security"),
+        ({CYCLONE: "<General>${MORE}</General>"}, f"{CYCLONE} is set, and sros cannot read it"),
+        ({CYCLONE: "file://plain,secured"}, f"{CYCLONE} has security"),
+        ({CYCLONE: "plain"}, ""),
+        ({PROFILES: "plain"}, ""),
+        ({PROFILES: "secured"}, f"{PROFILES} has security"),
+        ({PROFILES: "none"}, f"{PROFILES} is set, and sros cannot read it"),
+        ({"FASTDDS_ENVIRONMENT_FILE": "secured"}, "FASTDDS_ENVIRONMENT_FILE has security"),
+        ({**ON_ZENOH, PROFILES: "secured"}, ""),
+        ({**ON_ZENOH, SESSION: "session"}, ""),
+        ({**ON_ZENOH, SESSION: "plain"}, f"{SESSION} is set, and sros cannot read it"),
+        ({**ON_ZENOH, "ZENOH_CONFIG_OVERRIDE": WITH_KEY}, "ZENOH_CONFIG_OVERRIDE has security"),
+        (
+            {**ON_ZENOH, SESSION: "session", "ZENOH_CONFIG_OVERRIDE": WITH_KEY},
+            f"{SESSION} with ZENOH_CONFIG_OVERRIDE has security",
+        ),
+        ({**ON_ZENOH, SESSION: "password"}, f"{SESSION} has security"),
+    ],
+)
+def test_what_secures_the_nodes_of_a_shell(
+    tmp_path: Path, variables: dict[str, str], said: str
+) -> None:
+    for name, text in (
+        ("plain", "<!-- no security --><profiles/>"),
+        ("secured", "<Security> dds.sec.auth.plugin FASTDDS_DEFAULT_PROFILES_FILE"),
+        (
+            "session",
+            '{transport: {auth: {usrpwd: {user: null}}}, connect: {endpoints: ["tcp/a:1"]}}',
+        ),
+        ("password", '{transport: {auth: {usrpwd: {user: "me"}}}}'),
+    ):
+        (tmp_path / name).write_text(text)
+    found = [*secured_by(variables, tmp_path)]
+    assert len(found) == bool(said)
+    assert all(clause.startswith(said) for clause in found)
+    (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").symlink_to("secured")
+    at_last = "'DEFAULT_FASTRTPS_PROFILES.xml' in this folder has security"
+    assert (at_last in secured_by(variables, tmp_path)) != (ON_ZENOH.items() <= variables.items())

@@ -626,7 +626,6 @@ def test_what_is_refused(robot: Robot, words: str, said: str) -> None:
 
 
 def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
-    assert "is set" in robot.close(status=2, ROS_SECURITY_ENABLE="true").err
     robot.more = (Process(5, ("rmw_zenohd",), {}, datetime.now(UTC)),)
     assert "speaks Zenoh" in robot.close(status=2).err
     assert not (robot.folder / "robot").exists()
@@ -645,6 +644,25 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     for wrong in (other_unit, text.replace('"enclave": "/talker"', '"enclave": 5'), "{}"):
         file.write_text(wrong)
         assert "is not a list of processes" in robot.close(status=2).err
+
+
+def test_a_secured_shell_proves_nothing(robot: Robot) -> None:
+    """A listener that is secured itself hears no open node, whoever is there."""
+    refused = "ROS_SECURITY_ENABLE is set, so this shell does not see an open robot. "
+    assert refused in robot.close(status=2, ROS_SECURITY_ENABLE="true").err
+    robot.units = UNITS
+    robot.close()
+    assert refused in robot.close("--apply", status=2, ROS_SECURITY_ENABLE="true").err
+    assert robot.restarts == []
+    robot.close("--apply")
+    robot.nodes = (*robot.nodes, ("/", "/", "spy", "03", ["subscribe rt/chatter"]))
+    (robot.folder / "fast.xml").write_text("<name>dds.sec.auth.plugin</name>")
+    for variable, value in (
+        ("ROS_SECURITY_ENABLE", "true"),
+        ("FASTRTPS_DEFAULT_PROFILES_FILE", "fast.xml"),
+    ):
+        ended = robot.close("--proof", status=2, **{variable: value})
+        assert variable in ended.err and "does not see an open robot" in ended.err
 
 
 def test_a_dry_run_changes_nothing(robot: Robot) -> None:

@@ -130,6 +130,7 @@ def test_a_log_names_enclaves_itself(program: Program, tmp_path: Path) -> None:
     [
         ({}, "Nodes may be in another domain (ROS_DOMAIN_ID, --domain)"),
         ({"ROS_SECURITY_KEYSTORE": "/ks"}, "ROS_SECURITY_KEYSTORE is set, so the robot may be"),
+        ({"ROS_SECURITY_ENABLE": "true"}, "does not see open nodes, because ROS_SECURITY_ENABLE"),
         ({"ROS_DOMAIN_ID": "7"}, "Observed domain 7 for 1 s with rmw_fake."),
     ],
 )
