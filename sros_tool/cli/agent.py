@@ -126,7 +126,7 @@ def _init(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Set up the agent of the security folder FOLDER: FOLDER/.agent/agent.toml.
+    """Set up the agent of the security folder FOLDER, in FOLDER/.agent/agent.toml.
 
     FOLDER is where `sros import` or a play installs this robot's enclaves. The agent runs as the
     owner of FOLDER. Compare the printed SHA-256 of the root metadata with the SHA-256 that

@@ -88,9 +88,9 @@ def fleet() -> None:
 def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
     """Print the robots of KEYSTORE as an Ansible inventory.
 
-    Robots are hosts and groups are groups. Variables of a host are ansible_host, ansible_user,
-    sros_robot, sros_namespace, sros_domain, sros_router, sros_crossing,
-    sros_distribution, sros_renewal and sros_renewal_grace.
+    The robots are the hosts, and the groups of the fleet are the groups. The variables of a host
+    are ansible_host, ansible_user, sros_robot, sros_namespace, sros_domain, sros_router,
+    sros_crossing, sros_distribution, sros_renewal and sros_renewal_grace.
 
     Example:
       $ sros fleet inventory keystore > hosts.json
@@ -115,11 +115,11 @@ def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
 @keystore_argument("folder", "[DIR]")
 @click.option("--robot", metavar="NAME", required=True, help="The name of this robot.")
 def _report(folder: Path, robot: str) -> None:
-    """On a robot: print which files of its enclaves and which DDS it has, for `fleet confirm`.
+    """On a robot, print a report of its enclaves' files and its DDS, for `fleet confirm`.
 
-    The report is JSON: the time, the SHA-256 of each file of the enclaves in DIR except their keys,
-    and the DDS libraries that processes have loaded or that are installed. docs/json.md describes
-    it under confirmation.
+    The report is JSON. It has the time, the SHA-256 of each file of the enclaves in DIR except
+    their keys, and the DDS libraries that processes have loaded or that are installed.
+    docs/json.md describes the report under "confirmation".
 
     Example:
       $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
@@ -241,8 +241,7 @@ def _collect(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Collect the messages of robots: keep their confirmations, and sign their requests for
-    renewal.
+    """Collect the messages of robots, keep their confirmations, and sign requests for renewal.
 
     INBOX is a folder with ROBOT/confirmation.p7s of each robot that runs `sros agent`. Reads only
     the messages of robots in the fleet of KEYSTORE. Accepts a message if an enclave of the same
@@ -408,15 +407,16 @@ def _publish(
 ) -> int:
     """Publish a release for each robot of KEYSTORE in the folder PUB.
 
-    PUB has plain files for any web server, bucket or USB stick, and no private key: for each robot
-    an archive with the files of its enclaves, sealed by the permissions CA, and metadata of The
-    Update Framework, with which `sros agent` on the robot refuses old, mixed or forged files. Run
-    this verb after each change, and before the timestamp expires, for example each hour. Archives
-    of unchanged robots stay; archives of robots that were revoked or left the fleet are removed.
+    PUB has plain files for any web server, bucket or USB stick, and no private key. For each
+    robot, PUB has an archive with the files of the robot's enclaves, sealed by the permissions CA.
+    PUB also has metadata of The Update Framework, with which `sros agent` on the robot refuses
+    old, mixed or forged files. Run this verb after each change, and before the timestamp expires,
+    for example each hour. Archives of unchanged robots stay; archives of robots that were revoked
+    or left the fleet are removed.
 
-    The keys are in KEYSTORE/private. The root key only signs the list of the other keys: move it
-    away from the keystore, and name it with --root-key when you replace a key, and once a year to
-    renew that list.
+    The keys are in KEYSTORE/private. The root key only signs the list of the other keys. Move this
+    key away from the keystore, and name it with --root-key when you replace a key, and once a year
+    to renew that list.
 
     Example:
       $ sros fleet publish keystore pub
@@ -533,20 +533,20 @@ def _status(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Compare the files that each robot last confirmed with those that it should have.
+    """Compare the files that each robot last confirmed with the files that it should have.
 
-    A robot should have the files that an export from KEYSTORE would give it now. A file is current;
-    earlier (issued for this enclave before); another's (issued for another enclave); revoked;
-    missing; or unknown (never issued by this keystore). Processes use new files only after a
-    restart: confirmations by the Ansible collection and `sros agent` say which restarts are due,
-    confirmations by `sros fleet report` do not. A robot without a recent confirmation is offline.
-    Robots with the same state share a line, except a robot that says it has a release that was
-    never published: it is always named. The last line counts known vulnerabilities of the robots'
-    DDS, by the advisories of sros; --robot and --advisories name them.
+    A robot should have the files that an export from KEYSTORE would give it now. A file is
+    current; earlier (issued for this enclave before); another's (issued for another enclave);
+    revoked; missing; or unknown (never issued by this keystore). Processes use new files only
+    after a restart. Confirmations by the Ansible collection and `sros agent` say which restarts
+    are due, confirmations by `sros fleet report` do not. A robot without a recent confirmation is
+    offline. Robots with the same state share a line. A robot that claims a release that was never
+    published is always named. The last line counts the known vulnerabilities of the robots' DDS,
+    by the advisories of sros; --robot and --advisories list them.
 
-    The revocation list is in force on a robot that has it and says that no restart is due. A robot
-    does not say which of its earlier files a process has loaded: after any change of files, the
-    list counts as in force again only after the processes were restarted.
+    The revocation list is in force on a robot that has the list and reports that no restart is
+    due. A robot does not report which earlier files a process has loaded. So after any change of
+    files, the list is in force again only after the processes were restarted.
 
     Example:
       $ sros fleet status keystore
@@ -559,11 +559,11 @@ def _status(
       $ sros fleet status keystore --max-age 7d
       $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
 
-    The exit status is 0 if every robot that is not revoked confirmed that it has the files that an
-    export would give it now, and that no restart is due, its agent reports no problem, and robots
-    still accept what was published. Otherwise it is 1. The exit status is also 1 if a robot has a
-    DDS with known vulnerabilities that a later release of the same major version fixes (with
-    --no-advisories, this does not count).
+    The exit status is 0 if every robot that is not revoked has confirmed the files that it should
+    have, no restart is due, no agent reports a problem, and robots still accept what was
+    published. Otherwise it is 1. The exit status is also 1 if a robot has a DDS with known
+    vulnerabilities that a later release of the same major version fixes (with --no-advisories,
+    this does not count).
     """
     from sros_tool.checks.vulnerabilities import is_fixed_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
