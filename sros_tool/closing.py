@@ -291,6 +291,11 @@ class Proof(NamedTuple):
         """Whether the claim was tested, and does not hold."""
         return self.holds is False
 
+    @property
+    def may_be_left_out(self) -> bool:
+        """Whether ``--partial`` accepts the claim: not without an observer that hears the robot."""
+        return self.holds is None and self.claim not in (_TALK, _SILENCE)
+
 
 @shows(spread=("observed",))
 class Closing(NamedTuple):
@@ -318,6 +323,11 @@ class Closing(NamedTuple):
     """The proof that the robot is closed; empty before."""
     dry_run: DryRun
     changes: FileChanges
+
+    def is_proved(self, *, partial: bool) -> bool:
+        """Return whether the proof holds; ``partial`` accepts what could not be asked."""
+        claims = [proof.holds or (partial and proof.may_be_left_out) for proof in self.proofs]
+        return bool(claims) and all(claims)
 
     @property
     def is_signed(self) -> bool:
@@ -1149,12 +1159,9 @@ class OpenRobot:
         if missing:
             state = "not seen" if running.unseen or running.hidden else "not running"
             proof = proof._replace(reason=f"{proof.reason}; {state}: {', '.join(missing)}")
-        return [
-            proof,
-            *self._proof_of_requirements(),
-            self._proof_of_talk(before, missing),
-            self._proof_of_silence(before),
-        ]
+        talk = self._proof_of_talk(before, missing)
+        silence = self._proof_of_silence(before, hears=talk.holds is not None)
+        return [proof, *self._proof_of_requirements(), talk, silence]
 
     def _proof_of_requirements(self) -> Iterator[Proof]:
         """Decide the requirements for the enclaves that the processes use."""
@@ -1231,7 +1238,7 @@ class OpenRobot:
 
         Processes of the enclaves ``missing`` do not run.
         """
-        claim, denied = "everything that talked still talks", self._denied_rights()
+        denied = self._denied_rights()
         words = ("audit", str(self._rights), "--keystore", str(self.export), "--enclave", _OBSERVER)
         step = _Step(
             (*words, "--domain", str(self.domain), "--json", *["--partial"] * bool(missing))
@@ -1240,7 +1247,7 @@ class OpenRobot:
             try:
                 status, value = self._asked(step)
             except UnavailableError as error:
-                return Proof(claim, None, f"{error}")
+                return Proof(_TALK, None, f"{error}")
             wrong = {
                 "gone": _lost_endpoints(before, from_json(value), denied),
                 "denied": [f"{right['enclave']} {right['name']}" for right in value["denied"]],
@@ -1259,22 +1266,26 @@ class OpenRobot:
                 but = f", but for {counted(len(denied), 'right')} that the policy denies now"
                 seen = f"{number} with {before.endpoint_count} endpoints as before"
                 left = f", without {', '.join(missing)}" if missing else ""
-                return Proof(claim, True, f"{seen}{left}{but if denied else ''}")
-        return Proof(claim, False, reason)
+                return Proof(_TALK, True, f"{seen}{left}{but if denied else ''}")
+        return Proof(_TALK, False, reason)
 
-    def _proof_of_silence(self, before: Observation) -> Proof:
-        """Look for nodes as an open listener; before, the same listener saw all nodes."""
-        claim = "an open listener finds nothing"
+    def _proof_of_silence(self, before: Observation, *, hears: bool) -> Proof:
+        """Look for nodes as an open listener; before, the same listener saw all nodes.
+
+        Seeing none means something only if the observer ``hears`` the robot in its enclave now.
+        """
         words = ("generate_policy", str(self.folder / "open.xml"), "--domain", str(self.domain))
         try:
             _, value = self._asked(_Step((*words, "--dry-run", "--json")))
         except UnavailableError as error:
-            return Proof(claim, None, f"{error}")
+            return Proof(_SILENCE, None, f"{error}")
         if value["nodes"]:
             nodes = {f"{node['namespace'].rstrip('/')}/{node['name']}" for node in value["nodes"]}
-            return Proof(claim, False, f"it sees {first_few(sorted(nodes), 3)}")
+            return Proof(_SILENCE, False, f"it sees {first_few(sorted(nodes), 3)}")
+        if not hears:
+            return Proof(_SILENCE, None, "nor does the observer in its enclave see the robot now")
         number = counted(len(before.nodes), "node")
-        return Proof(claim, True, f"the observer that saw {number} before sees none")
+        return Proof(_SILENCE, True, f"the observer that saw {number} before sees none")
 
     def _asked(self, step: _Step) -> tuple[int, Any]:
         """Return the status of a verb, and the JSON that it prints."""
@@ -1309,6 +1320,8 @@ def _as_its_unit_starts(process: ClosedProcess) -> ClosedProcess:
 
 
 _CLAIM = "every process runs in its enclave"
+_TALK = "everything that talked still talks"
+_SILENCE = "an open listener finds nothing"
 
 
 def _may_enter(user: int, folder: os.stat_result) -> bool:

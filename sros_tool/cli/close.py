@@ -130,9 +130,7 @@ def close(
         closed = robot.prepare(duration, partial=partial, dry_run=dry_run)
         if applies and not closed.problems:
             closed = robot.apply(closed, partial=partial, dry_run=dry_run)
-    holds = bool(closed.proofs) and all(
-        proof.holds or (partial and not proof.fails) for proof in closed.proofs
-    )
+    holds = closed.is_proved(partial=partial)
     if as_json:
         print_json(closed)
     elif undoes:
@@ -214,7 +212,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
         following = following if robot.keystore.exists() else ""
         echo(f"the robot is closed{but}{_until(closed)}{following}", err=True)
     elif closed.proofs:
-        accept = "" if any(proof.fails for proof in closed.proofs) else _ACCEPT
+        accept = _ACCEPT if closed.is_proved(partial=True) else ""
         again = f"ask again with sros close {folder} --proof, or go back with --undo"
         echo(f"the robot is not proved closed; next: {accept}{again}", err=True)
     elif applies:

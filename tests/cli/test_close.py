@@ -494,6 +494,12 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     assert "no: the requirements hold: one is violated: robot/requirements.toml\n" in ended.out
     assert "/talker: may publish /chatter" in ended.err
     needed.write_text(kept)
+    robot.remaining = ()
+    ended = robot.close("--proof", "--partial", status=1)
+    assert "not asked: everything that talked still talks: there is nothing to audit" in ended.out
+    assert "not asked: an open listener finds nothing: nor does the observer in its" in ended.out
+    assert "accept with --partial" not in ended.err
+    robot.remaining = (TALKER, LISTENER)
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
     assert "not asked: every process runs in its enclave" in robot.close("--proof", status=1).out
     policy = robot.folder / "robot/policy.xml"
