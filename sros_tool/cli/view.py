@@ -1,4 +1,4 @@
-"""The verb `view`: draw who may do what, as a page, SVG, DOT, Mermaid or JSON."""
+"""The verb `view`: draw who may do what, as a page, SVG, DOT, Mermaid, a table or JSON."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
 
-_FORMATS = ("html", "svg", "dot", "mermaid", "json")
+_FORMATS = ("html", "svg", "dot", "mermaid", "markdown", "json")
 _WITH_FINDINGS = ("html", "json")
 """The formats that show the findings of `sros check`."""
-_ENDINGS = {".htm": "html", ".mmd": "mermaid", ".gv": "dot"}
+_ENDINGS = {".htm": "html", ".mmd": "mermaid", ".gv": "dot", ".md": "markdown"}
 
 
 class _SeveralObserved(SeveralValues):
@@ -168,6 +168,7 @@ def view(
       $ sros view keystore -o robot.html --open
       wrote 'robot.html'
       $ sros view policies/mobile_robot.xml --format svg -o mobile_robot.svg
+      $ sros view robot.xml --format markdown
       $ sros view robot.xml --focus /cmd_vel -o drive.html
       $ sros view robot.xml --requirements robot.requirements.toml -o broken.svg
       $ sros view robot.xml --observed learned.xml -o use.html
@@ -184,6 +185,12 @@ def view(
         raise UsageError("--hops is for --focus only", "", "Add --focus NAME.")
     moment = now()
     written = _format("json" if as_json else form, output, graphviz)
+    if written == "markdown" and (len(sources) > 1 or observed or hops):
+        raise UsageError(
+            "a table takes one source, and neither --observed nor --hops",
+            "",
+            "`sros diff_policy A B --format markdown` compares two.",
+        )
     if written in ("html", "svg") and not (output or show or dry_run) and _on_terminal():
         raise UsageError(
             "a page or picture would be written to this terminal",

@@ -1,4 +1,4 @@
-"""Render a scene as SVG, DOT or Mermaid.
+"""Render a scene as SVG, DOT or Mermaid, and a picture as a table in Markdown.
 
 The SVG has the positions of the scene; tools that read DOT or Mermaid place the cards themselves.
 """
@@ -13,6 +13,7 @@ from datetime import datetime
 from textwrap import wrap
 
 from sros_tool.errors import UnavailableError
+from sros_tool.markdown import code, plain
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.folding import Folding
 from sros_tool.report.layout import (
@@ -30,6 +31,7 @@ from sros_tool.report.layout import (
 )
 from sros_tool.report.pages import escape, render_page
 from sros_tool.report.picture import (
+    Lack,
     Overlay,
     OverlaySide,
     Picture,
@@ -381,6 +383,35 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
     return "\n".join((*lines, ""))
 
 
+def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
+    """Return a table of who may send to, and receive from, each name, in Markdown.
+
+    Without ``everything``, it lacks names to which enclaves have only the rights of every node.
+    """
+    rows: dict[tuple[str, str], tuple[list[str], list[str]]] = {
+        (edge.kind, edge.name): ([], [])
+        for edge in sorted(picture.edges)
+        if everything or not edge.common
+    }
+    for edge in sorted(picture.edges):
+        if ends := rows.get((edge.kind, edge.name)):
+            who = code(edge.enclave) + ("" if edge.qualifier is ALLOW else " is denied")
+            who += f" by {', '.join(map(code, edge.by))}" if edge.by else ""
+            who += f" ({', '.join(edge.parts)})" if edge.parts else ""
+            ends[0 if edge.sends else 1].append(who)
+    lacks = {(name.kind, name.name): name.lacks for name in picture.names}
+    lines = [f"### {plain(picture.title)}: who may do what", ""]
+    lines += [f"- {plain(headline)}" for headline in picture.headlines]
+    lines += ["", "| name | may send or call | may receive or serve |", "| --- | --- | --- |"]
+    for (kind, name), ends in rows.items():
+        cells = [f"{KIND_NAMES[kind]} {code(name)}"]
+        for end, lack in zip(ends, (Lack.SENDER, Lack.RECEIVER), strict=True):
+            nobody = ["nobody"] if lacks.get((kind, name)) is lack else []
+            cells.append(", ".join(dict.fromkeys((*nobody, *end))))
+        lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
+    return "\n".join((*lines, ""))
+
+
 def _graphviz_svg(dot: str) -> str:
     """Return the SVG that Graphviz draws from DOT text, or raise `UnavailableError`."""
     try:
@@ -536,7 +567,7 @@ def render(
     graphviz: bool = False,
     hops: int | None = None,
 ) -> str:
-    """Render a picture as text in one of the formats html, svg, dot and mermaid.
+    """Render a picture as text in one of the formats html, svg, dot, mermaid and markdown.
 
     Args:
         picture: the picture.
@@ -550,6 +581,8 @@ def render(
     Raises:
         UnavailableError: Graphviz is not installed.
     """
+    if form == "markdown":
+        return _render_markdown(folding.picture, everything=everything)
     placed = form in ("html", "svg") and not graphviz
     scenes = folding.scenes(placed=placed, hops=hops or 0)
     if form == "html":

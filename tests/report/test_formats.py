@@ -12,6 +12,7 @@ from lxml import etree
 
 from sros_tool.report.formats import render_dot, render_mermaid, render_svg
 from sros_tool.report.layout import scenes_of
+from sros_tool.report.picture import Lack
 from tests.report.pictures import HOSTILE, MOBILE_ROBOT, hostile_permissions, mobile_robot
 from tests.support.children import importing, python, run
 from tests.support.harness import copy_of, sros
@@ -19,11 +20,11 @@ from tests.support.long_form import some
 
 pytest_plugins = ["tests.report.browsing"]
 
-FORMATS = ("html", "svg", "dot", "mermaid", "json")
+FORMATS = ("html", "svg", "dot", "mermaid", "markdown", "json")
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-@pytest.mark.parametrize("form", some(["svg", "dot", "mermaid", "json"], 1))
+@pytest.mark.parametrize("form", some(["svg", "dot", "mermaid", "markdown", "json"], 1))
 def test_two_runs_write_the_same_bytes(form: str, robot_keystore: Path) -> None:
     found = set()
     for seed in ("1", "2"):
@@ -108,6 +109,34 @@ def test_mermaid_holds_no_letter_of_markup_in_a_label(tmp_path: Path) -> None:
     shown = sros("view", path, "--format", "mermaid").ok().out
     for label in re.findall(r'"([^"]*)"', shown):
         assert re.fullmatch(r"(?:<br/>|#\d+;|[A-Za-z0-9 /_.,:+-])*", label), label
+
+
+def test_a_table_has_every_right_that_not_every_node_needs(tmp_path: Path) -> None:
+    picture = mobile_robot()
+    table = sros("view", MOBILE_ROBOT, "--format", "markdown").ok().out
+    rows = [re.split(r"(?<!\\)\|", line)[1:-1] for line in table.splitlines() if line[:1] == "|"]
+    cells = {name.split("`")[1]: (senders, receivers) for name, senders, receivers in rows[2:]}
+    for edge in picture.edges:
+        if not edge.common:
+            assert f"`{edge.enclave}`" in cells[edge.name][not edge.sends], edge
+    assert cells["/cmd_vel"][0].strip() == "`/mobile_robot/velocity_mux`"
+    assert "`/mobile_robot/recorder` is denied by `/front_camera/*`" in table
+    for name, sides in cells.items():
+        lacks = {each.lacks for each in picture.names if each.name == name}
+        nobody = {Lack.SENDER: sides[0].strip(), Lack.RECEIVER: sides[1].strip()}
+        assert {side for side, text in nobody.items() if text[:6] == "nobody"} == lacks - {
+            Lack.NOTHING
+        }
+    every = sros("view", MOBILE_ROBOT, "--format", "markdown", "--all").ok().out
+    assert "`/parameter_events`" in every and "`/parameter_events`" not in table
+    (tmp_path / "hostile.xml").write_text(hostile_permissions())
+    hostile = sros("view", tmp_path / "hostile.xml", "--format", "markdown").ok().out
+    found = [line for line in hostile.splitlines() if line[:1] == "|"]
+    assert len(found) > 2
+    for row in found:  # three cells, whatever names are in them
+        assert len(re.findall(r"(?<!\\)\|", row)) == 4, row
+    two = sros("view", MOBILE_ROBOT, MOBILE_ROBOT, "--format", "markdown")
+    assert two.status == 2 and "`sros diff_policy A B --format markdown`" in two.err
 
 
 def test_json_is_complete() -> None:
