@@ -13,12 +13,14 @@ _TESTED = "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested."
 _CLOCK_BEHIND = "Often the clock of the robot is behind."
 
 _RESTORE = "Restore {path} from a backup."
-_RENEW = "Renew it: `sros renew {root} {enclave}`."
+_RENEW = "Renew the enclave: `sros renew {root} {enclave}`."
 _NEW_KEY = "Give the enclave another key: `sros renew {root} {enclave} --new-key`."
-_CLOCK = "Set the clock of this host; if it is right, sign again: `sros renew {root} {enclave}`."
+_CLOCK = (
+    "Set the clock of this host; if the clock is right, sign again: `sros renew {root} {enclave}`."
+)
 _CLOCK_OF_CRL = (
-    "Set the clock of this host; if it is right, sign the list again: `sros crl {root} --refresh`, "
-    "and export it to the robots again."
+    "Set the clock of this host; if the clock is right, sign the list again: `sros crl {root} "
+    "--refresh`, and export it to the robots again."
 )
 _SIGN = "Sign the permissions again: `sros create_permission {root} {enclave} POLICY`."
 _COMPLETE = "Create the missing file: `sros create_enclave {root} {enclave}`."
@@ -30,9 +32,9 @@ ORIGINAL_KEYSTORE = "keystore that has the CA keys"
 """How the remedies for an export name the keystore that issued it."""
 
 _IN_EXPORT = {
-    _CLOCK: "Set the clock of this host; if it is right, sign again in the keystore that has the "
-    "CA keys: `sros renew {root} {enclave}`. Then export the enclave again.",
-    _CLOCK_OF_CRL: "Set the clock of this host; if it is right, sign the list again in the "
+    _CLOCK: "Set the clock of this host; if the clock is right, sign again in the keystore that "
+    "has the CA keys: `sros renew {root} {enclave}`. Then export the enclave again.",
+    _CLOCK_OF_CRL: "Set the clock of this host; if the clock is right, sign the list again in the "
     "keystore that has the CA keys: `sros crl {root} --refresh`. Then export the enclave again.",
     REPLACE: "Export the enclave again. If `sros check {root}` finds the same in the keystore that "
     "has the CA keys, first replace the file there: `rm {path} && sros create_enclave {root} "
@@ -93,7 +95,7 @@ class Fault(Enum):
         "DDS cannot read it. If a file to be mounted into a container does not exist, some "
         "container programs make a folder with its name.",
         _RCL,
-        f"Remove it, and put the file in its place. {_RESTORE}",
+        f"Remove the folder or pipe, and put the file there. {_RESTORE}",
     )
     FILE_EMPTY = (
         "file-empty",

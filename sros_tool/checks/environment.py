@@ -162,7 +162,8 @@ UNSECURED_WITHOUT_ENCLAVE = FindingKind(
     ERROR,
     "ROS_SECURITY_ENCLAVE_OVERRIDE is not set, and nodes run unsecured",
     "A process without `--ros-args --enclave ENCLAVE` uses the enclave /, which the keystore does "
-    "not have. It runs UNSECURED, because ROS_SECURITY_STRATEGY is not exactly `Enforce`.",
+    "not have. The process runs UNSECURED, because ROS_SECURITY_STRATEGY is not exactly "
+    "`Enforce`.",
     _RCL,
     f"Write ROS_SECURITY_STRATEGY=Enforce. {_NAME_IT}",
 )
@@ -393,8 +394,9 @@ PROCESS_OPEN = FindingKind(
     "runtime.zenoh-process-open",
     ERROR,
     "a process of rmw_zenoh that runs open although security is enabled",
-    "It runs without a session file, or with one that has no access control: whoever connects to "
-    "it, or impersonates its router, can read everything from it and send it anything.",
+    "The process runs without a session file, or with one that has no access control: whoever "
+    "connects to the process, or impersonates its router, can read everything from it and send it "
+    "anything.",
     _SOURCE,
     f"Stop it, and start it again. {OWN_CONFIGURATION}",
 )

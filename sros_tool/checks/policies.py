@@ -498,7 +498,7 @@ NO_PARAMETERS = FindingKind(
     NOTE,
     "a node that may not offer any parameter service",
     "The node has all other rights that every node needs, so perhaps it was created without "
-    "parameters. Otherwise it fails when it starts.",
+    "parameters. Otherwise the node fails when it starts.",
     "ROS 2 Jazzy, rclcpp 28 (NodeOptions) and rclpy 7 (start_parameter_services).",
     f"If the node has parameters, allow these services. {_INCLUDE_HINT}",
 )
@@ -854,8 +854,8 @@ HALF_ACTION = FindingKind(
     "policy.action-in-part",
     ERROR,
     "an action of which only a part is allowed",
-    "An action consists of three services and two topics. Its client or server creates all five "
-    "when it starts, and fails if one of them is denied.",
+    "An action consists of three services and two topics. The client or server of an action "
+    "creates all five when it starts, and fails if one of them is denied.",
     "ROS 2 design, Actions; rcl_action 9 (rcl_action_client_init, rcl_action_server_init).",
     'Write <actions call="ALLOW"> or <actions execute="ALLOW"> with the name of the action.',
 )
@@ -914,7 +914,7 @@ MALFORMED = FindingKind(
     "a policy that cannot be read",
     "No verb of sros can use it.",
     "SROS2 policy XML 0.2.0 (policy.xsd of ros2/sros2) and the ROS 2 names.",
-    "Correct it at the reported place.",
+    "Correct the policy at the reported place.",
 )
 DUPLICATE = FindingKind(
     "policy.duplicate-enclave",
@@ -929,7 +929,7 @@ FALLBACK = FindingKind(
     "policy.include-fallback",
     WARNING,
     "an include whose file does not exist",
-    "Its <xi:fallback> is used instead, so the rights are not the intended ones.",
+    "The <xi:fallback> of the include is used instead, so the rights are not the intended ones.",
     "XInclude 1.0, 4.4.",
     "Put the file there, or remove the include.",
 )

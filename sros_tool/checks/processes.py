@@ -77,19 +77,22 @@ PROCESS_REVOKED = FindingKind(
     "runtime.process-revoked",
     ERROR,
     "a process of a revoked enclave",
-    "It keeps its certificate until it ends. Processes that started before the revocation list "
-    "changed still communicate with it.",
+    "The process keeps its certificate until it ends. Processes that started before the "
+    "revocation list changed still communicate with it.",
     "Fast DDS 2.14.5, Cyclone DDS 0.10.2 (they read the files when they start).",
-    "Stop it, and restart the processes that started before the revocation.",
+    "Stop the process, and restart all processes that started before the revocation.",
 )
 PROCESS_WITHOUT_FILES = FindingKind(
     "runtime.process-without-files",
     WARNING,
     "a process whose enclave is not there any more",
-    "It runs with files that were removed since it started, and does not start again. Without the "
-    "ledger, as on a robot, sros cannot tell whether the enclave was revoked.",
+    "The process runs with files that were removed since it started, and does not start again. "
+    "Without the ledger, as on a robot, sros cannot tell whether the enclave was revoked.",
     "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",
-    "Stop it if its enclave was revoked; otherwise bring the enclave back, and restart it.",
+    (
+        "Stop the process if its enclave was revoked; otherwise bring the enclave back, and "
+        "restart the process."
+    ),
 )
 PROCESS_EXPIRED = FindingKind(
     "runtime.process-expired",
@@ -123,7 +126,7 @@ PROCESS_NOT_SEEN = FindingKind(
     "runtime.process-not-seen",
     WARNING,
     "processes that could not be looked at",
-    "They may be nodes, even open or revoked ones. The other findings do not cover them.",
+    "Such processes may be nodes, even open or revoked ones. The other findings do not cover them.",
     "proc(5), ptrace(2) (PTRACE_MODE_READ_FSCREDS).",
     "Run the check as root, outside of containers: `sudo sros check runtime`.",
 )
@@ -392,8 +395,8 @@ DAEMON_UNSECURED = FindingKind(
     "runtime.daemon-unsecured",
     WARNING,
     "the ros2 daemon runs without security",
-    "`ros2 topic list` and other commands ask the daemon. It cannot see secured nodes, so the "
-    "graph seems empty.",
+    "`ros2 topic list` and other commands ask the daemon. The daemon cannot see secured nodes, so "
+    "the graph seems empty.",
     "ros2cli 0.32 (daemon); it keeps the environment in which it was started.",
     "Run `ros2 daemon stop`; the next command starts it again, with this environment.",
 )
@@ -417,9 +420,9 @@ PROCESS_RUNS_UNSECURED = FindingKind(
     "runtime.process-runs-unsecured",
     ERROR,
     "a node that runs open although security is enabled",
-    "Its ROS_SECURITY_STRATEGY is not exactly `Enforce`, so rcl starts it unsecured if its "
-    "enclave, or a file of the enclave, is missing: everybody on the network hears it and can send "
-    "to it.",
+    "The ROS_SECURITY_STRATEGY of the node is not exactly `Enforce`, so rcl starts the node "
+    "unsecured if its enclave, or a file of the enclave, is missing: everybody on the network "
+    "hears the node and can send to it.",
     "rcl 9 (rcl/src/rcl/security.c), rmw_dds_common (security.cpp); tested with ROS 2 Jazzy.",
     "Stop it, and start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
@@ -437,8 +440,8 @@ PROCESS_PERMISSIVE = FindingKind(
     "runtime.process-permissive",
     WARNING,
     "a process that is secured now, and would start without security",
-    "Its ROS_SECURITY_STRATEGY is not exactly `Enforce`: if its enclave, or a file of the enclave, "
-    "is missing, the process starts unsecured.",
+    "The ROS_SECURITY_STRATEGY of the process is not exactly `Enforce`: if its enclave, or a file "
+    "of the enclave, is missing, it starts unsecured.",
     "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",
     "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
@@ -446,7 +449,10 @@ PROCESS_OTHER_KEYSTORE = FindingKind(
     "runtime.process-other-keystore",
     WARNING,
     "a secured process among processes of another keystore",
-    "They trust other CAs, so they do not communicate, and do not report it.",
+    (
+        "The process trusts other CAs than its neighbors, so they do not communicate, and do not "
+        "report it."
+    ),
     "DDS-Security 1.1, 8.3.2.8; Fast DDS 2.14.5 and Cyclone DDS 0.10.2, tested.",
     "Start all processes of a domain with one keystore, or give each keystore its own domain.",
 )
@@ -464,7 +470,7 @@ PROCESS_ELSEWHERE = FindingKind(
     "runtime.process-elsewhere",
     NOTE,
     "a node in another network namespace",
-    "It cannot reach the nodes of this network, and is compared only with nodes of its own "
+    "The node cannot reach the nodes of this network, and is compared only with nodes of its own "
     "network.",
     "network_namespaces(7).",
     "Run `sros check runtime` in that network, too, or find out whether the node is meant to be "
@@ -496,9 +502,9 @@ NODE_OPEN = FindingKind(
     "runtime.node-open",
     WARNING,
     "a node that runs open in a domain without secured nodes",
-    "Everybody on the network hears it and can send to it.",
+    "Everybody on the network hears the node and can send to it.",
     "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",
-    "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`, or end it if nobody needs it.",
+    "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`, or end the node if nobody needs it.",
 )
 
 _MOST_NODES = 20

@@ -17,8 +17,8 @@ VACUOUS = FindingKind(
     "requirement.vacuous",
     WARNING,
     "a requirement, or a part of one, that cannot fail",
-    "It protects nothing: perhaps a name is misspelled or was changed, or the exceptions cover "
-    "every enclave.",
+    "Such a requirement protects nothing: perhaps a name is misspelled or was changed, or the "
+    "exceptions cover every enclave.",
     "The requirements file.",
     "Correct the name, here or in the policy (was a topic renamed?), or remove the requirement.",
 )

@@ -48,7 +48,7 @@ RMW_NOT_INSTALLED = FindingKind(
     "RMW_IMPLEMENTATION names an RMW that is not installed",
     "No node starts.",
     "rmw_implementation 2.15 (functions.cpp).",
-    "Install it, or set RMW_IMPLEMENTATION to an installed RMW.",
+    "Install this RMW, or set RMW_IMPLEMENTATION to an installed one.",
 )
 RMW_INSECURE = FindingKind(
     "runtime.rmw-without-security",

@@ -49,8 +49,8 @@ ACCEPTED = FindingKind(
     "The DDS of the other distribution accepts a file that is refused now, such as expired "
     "permissions: the enclave can join again.",
     _ENGINE,
-    "If it must stay out, revoke it with `sros revoke KEYSTORE ENCLAVE`. Otherwise replace the "
-    "refused file, so that both distributions accept it.",
+    "If the enclave must stay out, revoke it with `sros revoke KEYSTORE ENCLAVE`. Otherwise "
+    "replace the refused file, so that both distributions accept it.",
 )
 NO_NODE = FindingKind(
     "upgrade.node-cannot-start",

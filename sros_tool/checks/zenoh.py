@@ -57,8 +57,8 @@ ROUTER_WITHOUT_RULES = FindingKind(
     "zenoh.router-without-rules",
     ERROR,
     "a router without access control",
-    "It forwards everything between all connected processes: anyone with a certificate of the CA "
-    "can publish, hear, call and serve everything.",
+    "The router forwards everything between all connected processes: anyone with a certificate of "
+    "the CA can publish, hear, call and serve everything.",
     _TESTED,
     _BY_SROS,
 )
@@ -141,9 +141,9 @@ UNUSED = FindingKind(
     "zenoh.unused",
     WARNING,
     "a rule or a subject without effect",
-    "No policy names it, so it neither allows nor denies anything.",
+    "No policy names the rule or subject, so it neither allows nor denies anything.",
     "Zenoh 1.9 (authorization.rs).",
-    "Name it in a policy, or remove it.",
+    "Name the rule or subject in a policy, or remove it.",
 )
 PLAIN_ENDPOINT = FindingKind(
     "zenoh.plain-endpoint",
@@ -183,8 +183,8 @@ NAME_NOT_VERIFIED = FindingKind(
     "zenoh.name-not-verified",
     ERROR,
     "a session that accepts anybody as its router",
-    "It does not compare the endpoint's host with the certificate, and trusts the public CAs of "
-    "the web as well as its own CA. Without rules that require a name, the owner of any "
+    "The session does not compare the endpoint's host with the certificate, and trusts the public "
+    "CAs of the web as well as its own CA. Without rules that require a name, the owner of any "
     "certificate of these CAs can impersonate the router.",
     "Zenoh 1.9 (TLS link) and 1.10.2 (its log).",
     "Name the router in the subjects of access control, or set verify_name_on_connect and give the "
@@ -220,8 +220,8 @@ ADMIN_SPACE = FindingKind(
     "zenoh.admin-space",
     WARNING,
     "Zenoh's admin space",
-    "Anyone who can read it sees sessions, connections and the configuration; anyone who can "
-    "write to it can change them.",
+    "Anyone who can read the admin space sees sessions, connections and the configuration; anyone "
+    "who can write to it can change them.",
     _TESTED,
     'Write "enabled": false in adminspace.',
 )

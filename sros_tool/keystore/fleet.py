@@ -34,8 +34,8 @@ _COMMENT = """\
 # belongs to which robot. To change them, edit that file and run `sros generate_artifacts --fleet`.
 """
 FLEET_REMEDY = (
-    "Write it again from the fleet file: `sros generate_artifacts -k KEYSTORE -p POLICY_FILE "
-    "--fleet FLEET_FILE`."
+    "Write the copy again from the fleet file: `sros generate_artifacts -k KEYSTORE -p "
+    "POLICY_FILE --fleet FLEET_FILE`."
 )
 _SHOWN = 5
 

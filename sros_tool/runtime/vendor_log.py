@@ -118,7 +118,7 @@ _ALL = (
 _CHECK = "`sros explain KEYSTORE ENCLAVE --log LOG` finds the cause in the enclave."
 _FILE = "If ROS_SECURITY_LOG_FILE names a file, run `sros explain --log FILE` with it."
 _CHECK_OR_FILE = f"{_CHECK} {_FILE}"
-_RENEW = "Renew it: `sros renew KEYSTORE ENCLAVE`."
+_RENEW = "Renew the enclave: `sros renew KEYSTORE ENCLAVE`."
 _SIGN = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
 _SIGN_ONE = (
     f"`sros explain KEYSTORE ENCLAVE --log LOG` names the document. {_SIGN} Restore a governance "
@@ -911,7 +911,8 @@ _ZENOH_TEXTS: tuple[LogText, ...] = (
     ),
     _zenoh_text(
         "expired", r"received fatal alert: CertificateExpired",
-        "the certificate of this process has expired", "Renew it: `sros renew KEYSTORE ENCLAVE`.",
+        "the certificate of this process has expired",
+        "Renew the enclave: `sros renew KEYSTORE ENCLAVE`.",
     ),
     _zenoh_text(
         "refused", r"received fatal alert: (?P<alert>\w{1,40})",

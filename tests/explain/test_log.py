@@ -218,8 +218,8 @@ def test_a_remedy_on_a_robot_is_for_the_keystore_at_home(keystore: Path) -> None
     log = log_of(FAST_14, "permissions expired")
     found = sros("explain", keystore, ENCLAVE, "--log", log).out
     assert (
-        f"In the keystore that has the CA keys: Renew it: `sros renew KEYSTORE {ENCLAVE}`" in found
-    )
+        f"In the keystore that has the CA keys: Renew the enclave: `sros renew KEYSTORE {ENCLAVE}`"
+    ) in found
 
 
 def test_a_clock_is_set_on_the_robot_and_not_at_home(keystore: Path) -> None:
@@ -231,8 +231,9 @@ def test_a_clock_is_set_on_the_robot_and_not_at_home(keystore: Path) -> None:
     verified = sros("verify", keystore).out
     for said in (found, verified):
         assert (
-            "Set the clock of this host; if it is right, sign again in the keystore that has the "
-            f"CA keys: `sros renew KEYSTORE {ENCLAVE}`. Then export the enclave again." in said
+            "Set the clock of this host; if the clock is right, sign again in the keystore that "
+            f"has the CA keys: `sros renew KEYSTORE {ENCLAVE}`. Then export the enclave again."
+            in said
         )
         assert "CA keys: Set the clock" not in said
 

@@ -88,7 +88,7 @@ def test_every_reason_of_a_decision_is_of_the_policy_or_has_a_remedy() -> None:
 
 
 def test_remedies_name_the_keystore_and_the_enclave() -> None:
-    assert remedy("expired", "ks", "/a") == "Renew it: `sros renew ks /a`."
+    assert remedy("expired", "ks", "/a") == "Renew the enclave: `sros renew ks /a`."
     assert remedy("no-rule", "ks", "/a") == ""
     for word in KNOWN_CAUSES:
         assert "{" not in remedy(word, "ks", "/a")

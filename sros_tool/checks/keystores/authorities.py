@@ -55,7 +55,7 @@ NOT_A_CA = FindingKind(
     "a CA certificate without the right to issue certificates",
     "OpenSSL refuses every chain that contains it.",
     "RFC 5280, 4.2.1.9 and 4.2.1.3 (BasicConstraints, KeyUsage keyCertSign).",
-    "Replace it with `sros rotate_ca KEYSTORE`.",
+    "Replace the CA with `sros rotate_ca KEYSTORE`.",
 )
 CA_EXTENSIONS = FindingKind(
     "keystore.ca-extensions",
@@ -64,7 +64,7 @@ CA_EXTENSIONS = FindingKind(
     "Fast DDS verifies strictly, and refuses such a CA as soon as there is an intermediate CA. "
     "CAs made by ros2/sros2 lack these extensions.",
     "RFC 5280, 4.2.1.1 to 4.2.1.3; openssl verify -x509_strict.",
-    "Before you add intermediate CAs, replace it with `sros rotate_ca KEYSTORE`.",
+    "Before you add intermediate CAs, replace the CA with `sros rotate_ca KEYSTORE`.",
 )
 INTERMEDIATE = FindingKind(
     "portable.intermediate",
@@ -87,7 +87,7 @@ CA_PURPOSE = FindingKind(
     "neither.",
     "RFC 8550, 4.4.2; Fast DDS 2.9.1 and 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2 and 11.0.1; "
     "tested.",
-    "Replace it with `sros rotate_ca KEYSTORE`, or issue its certificate again with "
+    "Replace the CA with `sros rotate_ca KEYSTORE`, or issue its certificate again with "
     "digitalSignature.",
     vendors=(Vendor.FAST_2_9, Vendor.CYCLONE),
 )
@@ -187,7 +187,7 @@ CA_EXPIRES_SOON = FindingKind(
     "Everything that the CA issued or signed expires with it, and replacing a CA takes several "
     "stages.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
-    "Begin to replace it now, with `sros rotate_ca KEYSTORE`.",
+    "Begin to replace the CA now, with `sros rotate_ca KEYSTORE`.",
 )
 CA_EXPIRED = FindingKind(
     "keystore.ca-expired",
@@ -196,7 +196,7 @@ CA_EXPIRED = FindingKind(
     "Nothing can be issued or signed with the CA, and DDS refuses everything that it issued or "
     "signed.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 (Error '10' verifying CA certificate).",
-    "Replace it with `sros rotate_ca KEYSTORE`, or correct the clock.",
+    "Replace the CA with `sros rotate_ca KEYSTORE`, or correct the clock.",
 )
 CA_MISSING = FindingKind(
     "keystore.ca-missing",
@@ -204,7 +204,7 @@ CA_MISSING = FindingKind(
     "the certificate of a CA is missing",
     "Every enclave has a link to this file.",
     "ROS 2 keystore layout (public/).",
-    "Restore it from a backup; every exported enclave has a copy.",
+    "Restore the certificate from a backup; every exported enclave has a copy.",
 )
 CA_MISMATCH = FindingKind(
     "keystore.ca-key-mismatch",
@@ -239,7 +239,7 @@ SETTINGS_MISSING = FindingKind(
     "everything, for ten years.",
     "sros: sros.toml holds the settings of a keystore.",
     "Run `sros update_keystore KEYSTORE --discard-edits`, which writes the settings that the "
-    "ledger has. If it has none, restore sros.toml from a backup.",
+    "ledger has. If the ledger has none, restore sros.toml from a backup.",
 )
 SETTINGS_EDITED = FindingKind(
     "keystore.settings-edited",
@@ -266,8 +266,8 @@ LEFT_ENCLAVES = FindingKind(
     "Anyone who has the files of such an enclave has its rights until the files expire, and "
     "`--robot` no longer chooses the enclave.",
     "sros: the paths have the form of a robot's enclaves, and no robot has these enclaves.",
-    "Revoke them with `sros revoke KEYSTORE ENCLAVE...` if the robots are gone. Keep an enclave "
-    "that never belonged to a robot.",
+    "Revoke the enclaves with `sros revoke KEYSTORE ENCLAVE...` if the robots are gone. Keep an "
+    "enclave that never belonged to a robot.",
 )
 NOT_AS_SETTINGS = FindingKind(
     "governance.not-as-settings",
@@ -290,8 +290,8 @@ LEDGER_DAMAGED = FindingKind(
     "keystore.ledger-damaged",
     ERROR,
     "a ledger with lines that are missing or were changed",
-    "It may lack certificates that `sros revoke` should revoke, and permissions newer than the "
-    "present ones.",
+    "The ledger may lack certificates that `sros revoke` should revoke, and permissions newer "
+    "than the present ones.",
     "sros: each line of ledger.jsonl has the digest of the line before it; ledger.p7s has the "
     "digest of the last line.",
     "Restore ledger.jsonl and ledger.p7s from the same backup. Without one, state all rights again "
@@ -325,7 +325,7 @@ CRL_EXPIRES_SOON = FindingKind(
     "keystore.revocation-list-ends",
     ERROR,
     "a revocation list that expires soon, or has expired",
-    "Once it has expired, DDS refuses every participant.",
+    "Once the list has expired, DDS refuses every participant.",
     "RFC 5280, 5.1.2.5; Fast DDS 2.6 to 3.6; tested.",
     "Run `sros crl KEYSTORE --refresh`.",
 )

@@ -115,7 +115,7 @@ SUBJECT = FindingKind(
     "beyond ASCII in their escaped form; Fast DDS 2.6 and 2.9 treat spaces around = as part of the "
     "name.",
     "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
-    "Write it in the form of RFC 4514, CN=/name, without , | and quotes in the name.",
+    "Write the subject in the form of RFC 4514, CN=/name, without , | and quotes in the name.",
 )
 TIME_FORMAT = FindingKind(
     "portable.time-format",
@@ -471,8 +471,9 @@ UNAUTHENTICATED_KEPT_OUT = FindingKind(
     "governance.unauthenticated-kept-out",
     NOTE,
     "participants without an identity are allowed, but the vendor keeps them out",
-    "Fast DDS 2.9 ignores the attribute, and Cyclone DDS refuses them if RTPS messages are "
-    "protected. Another vendor may open topics to them, or refuse the document.",
+    "Fast DDS 2.9 ignores the attribute, and Cyclone DDS refuses such participants if RTPS "
+    "messages are protected. Another vendor may open topics to these participants, or refuse the "
+    "document.",
     UNAUTHENTICATED.source,
     UNAUTHENTICATED.remedy,
 )

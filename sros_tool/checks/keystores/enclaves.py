@@ -146,7 +146,7 @@ IS_A_CA = FindingKind(
     "an enclave whose certificate may issue certificates",
     "Anyone who has its key can issue identities that every node accepts.",
     "RFC 5280, 4.2.1.9.",
-    "Revoke it, and create the enclave again.",
+    "Revoke the enclave, and create it again.",
 )
 NOT_UNIQUE = FindingKind(
     "enclave.subject-not-unique",
@@ -171,16 +171,16 @@ EVERYTHING = FindingKind(
     "keystore.allow-everything",
     WARNING,
     "an enclave that may do everything",
-    "Its messages are authenticated and encrypted, but it can command every node.",
+    "The enclave's messages are authenticated and encrypted, but it can command every node.",
     "ros2/sros2 0.13 grants this to every enclave without a policy.",
-    "Give it a policy, with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
+    "Give the enclave a policy, with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
 )
 ONLY_DENIALS = FindingKind(
     "keystore.only-denials",
     NOTE,
     "an enclave that may do everything except what its deny rules name",
-    "Its messages are authenticated and encrypted, but it can command every node whose topics and "
-    "services no deny rule names.",
+    "The enclave's messages are authenticated and encrypted, but it can command every node whose "
+    "topics and services no deny rule names.",
     EVERYTHING.source,
     EVERYTHING.remedy,
     prominent=True,
@@ -197,7 +197,7 @@ CRL_MISSING = FindingKind(
     "enclave.crl-missing",
     ERROR,
     "an enclave without the revocation list of its keystore",
-    "Its node continues to communicate with revoked enclaves.",
+    "A node of this enclave continues to communicate with revoked enclaves.",
     "rmw_dds_common (crl.pem), since 2021.",
     "Run `sros crl KEYSTORE --refresh`, and export the enclave again.",
 )

@@ -77,7 +77,7 @@ REPLACEABLE = FindingKind(
     "keystore.replaceable",
     ERROR,
     "a folder above the keystore that other users can change",
-    "They can put another keystore in its place, and so decide whom a node trusts. Access control "
+    "These users can put another keystore there, and so decide whom a node trusts. Access control "
     "lists are not looked at.",
     "POSIX owners and modes; CWE-732; rcl 9 checks neither.",
     "Run `chmod go-w` on the folder, or move the keystore to a folder that only its owner and root "
@@ -113,9 +113,12 @@ LINK_ABSOLUTE = FindingKind(
     "keystore.link-absolute",
     WARNING,
     "a link with an absolute path",
-    "It breaks as soon as the keystore is moved, copied to a robot, or mounted in a container.",
+    (
+        "The link breaks as soon as the keystore is moved, copied to a robot, or mounted in a "
+        "container."
+    ),
     "ros2/sros2 keystore layout (relative links).",
-    "Replace it with a relative link: `ln -sr`.",
+    "Replace the link with a relative one: `ln -sr`.",
 )
 LINK_OUTSIDE = FindingKind(
     "keystore.link-outside",
@@ -148,16 +151,19 @@ STRAY_KEY = FindingKind(
     "keystore.stray-key",
     WARNING,
     "a private key where none belongs",
-    "It is perhaps a copy from a backup. No verb of sros protects, renews or removes it.",
+    (
+        "The key is perhaps a copy from a backup. No verb of sros protects, renews or removes "
+        "such a key."
+    ),
     "ROS 2 keystore layout: private/*.pem and enclaves/*/key.pem only.",
-    "Move it to a safe place, or delete it.",
+    "Move the key to a safe place, or delete it.",
 )
 ARCHIVE = FindingKind(
     "keystore.archive",
     WARNING,
     "an archive or a container of keys where none belongs",
-    "It may contain private keys: a backup of the keystore, for instance, contains its CA keys. "
-    "sros does not open it.",
+    "The file may contain private keys: a backup of the keystore, for instance, contains its CA "
+    "keys. sros does not open the file.",
     "ROS 2 keystore layout: private/ alone is for keys of CAs.",
     "Look at what is in it, and move it to a safe place. If others had access to a CA key in it, "
     "replace the CA (`sros rotate_ca`).",
@@ -207,7 +213,7 @@ UNKNOWN_FILE = FindingKind(
     "a file that is not part of a keystore",
     "Neither ROS 2 nor sros reads the file.",
     "ROS 2 keystore layout.",
-    "Delete it, or keep it elsewhere.",
+    "Delete the file, or keep it elsewhere.",
 )
 
 _KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED, AGENT)

@@ -45,7 +45,7 @@ KEY_TWICE = FindingKind(
     "keystore.key-twice",
     ERROR,
     "two enclaves with the same key",
-    "Each enclave can act as the other.",
+    "Each of the two enclaves can act as the other.",
     "RFC 5280, 4.1.2.6 (the subject is the holder of the key); DDS-Security 1.1, 9.3.",
     "Run `sros renew KEYSTORE ENCLAVE --new-key` for one of them.",
 )
@@ -53,10 +53,13 @@ UNEXPLAINED = FindingKind(
     "keystore.not-in-ledger",
     WARNING,
     "a certificate or document that the keystore never issued",
-    "It came from another source, or the ledger was reset to an earlier state.",
+    (
+        "The certificate or document came from another source, or the ledger was reset to an "
+        "earlier state."
+    ),
     "sros: ledger.jsonl.",
-    "Find out where it comes from. Then state the rights with `sros create_permission KEYSTORE "
-    "ENCLAVE POLICY_FILE`, and issue the certificate again with `sros renew KEYSTORE ENCLAVE "
+    "Find out the source. Then state the rights with `sros create_permission KEYSTORE ENCLAVE "
+    "POLICY_FILE`, and issue the certificate again with `sros renew KEYSTORE ENCLAVE "
     "--revoke-old`.",
 )
 OLD_PERMISSIONS = FindingKind(
@@ -83,7 +86,7 @@ LESS_PROTECTED = FindingKind(
     "governance.less-than-policy",
     ERROR,
     "names that are protected less than the policy demands",
-    "The governance of the keystore decides. It was not made from this policy, or was changed "
+    "The governance of the keystore decides; it was not made from this policy, or was changed "
     "since.",
     "DDS-Security 1.1, 9.4.1.2 (topic rules); sros: protect= in a policy.",
     "Run `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`, which raises the protection; all "
@@ -93,9 +96,9 @@ NOT_IN_POLICY = FindingKind(
     "enclave.not-in-policy",
     NOTE,
     "an enclave that no policy names",
-    "Its permissions cannot be compared with a policy.",
+    "The permissions of this enclave cannot be compared with a policy.",
     "sros: --policy.",
-    "Write a policy for it, or revoke it if nobody needs it.",
+    "Write a policy for the enclave, or revoke it if nobody needs it.",
 )
 NOT_IN_KEYSTORE = FindingKind(
     "keystore.enclave-missing",
@@ -119,8 +122,8 @@ REVOKED_BY_NEWER_LIST = FindingKind(
     "keystore.enclave-revoked",
     ERROR,
     "an enclave that a newer revocation list revokes",
-    "It was revoked after it was exported. It can still start, and communicates with all processes "
-    "that have not loaded the newer list.",
+    "The enclave was revoked after it was exported. It can still start, and communicates with all "
+    "processes that have not loaded the newer list.",
     "RFC 5280, 5; rmw_dds_common (crl.pem).",
     "Remove the enclave's folder from the robot.",
 )
@@ -128,7 +131,7 @@ OLDER_LIST = FindingKind(
     "enclave.crl-older",
     WARNING,
     "an enclave with an older revocation list than another enclave",
-    "Its processes communicate with enclaves that the newer list revokes.",
+    "Processes of this enclave communicate with enclaves that the newer list revokes.",
     "RFC 5280, 5.2.3; rmw_dds_common (crl.pem).",
     "Export the enclave again, with `sros distribute_key KEYSTORE ENCLAVE TARGET --force`.",
 )

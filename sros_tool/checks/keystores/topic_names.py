@@ -50,7 +50,7 @@ CAPITALS = FindingKind(
     "permissions.only-capitals-differ",
     WARNING,
     "two names that differ only in capitals",
-    "They are two topics: nodes on one topic do not communicate with nodes on the other.",
+    "The two names are two topics: nodes on one topic do not communicate with nodes on the other.",
     _MAPPING,
     "If one topic is meant, write its name in the same way in the permissions of all enclaves.",
 )

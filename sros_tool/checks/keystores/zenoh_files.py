@@ -68,10 +68,10 @@ LEFT_OUT = FindingKind(
     "zenoh.left-out",
     WARNING,
     "an enclave that has no rights on Zenoh",
-    "It gets no configuration, and all other enclaves deny it everything.",
+    "The enclave gets no configuration, and all other enclaves deny it everything.",
     _SOURCE,
-    "State its rights with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`, or revoke it if "
-    "nobody needs it.",
+    "State the enclave's rights with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`, or "
+    "revoke it if nobody needs it.",
 )
 SHARED_NODE = FindingKind(
     "zenoh.shared-node",
