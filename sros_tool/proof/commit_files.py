@@ -285,6 +285,10 @@ class CommitFiles:
                 )
         return top
 
+    def written(self, path: str) -> bytes:
+        """Return the content of a file of ``files``, from the folder, without asking git again."""
+        return (self.folder / path).read_bytes()
+
     def differing(self, work_tree: Path) -> list[str]:
         """Return the files of this snapshot that differ from a work tree, or are missing there."""
         paths = []
@@ -293,7 +297,7 @@ class CommitFiles:
                 there = None
                 with suppress(SrosError, OSError):
                     there = folder.read(path)
-                if there != (self.folder / path).read_bytes():
+                if there != self.written(path):
                     paths.append(path)
         return paths
 

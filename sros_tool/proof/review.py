@@ -518,10 +518,9 @@ class _Review:
     ) -> Iterator[str]:
         """Yield changed policies of which reviewed policies or keystores include only a part."""
         named = {str(path.relative_to(self.head.folder)) for path in reviewed}
-        content = self.request.repository.content
         known = {
-            path: content(entry.id)
-            for path, entry in changed
+            path: self.head.written(path)
+            for path, _ in changed
             if path in self.head.files and path not in named
         }
         policies = [path for path, data in known.items() if is_whole_policy(data)]
@@ -545,17 +544,13 @@ class _Review:
     ) -> Iterator[str]:
         """Yield changed files for includes of which reviewed policies use only a part."""
         files = self.head.files
-
-        def content(path: str) -> bytes | None:
-            return self.request.repository.content(files[path].id) if path in files else None
-
-        whole = used_whole(named, content)
+        whole = used_whole(named, lambda path: self.head.written(path) if path in files else None)
         for path, data in parts.items():
             with suppress(SrosError):
-                before = self.base.entry(path) if self.base else None
-                earlier = self.request.repository.content(before.id) if before else data
                 if not may_be_policy(data) or whole.get(path):
                     continue
+                before = self.base.entry(path) if self.base else None
+                earlier = self.request.repository.content(before.id) if before else data
                 if path in whole and same_root(earlier, data):
                     continue
             yield path
@@ -568,8 +563,8 @@ class _Review:
         repository, files = self.request.repository, self.head.files
         parts = [
             path
-            for path, entry in changed
-            if path in files and may_be_policy(repository.content(entry.id))
+            for path, _ in changed
+            if path in files and may_be_policy(self.head.written(path))
         ]
         ids: dict[str, str] = {}
         for folder in sorted({parent for part in parts for parent in Path(part).parents}):
