@@ -267,17 +267,27 @@ def _read(descriptor: int) -> str:
 
 def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
     """Map every path below a folder to its mode, and its bytes or the target of the link."""
-    found = {}
-    for parent, folders, files in os.walk(folder):
-        for name in (*folders, *files):
-            path = Path(parent, name)
-            mode = path.lstat().st_mode
-            if stat.S_ISLNK(mode):
-                content = os.fsencode(os.readlink(path))
-            else:
-                content = path.read_bytes() if stat.S_ISREG(mode) else b""
-            found[os.path.relpath(path, folder)] = (mode, content)
+    found: dict[str, tuple[int, bytes]] = {}
+    left = [""]
+    while left:
+        below = left.pop()
+        with os.scandir(folder / below) as listing:
+            for entry in listing:
+                mode = entry.stat(follow_symlinks=False).st_mode
+                content = b""
+                if stat.S_ISLNK(mode):
+                    content = os.fsencode(os.readlink(entry.path))
+                elif stat.S_ISREG(mode):
+                    content = _bytes_of(entry.path)
+                elif stat.S_ISDIR(mode):
+                    left.append(f"{below}{entry.name}/")
+                found[below + entry.name] = (mode, content)
     return found
+
+
+def _bytes_of(path: str) -> bytes:
+    with open(path, "rb", buffering=0) as file:
+        return file.read()
 
 
 def remains(folder: Path) -> list[str]:

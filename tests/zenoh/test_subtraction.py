@@ -23,6 +23,7 @@ from sros_tool.zenoh.subtraction import (
     subtract_all,
 )
 from tests.support.children import LONG
+from tests.support.long_form import some
 
 PARTS = ("a", "b", "ab", "ba", "aab", "az", "z", "_", "a9", "Z_b")
 NAMES = ["/" + "/".join(parts) for count in (1, 2, 3) for parts in product(PARTS, repeat=count)]
@@ -138,14 +139,17 @@ def test_what_two_differences_share_is_exact(
 
 @pytest.mark.parametrize(
     ("wide", "denied"),
-    [
-        ("/*", ["/" + "a" * 1990]),
-        ("/*a*a*a*a*a", ["/*b*b*b*b*b"]),
-        ("/a*b*", ["/" + "a/" * 900 + "b"]),
-        ("/*", [f"/*x{number}" for number in range(500)]),
-        ("/*", [f"/x{number}" + "y" * 1900 for number in range(300)]),
-        ("/*", [f"/*x{number}*/*y{number}" for number in range(300)]),
-    ],
+    some(
+        [
+            ("/*", ["/" + "a" * 1990]),
+            ("/*a*a*a*a*a", ["/*b*b*b*b*b"]),
+            ("/a*b*", ["/" + "a/" * 900 + "b"]),
+            ("/*", [f"/*x{number}" for number in range(500)]),
+            ("/*", [f"/x{number}" + "y" * 1900 for number in range(300)]),
+            ("/*", [f"/*x{number}*/*y{number}" for number in range(300)]),
+        ],
+        2,
+    ),
 )
 def test_a_hostile_policy_takes_no_unbounded_time(wide: str, denied: list[str]) -> None:
     begin = time.process_time()
