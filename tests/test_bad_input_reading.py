@@ -61,8 +61,10 @@ READERS: dict[str, Callable[[Path, Path], list[object]]] = {
 }
 
 
-@pytest.mark.parametrize("verb", READERS)
-@pytest.mark.parametrize("kind", [kind for kind in NOT_FILES if kind != "below a file"])
+@pytest.mark.parametrize(
+    ("verb", "kind"),
+    some([(verb, kind) for verb in READERS for kind in NOT_FILES if kind != "below a file"], 40),
+)
 def test_file(verb: str, kind: str, keystore: Path, tmp_path: Path) -> None:
     path = tmp_path / ("file.toml" if verb == "demo --scenario" else "file.xml")
     NOT_FILES[kind][0](path)

@@ -45,7 +45,7 @@ def named_commands() -> Iterator[tuple[str, str]]:
     """Yield every command of sros in backquotes, with its place."""
     for path in sorted(PACKAGE.rglob("*.py")):
         source = path.read_text()
-        for node in ast.walk(ast.parse(source)) if "sros " in source else ():
+        for node in ast.walk(ast.parse(source)) if QUOTED.search(source) else ():
             text = text_of(node)
             if text is None or "sros " not in text:
                 continue

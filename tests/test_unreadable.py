@@ -127,7 +127,7 @@ def closed(path: Path) -> Iterator[None]:
 
 
 @as_root
-@pytest.mark.parametrize("verb", some(WRITING, 4))
+@pytest.mark.parametrize("verb", some(WRITING, 2))
 def test_a_verb_that_writes_refuses_what_it_cannot_read(
     verb: str, place: Path, spare: Path
 ) -> None:
@@ -156,7 +156,7 @@ def test_an_export_reads_the_enclaves_that_it_exports(place: Path) -> None:
 
 
 @as_root
-@pytest.mark.parametrize("verb", READING)
+@pytest.mark.parametrize("verb", some(READING, 3))
 def test_a_verb_that_reads_says_what_it_cannot_read(verb: str, place: Path, spare: Path) -> None:
     whole = sros(*words(verb, spare))
     for part in FOLDERS:

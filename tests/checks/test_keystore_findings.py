@@ -23,6 +23,7 @@ from sros_tool.policy.document import read_policy
 from tests.checks.bench import SECRET, Bench
 from tests.checks.keystore_cases import CASES, STRANGER, give_away
 from tests.support.harness import copy_of, sros
+from tests.support.long_form import some
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
@@ -84,7 +85,7 @@ def test_a_remedy_that_needs_ca_keys_is_for_the_original_keystore(bench: Bench) 
     assert told.endswith("Then export the enclave again.")
 
 
-@pytest.mark.parametrize("expected", CASES)
+@pytest.mark.parametrize("expected", some([*CASES], 60))
 def test_found(expected: str, bench: Bench) -> None:
     """Twin: `test_nothing_in_a_sound_keystore`."""
     CASES[expected](bench)

@@ -241,7 +241,7 @@ ON_A_ROBOT = {verb for verb in CASES if verb.startswith("agent ") or verb == "cl
 )
 def test_what_a_verb_prints(verb: str, made_folder: Path, tmp_path: Path) -> None:
     seen = Seen()
-    whole = drawn(verb, 1 / 2)
+    whole = drawn(verb, 1 / 4)
     for case in CASES[verb] if whole else CASES[verb][:1]:
         seen.check(verb, both_ways(verb, case, made_folder, tmp_path))
     assert seen.unseen(verb) == [] or not whole

@@ -19,6 +19,7 @@ import pytest
 from tests.conftest import POLICY
 from tests.keystore.test_confirmation import DDS
 from tests.support.harness import copy_of, policy_text, publish, sros
+from tests.support.long_form import some
 from tests.support.tables import for_every
 from tests.support.verbs import COMMANDS, module_of
 
@@ -187,7 +188,7 @@ def test_the_status_of_every_verb_is_tested() -> None:
     assert all(Path(__file__).parents[2].joinpath(path).exists() for path in ELSEWHERE.values())
 
 
-@pytest.mark.parametrize("verb", STATUS)
+@pytest.mark.parametrize("verb", some([*STATUS], 12))
 def test_status(verb: str, made: Path, tmp_path: Path) -> None:
     folder = copy_of(made, tmp_path / "w")
     for wanted in (2, 1, 0):  # what is done last may change the folder

@@ -21,6 +21,7 @@ from sros_tool.zenoh.document import (
     parse_configuration,
 )
 from tests.support.children import LONG, apart
+from tests.support.long_form import some
 
 RULE = {"id": "r", "permission": "allow", "messages": ["put"], "key_exprs": ["a"]}
 SUBJECT = {"id": "s", "cert_common_names": ["/talker"]}
@@ -150,7 +151,7 @@ REFUSED: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize(("problem", "value"), REFUSED.items())
+@pytest.mark.parametrize(("problem", "value"), some([*REFUSED.items()], 12))
 def test_refused_as_by_zenoh(problem: str, value: Any) -> None:
     with pytest.raises(DocumentError, match=problem):
         read(value)
