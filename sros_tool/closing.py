@@ -311,6 +311,8 @@ class Closing(NamedTuple):
     otherwise it has to be restarted."""
     new: Sequence[str]
     """The enclaves of the policy of which no process was observed, and none runs."""
+    without: Sequence[str]
+    """The enclaves of which no process has to run: those of `--without`."""
     valid_until: datetime | None
     """When the first enclave of the export expires, in UTC; null without an export."""
     denied: Sequence[str]
@@ -338,7 +340,7 @@ class Closing(NamedTuple):
     def left(self) -> Sequence[str]:
         """The enclaves of which no process runs with the present files, and one should."""
         names = {process.enclave for process in self.observed.processes} | {*self.new}
-        names |= self.secured.keys()
+        names = names.difference(self.without) | self.secured.keys()
         return sorted(name for name in names if not self.secured.get(name))
 
     @property
@@ -579,8 +581,10 @@ class OpenRobot:
             file in it is broken.
     """
 
-    def __init__(self, folder: Path, domain: int | None, shell: Shell) -> None:
-        self.folder, self._shell = folder, shell
+    def __init__(
+        self, folder: Path, domain: int | None, shell: Shell, without: Iterable[str] = ()
+    ) -> None:
+        self.folder, self._shell, self._without = folder, shell, sorted({*without})
         self.policy, self.observer = folder / CLOSED_POLICY, folder / "observer.xml"
         self.requirements = folder / _REQUIREMENTS
         self.keystore, self.export = folder / "keystore", folder / "export"
@@ -696,7 +700,14 @@ class OpenRobot:
             new = {enclave.path for enclave in policy.enclaves} - known - {*observed.elsewhere}
         new -= {_OBSERVER} if self.observed else new
         until = self._valid_until()
-        started = observed, (), secured, sorted(new), until
+        known = {process.enclave for process in observed.processes} | new | secured.keys()
+        if unknown := sorted({*self._without} - known):
+            raise UsageError(
+                f"the robot has no enclave {unknown[0]}",
+                f"It has {first_few(sorted(known), _MOST_NAMES)}.",
+                "Correct --without.",
+            )
+        started = observed, (), secured, sorted(new), self._without, until
         return Closing(self.folder, *started, (), (), (), (), False, ())
 
     def _with_later(
@@ -1006,7 +1017,7 @@ class OpenRobot:
 
     # ── applying ────────────────────────────────────────────────────────────────────────────
 
-    def apply(self, prepared: Closing, *, partial: bool, dry_run: bool) -> Closing:
+    def apply(self, prepared: Closing, *, dry_run: bool) -> Closing:
         """Restart the systemd units that do not run in their enclaves, with drop-ins.
 
         Proves that the robot is closed, if nothing is left to do by hand.
@@ -1026,7 +1037,7 @@ class OpenRobot:
         self._restart(sorted(open_units), dry_run=dry_run)
         done = [FileChange(action, str(_SYSTEMD / path)) for path, action in changes.items()]
         by_hand = dry_run or prepared.left_by_hand
-        proofs = () if by_hand else self._proofs(prepared, _RESTART_SECONDS, partial=partial)
+        proofs = () if by_hand else self._proofs(prepared, _RESTART_SECONDS)
         total = [*prepared.changes, *done]
         if not proofs:
             return prepared._replace(changes=total)
@@ -1108,13 +1119,13 @@ class OpenRobot:
 
     # ── the proof ───────────────────────────────────────────────────────────────────────────
 
-    def prove(self, *, partial: bool, dry_run: bool) -> Closing:
-        """Prove that the robot is closed; ``partial`` accepts processes that do not run."""
+    def prove(self, *, dry_run: bool) -> Closing:
+        """Prove that the robot is closed."""
         self._check_shell()
         closing = self._closing()._replace(dry_run=dry_run)
         if dry_run:
             return closing
-        proofs = self._proofs(closing, _START_SECONDS, partial=partial)
+        proofs = self._proofs(closing, _START_SECONDS)
         fails = any(proof.fails for proof in proofs)
         if not fails and self.policy.exists() and (changed := self._enclaves_changed()):
             where = "" if self.keystore.exists() else ", where the keystore is,"
@@ -1134,7 +1145,7 @@ class OpenRobot:
         policy = {enclave.path for enclave in read_policy(self.policy).enclaves}
         return sorted({*stale, *policy.difference(list_enclaves(self.export))})
 
-    def _proofs(self, closing: Closing, patience: float, *, partial: bool) -> list[Proof]:
+    def _proofs(self, closing: Closing, patience: float) -> list[Proof]:
         """Wait until each process runs in its enclave, and prove that the robot is closed."""
         observed = closing.observed
         expected = {process.enclave for process in observed.processes} | {*closing.new}
@@ -1148,8 +1159,11 @@ class OpenRobot:
                 break
             if time.monotonic() > end:
                 earlier = {enclave.name for _, enclave in self._secured(running)}
-                if not partial or earlier.intersection(missing) or expected == {*missing}:
-                    why = self._why_missing(missing, observed.as_they_run(running), running)
+                needed = {*missing}.difference(self._without) | earlier.intersection(missing)
+                if needed or expected == {*missing}:
+                    why = self._why_missing(
+                        sorted(needed) or missing, observed.as_they_run(running), running
+                    )
                     return [Proof(_CLAIM, False, why)]
                 break
             time.sleep(0.2)
@@ -1183,17 +1197,18 @@ class OpenRobot:
         """Return which enclaves have no process, or an open one, and which have earlier files."""
         earlier = {enclave.name: process.pid for process, enclave in self._secured(running)}
         are_open = {process.enclave: process.pid for process in observed.processes if process.pid}
-        absent = [
+        absent = [name for name in missing if name not in earlier]
+        named = ", ".join(
             f"{name} (stop process {are_open[name]}, which is open)" if name in are_open else name
-            for name in missing
-            if name not in earlier
-        ]
+            for name in absent
+        )
         old = [f"{name} (process {earlier[name]})" for name in missing if name in earlier]
         reasons = [
-            f"no secured process of {', '.join(absent)}; start it as {self.start / COMMANDS} says; "
-            f"if it ended: sros explain {shlex.quote(str(self.export))} --log ITS_LOG; "
-            "if it does not always run: --proof --partial"
+            f"no secured process of {named}; start it as {self.start / COMMANDS} says; "
+            f"if it ended: sros explain {shlex.quote(str(self.export))} --log ITS_LOG"
         ] * bool(absent)
+        if may_end := [name for name in absent if name not in are_open]:
+            reasons.append(f"if it does not always run, add --without {may_end[0]}")
         if old:
             reasons.append(f"earlier files in the processes of {', '.join(old)}; restart them")
         return "; ".join(reasons)

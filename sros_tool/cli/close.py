@@ -70,7 +70,14 @@ def _run(words: Sequence[str], live: bool) -> tuple[int, str, str]:
 @click.option(
     "--partial",
     is_flag=True,
-    help="Accept that some processes or nodes are left out, or could not be asked.",
+    help="Accept processes whose nodes sros does not know, nodes that no process here has, and "
+    "processes that could not be looked at.",
+)
+@click.option(
+    "--without",
+    metavar="ENCLAVE",
+    multiple=True,
+    help="Accept that no process of ENCLAVE runs; repeat it for others.",
 )
 @dry_run_option
 @json_option
@@ -82,6 +89,7 @@ def close(
     proves: bool,
     undoes: bool,
     partial: bool,
+    without: tuple[str, ...],
     dry_run: bool,
     as_json: bool,
 ) -> int:
@@ -118,18 +126,18 @@ def close(
     shell = closing.Shell(
         _run, lambda line: echo(line, err=True), os.environ, now, local_zone(os.environ)
     )
-    robot = closing.OpenRobot(folder, domain_of(domain_text), shell)
+    robot = closing.OpenRobot(folder, domain_of(domain_text), shell, without)
     if (applies or proves or undoes) and not robot.observed:
         name = shlex.quote(str(folder))
         raise UsageError(f"'{folder}' has no watched robot", "", f"Run `sros close {name}` first.")
     if undoes:
         closed = robot.undo(dry_run=dry_run)
     elif proves:
-        closed = robot.prove(partial=partial, dry_run=dry_run)
+        closed = robot.prove(dry_run=dry_run)
     else:
         closed = robot.prepare(duration, partial=partial, dry_run=dry_run)
         if applies and not closed.problems:
-            closed = robot.apply(closed, partial=partial, dry_run=dry_run)
+            closed = robot.apply(closed, dry_run=dry_run)
     holds = closed.is_proved(partial=partial)
     if as_json:
         print_json(closed)
@@ -206,7 +214,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
     elif holds:
         asked = all(proof.holds for proof in closed.proofs)
         but = "" if asked else ", except for what was not asked"
-        if missing := [name for name in closed.left if name not in closed.secured]:
+        if missing := [name for name in closed.without if name not in closed.secured]:
             but += f", without a process of {', '.join(missing)}"
         following = f"; next: bring {folder}/keystore to another machine: it has the CA keys"
         following = following if robot.keystore.exists() else ""

@@ -443,7 +443,12 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     robot.by_hand, robot.absent, robot.remaining = {"/talker"}, {"/listener"}, (TALKER,)
     ended = robot.close("--proof", status=1)
     assert "no: every process runs in its enclave: no secured process of /listener; st" in ended.out
-    ended = robot.close("--proof", "--partial")
+    assert "if it does not always run, add --without /listener\n" in ended.out
+    assert ended.out == robot.close("--proof", "--partial", status=1).out
+    assert "has no enclave /x. It has /l" in robot.close("--proof", "--without", "/x", status=2).err
+    without = "--proof", "--without", "/listener"
+    assert robot.close("--apply", *without[1:]).err.endswith("it has the CA keys\n")
+    ended = robot.close(*without)
     assert (
         "yes: every process runs in its enclave: 1 enclave, and no open process; not running: "
         "/listener\n"
@@ -451,12 +456,15 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert "talks: 1 node with 18 endpoints as before, without /listener\n" in ended.out
     assert "the robot is closed, without a process of /listener, its files are" in ended.err
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
-    assert "; not seen: /listener\n" in robot.close("--proof", "--partial").out
+    assert "; not seen: /listener\n" in robot.close(*without, "--partial").out
     robot.unseen = ()
     robot.absent = set()
-    assert "process 4712 (run): in domain 0" in robot.close("--proof", "--partial", status=1).out
+    assert "process 4712 (run): in domain 0" in robot.close(*without, status=1).out
+    robot.by_hand, robot.absent = set(), {"/listener"}
+    killed = robot.close(*without, status=1).out
+    assert "no secured process of /talker (stop" in killed
     robot.absent = {"/listener", "/talker"}
-    assert "no secured process" in robot.close("--proof", "--partial", status=1).out
+    assert "no secured process" in robot.close(*without, "--without", "/talker", status=1).out
 
 
 def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
