@@ -92,7 +92,7 @@ from sros_tool.runtime.rmw import RMW, chosen_vendor
 from sros_tool.runtime.units import unit_changes, unit_instance, unit_words, write_units
 from sros_tool.runtime.variables import ENCLAVE, KEYSTORE, domain_of
 from sros_tool.values import DryRun, FileChange, FileChanges, Words, as_plain, shows
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import counted, enumerated, first_few
 from sros_tool.xml import read_bytes
 
 _FAST_DDS = "010f"
@@ -671,6 +671,9 @@ class OpenRobot:
                 problems += [problem] if problem else []
                 is_stopped = step.guards and state == "findings"
             steps.append(CloseStep(step.command, state))
+            if step.into == self.seen and not (dry_run or partial):
+                problems += (twins := [*self._twins()])
+                is_stopped = bool(twins)
         closing = self._closing()._replace(steps=steps, dry_run=dry_run)
         if dry_run or is_stopped:
             return closing._replace(problems=problems)
@@ -833,6 +836,22 @@ class OpenRobot:
             f"({first_few(rights, _MOST_NAMES)}); if a process should not have them, stop it, and "
             f"run `sros close {shlex.quote(str(self.folder))}`; if they are right, add them: {add}"
         )
+
+    def _twins(self) -> Iterator[str]:
+        """Yield which processes have nodes of the same names: one enclave has the rights of all."""
+        by_enclave: dict[str, list[ClosedProcess]] = {}
+        for process in self.observed.processes if self.observed else ():
+            by_enclave.setdefault(process.enclave, []).append(process)
+        folder = shlex.quote(str(self.folder))
+        for enclave, twins in by_enclave.items():
+            if len(twins) > 1:
+                commands = [f"process {twin.pid} ({shlex.join(twin.command)})" for twin in twins]
+                yield (
+                    f"{enumerated(commands)} call themselves {enclave}, and its enclave would have "
+                    "the rights of all; nothing was signed; if one is not of the robot, stop it, "
+                    f"remove '{self.policy}', and watch again: sros close {folder} --for 1m; "
+                    "if all are, accept it: --partial"
+                )
 
     def _write_processes(self, observed: ObservedProcesses) -> None:
         self.observed = observed

@@ -562,9 +562,7 @@ class _Review:
         """
         repository, files = self.request.repository, self.head.files
         parts = [
-            path
-            for path, _ in changed
-            if path in files and may_be_policy(self.head.written(path))
+            path for path, _ in changed if path in files and may_be_policy(self.head.written(path))
         ]
         ids: dict[str, str] = {}
         for folder in sorted({parent for part in parts for parent in Path(part).parents}):

@@ -603,6 +603,23 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     robot.close("--apply")
 
 
+def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
+    """Or whoever calls itself /talker while sros watches gets its rights into /talker."""
+    twin = ("/", "/", "talker", "010f0000070000000000", ["publish rt/cmd_vel"])
+    robot.nodes = (*robot.nodes, twin)
+    command, library = ("/tmp/evil", "a b"), frozenset({"libfastrtps"})
+    robot.more = (Process(7, command, {}, datetime.now(UTC), libraries=library),)
+    said = robot.close(status=1).out
+    both = "process 7 (/tmp/evil 'a b') and process 4711 (/opt/run talker) call themselves /talker,"
+    assert both in said
+    assert not (robot.folder / "robot/keystore").exists()
+    assert both in robot.close("--apply", status=1).out
+    robot.nodes, robot.more = robot.nodes[:2], ()
+    (robot.folder / "robot/policy.xml").unlink()
+    robot.close("--for", "1s")
+    assert "cmd_vel" not in (robot.folder / "robot/policy.xml").read_text()
+
+
 def test_a_policy_with_an_error_closes_nothing(robot: Robot) -> None:
     robot.units = UNITS
     robot.close()
