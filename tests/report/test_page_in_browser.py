@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import product
@@ -46,25 +46,45 @@ pytestmark = pytest.mark.browser
 PRODUCTION = templates_dir() / "production.toml"
 ASKED_FOR_FLOW = ("/cmd_vel", "/scan", "/navigate_to_pose", "/lifecycle_manager/is_active")
 SIZES = {"desk": (1440, 900), "phone": (390, 844)}
+_TABS: dict[Browser, Page] = {}
+"""The tab of a browser that no test uses now."""
 
 
 @contextmanager
-def opened(browser: Browser, path: Path, **options: Any) -> Iterator[Page]:
-    """The page, opened from disk; afterwards nothing may have failed, or have been asked for."""
+def opened(
+    browser: Browser, path: Path, size: str = "desk", *, kept: bool = True
+) -> Iterator[Page]:
+    """The page, opened from disk; afterwards nothing may have failed, or have been asked for.
+
+    A new tab costs twice as much as what it shows, so the tab is ``kept`` for the next test unless
+    this one fails, or gives the tab what cannot be taken back.
+    """
     said: list[str] = []
     asked: list[str] = []
-    page = new_page(browser, **{"viewport": {"width": 1440, "height": 900}, **options})
-    page.on("console", lambda message: said.append(message.text))
-    page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("request", lambda request: asked.append(request.url))
+    listeners: dict[Any, Callable[[Any], None]] = {
+        "console": lambda message: said.append(message.text),
+        "pageerror": lambda error: said.append(str(error)),
+        "request": lambda request: asked.append(request.url),
+    }
+    page = _TABS.pop(browser, None) or new_page(browser)
+    width, height = SIZES[size]
+    page.set_viewport_size({"width": width, "height": height})
+    for event, listener in listeners.items():
+        page.on(event, listener)
     try:
         page.goto(path.as_uri())
         page.wait_for_selector("body[data-ready]")
         yield page
         assert not said
         assert set(asked) == {path.as_uri()}
+        for event, listener in listeners.items():
+            page.remove_listener(event, listener)
+        if kept:
+            page.goto("about:blank")
+            _TABS[browser] = page
     finally:
-        page.close()
+        if browser not in _TABS:
+            page.close()
 
 
 @pytest.fixture(scope="module")
@@ -332,7 +352,7 @@ def test_what_ends_at_the_same_moment_is_one_row_where_there_is_much(
 def test_what_ended_is_seen_on_the_day_on_which_one_looks(
     browser: Browser, robot_page: Path
 ) -> None:
-    with opened(browser, robot_page) as page:
+    with opened(browser, robot_page, kept=False) as page:
         page.click("#tab-timeline")
         assert page.locator("#timeline .chip.error").count() == 0
         page.clock.install(time="2039-01-01T00:00:00Z")
@@ -389,8 +409,7 @@ def test_tab_leads_through_every_control_and_out_of_the_map(
 @pytest.mark.parametrize("size", SIZES)
 def test_axe_finds_nothing(browser: Browser, robot_page: Path, built: Path, size: str) -> None:
     axe = (built / "node_modules/axe-core/axe.min.js").read_text()
-    viewport = dict(zip(("width", "height"), SIZES[size], strict=True))
-    with opened(browser, robot_page, viewport=viewport) as page:
+    with opened(browser, robot_page, size) as page:
         page.evaluate(axe)
 
         def check(where: str, **options: object) -> None:
@@ -429,7 +448,7 @@ def test_axe_finds_nothing(browser: Browser, robot_page: Path, built: Path, size
 def test_no_text_leaves_its_card_and_nothing_is_wider_than_the_window(
     browser: Browser, robot_page: Path, size: str
 ) -> None:
-    width, height = SIZES[size]
+    width, _ = SIZES[size]
     outside = """() => [...document.querySelectorAll('#map .card')].filter(card => {
         const box = card.querySelector('rect').getBoundingClientRect();
         return [...card.querySelectorAll('text')].some(text => {
@@ -437,7 +456,7 @@ def test_no_text_leaves_its_card_and_nothing_is_wider_than_the_window(
             return inner.right > box.right + 1 || inner.bottom > box.bottom + 1;
         });
     }).map(card => card.textContent)"""
-    with opened(browser, robot_page, viewport={"width": width, "height": height}) as page:
+    with opened(browser, robot_page, size) as page:
         for scene in ("0", "1"):
             page.evaluate("document.querySelectorAll('.fold').forEach(f => f.open = true)")
             page.select_option("#scene", scene)
@@ -529,8 +548,8 @@ def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -
 
 @pytest.mark.parametrize("size", SIZES)
 def test_fit_shows_the_whole_map(browser: Browser, robot_page: Path, size: str) -> None:
-    width, height = SIZES[size]
-    with opened(browser, robot_page, viewport={"width": width, "height": height}) as page:
+    _, height = SIZES[size]
+    with opened(browser, robot_page, size) as page:
         page.click("#zoom-fit")
         box = page.locator("#map").bounding_box()
         room = page.locator("#canvas").bounding_box()
@@ -572,7 +591,7 @@ def test_the_table_has_every_name_and_those_that_only_one_side_may_use(
 
 
 def test_it_prints_every_part(browser: Browser, robot_page: Path) -> None:
-    with opened(browser, robot_page) as page:
+    with opened(browser, robot_page, kept=False) as page:
         page.emulate_media(media="print")
         for part in ("#map", "#timeline", "#findings"):
             assert page.locator(part).is_visible(), part
