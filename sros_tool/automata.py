@@ -498,11 +498,15 @@ class NameSet:
         A rule is a set and whether its names are accepted; ``otherwise`` decides on all other
         names.
         """
-        joined = tuple(
+        joined = [
             (cls.union(names for names, _ in same)._node, kept)
             for kept, same in groupby(rules, key=lambda pair: pair[1])
-        )
-        return cls._of(_First(joined, otherwise))
+        ]
+        if joined and joined[-1][1] is otherwise:
+            joined.pop()  # it changes nothing
+        if len(joined) == 1 and not otherwise:
+            return cls._of(joined[0][0])
+        return cls._of(_First(tuple(joined), otherwise))
 
     @classmethod
     def union(cls, sets: Iterable[NameSet]) -> NameSet:

@@ -822,13 +822,14 @@ class _Stated:
         self, names: NameSet, key: tuple[str, AccessVerb, str], world: _World, limit: SearchLimit
     ) -> str | None:
         """Return an example name; if possible, the same as in another world, or a stated name."""
+        example = _example(names, key[2], world, limit)
+        if example is None:
+            return None
         for topic in chain(self._examples[key], self._likely_topics(key[2])):
             if topic in names and (world.longest is None or len(topic.encode()) <= world.longest):
                 self._examples[key] += [topic] if topic not in self._examples[key] else []
                 return topic
-        example = _example(names, key[2], world, limit)
-        if example is not None:
-            self._examples[key].append(example)
+        self._examples[key].append(example)
         return example
 
     def _likely_topics(self, expression: str) -> Iterator[str]:
