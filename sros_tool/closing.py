@@ -150,15 +150,21 @@ class ClosedProcess(NamedTuple):
     """The id of the Docker container in which it runs; empty outside of containers."""
     rmw: str = ""
     """rmw_zenoh_cpp for a process on Zenoh; empty on DDS."""
+    shares: Sequence[str] = ()
+    """The other enclaves whose processes the same command starts, as `multiprocessing` does."""
+    chooses: bool = False
+    """Whether the program itself gives the process its enclave, by ROS_SECURITY_ENCLAVE_OVERRIDE.
+    """
 
     @classmethod
     def of(
         cls, process: Process, enclave: str, origin: ProcessOrigin, known_by: str
     ) -> ClosedProcess:
         """Return a running process with its enclave and what started it."""
-        start = enclave, process.pid, process.command, origin.folder, process.user, origin.unit
+        start = enclave, *process.program, origin.folder, process.user, origin.unit
         rmw = RMW_ZENOH if process.is_zenoh else ""
-        return cls(*start, known_by, origin.launch, origin.container, rmw)
+        chooses = process.environment.get(ENCLAVE) == enclave
+        return cls(*start, known_by, origin.launch, origin.container, rmw, (), chooses)
 
     def as_it_runs(self, running: RunningProcesses) -> ClosedProcess:
         """Return a copy with the id that a process with this command has now.
@@ -167,7 +173,8 @@ class ClosedProcess(NamedTuple):
         but could not be examined, keeps its id, and so does a process that its unit restarts.
         """
         commands = ((*self.command,), (*self.command, ROS_ARGS, "--enclave", self.enclave))
-        pids = [process.pid for process in running.processes if process.command in commands]
+        programs = [process.program for process in running.processes]
+        pids = [pid for pid, command in programs if command in commands]
         unseen = {process.pid for process in running.unseen}
         if self.unit or running.hidden or self.pid in unseen or self.pid in pids:
             return self
@@ -234,8 +241,8 @@ class ObservedProcesses(NamedTuple):
             for process in running.processes
             if _is_in_domain(process, self.domain)
             and not (process.is_daemon or process.asks_for_security)
-            and process.pid not in pids
-            and process.command not in commands
+            and process.program[0] not in pids
+            and process.program[1] not in commands
         ]
         processes = [process.as_it_runs(running) for process in self.processes]
         return self._replace(processes=processes, unknown=unknown)
@@ -244,9 +251,22 @@ class ObservedProcesses(NamedTuple):
         """Return a copy without enclaves that the policy does not have any more."""
         names = {_ROUTER, *(enclave.path for enclave in policy.enclaves)}
         return self._replace(
-            processes=[process for process in self.processes if process.enclave in names],
+            processes=[
+                process._replace(shares=sorted(names.intersection(process.shares)))
+                for process in self.processes
+                if process.enclave in names
+            ],
             elsewhere=[enclave for enclave in self.elsewhere if enclave in names],
         )
+
+    def started_in(self, process: ClosedProcess) -> str:
+        """Return the enclave in which the command of a process is started.
+
+        Another one than that of the process if the program gives the process its enclave.
+        """
+        names = {process.enclave, *process.shares}
+        program = [each for each in self.processes if each.enclave in names]
+        return min((each.chooses, each.enclave) for each in program)[1]
 
     def by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
         """Map shell commands to the processes that they start and that no unit starts alone.
@@ -261,7 +281,8 @@ class ObservedProcesses(NamedTuple):
         commands: dict[str, list[ClosedProcess]] = {}
         for process in sorted(self.processes, key=lambda process: process.enclave != _ROUTER):
             if not process.unit:
-                command = process.secured_command(folder, launches.get(tuple(process.launch), ""))
+                first = process._replace(enclave=self.started_in(process))
+                command = first.secured_command(folder, launches.get(tuple(process.launch), ""))
                 commands.setdefault(command, []).append(process)
         return commands
 
@@ -374,7 +395,8 @@ def assign(
         if _is_in_domain(process, domain) and not process.is_daemon
     }
     origins = {pid: process_origin(pid) for pid in left}
-    units = Counter(origin.unit for origin in origins.values())
+    programs = {process.program[0]: origins[pid].unit for pid, process in left.items()}
+    units = Counter(programs.values())
     assigned: list[ClosedProcess] = []
 
     def give(process: Process, enclave: str, known_by: str) -> None:
@@ -402,10 +424,15 @@ def assign(
             if len(processes) <= len({node.participant for node in of_enclave}):
                 for process in processes:
                     give(process, enclave, known_by)
+    of_program: dict[int, set[str]] = {}
+    for each in assigned:
+        of_program.setdefault(each.pid, set()).add(each.enclave)
     return ObservedProcesses(
         domain,
-        sorted(assigned),
-        [*map(_described, left.values())],
+        sorted(
+            each._replace(shares=sorted(of_program[each.pid] - {each.enclave})) for each in assigned
+        ),
+        [_described(process) for process in left.values() if process.pid not in of_program],
         sorted(
             enclave
             for enclave, of_enclave in by_enclave.items()
@@ -476,7 +503,7 @@ def read_processes(path: Path) -> ObservedProcesses:
         processes = [ClosedProcess(**process) for process in value["processes"]]
         for process in processes:
             words = (process.enclave, process.folder, process.container, process.rmw)
-            texts = (*words, *process.command, *process.launch)
+            texts = (*words, *process.command, *process.launch, *process.shares)
             if not all(isinstance(text, str) for text in texts):
                 raise ValueError(f"{texts} are not all text")
             if process.unit and not re.fullmatch(SERVICE_NAME, process.unit, re.A):
@@ -671,9 +698,9 @@ class OpenRobot:
                 problems += [problem] if problem else []
                 is_stopped = step.guards and state == "findings"
             steps.append(CloseStep(step.command, state))
-            if step.into == self.seen and not (dry_run or partial):
-                problems += (twins := [*self._twins()])
-                is_stopped = bool(twins)
+            if step.into == self.seen and not dry_run:
+                mixed = [*self._programs(), *(() if partial else self._twins())]
+                problems, is_stopped = [*problems, *mixed], bool(mixed)
         closing = self._closing()._replace(steps=steps, dry_run=dry_run)
         if dry_run or is_stopped:
             return closing._replace(problems=problems)
@@ -724,11 +751,11 @@ class OpenRobot:
         later = []
         for process, enclave in self._secured(running):
             if enclave.name not in known and process.user in (0, self.export.stat().st_uid):
-                command, argument = process.command, (ROS_ARGS, "--enclave", enclave.name)
+                command, argument = process.program[1], (ROS_ARGS, "--enclave", enclave.name)
                 if command[-3:] == argument:  # sros wrote it
                     command = command[:-3]
                 origin = process_origin(process.pid)
-                started = replace(process, command=command)
+                started = replace(process, command=command, forked_by=(0, ()))
                 later.append(ClosedProcess.of(started, enclave.name, origin, "enclave"))
         return observed._replace(processes=[*observed.processes, *later])
 
@@ -837,6 +864,27 @@ class OpenRobot:
             f"run `sros close {shlex.quote(str(self.folder))}`; if they are right, add them: {add}"
         )
 
+    def _programs(self) -> Iterator[str]:
+        """Yield which programs start processes of several enclaves, which would all have one."""
+        observed = (self.observed or ObservedProcesses(self.domain)).within(
+            read_policy(self.policy)
+        )
+        by_program: dict[tuple[str, ...], list[ClosedProcess]] = {}
+        for process in observed.processes:
+            names = sorted({process.enclave, *process.shares})
+            by_program.setdefault(tuple(names), []).append(process)
+        for enclaves, processes in by_program.items():
+            if len(enclaves) > 1 and sum(not process.chooses for process in processes) > 1:
+                yield (
+                    f"{shlex.join(processes[0].command)} starts the processes of "
+                    f"{enumerated(enclaves)}, and all of them would run in one enclave; nothing "
+                    f"was signed; in '{self.policy}', move their profiles into one of these "
+                    "enclaves, which then has the rights of all, and remove the others; or let the "
+                    f"program start each with the method spawn after setting {ENCLAVE} in "
+                    "os.environ, and watch again: "
+                    f"sros close {shlex.quote(str(self.folder))} --for 1m"
+                )
+
     def _twins(self) -> Iterator[str]:
         """Yield which processes have nodes of the same names: one enclave has the rights of all."""
         by_enclave: dict[str, list[ClosedProcess]] = {}
@@ -844,7 +892,7 @@ class OpenRobot:
             by_enclave.setdefault(process.enclave, []).append(process)
         folder = shlex.quote(str(self.folder))
         for enclave, twins in by_enclave.items():
-            if len(twins) > 1:
+            if len({twin.pid for twin in twins}) > 1:
                 commands = [f"process {twin.pid} ({shlex.join(twin.command)})" for twin in twins]
                 yield (
                     f"{enumerated(commands)} call themselves {enclave}, and its enclave would have "
@@ -858,11 +906,26 @@ class OpenRobot:
         replace_file(self.processes, f"{json.dumps(as_plain(observed), indent=2)}\n".encode())
 
     def _observation(self) -> Observation:
-        """Return the nodes that were observed, without those of enclaves that the policy lacks."""
-        names = {enclave.path for enclave in read_policy(self.policy).enclaves}
+        """Return the nodes that were observed, in the enclaves that the policy has now.
+
+        A node whose profile was moved to another enclave is in that one; a node without an enclave
+        is left out.
+        """
+        enclaves = read_policy(self.policy).enclaves
+        names = {enclave.path for enclave in enclaves}
+        moved = {
+            (profile.ns, profile.node): (enclave.path,)
+            for enclave in enclaves
+            for profile in enclave.all_profiles()
+        }
         try:
-            nodes = from_json(json.loads(read_bytes(self.seen, "observation"))).nodes
-            return make_observation(node for node in nodes if names.issuperset(node.enclaves))
+            nodes = []
+            for node in from_json(json.loads(read_bytes(self.seen, "observation"))).nodes:
+                if names.issuperset(node.enclaves):
+                    nodes.append(node)
+                elif place := moved.get((node.ns, stable_name(node.name))):
+                    nodes.append(replace(node, enclaves=place))
+            return make_observation(nodes)
         except (ValueError, TypeError, KeyError) as error:
             raise DocumentError(
                 f"'{self.seen}' is not an observation",
@@ -898,7 +961,7 @@ class OpenRobot:
             "# Rename the services to those of your own file; give both to Docker Compose 2."
         ]
         for process in observed.processes:
-            of_enclave = variables[process.enclave]
+            of_enclave = variables[observed.started_in(process)]
             if process.unit:
                 text = render_environment(of_enclave, "systemd")
                 if _needs_enclave_argument(process):
@@ -1053,7 +1116,7 @@ class OpenRobot:
             write_units(_SYSTEMD, files, changes)
         secured = prepared.secured
         open_units = [unit for enclave, unit in observed.units.items() if not secured.get(enclave)]
-        self._restart(sorted(open_units), dry_run=dry_run)
+        self._restart(sorted({*open_units}), dry_run=dry_run)
         done = [FileChange(action, str(_SYSTEMD / path)) for path, action in changes.items()]
         by_hand = dry_run or prepared.left_by_hand
         proofs = () if by_hand else self._proofs(prepared, _RESTART_SECONDS)
@@ -1118,7 +1181,7 @@ class OpenRobot:
         """
         running = ProcessTable().look(self._shell.now())
         are_open = {
-            process.command
+            process.program[1]
             for process in filter(self._is_neighbour, running.processes)
             if not process.asks_for_security
         }

@@ -292,7 +292,7 @@ def _together(processes: Sequence[ClosedProcess]) -> str:
     if first.launch or first.container:
         names = enumerated([process.enclave for process in processes])
         return f"{'the containers' if first.container else 'the launch'} of {names}"
-    pids = [str(process.pid) for process in processes if process.pid]
+    pids = [*dict.fromkeys(str(process.pid) for process in processes if process.pid)]
     return f"process {enumerated(pids)}" if pids else ""
 
 

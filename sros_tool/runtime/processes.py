@@ -99,7 +99,8 @@ class Process:
     names of the libraries of ROS 2, DDS and Zenoh that it has mapped, such as "libddsc", and
     ``dds`` the DDS libraries with their versions.  ``network`` names its network
     namespace; "" is the namespace of this process.  ``enclave`` is the enclave that it names, if it
-    asks for security, and ``configuration`` the file that it names for Zenoh.
+    asks for security, and ``configuration`` the file that it names for Zenoh.  ``forked_by`` are
+    the id and command of the first process of its program, if another one started it.
     """
 
     pid: int
@@ -112,6 +113,12 @@ class Process:
     enclave: ProcessEnclave | None = None
     configuration: LoadedFile | None = None
     dds: tuple[MappedLibrary, ...] = ()
+    forked_by: tuple[int, tuple[str, ...]] = (0, ())
+
+    @property
+    def program(self) -> tuple[int, tuple[str, ...]]:
+        """The id and the command of the process that has to be started for this one to run."""
+        return self.forked_by if self.forked_by[0] else (self.pid, self.command)
 
     @property
     def label(self) -> str:
@@ -432,7 +439,33 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
         _user(folder),
         "" if network == _namespace(Path("/proc/thread-self/ns/net")) else network,
         dds=_mapped_dds(maps),
+        forked_by=_forked_by(folder, command),
     )
+
+
+def _forked_by(folder: int, command: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:
+    """Return the id and command of the first process of a program; (0, ()) if it is this one.
+
+    A fork has the command of its parent.  A child of Python's ``multiprocessing`` has one that
+    only its parent can start (CPython, ``multiprocessing/spawn.py`` and ``forkserver.py``).
+    """
+    first: tuple[int, tuple[str, ...]] = (0, ())
+    with suppress(OSError):
+        parent = _stat(folder).parent
+        while parent > 1:
+            handle = os.open(f"../{parent}", os.O_RDONLY | os.O_DIRECTORY, dir_fd=folder)
+            try:
+                words, above = tuple(_words(handle, "cmdline")), _stat(handle).parent
+            finally:
+                os.close(handle)
+            is_python = bool(words) and Path(words[0]).name.startswith("python")
+            if words != command and not (is_python and any(map(_CHILD.match, command))):
+                break
+            first, command, parent = (parent, words), words, above
+    return first
+
+
+_CHILD = re.compile(r"from multiprocessing\.(?:spawn|forkserver) import ")
 
 
 def _mapped_dds(maps: bytes) -> tuple[MappedLibrary, ...]:

@@ -29,6 +29,7 @@ from sros_tool.runtime.processes import (
     ProcessTable,
     RunningProcesses,
     UnseenProcess,
+    _forked_by,
     launch_verb,
     process_origin,
     with_files,
@@ -620,6 +621,60 @@ def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
     assert "cmd_vel" not in (robot.folder / "robot/policy.xml").read_text()
 
 
+def test_a_program_that_starts_its_nodes_has_one_enclave(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One command starts all of them; a node that moved to its enclave still has to talk."""
+    program, of_root = (4700, ("python3", "pumps.py")), robot.process
+    monkeypatch.setattr(
+        robot, "process", lambda *e, **more: replace(of_root(*e, **more), forked_by=program)
+    )
+    said = robot.close("--partial", status=1).out
+    assert "  python3 pumps.py starts the processes of /listener and /talker, and all of" in said
+    assert not (robot.folder / "robot/keystore").exists()
+    policy = robot.folder / "robot/policy.xml"
+    moved = re.sub(
+        r' *</profiles>\s*</enclave>\s*<enclave path="/talker">\s*<profiles>\n',
+        "",
+        policy.read_text(),
+    )
+    policy.write_text(moved)
+    ended = robot.close()
+    assert "  /listener: process 4700, known by its process id, with the nodes /l" in ended.out
+    commands = (robot.folder / "robot/start/commands.txt").read_text()
+    export = robot.folder / "robot/export"
+    assert f"cd /opt && sros run {export} /listener -- python3 pumps.py\n" in commands
+    assert "/talker --" not in commands
+    robot.by_hand, in_one = {"/listener"}, lambda *nodes: [("/listener", *of[1:]) for of in nodes]
+    robot.absent = {"/talker"}
+    monkeypatch.setattr("tests.cli.test_close.secured", in_one)
+    assert "talks: 2 nodes with 36 endpoints as before\n" in robot.close("--proof").out
+    robot.remaining = (LISTENER,)
+    said = robot.close("--proof", status=1).out
+    assert "no: everything that talked still talks: gone: /talker publish r" in said
+
+
+def test_a_program_that_gives_its_processes_their_enclaves(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spawned = ("python3", "-c", "from multiprocessing.spawn import spawn_main; spawn_main(4)")
+    of_root = robot.process
+
+    def process_of(enclave: str, **more: Any) -> Process:
+        made = replace(of_root(enclave, **more), forked_by=(4700, ("python3", "pumps.py")))
+        environment = {"ROS_SECURITY_ENCLAVE_OVERRIDE": enclave, **made.environment}
+        return replace(made, command=spawned, environment=environment)
+
+    monkeypatch.setattr(robot, "process", process_of)
+    library = frozenset({"libfastrtps"})
+    robot.more = (Process(4700, ("python3", "pumps.py"), {}, datetime.now(UTC), libraries=library),)
+    robot.close()
+    said = robot.close("--apply", status=1).out
+    run = f"sros run {robot.folder / 'robot/export'} /listener -- python3 pumps.py\n"
+    assert f"stop process 4700, and start it with:\n  cd /opt && {run}" in said
+    assert said.count("pumps.py") == 1
+
+
 def test_a_policy_with_an_error_closes_nothing(robot: Robot) -> None:
     robot.units = UNITS
     robot.close()
@@ -865,6 +920,32 @@ def test_the_unit_of_a_process(tmp_path: Path, text: str, unit: str) -> None:
     made_up(tmp_path, 7, "/opt/talker", parent=1, cgroup=text)
     assert process_origin(7, tmp_path) == ProcessOrigin(unit, "/opt")
     assert process_origin(8, tmp_path) == ProcessOrigin()
+
+
+SPAWNED = ("python3", "-c", "from multiprocessing.spawn import spawn_main; spawn_main(4)", "x")
+FORKSERVER = ("python3", "-c", "from multiprocessing.forkserver import main; main(4)")
+
+
+@pytest.mark.parametrize(
+    ("commands", "program"),
+    [
+        ([("/bin/sh",), ("python3", "a.py")], 0),
+        ([("/bin/sh",), ("python3", "a.py"), ("python3", "a.py")], 8),
+        ([("/opt/a",), ("/opt/a",), ("/opt/a",)], 7),
+        ([("/bin/sh",), ("python3.12", "a.py"), SPAWNED], 8),
+        ([("python3", "a.py"), FORKSERVER, FORKSERVER], 7),
+        ([("/lib/systemd", "--user"), SPAWNED], 0),
+    ],
+)
+def test_the_program_of_a_process(
+    tmp_path: Path, commands: list[tuple[str, ...]], program: int
+) -> None:
+    for pid, command in enumerate(commands, 7):
+        made_up(tmp_path, pid, *command, parent=pid - 1 if pid > 7 else 1)
+    folder = os.open(tmp_path / str(pid), os.O_RDONLY)
+    first = _forked_by(folder, command)
+    os.close(folder)
+    assert first == (program, commands[program - 7] if program else ())
 
 
 @pytest.mark.parametrize("path", ["system.slice/docker-{}.scope", "docker/{}"])
