@@ -261,7 +261,17 @@ class Participant:
         refused = code == _NOT_ALLOWED_BY_SECURITY or (
             secured and bool(participant_refusal("\n".join(messages)))
         )
-        return SecurityRefusedError(what, reason) if refused else DdsError(what, reason)
+        if refused:
+            return SecurityRefusedError(what, reason)
+        return DdsError(what, reason, _MORE_PARTICIPANTS if "participant index" in reason else "")
+
+
+_MORE_PARTICIPANTS = (
+    "Without multicast, Cyclone DDS has room for ten participants of a domain. Allow more, with "
+    "CYCLONEDDS_URI='<CycloneDDS><Domain><Discovery><MaxAutoParticipantIndex>100"
+    "</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>', or add --backend rclpy to a "
+    "node of `sros demo`."
+)
 
 
 class Writer:

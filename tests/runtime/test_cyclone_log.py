@@ -1,12 +1,14 @@
-"""The log of Cyclone DDS in processes that fork."""
+"""The log of Cyclone DDS: in processes that fork, and what its messages advise."""
 
 from __future__ import annotations
 
 import os
 import stat
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
-from sros_tool.runtime.cyclone import CycloneLog
+from sros_tool.runtime.cyclone import CycloneLibrary, CycloneLog, Participant
 
 
 def exit_of_child_that_holds(folder: Path, *, instead: bool) -> int:
@@ -30,3 +32,17 @@ def exit_of_child_that_holds(folder: Path, *, instead: bool) -> int:
 def test_a_fork_leaves_a_file_alone_that_has_the_number_of_a_closed_log(tmp_path: Path) -> None:
     assert exit_of_child_that_holds(tmp_path, instead=True) == 1
     assert exit_of_child_that_holds(tmp_path, instead=False) == 0
+
+
+def test_a_full_domain_without_multicast_says_how_to_have_more_participants() -> None:
+    said = 'lo" is not multicast-capable', "Failed to find a free participant index for domain 7"
+    library = SimpleNamespace(
+        log=SimpleNamespace(messages=lambda: list(said)),
+        api=SimpleNamespace(dds_strretcode=lambda _code: b"Error"),
+    )
+    participant = object.__new__(Participant)
+    participant._library = cast(CycloneLibrary, library)
+    error = participant._failure(-1, "cannot join domain 7")
+    assert "<MaxAutoParticipantIndex>100" in error.remedy and "--backend rclpy" in error.remedy
+    library.log.messages = lambda: ["no such interface"]
+    assert participant._failure(-1, "cannot join domain 7").remedy == ""
