@@ -15,6 +15,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import stat
 import subprocess
 import sys
@@ -363,6 +364,12 @@ class Closing(NamedTuple):
         names = {process.enclave for process in self.observed.processes} | {*self.new}
         names = names.difference(self.without) | self.secured.keys()
         return sorted(name for name in names if not self.secured.get(name))
+
+    @property
+    def stopped(self) -> set[str]:
+        """The enclaves of which no process runs, open or closed."""
+        stopped = {process.enclave for process in self.observed.processes if not process.pid}
+        return {*self.new, *stopped} - self.secured.keys()
 
     @property
     def left_by_hand(self) -> Mapping[str, Sequence[ClosedProcess]]:
@@ -975,8 +982,9 @@ class OpenRobot:
             service = render_container(Container(process.enclave, name, of_enclave, where), COMPOSE)
             services += ["services:", *service.splitlines()[1:]][len(services) > 1 :]
         lines = self._command_lines(closing)
-        launch = shlex.join(_launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
-        lines += ["", "# Any launch file; each process needs name= in it.", launch]
+        if shutil.which("ros2", path=self._shell.environment.get("PATH")):
+            launch = shlex.join(_launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
+            lines += ["", "# Any launch file; each process needs name= in it.", launch]
         files |= {COMMANDS: _text(lines).lstrip(), _SERVICES: _text(services)}
         changes = unit_changes(self.start, files, force=True)
         write_units(self.start, files, changes)
@@ -1322,8 +1330,19 @@ class OpenRobot:
         running, now = replace(running, processes=near), self._shell.now()
         found = process_findings(here, running, now=now, zone=self._shell.zone)
         findings = [finding for finding in found if finding.severity > NOTE]
+        present, known = (
+            self._in_their_enclaves(running),
+            self.observed or ObservedProcesses(self.domain),
+        )
+        closed = {tuple(process.command): process.enclave for process in known.processes}
+        left_over = {
+            process.label: f"Stop it: another process runs in {closed[process.program[1]]}."
+            for process in near
+            if not process.asks_for_security and closed.get(process.program[1]) in present
+        }
         for finding in findings:
-            self._shell.say(f"{finding.subject}: {finding.text}. {finding.remedy}")
+            remedy = left_over.get(finding.subject, finding.remedy)
+            self._shell.say(f"{finding.subject}: {finding.text}. {remedy}")
         wrong = [finding for finding in findings if finding.id != PROCESS_NOT_SEEN.id]
         if findings:
             first = (wrong or findings)[0]

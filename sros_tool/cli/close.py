@@ -128,6 +128,12 @@ def close(
     )
     robot = closing.OpenRobot(folder, domain_of(domain_text), shell, without)
     if (applies or proves or undoes) and not robot.observed:
+        if not folder.is_dir():
+            raise UsageError(
+                f"there is no folder '{folder}' here",
+                f"This is '{Path.cwd()}'.",
+                "Name the folder of the closed robot, or go to where it is.",
+            )
         name = shlex.quote(str(folder))
         raise UsageError(f"'{folder}' has no watched robot", "", f"Run `sros close {name}` first.")
     if undoes:
@@ -233,7 +239,8 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
         ask = f"sros close {folder} --proof"
         steps = f"stop the robot, start each process by the commands in {robot.start / COMMANDS}"
         if closed.secured:
-            steps = f"stop them, start them by the first commands in {robot.start / COMMANDS}"
+            stop = "" if closed.stopped.issuperset(closed.left) else "stop them, "
+            steps = f"{stop}start them by the first commands in {robot.start / COMMANDS}"
         if not closed.left:
             following = ask
         elif any(name in observed.units for name in closed.left):
@@ -260,15 +267,14 @@ def _show_undone(robot: OpenRobot, closed: Closing) -> None:
 
 def _state(closed: Closing, *, applies: bool) -> str:
     """Return how far the processes run closed."""
-    stopped = {process.enclave for process in closed.observed.processes if not process.pid}
     if not closed.secured:
         nothing = "nothing was closed" if applies else "nothing is closed yet"
-        return "no process of the robot runs" if stopped >= {*closed.left} else nothing
+        return "no process of the robot runs" if closed.stopped >= {*closed.left} else nothing
     words = {
         name: _EARLIER
         if name in closed.secured
         else "not running"
-        if name in {*closed.new, *stopped}
+        if name in closed.stopped
         else "open"
         for name in closed.left
     }

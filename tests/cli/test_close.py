@@ -355,6 +355,15 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     assert "; next: stop them, start them by the first commands in robot/start/c" in ended.err
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert re.search(r"\A# Stop .*\n\n# /listener\n.*\n\n# These .*\n\n# /talker\n", commands)
+    assert ("ros2 launch" in commands) == bool(shutil.which("ros2"))
+    (robot.folder / "bin/ros2").symlink_to("systemctl")
+    robot.absent = {"/listener"}
+    ended = robot.close()
+    commands = (robot.folder / "robot/start/commands.txt").read_text()
+    assert "\nros2 launch --secured " in commands
+    assert "except for /listener (not running), its files" in ended.err
+    assert "; next: start them by the first commands in robot/start/commands.txt" in ended.err
+    robot.absent = set()
     assert "start it with" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
     robot.by_hand = {"/talker", "/listener"}
@@ -477,6 +486,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
         "no: every process runs in its enclave: process 5 (spy)"
         in robot.close("--proof", status=1).out
     )
+    robot.more = (robot.process("/talker", is_secured=False),)
+    ended = robot.close("--proof", status=1)
+    assert "'true'. Stop it: another process runs in /talker.\n" in ended.err
     robot.more = ()
     robot.outdated = {"/talker"}
     named = f"earlier files in the processes of /talker (process {PID['/talker']}); restart them\n"
@@ -708,9 +720,9 @@ def test_processes_of_another_user_need_the_files(
     [
         ("--apply --undo", "exclude each other"),
         ("--apply --for 1s", "--for is for watching"),
-        ("--apply", "has no watched robot"),
-        ("--proof", "has no watched robot"),
-        ("--undo", "has no watched robot"),
+        ("--apply", "there is no folder 'robot' here. This is '/"),
+        ("--proof", "there is no folder 'robot' here. This is '/"),
+        ("--undo", "there is no folder 'robot' here. This is '/"),
     ],
 )
 def test_what_is_refused(robot: Robot, words: str, said: str) -> None:
@@ -726,6 +738,7 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     assert "no node was observed" in robot.close(status=2).err
     assert not (robot.folder / "robot").exists()
     (robot.folder / "robot").mkdir()  # by somebody else: it stays
+    assert "has no watched robot" in robot.close("--proof", status=2).err
     robot.close(status=2)
     assert (robot.folder / "robot").exists()
     robot.nodes = (TALKER, LISTENER)
