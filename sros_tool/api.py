@@ -124,7 +124,7 @@ def create_keystore(
         Path(path),
         template=load_template(template) if isinstance(template, str) else template,
         domains=DomainSet.parse(str(domains), "domains"),
-        now=_moment(now),
+        now=_time_or_now(now),
         keyring=_keyring(secrets, identity_key, encrypt=encrypt_ca_keys, short=short_passphrase),
         imported={} if identity_ca is None else {"identity": _content(identity_ca)},
     )
@@ -243,7 +243,7 @@ def generate(
         Path(keystore),
         enclaves=names,
         policies=_fleet_policies(policies, fleet) if fleet else [_policy(e) for e in policies],
-        now=_moment(now),
+        now=_time_or_now(now),
         domain=_domain(domain),
         keyring=_keyring(secrets),
         dry_run=dry_run,
@@ -346,7 +346,7 @@ def renew(
     return lifecycle.renew(
         Path(keystore),
         names,
-        now=_moment(now),
+        now=_time_or_now(now),
         expiring=None if expiring is None else Threshold(remaining=expiring),
         new_key=new_key,
         revoke_old=revoke_old,
@@ -400,7 +400,7 @@ def revoke(
     return lifecycle.revoke(
         Path(keystore),
         names,
-        now=_moment(now),
+        now=_time_or_now(now),
         reason=reason,
         crl=b"" if crl is None else _content(crl),
         keyring=_keyring(secrets),
@@ -442,7 +442,7 @@ def fleet_status(
     from sros_tool.keystore.reader import Keystore as OpenedKeystore
 
     fleet = status.fleet_status(OpenedKeystore(Path(keystore)), tuple(_no_string("robots", robots)))
-    return fleet.with_overdue(_moment(now), max_age)
+    return fleet.with_overdue(_time_or_now(now), max_age)
 
 
 def export_enclaves(
@@ -475,7 +475,9 @@ def export_enclaves(
     names = tuple(_no_string("enclaves", enclaves))
     if not names:
         raise UsageError("no enclave is given to export", "", "Pass at least one enclave name.")
-    return distribute(Path(keystore), names, Path(target), now=_moment(now), force=force).target
+    return distribute(
+        Path(keystore), names, Path(target), now=_time_or_now(now), force=force
+    ).target
 
 
 def explain_access(
@@ -534,8 +536,8 @@ def explain_access(
     if vendor not in vendors:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
     (vendor,) = _vendors(vendor, distribution)
-    asking = AskingContext(_moment(now), zone, domain)
-    asked = _asked(keystore, enclave, policy, asking)
+    asking = AskingContext(_time_or_now(now), zone, domain)
+    asked = _enclave_to_ask(keystore, enclave, policy, asking)
     context = asking.context(asked.enclave.joined_domains)
     evaluator = Evaluator(Vendor(vendor), asked.enclave, context)
     question, _ = question_meant(evaluator, asked, question, kind)
@@ -553,7 +555,7 @@ def explain_access(
     )
 
 
-def _asked(
+def _enclave_to_ask(
     keystore: AnyPath | Policy,
     name: str,
     policy: AnyPath | Policy | None,
@@ -637,7 +639,7 @@ def check(
         else _policy(policy)
         for policy in _no_string("policies", policies)
     )
-    at = Circumstances(_moment(now), zone, _domain(domain), read, fleet=robots)
+    at = Circumstances(_time_or_now(now), zone, _domain(domain), read, fleet=robots)
     findings = path_findings(map(Path, paths), at)
     return FindingFilter(severity=levels[severity], strict=strict).choose(findings).shown
 
@@ -700,7 +702,7 @@ def check_requirements(
     files = [requirements] if isinstance(requirements, str | PathLike) else requirements
     system = load_system(
         [Path(path)] if isinstance(path, str | PathLike) else list(map(Path, path)),
-        at=_moment(now),
+        at=_time_or_now(now),
         zone=zone,
         domain=of,
         fleet=read_fleet(Path(fleet)) if fleet else None,
@@ -754,7 +756,7 @@ def new_access(
     return compare_access(load_side(Path(base), earlier), load_side(Path(head), robots))
 
 
-def _moment(now: datetime | None) -> datetime:
+def _time_or_now(now: datetime | None) -> datetime:
     """Return ``now``, which must have a time zone, or the current time if it is None."""
     if now is None:
         return datetime.now(UTC)

@@ -46,10 +46,10 @@ class Letters:
     @classmethod
     def between(cls, ends: Iterable[tuple[str, str]]) -> Letters:
         """Return the characters of inclusive ranges; one whose end is before its start is empty."""
-        return cls._joined((ord(low), ord(high)) for low, high in ends)
+        return cls._joined_ranges((ord(low), ord(high)) for low, high in ends)
 
     @classmethod
-    def _joined(cls, ranges: Iterable[tuple[int, int]]) -> Letters:
+    def _joined_ranges(cls, ranges: Iterable[tuple[int, int]]) -> Letters:
         found: list[tuple[int, int]] = []
         for low, high in sorted(part for part in ranges if part[0] <= part[1]):
             if found and low <= found[-1][1] + 1:
@@ -61,7 +61,7 @@ class Letters:
     @classmethod
     def union(cls, sets: Iterable[Letters]) -> Letters:
         """Return the characters that are in at least one of the sets."""
-        return cls._joined(part for letters in sets for part in letters.ranges)
+        return cls._joined_ranges(part for letters in sets for part in letters.ranges)
 
     def __or__(self, other: Letters) -> Letters:
         return self.union((self, other))
@@ -133,9 +133,9 @@ class Automaton:
     @lru_cache(maxsize=4096)  # noqa: B019 - few automata, and each is compared by its hash
     def between(self, begin: str, end: str) -> Automaton:
         """Return an automaton for the texts that this one accepts between ``begin`` and ``end``."""
-        starts = self._reached(frozenset((0,)), begin)
+        starts = self._reached_places(frozenset((0,)), begin)
         stops = frozenset(
-            at for at in range(self.size) if self._reached(frozenset((at,)), end) & self.ends
+            at for at in range(self.size) if self._reached_places(frozenset((at,)), end) & self.ends
         )
         edges = [(at + 1, letters, to + 1) for at, letters, to in self.edges]
         first = [(0, letters, to + 1) for at, letters, to in self.edges if at in starts]
@@ -153,7 +153,7 @@ class Automaton:
             ends = frozenset((more + size + i,))
         return Automaton(tuple(edges), ends)
 
-    def _reached(self, places: frozenset[int], text: str) -> frozenset[int]:
+    def _reached_places(self, places: frozenset[int], text: str) -> frozenset[int]:
         for letter in text:
             places = frozenset(
                 to for at, letters, to in self.edges if at in places and letter in letters
@@ -190,7 +190,7 @@ class Automaton:
                 self._moves[letter] = _moves(
                     (start, stop) for start, letters, stop in self.edges if letter in letters
                 )
-            reached = _moved(reached, self._moves[letter])
+            reached = _moved_places(reached, self._moves[letter])
             if not reached:
                 return False
         return bool(reached & self.end_bits)
@@ -286,7 +286,7 @@ def _moves(edges: Iterable[tuple[int, int]]) -> _Moves:
     return found
 
 
-def _moved(reached: int, moves: _Moves) -> int:
+def _moved_places(reached: int, moves: _Moves) -> int:
     following = 0
     for by, places in moves.items():
         some = reached & places
@@ -539,7 +539,7 @@ class NameSet:
 
         Returns None if that would be all names.
         """
-        return _around(self._node, _longest_affixes_first)
+        return _including_set(self._node, _longest_affixes_first)
 
     def __or__(self, other: NameSet) -> NameSet:
         return NameSet.union((self, other))
@@ -643,7 +643,9 @@ class Surroundings:
     automata: frozenset[Automaton]
 
 
-def _around(node: _Node, best: Callable[[Surroundings], tuple[int, int]]) -> Surroundings | None:
+def _including_set(
+    node: _Node, best: Callable[[Surroundings], tuple[int, int]]
+) -> Surroundings | None:
     """Return a simple set that includes ``node``, or None; of several, the smallest by ``best``."""
     match node:
         case _Some():
@@ -651,7 +653,7 @@ def _around(node: _Node, best: Callable[[Surroundings], tuple[int, int]]) -> Sur
         case _Not():
             return None
         case _Every():
-            parts = (_around(part, best) for part in node.of)
+            parts = (_including_set(part, best) for part in node.of)
             return min(filter(None, parts), key=best, default=None)
         case _First():
             operands = [part for part, kept in node.of if kept]
@@ -659,7 +661,7 @@ def _around(node: _Node, best: Callable[[Surroundings], tuple[int, int]]) -> Sur
                 return None
         case _AtLeast():
             operands = list(node.of)
-    found = [_around(operand, best) for operand in operands]
+    found = [_including_set(operand, best) for operand in operands]
     known = [surroundings for surroundings in found if surroundings is not None]
     if len(known) < len(found):
         return None
@@ -758,14 +760,14 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
         raise _too_many()
     exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
     everything = frozenset[Automaton]().union(*(leaf.everything for leaf in leaves))
-    around = _around(node, _fewest_automata_first)
-    for own in sorted(automata if around is None else around.automata, key=_order):
+    around = _including_set(node, _fewest_automata_first)
+    for own in sorted(automata if around is None else around.automata, key=_automaton_order):
         met = frozenset(automaton for leaf in leaves for automaton in leaf.meeting(own))
         if others := len(met) // _OF_A_STEP:
             limit.spend(others)
         left = _reduced(node, everything | {own}, met)
         if left is not False:
-            yield _Search(_within(own, left), frozenset(filter(own.matches, exact)))
+            yield _Search(_accepted_names(own, left), frozenset(filter(own.matches, exact)))
     none = frozenset[Automaton]()
     if around is None and not everything and _reduced(node, none, none):
         left = _reduced(node, none, None)
@@ -819,13 +821,13 @@ def _in_all(sets: Iterable[frozenset[Automaton]]) -> frozenset[Automaton]:
     return first.intersection(*others)
 
 
-def _within(own: Automaton, left: _Node | bool) -> _Node:
+def _accepted_names(own: Automaton, left: _Node | bool) -> _Node:
     """Return the names of the set ``left`` that ``own`` accepts; True stands for all names."""
     node = _Some(automata=frozenset((own,)))
     return node if isinstance(left, bool) else _Every((node, left))
 
 
-def _order(automaton: Automaton) -> tuple[str, str, str]:
+def _automaton_order(automaton: Automaton) -> tuple[str, str, str]:
     return automaton.order
 
 
@@ -839,7 +841,7 @@ class _Search:
     def __init__(self, node: _Node, taken: frozenset[str]) -> None:
         self._node = node
         found = {automaton for leaf in _leaves(node) for automaton in leaf.automata}
-        self._machine = _machine(tuple(sorted(found, key=_order)))
+        self._machine = _machine(tuple(sorted(found, key=_automaton_order)))
         self._needed = _needed(node)
         self._taken = _ExcludedNames(name for name in taken if node.truth(_asked_of(name)))
 
@@ -865,7 +867,7 @@ class _Search:
             ways = taken.ways(place, machine.classes)
             limit.spend(len(ways) * (1 + machine.size // 1024))
             for letter, moves, there in ways:
-                to = _moved(reached, moves) & machine.useful
+                to = _moved_places(reached, moves) & machine.useful
                 new, paid = (to, there), cost + len(letter.encode())
                 if costs.get(new, paid + 1) <= paid or (left := self._left(to)) is None:
                     continue
@@ -984,7 +986,7 @@ def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
         letters = Letters(tuple(ranges))
         of = (by_letters[kind] for kind, has in zip(kinds, key, strict=True) if has)
         found.append(_Class(letters, _best(letters), _moves(each for some in of for each in some)))
-    return tuple(sorted(found, key=lambda each: _rank(each.best)))
+    return tuple(sorted(found, key=lambda each: _letter_rank(each.best)))
 
 
 def _best(letters: Letters, without: Container[str] = ()) -> str:
@@ -998,7 +1000,7 @@ def _best(letters: Letters, without: Container[str] = ()) -> str:
     return next((letter for letter in every if letter not in without), "")
 
 
-def _rank(letter: str) -> tuple[int, str]:
+def _letter_rank(letter: str) -> tuple[int, str]:
     at = _PREFERRED.find(letter)
     return (at if at >= 0 else len(_PREFERRED)), letter
 

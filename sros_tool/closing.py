@@ -1361,7 +1361,7 @@ class OpenRobot:
         )
         for _ in range(_TRIES):  # nodes may still be starting
             try:
-                status, value = self._asked(step)
+                status, value = self._status_and_json(step)
             except UnavailableError as error:
                 return Proof(_TALK, None, f"{error}")
             wrong = {
@@ -1392,7 +1392,7 @@ class OpenRobot:
         """
         words = ("generate_policy", str(self.folder / "open.xml"), "--domain", str(self.domain))
         try:
-            _, value = self._asked(_Step((*words, "--dry-run", "--json")))
+            _, value = self._status_and_json(_Step((*words, "--dry-run", "--json")))
         except UnavailableError as error:
             return Proof(_SILENCE, None, f"{error}")
         if value["nodes"]:
@@ -1403,7 +1403,7 @@ class OpenRobot:
         number = counted(len(before.nodes), "node")
         return Proof(_SILENCE, True, f"the observer that saw {number} before sees none")
 
-    def _asked(self, step: _Step) -> tuple[int, Any]:
+    def _status_and_json(self, step: _Step) -> tuple[int, Any]:
         """Return the status of a verb, and the JSON that it prints."""
         self._shell.say(f"$ {step.command}")
         status, output, _ = self._shell.run(step.words, False)

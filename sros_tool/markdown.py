@@ -18,20 +18,20 @@ _PUNCTUATION = re.compile(r"([\\`*_\[\]<>#~|!&@])")
 
 def code(text: str) -> str:
     """Return ``text`` as a code span on one line, cut if it is long."""
-    shown = _shown(text if len(text) <= _LONGEST else f"{text[:_LONGEST]}...")
+    shown = _visible_line(text if len(text) <= _LONGEST else f"{text[:_LONGEST]}...")
     ticks = "`" * _ticks(shown)
     return f"{ticks} {shown or ' '} {ticks}" if len(ticks) > 1 or not shown else f"`{shown}`"
 
 
 def plain(text: str) -> str:
     """Return ``text`` with Markdown markup escaped."""
-    return _PUNCTUATION.sub(r"\\\1", _shown(text))
+    return _PUNCTUATION.sub(r"\\\1", _visible_line(text))
 
 
 def fenced(text: str, language: str = "text") -> str:
     """Return ``text`` as a fenced block; the fence is longer than any backtick run in ``text``."""
     fence = "`" * max(3, _ticks(text))
-    lines = "\n".join(map(_shown, text.rstrip("\n").split("\n")))
+    lines = "\n".join(map(_visible_line, text.rstrip("\n").split("\n")))
     return f"{fence}{language}\n{lines}\n{fence}"
 
 
@@ -63,7 +63,7 @@ _BLANK = "\u115f\u1160\u2800\u3164\uffa0\U0001d159"
 """Printable characters that are invisible."""
 
 
-def _shown(text: str) -> str:
+def _visible_line(text: str) -> str:
     """Return ``text`` on one line, with invisible and unprintable characters escaped."""
     return "".join(
         character if _is_seen(character) else f"\\x{ord(character):02x}" for character in text

@@ -225,9 +225,9 @@ class Network:
         ignored = ["rt" + name for name in without]
         ignored += [f"rq/{name.lstrip('/')}{SERVICE_ENDS['rq']}" for name in questions]
         by_domains: DomainRights = rights if isinstance(rights, Mapping) else {None: [*rights]}
-        ends = _ends(by_domains, ignored)
+        ends = _writers_and_readers(by_domains, ignored)
         opened = tuple(dict.fromkeys(unguarded))
-        joined = _joined(by_domains) if opened else {}
+        joined = _domains_by_enclave(by_domains) if opened else {}
         for each, enclave in product(opened, everybody):
             outside = sorted({*each.without, *ignored})
             met = tuple(other for other in outside if overlap(other, each.topic))
@@ -239,7 +239,7 @@ class Network:
         self._sides = {direction: _Direction(accesses) for direction, accesses in ends.items()}
         self._router_of = links.router_of if links else {}
         self._passing = {
-            router: _Direction(_ends({None: given}, ignored)["publish"])
+            router: _Direction(_writers_and_readers({None: given}, ignored)["publish"])
             for router, given in (links.passing.items() if links else ())
         }
 
@@ -319,7 +319,7 @@ class Network:
         return next(filter(None, names), "")
 
 
-def _joined(rights: DomainRights) -> dict[str, list[DomainSet | None]]:
+def _domains_by_enclave(rights: DomainRights) -> dict[str, list[DomainSet | None]]:
     """Map enclaves to the sets of ROS domains in which they may do something."""
     joined: dict[str, list[DomainSet | None]] = defaultdict(list)
     for domains, some in rights.items():
@@ -343,7 +343,9 @@ def _both(one: DomainSet, other: DomainSet) -> tuple[DomainSet] | tuple[()]:
     return (common,) if common.ranges else ()
 
 
-def _ends(rights: DomainRights, ignored: Collection[str]) -> dict[str, list[_Access]]:
+def _writers_and_readers(
+    rights: DomainRights, ignored: Collection[str]
+) -> dict[str, list[_Access]]:
     """Return which enclaves may write (publish) and read (subscribe) which topics.
 
     Topics in ``ignored`` are left out.

@@ -492,7 +492,7 @@ class _Round:
             expiry={name: _expiry(opened.get(name)) for name in names},
             running=seen.states,
             clock=clock,
-            problems=_short(self._problems),
+            problems=_shortened_problems(self._problems),
             requests=asked.requests,
             crl=self._list_to_send(names),
         )
@@ -638,7 +638,7 @@ def _expiry(enclave: _Opened | None) -> EnclaveExpiry:
     return EnclaveExpiry(None, enclave.permissions_until())
 
 
-def _short(problems: Iterable[str]) -> tuple[str, ...]:
+def _shortened_problems(problems: Iterable[str]) -> tuple[str, ...]:
     """Return problems in the form of a confirmation: not too long, and not too many."""
     texts = []
     for problem in dict.fromkeys(problems):

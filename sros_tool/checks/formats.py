@@ -117,7 +117,7 @@ def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
         "ruleId": finding.id,
         "ruleIndex": rule,
         "level": finding.severity.word,
-        "message": {"text": _plain(f"{finding.subject}: {finding.text}. {finding.remedy}")},
+        "message": {"text": _without_links(f"{finding.subject}: {finding.text}. {finding.remedy}")},
     }
     if finding.file:
         result["locations"] = [_location(finding.file, finding.line, base)]
@@ -126,7 +126,7 @@ def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
             {
                 "id": number,
                 **_location(place.file, place.line, base),
-                "message": {"text": _plain(place.text)},
+                "message": {"text": _without_links(place.text)},
             }
             for number, place in enumerate(finding.related)
         ]
@@ -149,7 +149,7 @@ def _location(file: str, line: int | None, base: Path) -> dict[str, Any]:
     }
 
 
-def _plain(text: str) -> str:
+def _without_links(text: str) -> str:
     """Escape embedded links (SARIF 2.1.0, 3.11.6), as others may have chosen a name in the text.
 
     Only text with the form of a link is escaped, because many viewers show the escapes.
@@ -195,7 +195,7 @@ def keystore_metrics(
         KeystoreError: the path is not a keystore, or some enclaves cannot be listed.
     """
     lifetimes, unreadable = survey(keystore)
-    expiries = [*_shared(keystore), *_enclave_expiries(keystore, lifetimes)]
+    expiries = [*_shared_expiries(keystore), *_enclave_expiries(keystore, lifetimes)]
     earliest: dict[str, datetime] = {}
     for expiry in expiries:
         earliest[expiry.kind] = min(expiry.moment, earliest.get(expiry.kind, expiry.moment))
@@ -258,7 +258,7 @@ def keystore_metrics(
     )
 
 
-def _shared(keystore: Keystore) -> Iterator[Expiry]:
+def _shared_expiries(keystore: Keystore) -> Iterator[Expiry]:
     """Yield the expiry of the files that all enclaves share; unreadable files are left out."""
     for role in ROLES:
         with suppress(SrosError):

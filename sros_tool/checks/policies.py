@@ -346,7 +346,7 @@ def _offered_by_others(unused: Iterable[_Statement]) -> Iterator[Finding]:
         owner = owners.get((statement.right.right, statement.name))
         if owner and not statement.is_private and statement.right.enclave != owner.right.enclave:
             asking = _ASKING_SIDE[statement.right.right]
-            place = RelatedPlace(f"{owner.right.enclave} offers it", *_place(owner.source))
+            place = RelatedPlace(f"{owner.right.enclave} offers it", *_source_place(owner.source))
             text = (
                 f"{statement.right.describe()} is under the name of a node in {owner.right.enclave}"
                 f", which offers it, too ({place}), and nobody may {asking} it"
@@ -366,13 +366,13 @@ def _misspelt(each: _Statement, other: str, candidates: Sequence[_Statement]) ->
         article = "an" if kind == "action" else "a"
         hint = f"{first.right.enclave} has it as {article} {kind} ({first.right.right}), unused"
         if each.right.kind == "actions":
-            place = RelatedPlace("", *_place(first.source))
+            place = RelatedPlace("", *_source_place(first.source))
             remedy = f"Write it at {place} {_as_action(other, first.written)}"
         elif kind == "action":
             remedy = f"Write it {_as_action('call', each.written)}"
     text = f"no enclave may {other} {each.name}; {hint}"
     places = tuple(
-        RelatedPlace(f"{one.right.enclave} may {one.right.describe()}", *_place(one.source))
+        RelatedPlace(f"{one.right.enclave} may {one.right.describe()}", *_source_place(one.source))
         for one in shown
     )
     return each.found(MISSPELT, text, remedy=remedy)._replace(related=places)
@@ -382,7 +382,7 @@ def _as_action(right: str, name: str) -> str:
     return f'as an action: <actions {right}="ALLOW"><action>{name}</action></actions>.'
 
 
-def _place(source: Source) -> tuple[str, int | None]:
+def _source_place(source: Source) -> tuple[str, int | None]:
     return source.file, source.line or None
 
 
@@ -1156,7 +1156,7 @@ class NearNames:
         self._by_end: dict[str, list[str]] = defaultdict(list)
         self._names = dict.fromkeys(names)
         for name in self._names:
-            for end in _ends(name):
+            for end in _name_ends(name):
                 self._by_end[end].append(name)
             for key in set(_keys(name)):
                 self._by_key[key].append(name)
@@ -1176,12 +1176,12 @@ class NearNames:
 
         Names of one part, such as /scan, are too common to be meant by others.
         """
-        shorter = (end for end in _ends(name) if end in self._names)
+        shorter = (end for end in _name_ends(name) if end in self._names)
         longer = self._by_end.get(name, ()) if name.count("/") > 1 else ()
         return sorted({*shorter, *longer} - {name})
 
 
-def _ends(name: str) -> Iterator[str]:
+def _name_ends(name: str) -> Iterator[str]:
     """Yield the ends of a name that consist of at least two parts, without the whole name."""
     parts = name.split("/")[1:]
     for at in range(1, len(parts) - 1):
@@ -1190,7 +1190,7 @@ def _ends(name: str) -> Iterator[str]:
 
 def _keys(name: str) -> Iterator[str]:
     """Yield index keys of a name; similar names have a key in common."""
-    yield _plain(name)
+    yield _without_separators(name)
     parts = _PARTS.split(name)
     for index, part in enumerate(parts):
         if len(part) < _SHORTEST - 1:
@@ -1200,12 +1200,12 @@ def _keys(name: str) -> Iterator[str]:
             yield f"{before}{part[:at]}{part[at + 1 :]}\0{after}"
 
 
-def _plain(name: str) -> str:
+def _without_separators(name: str) -> str:
     return name.replace("_", "").replace("/", "").lower()
 
 
 def _is_near(one: str, other: str) -> bool:
-    if _plain(one) == _plain(other):
+    if _without_separators(one) == _without_separators(other):
         return True
     pairs = zip(_PARTS.split(one), _PARTS.split(other), strict=False)
     different = [(a, b) for a, b in pairs if a != b]

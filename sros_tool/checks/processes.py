@@ -553,13 +553,13 @@ def process_findings(
     nodes = [process for process in running.processes if not process.is_daemon]
     security = {node.pid: _security_of(node) for node in nodes}
     secured = [node for node in nodes if security[node.pid] is Security.SECURED]
-    closed = {_place(node) for node in nodes if node.asks_for_security}
+    closed = {_network_and_domain(node) for node in nodes if node.asks_for_security}
     closed |= {here} if is_secured_here else set()
     open_nodes: list[Process] = []
     for process in running.processes:
         if process.is_daemon:
             # Each domain has its own daemon; commands ask the daemon of their domain.
-            if is_secured_here and _place(process) == here:
+            if is_secured_here and _network_and_domain(process) == here:
                 yield from _daemon(process, environment)
             continue
         yield from _zenoh(process)
@@ -567,8 +567,8 @@ def process_findings(
             yield from _file_findings(process, now=now, zone=zone)
             yield from _unsecured(process)
         elif security[process.pid] is Security.OPEN:
-            if _place(process) in closed:
-                text = f"{_where(process)}, with {ENABLE} not 'true'"
+            if _network_and_domain(process) in closed:
+                text = f"{_domain_text(process)}, with {ENABLE} not 'true'"
                 yield PROCESS_UNSECURED.found(process.label, text)
             else:
                 open_nodes.append(process)
@@ -580,12 +580,12 @@ def process_findings(
     yield from _not_seen(running)
 
 
-def _place(process: Process) -> tuple[str, str]:
+def _network_and_domain(process: Process) -> tuple[str, str]:
     """Return the network and the domain of a process; equal results mean neighbours."""
     return process.network, process.environment.get(DOMAIN) or "0"
 
 
-def _where(process: Process) -> str:
+def _domain_text(process: Process) -> str:
     there = " of another network namespace" if process.network else ""
     return f"in domain {process.domain}{there}"
 
@@ -687,18 +687,18 @@ def _not_secured(
     if asks or not _is_open(environment):
         for node in nodes:
             if not node.network:  # the others are named as such, with their security
-                yield NODE_OPEN.found(node.label, f"it runs {_where(node)}")
+                yield NODE_OPEN.found(node.label, f"it runs {_domain_text(node)}")
         return
     if one_by_one:
         for node in nodes:
-            yield NOT_SECURED.found(node.label, f"it runs open {_where(node)}")
+            yield NOT_SECURED.found(node.label, f"it runs open {_domain_text(node)}")
         return
-    running = f"; running without it: {_some(nodes)}" if nodes else ""
+    running = f"; running without it: {_first_nodes(nodes)}" if nodes else ""
     yield NOT_SECURED.found(ENABLE, value_text(environment, ENABLE) + running)
 
 
-def _some(nodes: Sequence[Process]) -> str:
-    return first_few([f"{node.label} {_where(node)}" for node in nodes], _MOST_NODES)
+def _first_nodes(nodes: Sequence[Process]) -> str:
+    return first_few([f"{node.label} {_domain_text(node)}" for node in nodes], _MOST_NODES)
 
 
 # ── next to each other ─────────────────────────────────────────────────────────────────────
@@ -707,7 +707,7 @@ def _some(nodes: Sequence[Process]) -> str:
 def _by_place(processes: Iterable[Process]) -> Mapping[tuple[str, str], list[Process]]:
     found: dict[tuple[str, str], list[Process]] = defaultdict(list)
     for process in processes:
-        found[_place(process)].append(process)
+        found[_network_and_domain(process)].append(process)
     return found
 
 
@@ -753,7 +753,7 @@ def _other_keystores(
             if len(groups) < 2:
                 continue
             (_, largest), *more = sorted(groups, key=lambda pair: -len(pair[1]))
-            main = f"{largest[0].label} {_where(largest[0])} has '{_keystore(largest[0])}'"
+            main = f"{largest[0].label} {_domain_text(largest[0])} has '{_keystore(largest[0])}'"
             others = [group for _, group in more]
         for process in (process for group in others for process in group):
             text = f"it has keystore '{_keystore(process)}', and {main}"

@@ -101,7 +101,7 @@ class FindingFilter:
         if self.strict:
             wanted = [finding._replace(accepted="") for finding in wanted]
         shown = [finding for finding in wanted if self._shows(finding)]
-        shown.sort(key=lambda finding: (-_prominence(finding).weight, *_place(finding)))
+        shown.sort(key=lambda finding: (-_prominence(finding).weight, *_finding_place(finding)))
         hidden = [finding for finding in wanted if not self._shows(finding)]
         accepted = [
             finding for finding in hidden if finding.accepted and finding.kind.severity > NOTE
@@ -113,7 +113,7 @@ def _prominence(finding: Finding) -> Severity:
     return max(finding.severity, WARNING if finding.kind.prominent else NOTE)
 
 
-def _place(finding: Finding) -> tuple[str, int]:
+def _finding_place(finding: Finding) -> tuple[str, int]:
     return finding.file, finding.line or 0
 
 

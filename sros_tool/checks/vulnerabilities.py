@@ -162,7 +162,7 @@ def _library_findings(
             kind = KNOWN_VULNERABILITIES
             if library.packaged:
                 kind = PACKAGE_VULNERABILITIES
-            described = _described(known.known, library.version)
+            described = _counted_vulnerabilities(known.known, library.version)
             if known.unclear:
                 described += f". {_unclear(known.unclear)}"
             if (first := said.setdefault(f"{name}: {described}", place)) != place:
@@ -219,7 +219,7 @@ def _users(
     return users
 
 
-def _described(known: Sequence[Advisory], version: str) -> str:
+def _counted_vulnerabilities(known: Sequence[Advisory], version: str) -> str:
     """Return a clause with the number of vulnerabilities, what they need, and their ids."""
     secured = sum("security" in advisory.needs for advisory in known)
     needs = [f"{len(known) - secured} concern all processes"] if secured < len(known) else []

@@ -280,7 +280,9 @@ def _links(document: ConfigurationDocument) -> Iterator[Finding]:
         for endpoint in endpoints:
             allowed = document.protocols is None or endpoint.protocol in document.protocols
             if not allowed:
-                text = f"{what} has {endpoint.text}, and the protocols are {_listed(document)}"
+                text = (
+                    f"{what} has {endpoint.text}, and the protocols are {_protocols_text(document)}"
+                )
                 yield _finding_at(document, ENDPOINT_REFUSED, f"{what}/endpoints", text)
             elif not endpoint.is_encrypted():
                 default = "" if f"{what}/endpoints" in document.lines else ", by default"
@@ -289,7 +291,7 @@ def _links(document: ConfigurationDocument) -> Iterator[Finding]:
     if not any(endpoint.is_encrypted() for _, endpoints in both for endpoint in endpoints):
         return
     if document.protocols is None or set(document.protocols) - ENCRYPTED:
-        text = f"the protocols are {_listed(document)}"
+        text = f"the protocols are {_protocols_text(document)}"
         yield _finding_at(document, PROTOCOLS_OPEN, f"{_LINK}/protocols", text)
     for endpoint in document.listen:
         if endpoint.is_encrypted() and not endpoint.option("enable_mtls", document.tls.mutual):
@@ -322,7 +324,7 @@ def _router_name_findings(document: ConfigurationDocument) -> Iterator[Finding]:
         yield _finding_at(document, NAME_NOT_VERIFIED, f"{_TLS}/verify_name_on_connect", text)
 
 
-def _listed(document: ConfigurationDocument) -> str:
+def _protocols_text(document: ConfigurationDocument) -> str:
     return "not limited" if document.protocols is None else ", ".join(document.protocols) or "none"
 
 
@@ -383,7 +385,7 @@ def _subjects(document: ConfigurationDocument) -> Iterator[Finding]:
         yield SELF_LIMITING.found(document.mode.value, text, document.name, open_to_all[0].line)
     else:
         for subject in open_to_all:
-            text = f"subject {subject.id} has {_described(subject)}, and rules that allow"
+            text = f"subject {subject.id} has {_described_subject(subject)}, and rules that allow"
             yield EVERYBODY.found(f"subject {subject.id}", text, document.name, subject.line)
     pairs = list(islice(_overlapping(access.subjects), _MOST_PAIRS + 1))
     if pairs:
@@ -412,7 +414,7 @@ def _ids(subjects: Sequence[AclSubject]) -> str:
     return first_few([subject.id for subject in subjects], _FEW)
 
 
-def _described(subject: AclSubject) -> str:
+def _described_subject(subject: AclSubject) -> str:
     stated = [name for name in PROPERTIES if getattr(subject, name) is not None]
     return f"only {' and '.join(stated)}" if stated else "no property"
 
@@ -456,7 +458,7 @@ def _wildcard_past(
                     for allowing in same
                     if allowing.allows
                     for wide in allowing.key_expressions
-                    if _meet(wide, key, limit)
+                    if _values_intersect(wide, key, limit)
                 ]
             for wide, by in passing:
                 if not any(includes(other, wide) for other in denied):
@@ -480,7 +482,7 @@ def _overruled(
                 passing = [
                     key if includes(wide, key) else wide
                     for wide in allowed
-                    if _meet(wide, key, limit)
+                    if _values_intersect(wide, key, limit)
                 ]
             for passed in passing:
                 if not any(includes(wide, passed) for wide in denied):
@@ -496,7 +498,7 @@ def _keys(rules: Iterable[AclRule], *, allows: bool) -> list[str]:
     return [key for rule in rules if rule.allows is allows for key in rule.key_expressions]
 
 
-def _meet(first: str, second: str, limit: ComparisonLimit) -> bool:
+def _values_intersect(first: str, second: str, limit: ComparisonLimit) -> bool:
     limit.spend(len(first) + len(second))
     return intersects(first, second)
 

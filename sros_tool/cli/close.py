@@ -231,7 +231,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
         echo(f"the robot is not proved closed; next: {accept}{again}", err=True)
     elif applies:
         for command, processes in closed.left_by_hand.items():
-            stop = _together(processes)
+            stop = _started_together(processes)
             echo(f"stop {stop}, and start it with:" if stop else "start again with:")
             echo(f"  {command}")
         echo(f"next: these commands, and then sros close {folder} --proof", err=True)
@@ -289,7 +289,7 @@ def _until(closed: Closing) -> str:
     return f", its files are valid until {iso(closed.valid_until)}"
 
 
-def _together(processes: Sequence[ClosedProcess]) -> str:
+def _started_together(processes: Sequence[ClosedProcess]) -> str:
     """Return what is stopped and started by one command: a process, a launch, the containers.
 
     Returns "" if no process runs any more.

@@ -465,9 +465,9 @@ def _show_signed(
         word = "renewed" if outcome == "renewed" else "signed the request of"
         echo(f"{word} enclave {name} for the key {key}", err=stream)
     if answer and not signed.dry_run:
-        echo(f"  the robot will trust {_named(signed.identity_ca)}", err=stream)
+        echo(f"  the robot will trust {_ca_text(signed.identity_ca)}", err=stream)
         if signed.permissions_ca != signed.identity_ca:
-            echo(f"  and {_named(signed.permissions_ca)}", err=stream)
+            echo(f"  and {_ca_text(signed.permissions_ca)}", err=stream)
         if not stream:
             echo(
                 f"  send '{answer}' to the robot: sros import {answer.name} DIR --ca "
@@ -590,9 +590,9 @@ def _imported_lines(done: ImportedEnclave, *, pinned: bool) -> Iterator[str]:
     from sros_tool.validity import iso
 
     yield f"imported enclave {done.name}, which can run until {iso(done.until)}"
-    yield f"  it trusts {_named(done.identity_ca)}"
+    yield f"  it trusts {_ca_text(done.identity_ca)}"
     if done.permissions_ca != done.identity_ca:
-        yield f"  and {_named(done.permissions_ca)}"
+        yield f"  and {_ca_text(done.permissions_ca)}"
     if done.first and not pinned:
         yield (
             "  compare both with the output of sign_request, or use --ca: otherwise they are "
@@ -600,7 +600,7 @@ def _imported_lines(done: ImportedEnclave, *, pinned: bool) -> Iterator[str]:
         )
 
 
-def _named(certificate: x509.Certificate) -> str:
+def _ca_text(certificate: x509.Certificate) -> str:
     from sros_tool.pki.certificates import digest, subject_text
 
     return f"{subject_text(certificate.subject)}, SHA-256 {digest(certificate)}"

@@ -752,7 +752,7 @@ def _groups(compared: ComparedFleet, robots: Sequence[str]) -> list[_Group]:
 
     If ``robots`` are named, each robot is a group of its own.
     """
-    status, places = compared.status, _places(compared.status.names)
+    status, places = compared.status, _robot_positions(compared.status.names)
     alike: dict[tuple[str, ...], list[RobotStatus]] = {}
     current: list[RobotStatus] = []
     whats: dict[str, str] = {}
@@ -849,7 +849,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part or 0), "") if part.isdigit() else (0, part) for part in _DIGITS.split(name)]
 
 
-def _places(robots: Iterable[str]) -> dict[str, int]:
+def _robot_positions(robots: Iterable[str]) -> dict[str, int]:
     """Map the robots of a fleet to their positions, r2 before r10."""
     return {name: place for place, name in enumerate(sorted(robots, key=_natural))}
 
@@ -864,7 +864,7 @@ def _robot_names(
 
     Many neighbors in the fleet, with names that differ in a number, become "r4 to r50".
     """
-    places, left, words = _places(everybody), set(names), []
+    places, left, words = _robot_positions(everybody), set(names), []
     number = len(left)
     for group, members in sorted(groups.items(), key=lambda item: -len(item[1])):
         if len(members) > _MOST_GROUPS and left.issuperset(members):

@@ -207,19 +207,19 @@ def _authority(role: str, authority: AuthorityFile | UnreadableFile) -> Iterator
     first = authority.file.first
     key = "key here" if authority.key_present else "key elsewhere"
     yield (
-        f"  {role} CA {_named(first.subject, first.sha256)}, {first.key}, {key}, "
+        f"  {role} CA {_authority_name(first.subject, first.sha256)}, {first.key}, {key}, "
         f"valid until {iso(first.not_after)}"
     )
     for other in authority.file.further or ():
         yield (
-            f"    next to it {_named(other.subject, other.sha256)}, {other.key}, "
+            f"    next to it {_authority_name(other.subject, other.sha256)}, {other.key}, "
             f"valid until {iso(other.not_after)}, serial {other.serial}"
         )
     if crl := authority.file.crl:
         yield f"    {_list(crl)}"
 
 
-def _named(subject: str | None, sha256: str | None) -> str:
+def _authority_name(subject: str | None, sha256: str | None) -> str:
     """Return the subject of a CA with the first digits of its SHA-256, as `authority_text` does."""
     return f"{subject} (SHA-256 {sha256[:8]})" if sha256 else str(subject)
 
@@ -241,8 +241,8 @@ def _enclave(enclave: DescribedEnclave) -> Iterator[str]:
         yield f"  {problem}"
     yield f"  expires {_moment(facts.expires)} (the first of its files)"
     yield f"  subject {facts.subject}, certificate until {_moment(facts.valid_until)}"
-    identity = _named(facts.identity_ca, facts.identity_ca_sha256)
-    permissions = _named(facts.permissions_ca, facts.permissions_ca_sha256)
+    identity = _authority_name(facts.identity_ca, facts.identity_ca_sha256)
+    permissions = _authority_name(facts.permissions_ca, facts.permissions_ca_sha256)
     yield f"  identity CA {identity}, permissions CA {permissions}"
     yield f"  domains {facts.domains}"
     if facts.token:
@@ -372,7 +372,7 @@ def _signature(signature: SignatureFacts) -> Iterator[str]:
         return
     verified = {True: "signature verified", False: "SIGNATURE NOT VERIFIED", None: "not verified"}
     yield (
-        f"signed by {_named(signer.signer, signer.signer_sha256)}, {signer.digest}, "
+        f"signed by {_authority_name(signer.signer, signer.signer_sha256)}, {signer.digest}, "
         f"{signer.bytes} bytes: {verified[signature.signature_verified]}"
     )
     if signer.signature_problem:

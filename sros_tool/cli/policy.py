@@ -706,7 +706,7 @@ def _show_new_access(
 def added_lines(head: AccessSource, growth: Growth) -> list[str]:
     """Return the added access as lines that begin with "+"."""
     return [
-        *_folded(head, "+", growth.added, growth),
+        *_folded_gains(head, "+", growth.added, growth),
         *(f"+ less protection: {change}" for change in growth.lost),
         *_reach_lines(head, growth.reach),
     ]
@@ -717,10 +717,12 @@ def _removed_lines(base: AccessSource, growth: Growth) -> list[str]:
         f"- more protection: {change.key} {change.after} -> {change.before}"
         for change in growth.gained
     )
-    return [*_folded(base, "-", growth.removed, growth), *more]
+    return [*_folded_gains(base, "-", growth.removed, growth), *more]
 
 
-def _folded(side: AccessSource, sign: str, gains: Iterable[Gain], growth: Growth) -> list[str]:
+def _folded_gains(
+    side: AccessSource, sign: str, gains: Iterable[Gain], growth: Growth
+) -> list[str]:
     from sros_tool.fleet.robots import folded
 
     lines = [(gain.enclaves[0], f"{sign} {_gain_text(sign, gain, growth)}") for gain in gains]

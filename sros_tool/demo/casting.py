@@ -207,7 +207,7 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime
         )
     service = _service(rights, cast) if "server" in cast else ""
     attacked = chosen.removeprefix("rt")
-    widest = dict(_widest(rights, cast, attacked, service))
+    widest = dict(_widest_enclaves(rights, cast, attacked, service))
     cast |= {part: enclave for part, (enclave, _) in widest.items()}
     return UserKeystore(
         root=root,
@@ -374,7 +374,7 @@ def _best_cast(
         )
         if guests:
             cast["guest"] = guests[0]
-        nested = [(g, a) for g, a in permutations(rights, 2) if _within(g, a)]
+        nested = [(g, a) for g, a in permutations(rights, 2) if _is_below(g, a)]
         lent = next(((g, a) for g, a in nested if a in talkers and g not in talkers), None)
         if lent and not set(lent) & set(pair):
             cast["guest"], cast["admin"] = lent
@@ -439,7 +439,7 @@ def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     return SERVICE
 
 
-def _widest(
+def _widest_enclaves(
     rights: Mapping[str, Grant], cast: Mapping[str, str], topic: str, service: str
 ) -> Iterator[tuple[str, tuple[str, str]]]:
     """Yield part, enclave and reason for the enclaves with the widest permissions.
@@ -492,7 +492,7 @@ def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     return next((t for t in own if allows(rights[cast["listener"]], "subscribe", t)), "")
 
 
-def _within(short: str, long: str) -> bool:
+def _is_below(short: str, long: str) -> bool:
     """Return whether the path ``long`` is below the path ``short``."""
     return set(short.strip("/").split("/")) < set(long.strip("/").split("/"))
 

@@ -589,20 +589,20 @@ def open_default(template: Template) -> Template:
 
 def unprotected(template: Template) -> Template:
     """Return the template with access control on and message protection off."""
-    return _protected(template, Level.NONE)
+    return _with_protection(template, Level.NONE)
 
 
 def signed(template: Template) -> Template:
     """Return the template changed to access control and signed, unencrypted messages."""
-    return _protected(template, Level.SIGN)
+    return _with_protection(template, Level.SIGN)
 
 
 def encrypted(template: Template) -> Template:
     """Return the template changed to access control and encrypted messages."""
-    return _protected(template, Level.ENCRYPT)
+    return _with_protection(template, Level.ENCRYPT)
 
 
-def _protected(template: Template, level: Level) -> Template:
+def _with_protection(template: Template, level: Level) -> Template:
     """Return the template changed to the same protection level for all topics.
 
     A payload is signed as part of its submessage: Fast DDS loses messages with a signed payload

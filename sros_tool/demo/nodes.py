@@ -271,13 +271,13 @@ class OtherTypes:
         self._due = moment + self._period
         if (seen := Counter(self._types())) != self._seen:
             self._seen = seen
-            self._events.report(EventKind.SEEN, "; ".join(map(self._described, sorted(seen))))
+            self._events.report(EventKind.SEEN, "; ".join(map(self._kind_text, sorted(seen))))
         for kind in [kind for kind, number in self._heard.items() if number]:
             text = f"{counted(number := self._heard[kind], 'message')} of {kind}"
             self._heard[kind] -= number
             self._events.report(EventKind.HEARD, text, count=number)
 
-    def _described(self, kind: str) -> str:
+    def _kind_text(self, kind: str) -> str:
         what = "publisher" if self._count else "subscription"
         text = f"{self._topic} has {counted(self._seen[kind], what)} of {kind}"
         if kind == self._own:

@@ -226,7 +226,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             )
             row_results = run_isolated(partial(run_rows, plan), isolation, progress)
             if zenoh:
-                results += _parted(scenarios, row_results)
+                results += _scenario_results(scenarios, row_results)
                 continue
             cast = keystores.members(scenario.rows, on_ros=backend.name == RCLPY) if user else ()
             summary = (
@@ -266,7 +266,9 @@ def _result_of(
     return ScenarioResult(scenario.name, scenario.title, rows, cast, attacked)
 
 
-def _parted(scenarios: Sequence[Scenario], rows: Sequence[RowResult]) -> Iterator[ScenarioResult]:
+def _scenario_results(
+    scenarios: Sequence[Scenario], rows: Sequence[RowResult]
+) -> Iterator[ScenarioResult]:
     """Yield the result of each scenario in order, with its part of the rows of all scenarios."""
     left = iter(rows)
     for scenario in scenarios:

@@ -156,7 +156,7 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
             f"A node can {word} {' or '.join(map(_a, fitting))}, and {others} {_a(chosen)}.",
             f"Leave --type out, or write --type {fitting[0]}.",
         )
-    return Question(word, chosen, _RIGHTS[word, chosen], _checked(name, word, chosen))
+    return Question(word, chosen, _RIGHTS[word, chosen], _checked_name(name, word, chosen))
 
 
 _OF_ACTIONS = {"call": "call", "serve": "execute"}
@@ -176,7 +176,7 @@ def about_action(question: Question, rights: Iterable[Right]) -> Question | None
     return ask(_OF_ACTIONS[question.word], question.name, "action")
 
 
-def _checked(name: str, word: str, kind: str) -> str:
+def _checked_name(name: str, word: str, kind: str) -> str:
     """Return the name; raise UsageError if no node can use it."""
     if not name:
         raise UsageError(f"{word} needs the name of {_a(kind)}", "", f"Write `{word} /NAME`.")
@@ -619,15 +619,15 @@ class Evaluator:
         access = self.access
         own: list[tuple[Part | None, Decision]] = [(None, self._participant.join())]
         if access is None:
-            return self._made(question, own)
+            return self._combined_answer(question, own)
         if own[0][1].outcome not in (Outcome.REFUSED, Outcome.CRASHES):
             own += [(part, access.decide(part.verb, part.topic)) for part in _OWN_PARTS]
         asked = tuple(
             DecidedPart(part, access.decide(part.verb, part.topic)) for part in question.parts
         )
-        return self._made(question, own, asked)
+        return self._combined_answer(question, own, asked)
 
-    def _made(
+    def _combined_answer(
         self,
         question: Question,
         own: Sequence[tuple[Part | None, Decision]],

@@ -351,7 +351,7 @@ class Audit:
     @cached_property
     def missing(self) -> Learned:
         """The rights to add to the policy; rights that a deny rule denies are not included."""
-        learned = learn(_used(self.denied, self.observation))
+        learned = learn(_nodes_using_denied(self.denied, self.observation))
         return replace(learned, source=RightsFound.AUDIT)
 
 
@@ -580,7 +580,7 @@ def _by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
     return tuple(by_right[right] for right in sorted(by_right, key=order))
 
 
-def _used(denied: Iterable[DeniedRight], observation: Observation) -> Observation:
+def _nodes_using_denied(denied: Iterable[DeniedRight], observation: Observation) -> Observation:
     """Return the nodes with the endpoints of denied rights, unless a deny rule denies a right."""
     wanted: dict[tuple[str, str], set[Endpoint]] = {}
     for right in denied:

@@ -351,14 +351,14 @@ def _by_place(
     found: dict[tuple[str, str], set[NodeRight]] = {}
     (only,) = present if len(present) == 1 else (None,)
     (one,) = own if len(own) == 1 else (None,)
-    rest = only or (_place(one, present) if one and not present else _ANY_NODE)
+    rest = only or (_profile_of_node(one, present) if one and not present else _ANY_NODE)
     for right in rights:
         served = nodes_served([(right.right, right.name)])
-        found.setdefault(_place(served[0], present) if served else rest, set()).add(right)
+        found.setdefault(_profile_of_node(served[0], present) if served else rest, set()).add(right)
     return {place: frozenset(node_rights) for place, node_rights in found.items()}
 
 
-def _place(fqn: str, present: Iterable[tuple[str, str]]) -> tuple[str, str]:
+def _profile_of_node(fqn: str, present: Iterable[tuple[str, str]]) -> tuple[str, str]:
     """Return namespace and name of the profile for the node ``fqn``, perhaps with wildcards."""
     ns, _, name = fqn.rpartition("/")
     return next((each for each in present if covers(_fqn(each), fqn)), (ns or "/", name))

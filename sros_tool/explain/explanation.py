@@ -74,7 +74,7 @@ def explain(evaluator: Evaluator, question: Question) -> Answer:
     )
     if answer.allowed:
         return answer
-    if not answer.problems and (changed := _changed(evaluator, answer)):
+    if not answer.problems and (changed := _with_policy_change(evaluator, answer)):
         return changed
     faulty = (problem.file for problem in answer.problems if problem.fault.id == answer.reason)
     text = remedy(answer.reason, str(enclave.root or ""), enclave.name, next(faulty, ""))
@@ -112,7 +112,7 @@ def _states_policy(enclave: LoadedEnclave) -> bool:
     return False
 
 
-def _changed(evaluator: Evaluator, answer: Answer) -> Answer | None:
+def _with_policy_change(evaluator: Evaluator, answer: Answer) -> Answer | None:
     """Return the answer with the change of the policy that would allow the access, or None."""
 
     change = _smallest_change(evaluator, answer)
@@ -187,24 +187,24 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
     keystore = Path(root) if root and Path(root).is_dir() else None
     if keystore and not has_authorities(keystore):
         if "`" not in text or fault is Fault.GOVERNANCE_DOMAIN:
-            return _filled(text, root, enclave, file)
+            return _filled_remedy(text, root, enclave, file)
         if fault:
-            return _filled(fault.remedy_in_export(file), "KEYSTORE", enclave, file)
-        return in_original_keystore(_filled(text, "KEYSTORE", enclave, file))
+            return _filled_remedy(fault.remedy_in_export(file), "KEYSTORE", enclave, file)
+        return in_original_keystore(_filled_remedy(text, "KEYSTORE", enclave, file))
     if keystore and fault:
         wrong_issuer = fault is Fault.CERTIFICATE_ISSUER
         if wrong_issuer and _is_own_copy(keystore, enclave, IDENTITY_CA_FILE):
-            return _filled(REPLACE, root, enclave, IDENTITY_CA_FILE)
+            return _filled_remedy(REPLACE, root, enclave, IDENTITY_CA_FILE)
         if (wrong_issuer or fault is Fault.CA_EXPIRED) and _is_rotating(keystore):
             text = _ROTATION
         elif fault in _OF_VALIDITY and not _is_latest(keystore, enclave):
             text = _RIGHTS
         elif fault not in _NOT_IN_THE_FILE and _is_own_copy(keystore, enclave, file):
             text = REPLACE
-    return _filled(text, root or "KEYSTORE", enclave, file)
+    return _filled_remedy(text, root or "KEYSTORE", enclave, file)
 
 
-def _filled(text: str, root: str, enclave: str, file: str) -> str:
+def _filled_remedy(text: str, root: str, enclave: str, file: str) -> str:
     path = enclave_path(Path(root), enclave) / (file or "cert.pem")
     # Quoted, so that text copied into a shell cannot become another command.
     return text.format(root=quote(root), enclave=quote(enclave), path=quote(str(path)))
@@ -271,7 +271,7 @@ def _smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | Non
             return PolicyChange(
                 tuple(add),
                 tuple(lift),
-                _addition(add[0], _places(enclave.policy, answer)) if add else "",
+                _addition(add[0], _node_names(enclave.policy, answer)) if add else "",
                 tuple(_edits(lift, enclave.policy)) if enclave.policy else (),
             )
         if tried.reason in _NO_RULE and wanted not in present:
@@ -344,7 +344,7 @@ def _addition(right: Right, places: Iterable[tuple[str, str]]) -> str:
     return write_policy(Policy((enclave,))).decode().rstrip()
 
 
-def _places(policy: Enclave | None, answer: Answer) -> Iterator[tuple[str, str]]:
+def _node_names(policy: Enclave | None, answer: Answer) -> Iterator[tuple[str, str]]:
     """Yield namespace and name of an enclave's nodes.
 
     Without a policy, these are the nodes whose standard services the permissions allow.

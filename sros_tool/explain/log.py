@@ -251,7 +251,7 @@ def explain_log(
     naming = _lines_naming(lines, {denial.topic for denial in denied})
     denials = [(denial, naming[denial.process, denial.topic]) for denial in denied]
     reported = {denial.process for denial in denied}
-    hits = _strongest(_hits(_joined(lines)), reported)
+    hits = _strongest(_hits(_joined_lines(lines)), reported)
     findings = [examiner.message(group) for group in _grouped(hits) if examiner.matters(group[0])]
     findings += [examiner.denial(denial, named) for denial, named in denials]
     findings += _dropped(lines, root)
@@ -289,7 +289,7 @@ class _Hit:
         return _NUMBERS.sub("", plain_refusal(self.text))
 
 
-def _joined(lines: list[str]) -> Iterator[tuple[int, str]]:
+def _joined_lines(lines: list[str]) -> Iterator[tuple[int, str]]:
     """Yield lines with their numbers; an error stack of OpenSSL is joined to the line before."""
     number, current = 0, ""
     for index, line in enumerate(lines, 1):
@@ -653,7 +653,7 @@ class _Examiner:
         node, nodes = serving_node(denial), _served(answer)
         if node and not any(covers(each, node) for each in nodes):
             enclaves = self._keystore.enclaves_for(node) if self._keystore else ()
-            this = f"the permissions are for {_listed(nodes)}, and " if nodes else ""
+            this = f"the permissions are for {_listed_nodes(nodes)}, and " if nodes else ""
             if enclaves:
                 return [f"{this}this is the node {node}, for which there is {_or(enclaves)}"], (
                     f"Start it in the enclave that is for it: `sros run {quote(self._root)} "
@@ -765,7 +765,7 @@ def _nodes(answer: Answer) -> tuple[str, ...]:
     """Return a clause on the nodes that an enclave's permissions name, in a tuple; or ()."""
     nodes = _served(answer)
     if nodes:
-        return (f"its permissions are for {_listed(nodes)}",)
+        return (f"its permissions are for {_listed_nodes(nodes)}",)
     return (f"its permissions lack {_EVERY_NODE}",)
 
 
@@ -787,7 +787,7 @@ def _or(enclaves: Sequence[str]) -> str:
     return f"the enclave{'s' * (len(enclaves) > 1)} {' and '.join(enclaves)}"
 
 
-def _listed(nodes: Sequence[str]) -> str:
+def _listed_nodes(nodes: Sequence[str]) -> str:
     return f"the node{'s' * (len(nodes) > 1)} {', '.join(nodes)}"
 
 

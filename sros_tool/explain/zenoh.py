@@ -202,12 +202,12 @@ class ZenohAnswer:
     @property
     def dropped(self) -> Check | None:
         """The check that drops a message, or None; if several do, one on data."""
-        return _first((check for check in self.checks if not check.allowed), self.enclave)
+        return _check_to_report((check for check in self.checks if not check.allowed), self.enclave)
 
     @property
     def deciding(self) -> Check | None:
         """The check whose rule decides the answer; None if nothing was checked."""
-        return self.dropped or _first(self.checks, self.enclave)
+        return self.dropped or _check_to_report(self.checks, self.enclave)
 
     @property
     def links(self) -> tuple[CheckedLink, ...]:
@@ -349,17 +349,19 @@ class ZenohEvaluator:
         if router.process is None:
             text = f"no link to the router {router.enclave}: {router.problem}"
             return replace(answer, text=text)
-        if not _meet(own.endpoints, router.endpoints):
-            text = f"no link to the router: {own.file} connects to {_listed(own.endpoints)}, and "
-            text += f"{ROUTER_FILE} listens at {_listed(router.endpoints)}"
+        if not _addresses_meet(own.endpoints, router.endpoints):
+            text = (
+                f"no link to the router: {own.file} connects to {_places_text(own.endpoints)}, and "
+            )
+            text += f"{ROUTER_FILE} listens at {_places_text(router.endpoints)}"
             return replace(answer, text=text)
         wanted = self._rights(enclave, question)
-        checks = self._deciding(own.process, router.process, wanted, brief=brief)
+        checks = self._deciding_checks(own.process, router.process, wanted, brief=brief)
         answer = replace(answer, checks=checks)
         text = self._why(answer.deciding)
         if answer.dropped:
             return replace(answer, outcome=_Outcome.DROPPED, text=text)
-        reached = tuple(self._reached(own, wanted)) if reach else ()
+        reached = tuple(self._reached_enclaves(own, wanted)) if reach else ()
         return replace(
             answer,
             outcome=_Outcome.ALLOWED,
@@ -382,11 +384,13 @@ class ZenohEvaluator:
             begun = self._rendered.beginning(self.keystore.read(path, "Zenoh configuration"))
         except SrosError:
             return None
-        if begun is None or not _meet(tuple(map(ZenohEndpoint, begun.connect)), router.endpoints):
+        if begun is None or not _addresses_meet(
+            tuple(map(ZenohEndpoint, begun.connect)), router.endpoints
+        ):
             return None
         session = _unrestricted(enclave, begun.mode)
-        checks = tuple(self._decided(session, router.process, self._rights(enclave, question)))
-        dropping = _first((check for check in checks if not check.allowed), enclave)
+        checks = tuple(self._link_checks(session, router.process, self._rights(enclave, question)))
+        dropping = _check_to_report((check for check in checks if not check.allowed), enclave)
         if dropping is None or dropping.message not in _DATA:
             return None
         outcome, text = _Outcome.DROPPED, self._why(dropping)
@@ -576,7 +580,7 @@ class ZenohEvaluator:
     ) -> tuple[Delivery, ...]:
         return tuple(self._delivery((own, other), right) for right in wanted)
 
-    def _deciding(
+    def _deciding_checks(
         self, own: ZenohProcess, router: ZenohProcess, wanted: Sequence[Right], *, brief: bool
     ) -> tuple[Check, ...]:
         """Return the checks that decide on the rights of an enclave.
@@ -584,18 +588,18 @@ class ZenohEvaluator:
         These are the checks on its link with the router.  If the router denies a right in peer
         mode, they are the checks on its link with the first peer that allows the right.
         """
-        checks = tuple(self._decided(own, router, wanted))
+        checks = tuple(self._link_checks(own, router, wanted))
         if own.mode is not Mode.PEER or brief or all(each.allowed for each in checks):
             return checks
         for name in self.names:
             if name == own.name or name in self.routers:
                 continue
             # What the session itself lets through comes first: it needs no other file.
-            alone = self._decided(own, _unrestricted(name, Mode.PEER), wanted)
+            alone = self._link_checks(own, _unrestricted(name, Mode.PEER), wanted)
             if all(each.allowed for each in alone):
                 other = self._file(name, SESSION_FILE).process
                 if other and other.mode is Mode.PEER:
-                    direct = tuple(self._decided(own, other, wanted))
+                    direct = tuple(self._link_checks(own, other, wanted))
                     if all(each.allowed for each in direct):
                         return direct
         return checks
@@ -604,7 +608,7 @@ class ZenohEvaluator:
         """Return the rights that a question asks for; () for the question whether it may join."""
         return parts(Right(enclave, ALLOW, question.right, question.name)) if question.right else ()
 
-    def _decided(
+    def _link_checks(
         self, own: ZenohProcess, other: ZenohProcess, wanted: Sequence[Right]
     ) -> Iterator[Check]:
         """Yield the checks by which both ends of a link decide on rights, or on joining."""
@@ -642,7 +646,7 @@ class ZenohEvaluator:
         )
         return token((own, other), node, everything), token((other, own), everything, everything)
 
-    def _reached(self, own: ZenohFile, wanted: Sequence[Right]) -> Iterator[Reached]:
+    def _reached_enclaves(self, own: ZenohFile, wanted: Sequence[Right]) -> Iterator[Reached]:
         """Yield the enclaves that have the right at the other end."""
         for name in self.names if wanted else ():
             if name == own.enclave or name in self.routers:
@@ -710,14 +714,14 @@ _DATA = (Message.PUT, Message.QUERY, Message.LIVELINESS_TOKEN)
 """The messages that transport data or announce a node; other messages only prepare for them."""
 
 
-def _first(checks: Iterable[Check], enclave: str) -> Check | None:
+def _check_to_report(checks: Iterable[Check], enclave: str) -> Check | None:
     """Return the check to report: on data before others, of other enclaves before ``enclave``."""
     return min(
         checks, key=lambda each: (each.message not in _DATA, each.enforcer == enclave), default=None
     )
 
 
-def _meet(connect: Sequence[ZenohEndpoint], listen: Sequence[ZenohEndpoint]) -> bool:
+def _addresses_meet(connect: Sequence[ZenohEndpoint], listen: Sequence[ZenohEndpoint]) -> bool:
     """Return whether a process may connect to an address at which another process listens.
 
     Only ports and protocols are compared: a host can have several names.
@@ -728,7 +732,7 @@ def _meet(connect: Sequence[ZenohEndpoint], listen: Sequence[ZenohEndpoint]) -> 
     )
 
 
-def _listed(endpoints: Sequence[ZenohEndpoint]) -> str:
+def _places_text(endpoints: Sequence[ZenohEndpoint]) -> str:
     return ", ".join(endpoint.text for endpoint in endpoints[:3]) or "nothing"
 
 

@@ -125,7 +125,9 @@ class Fleet:
         """
         if name in self.robots:
             return self.robots[name]
-        raise DocumentError(f"the fleet has no robot {name!r}", remedy=_near(name, self.robots))
+        raise DocumentError(
+            f"the fleet has no robot {name!r}", remedy=_similar_names_remedy(name, self.robots)
+        )
 
     def members(self, group: str) -> tuple[Robot, ...]:
         """Return the robots of a group; "" stands for the whole fleet.
@@ -137,7 +139,8 @@ class Fleet:
             return tuple(self.robots.values())
         if group not in self.groups:
             raise DocumentError(
-                f"the fleet has no group {group!r}", remedy=_near(group, self.groups)
+                f"the fleet has no group {group!r}",
+                remedy=_similar_names_remedy(group, self.groups),
             )
         return tuple(self.robots[name] for name in self.groups[group])
 
@@ -150,7 +153,7 @@ class Fleet:
         return replace(self, enclaves=tuple(dict.fromkeys((*enclaves, *of_routers))))
 
 
-def _near(name: str, known: Iterable[str]) -> str:
+def _similar_names_remedy(name: str, known: Iterable[str]) -> str:
     """Return the remedy for an unknown name: similar known names, or else the first ones."""
     names = list(known)
     similar = get_close_matches(name[:_MAX_NAME], names, n=3, cutoff=0.5) or names[:3]

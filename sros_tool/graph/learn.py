@@ -622,11 +622,11 @@ def _enclave_name(nodes: Sequence[ObservedNode]) -> str:
 
     It is the full name of the main node, without the part that changes with every start.
     """
-    main = min(nodes, key=_rank)
+    main = min(nodes, key=_enclave_rank)
     return replace(main, name=stable_name(main.name).rstrip("_*") or main.name).fqn
 
 
-def _rank(node: ObservedNode) -> tuple[bool, bool, int, str]:
+def _enclave_rank(node: ObservedNode) -> tuple[bool, bool, int, str]:
     """Return the sort key of a node: a process's enclave is named after the lowest node."""
     (reply,) = dds_names("reply", expand(_CONTAINER, node.ns, node.name)).publish
     is_container = Endpoint(reply, PUBLISH) in node.endpoints
@@ -779,7 +779,7 @@ def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
     merged = merge_into(path, additions)
     document, included = merged.document, tuple[str, ...]()
     if common and document != before:
-        by_name, shown = _parted(path, before, merged.document, learned, common)
+        by_name, shown = _rights_and_profiles(path, before, merged.document, learned, common)
         document = merge_into(path, by_name.policy()).document
         document, included = _with_includes(path, before, document, shown)
     least = policy_rights(read_policy(path, merged.document))
@@ -795,7 +795,7 @@ def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
     )
 
 
-def _parted(
+def _rights_and_profiles(
     path: Path, before: bytes, merged: bytes, learned: Learned, common: CommonParts
 ) -> tuple[Learned, list[LearnedProfile]]:
     """Return the rights to write name by name, and the profiles to write with includes.

@@ -119,8 +119,8 @@ def compare_governance(old: Governance, new: Governance) -> tuple[SettingChange,
 def _governance_changes(old: Governance, new: Governance) -> Iterator[SettingChange]:
     before, after = old.domains().closed(), new.domains().closed()
     for effect, domains, meaning in (
-        (Effect.LOOSER, _without(after, before), "enclaves may also join domain {}"),
-        (Effect.TIGHTER, _without(before, after), "no enclave may join domain {} any more"),
+        (Effect.LOOSER, _domains_without(after, before), "enclaves may also join domain {}"),
+        (Effect.TIGHTER, _domains_without(before, after), "no enclave may join domain {} any more"),
     ):
         if domains.ranges:
             yield SettingChange(effect, "domain", str(before), str(after), meaning.format(domains))
@@ -140,7 +140,7 @@ def _governance_changes(old: Governance, new: Governance) -> Iterator[SettingCha
                 yield SettingChange(Effect.TIGHTER, key, "a rule", "no rule", text)
 
 
-def _without(domains: DomainSet, removed: DomainSet) -> DomainSet:
+def _domains_without(domains: DomainSet, removed: DomainSet) -> DomainSet:
     return DomainSet.of(*((domain, domain) for domain in domains if domain not in removed))
 
 
@@ -163,14 +163,14 @@ def _topic_pairs(
         # Which of the two decides depends on their order, so ask for a topic of both.
         if parted and (name := common_name((one, other), absolute=False)):
             expressions.append(name)
-    before_of, after_of = _deciding(old), _deciding(new)
+    before_of, after_of = _first_covering_rule(old), _first_covering_rule(new)
     for expression in expressions:
         before, after = before_of(expression), after_of(expression)
         if (before is None) != (after is None) or (before and after and not _equal(before, after)):
             yield expression, before, after
 
 
-def _deciding(domain: DomainRule) -> Callable[[str], TopicRule | None]:
+def _first_covering_rule(domain: DomainRule) -> Callable[[str], TopicRule | None]:
     """Return a function that returns the first rule that covers a topic expression, or None."""
     numbered = list(enumerate(domain.topic_access_rules))
     own = {rule.topic_expression: (number, rule) for number, rule in reversed(numbered)}
@@ -308,7 +308,7 @@ def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[S
     ):
         before, after = getattr(old, name), getattr(new, name)
         if before != after:
-            longer = _end(after, now) > _end(before, now)
+            longer = _expiry_of_span(after, now) > _expiry_of_span(before, now)
             effect = Effect.LOOSER if longer else Effect.TIGHTER
             meaning = f"{what} expire {'later' if longer else 'earlier'}"
             yield SettingChange(effect, key, span_text(before), span_text(after), meaning)
@@ -426,7 +426,7 @@ def _choice_text(key: str, value: bool | str) -> str:
     return str(value).lower() if isinstance(value, bool) else value
 
 
-def _end(span: Span, now: datetime) -> datetime:
+def _expiry_of_span(span: Span, now: datetime) -> datetime:
     try:
         return window(now, span).not_after
     except UsageError:  # a fixed date that is over

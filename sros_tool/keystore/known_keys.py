@@ -94,7 +94,7 @@ class KnownKeys:
         known = serials if indexed else ()  # the ledger has them
         for path in revoked_certificates(self._keystore.root, known):
             try:
-                descriptions.update([_described(self._keystore.certificate(path))])
+                descriptions.update([_key_and_description(self._keystore.certificate(path))])
             except SrosError:
                 if path.parent.name not in serials:
                     raise
@@ -181,7 +181,7 @@ class KnownKeys:
         """
         revoked = self._revoked.get(key_digest(key))
         if certificate and certificate.serial_number in self._revoked_serials:
-            revoked = _described(certificate)[1]
+            revoked = _key_and_description(certificate)[1]
         if revoked:
             raise KeystoreError(
                 f"the key of {whose} was revoked", f"It is the key of {revoked}.", remedy
@@ -189,7 +189,7 @@ class KnownKeys:
 
     def refuse_second(self, key: PublicKey, name: str, remedy: str) -> None:
         """Raise `KeystoreError` if another enclave than ``name`` has ``key``."""
-        if others := self._others(key, name):
+        if others := self._other_enclaves(key, name):
             raise KeystoreError(
                 f"the key for enclave {name} is the key of enclave {others[0]}",
                 "Two enclaves with one key are one identity: each can act as the other.",
@@ -223,7 +223,7 @@ class KnownKeys:
                     "act as the others. Renew it with a new key.",
                 )
 
-    def _others(self, key: PublicKey, name: str) -> list[str]:
+    def _other_enclaves(self, key: PublicKey, name: str) -> list[str]:
         return [enclave for enclave in self._holders(key_digest(key)) if enclave != name]
 
     def _holders(self, key: str) -> Sequence[str]:
@@ -241,7 +241,7 @@ class KnownKeys:
         return [name for name in sorted(recorded) if key in _digests(self._keystore, name)]
 
 
-def _described(certificate: x509.Certificate) -> tuple[str, str]:
+def _key_and_description(certificate: x509.Certificate) -> tuple[str, str]:
     """Return the digest of a certificate's key, and a description of the certificate."""
     subject = subject_text(certificate.subject)
     return _digest_of(certificate), f"certificate {certificate.serial_number:x} of {subject}"

@@ -345,7 +345,7 @@ class LedgerFile:
         if index is None or (many and self.is_complete):
             return self.ledger()
         terms = [(name, value) for value in values]
-        return self._compared(_EVERY, terms).ledger
+        return self._reading_with(_EVERY, terms).ledger
 
     def next_number(self) -> int:
         """Return the number for a new answer, as `Ledger.next_number`."""
@@ -432,15 +432,15 @@ class LedgerFile:
         ``terms`` are the field values by which the index finds these lines; None if it cannot.
         """
         if having not in self._readings:
-            self._readings[having] = self._compared(having, terms)
+            self._readings[having] = self._reading_with(having, terms)
         return self._readings[having]
 
-    def _compared(self, having: bytes, terms: _Terms | None) -> _Reading:
+    def _reading_with(self, having: bytes, terms: _Terms | None) -> _Reading:
         while True:
             known = self._files
             files = known or self._read()
             try:
-                found = self._found(files, terms)
+                found = self._indexed_lines(files, terms)
             except IndexDamagedError:
                 if self._restored():
                     continue
@@ -511,7 +511,7 @@ class LedgerFile:
         file.seek(0)
         return index if ends_so else None
 
-    def _found(self, files: _Files, terms: _Terms | None) -> _Lines | None:
+    def _indexed_lines(self, files: _Files, terms: _Terms | None) -> _Lines | None:
         """Return the lines that the index finds; None if it is not there or finds none of them.
 
         Raises:

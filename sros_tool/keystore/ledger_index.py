@@ -123,7 +123,7 @@ def _bucket_of(term: bytes) -> int:
     return int.from_bytes(term[:2], "big") % _BUCKETS
 
 
-def _joined(names: Iterable[str]) -> bytes:
+def _joined_terms(names: Iterable[str]) -> bytes:
     return "\n".join(sorted(names)).encode("utf-8", "surrogatepass")
 
 
@@ -212,7 +212,7 @@ class LedgerIndex:
             IndexDamagedError: they are not what they were when the head was signed.
         """
         there = dict(self._rows("SELECT bucket, names FROM buckets"))
-        buckets = [self._checked(there.get(i, b""), 2 * i) for i in range(_BUCKETS)]
+        buckets = [self._checked_bucket(there.get(i, b""), 2 * i) for i in range(_BUCKETS)]
         if not parts:
             return _split(b"\n".join(filter(None, buckets)))
         texts = [part.encode("utf-8", "surrogatepass") for part in parts]
@@ -226,12 +226,12 @@ class LedgerIndex:
             IndexDamagedError: it is not what it was when the head was signed.
         """
         rows = self._rows("SELECT names FROM buckets WHERE bucket = ?", bucket)
-        names = self._checked(rows[0][0] if rows else b"", 2 * bucket)
+        names = self._checked_bucket(rows[0][0] if rows else b"", 2 * bucket)
         return names, self._postings_in(bucket)
 
     def _postings_in(self, bucket: int) -> bytes:
         rows = self._rows("SELECT postings FROM buckets WHERE bucket = ?", bucket)
-        return self._checked(rows[0][0] if rows else b"", 2 * bucket + 1)
+        return self._checked_bucket(rows[0][0] if rows else b"", 2 * bucket + 1)
 
     def _rows(self, query: str, *values: int) -> list[tuple[Any, ...]]:
         try:
@@ -239,7 +239,7 @@ class LedgerIndex:
         except (OSError, sqlite3.Error, ValueError, SrosError) as error:
             raise IndexDamagedError(f"'{self._path}' cannot be read") from error
 
-    def _checked(self, data: Any, number: int) -> bytes:
+    def _checked_bucket(self, data: Any, number: int) -> bytes:
         """Return the content of the bucket ``number``, if its digest is as recorded."""
         digest = self._digests[number * _DIGEST : (number + 1) * _DIGEST]
         if type(data) is not bytes or hashlib.sha256(data).digest() != digest:
@@ -309,7 +309,7 @@ class IndexUpdate:
             before, postings = self._base.bucket(bucket) if self._base else (b"", b"")
             left = {name for name in _split(before) if names.get(name, True)}
             left.update(name for name, is_there in names.items() if is_there)
-            parts = _joined(left), postings + self._added.pop(bucket)
+            parts = _joined_terms(left), postings + self._added.pop(bucket)
             self._buckets[bucket] = parts
             digest = b"".join(hashlib.sha256(part).digest() for part in parts)
             digests[bucket * len(_EMPTY) : (bucket + 1) * len(_EMPTY)] = digest

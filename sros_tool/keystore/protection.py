@@ -110,7 +110,7 @@ class _Raising:
 
     def state(self, stated: StatedProtection) -> None:
         topics = protected_topics(stated.kind, stated.name)
-        deciding = {topic: self._deciding(topic, stated) for topic in topics}
+        deciding = {topic: self._deciding_entry(topic, stated) for topic in topics}
         if len({self._value(number) for number in deciding.values()}) > 1:
             for part in _parts(stated):
                 self.state(part)
@@ -135,7 +135,7 @@ class _Raising:
             any(covers(topic, other) and covers(other, topic) for other in own) for topic in topics
         )
 
-    def _deciding(self, topic: str, stated: StatedProtection) -> int | None:
+    def _deciding_entry(self, topic: str, stated: StatedProtection) -> int | None:
         """Return the number of the settings entry that decides on all names of ``topic``, or None.
 
         Entries for a part of the names are raised to the stated level.

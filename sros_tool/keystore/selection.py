@@ -144,19 +144,19 @@ def _unrecorded_notes(root: Path, below: list[str], left: list[str]) -> Iterator
     if below:
         yield Note(
             "fleet.revoked-unrecorded",
-            f"Also revoked, although the fleet does not record it: {_some(below)}, in the folder "
-            "of a robot that you revoke.",
+            f"Also revoked, although the fleet does not record it: {_names_text(below)}, in the "
+            "folder of a robot that you revoke.",
         )
     if left:
         yield Note(
             "fleet.unrecorded-enclaves",
-            f"Still valid, because the fleet does not record whose it is: {_some(left)}, with the "
-            "name of a robot that you revoke in the path. If the key was on that robot, run "
-            f"`sros revoke {quote(str(root))} {arguments_for(root, left)}`.",
+            f"Still valid, because the fleet does not record whose it is: {_names_text(left)}, "
+            "with the name of a robot that you revoke in the path. If the key was on that robot, "
+            f"run `sros revoke {quote(str(root))} {arguments_for(root, left)}`.",
         )
 
 
-def _some(names: list[str]) -> str:
+def _names_text(names: list[str]) -> str:
     return first_few(names, _SHOWN)
 
 
@@ -189,7 +189,7 @@ def _robots_enclaves(
             if left := _named_after(keystore, name):
                 raise KeystoreError(
                     f"the fleet in keystore '{root}' gives no enclave to a robot {name}",
-                    f"It has {_some(left)}: perhaps the robot left the fleet, or a group.",
+                    f"It has {_names_text(left)}: perhaps the robot left the fleet, or a group.",
                     f"Name the enclaves themselves: {arguments_for(root, left)}.",
                 )
             fleet.robot(name)
@@ -309,11 +309,11 @@ def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
     found = [enclave for enclave in there if lower[enclave].endswith(end)]
     if not found:
         last = {enclave: text.rpartition("/")[2] for enclave, text in lower.items()}
-        found = _alike(end.rpartition("/")[2], last, _ALIKE)
-    return tuple(sorted(found or _alike(end, lower, _WHOLE_ALIKE))[:3])
+        found = _similar_enclaves(end.rpartition("/")[2], last, _ALIKE)
+    return tuple(sorted(found or _similar_enclaves(end, lower, _WHOLE_ALIKE))[:3])
 
 
-def _alike(text: str, texts: Mapping[str, str], least: float) -> list[str]:
+def _similar_enclaves(text: str, texts: Mapping[str, str], least: float) -> list[str]:
     """Return the enclaves (keys of ``texts``) whose value is similar to ``text``."""
     import difflib
 

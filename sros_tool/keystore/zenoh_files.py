@@ -364,7 +364,7 @@ def drifted(
             kind = None
             if present is None:
                 kind = Drift.MISSING
-            elif _without(present, wanted.unread, reader) != document:
+            elif _without_rules_for(present, wanted.unread, reader) != document:
                 kind = Drift.DIFFERS
             elif not is_signed(keystore.root / path, present, authority, keystore.files):
                 kind = Drift.UNSIGNED
@@ -378,7 +378,9 @@ def drifted(
     return tuple(files)
 
 
-def _without(document: bytes, names: Collection[str], reader: RenderedReader) -> bytes | None:
+def _without_rules_for(
+    document: bytes, names: Collection[str], reader: RenderedReader
+) -> bytes | None:
     """Return a configuration without the rules for the enclaves ``names``.
 
     Returns None if ``names`` is not empty and this version of sros would write the file

@@ -257,10 +257,10 @@ def _check_vendors(source: Source, grant: Grant, domain: int, rules: Sequence[Ru
             more, less = granted - meant, meant - granted
             topic = ((more | less) & _ros_topics()).example()
             if topic is not None:
-                raise _refused(source, grant, verb, topic, decisions)
+                raise _vendors_differ_error(source, grant, verb, topic, decisions)
 
 
-def _refused(
+def _vendors_differ_error(
     source: Source,
     grant: Grant,
     verb: AccessVerb,

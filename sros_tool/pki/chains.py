@@ -545,14 +545,14 @@ def _is_allowed(name: x509.GeneralName | None, constraints: x509.NameConstraints
     if not (permitted or excluded):
         return True
     try:
-        return (not permitted or any(_within(name, base) for base in permitted)) and not any(
-            _within(name, base) for base in excluded
+        return (not permitted or any(_is_in_subtree(name, base) for base in permitted)) and not any(
+            _is_in_subtree(name, base) for base in excluded
         )
     except ValueError:
         return False
 
 
-def _within(name: x509.GeneralName, base: x509.GeneralName) -> bool:
+def _is_in_subtree(name: x509.GeneralName, base: x509.GeneralName) -> bool:
     """Return whether a name is in the subtree ``base``.
 
     Raises:

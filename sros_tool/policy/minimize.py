@@ -409,7 +409,7 @@ def _profile(
                 if qualifier is DENY or whole in kept:
                     said.setdefault((group.kind, name, level), {})[right, qualifier] = None
                 for each in pending.pop(whole, ()):
-                    written = _written(each.name, name, profile)
+                    written = _name_written_like(each.name, name, profile)
                     said.setdefault((each.kind, written, level), {})[each.right, ALLOW] = None
     groups: dict[tuple[str, GroupRights, Level | None], list[str]] = {}
     for (kind, name, level), rights in said.items():
@@ -424,7 +424,7 @@ def _profile(
     )
 
 
-def _written(fqn: str, like: str, profile: Profile) -> str:
+def _name_written_like(fqn: str, like: str, profile: Profile) -> str:
     """Return an absolute name written like ``like`` (relative or private) if possible."""
     if like.startswith("/"):
         return fqn
@@ -479,7 +479,7 @@ def propose_wildcards(
         other = candidates.get(frozenset(found))
         # Of wildcards for the same names, the longest one allows least.
         if other is None or len(rule.name) > len(other.rule.name):
-            adds = tuple(sorted(_matching(rule, foreign), key=order))
+            adds = tuple(sorted(_rights_matching(rule, foreign), key=order))
             saves = sum(map(size, found)) - size(rule)
             names = tuple(sorted(found, key=order))
             candidates[frozenset(found)] = WildcardProposal(rule, names, adds, saves)
@@ -540,7 +540,7 @@ def _foreign(enclave: str, own: Rules, known: Iterable[Right]) -> dict[str, list
     }
 
 
-def _matching(rule: Right, names_by_right: dict[str, list[str]]) -> Iterator[Right]:
+def _rights_matching(rule: Right, names_by_right: dict[str, list[str]]) -> Iterator[Right]:
     """Yield the rights to the names that a rule with a wildcard matches."""
     for part in parts(rule):
         match = compiled(part.name).match

@@ -73,7 +73,9 @@ def covers(wide: str, narrow: str) -> bool:
         return False
     if not is_expression(narrow):
         return matches(wide, narrow)
-    return narrow.startswith(literal_prefix(wide)) and _form(wide).covers(_form(narrow))
+    return narrow.startswith(literal_prefix(wide)) and _pattern_form(wide).covers(
+        _pattern_form(narrow)
+    )
 
 
 def overlap(one: str, other: str) -> bool:
@@ -83,7 +85,7 @@ def overlap(one: str, other: str) -> bool:
     if not is_expression(other):
         return matches(one, other)
     shorter, longer = sorted((literal_prefix(one), literal_prefix(other)), key=len)
-    return longer.startswith(shorter) and _form(one).overlaps(_form(other))
+    return longer.startswith(shorter) and _pattern_form(one).overlaps(_pattern_form(other))
 
 
 _Pieces = tuple[frozenset[str], ...]
@@ -127,9 +129,11 @@ class _Form:
         if self.starred and other.starred:
             # A name that begins and ends as both demand, and has the middle of one and then that
             # of the other in between, matches both: the stars match the rest.
-            return _meet(self.front, other.front) and _meet(self.back[::-1], other.back[::-1])
+            return _pieces_meet(self.front, other.front) and _pieces_meet(
+                self.back[::-1], other.back[::-1]
+            )
         if not self.starred and not other.starred:
-            return len(self.pieces) == len(other.pieces) and _meet(self.pieces, other.pieces)
+            return len(self.pieces) == len(other.pieces) and _pieces_meet(self.pieces, other.pieces)
         return self._meets(other) if self.starred else other._meets(self)
 
     def _meets(self, fixed: _Form) -> bool:
@@ -171,13 +175,13 @@ class _Form:
         return self._letters[letter]
 
 
-def _meet(one: _Pieces, other: _Pieces) -> bool:
+def _pieces_meet(one: _Pieces, other: _Pieces) -> bool:
     """Return whether the pieces at every position share a letter; extra pieces are ignored."""
     return not any(map(frozenset.isdisjoint, one, other))
 
 
 @lru_cache(maxsize=4 * _MANY)
-def _form(expression: str) -> _Form:
+def _pattern_form(expression: str) -> _Form:
     return _Form(_pieces(expression))
 
 
@@ -377,7 +381,7 @@ def _letters_of(expression: str) -> str:
     """Return the fixed letters of an expression, with NUL for all other characters."""
     if "[" not in expression:
         return expression.replace("*", _BETWEEN).replace("?", _BETWEEN)
-    pieces = _form(expression).pieces
+    pieces = _pattern_form(expression).pieces
     return "".join(
         next(iter(piece)) or _BETWEEN if len(piece) == 1 else _BETWEEN for piece in pieces
     )

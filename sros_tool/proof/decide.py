@@ -182,7 +182,7 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
         _confirm(requirement, witness, world)
     empty = tuple(_empty(requirement, world, limit))
     always = "" if witness or empty else _always(requirement, world)
-    assumed = "" if witness else _assumed(requirement, world, limit)
+    assumed = "" if witness else _assumed_protection(requirement, world, limit)
     kept = None
     if isinstance(requirement, Must) and not witness and world.crossing:
         kept = _kept_from_others(requirement, world, limit)
@@ -257,7 +257,7 @@ def _topics_of_rights(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]
                 yield right, part, part.topics(name)
 
 
-def _matching(patterns: Sequence[str], enclaves: Collection[str]) -> set[str]:
+def _matching_enclaves(patterns: Sequence[str], enclaves: Collection[str]) -> set[str]:
     """Return the enclaves that match a pattern of the list, and none of its exceptions."""
     matching: set[str] = set()
     excepted: set[str] = set()
@@ -288,7 +288,7 @@ def _uses_of_rights(
     rights: RightNames, world: World, limit: SearchLimit, without: Sequence[str] = ()
 ) -> Mapping[str, Sequence[Use]]:
     """Map enclaves with some of the rights to a use of each; leave out ``without``."""
-    left_out = _matching(without, world.enclaves)
+    left_out = _matching_enclaves(without, world.enclaves)
     uses: defaultdict[str, list[Use]] = defaultdict(list)
     for right, part, topics in _topics_of_rights(rights):
         for met in world.side(part.writes).meeting(topics, limit):
@@ -321,7 +321,7 @@ def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | 
             for part in _parts_of(right):
                 own = NameSet()
                 if enclave not in world.idle:
-                    own = _own(world, enclave, part.writes)
+                    own = _own_topics(world, enclave, part.writes)
                 topics = part.topics(name)
                 # Of a wildcard, only names that a node can have are asked for.
                 topic = (topics.valid() - own).example(limit, longest=world.longest)
@@ -330,7 +330,7 @@ def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | 
     lacking += [
         Use(enclave, "", topic, topic, writes)
         for writes, topic in world.needed
-        if not lacking and topic not in _own(world, enclave, writes)
+        if not lacking and topic not in _own_topics(world, enclave, writes)
     ]
     if not lacking or _is_elsewhere(world, enclave, limit):
         return None
@@ -341,7 +341,7 @@ def _is_elsewhere(world: World, enclave: str, limit: SearchLimit) -> bool:
     """Return whether an enclave has rights in other ROS domains, and none in that of ``world``."""
 
     def has_rights(some: World) -> bool:
-        sides = (_own(some, enclave, writes) for writes in (True, False))
+        sides = (_own_topics(some, enclave, writes) for writes in (True, False))
         return any(names.example(limit, longest=some.longest) for names in sides)
 
     return bool(world.elsewhere) and not has_rights(world) and any(map(has_rights, world.elsewhere))
@@ -352,7 +352,7 @@ def _kept_from_others(requirement: Must, world: World, limit: SearchLimit) -> Ke
     enclave = requirement.enclave
     for right, names in requirement.rights:
         for part, name in product(_parts_of(right), names):
-            topics, own = part.topics(name), _own(world, enclave, part.writes)
+            topics, own = part.topics(name), _own_topics(world, enclave, part.writes)
             others: dict[str, str] = {}
             for met in world.side(not part.writes).meeting(topics, limit):
                 ends = (enclave, met.enclave) if part.writes else (met.enclave, enclave)
@@ -367,7 +367,7 @@ def _kept_from_others(requirement: Must, world: World, limit: SearchLimit) -> Ke
     return None
 
 
-def _own(world: World, enclave: str, writes: bool) -> NameSet:
+def _own_topics(world: World, enclave: str, writes: bool) -> NameSet:
     """Return the topics that an enclave may write (or read) by its own permissions."""
     access = world.own.get(enclave)
     if access is None:
@@ -459,7 +459,7 @@ def _shared_by(
 
 def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with the shortest name that a wildcard allows beyond the requirement."""
-    enclaves = sorted(_matching(requirement.enclaves, world.enclaves))
+    enclaves = sorted(_matching_enclaves(requirement.enclaves, world.enclaves))
     uses: defaultdict[str, list[Use]] = defaultdict(list)
     for right, names in requirement.rights:
         for part in _sufficient_parts(right):
@@ -483,7 +483,7 @@ _READ_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/parameter_events"))
 
 def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with the shortest name for which an enclave has another right."""
-    enclaves = sorted(_matching(requirement.enclaves, world.enclaves))
+    enclaves = sorted(_matching_enclaves(requirement.enclaves, world.enclaves))
     uses: defaultdict[str, list[Use]] = defaultdict(list)
     for writes, ordinary in ((True, _WRITTEN_BY_EVERY_NODE), (False, _READ_BY_EVERY_NODE)):
         allowed = NameSet.union(
@@ -528,7 +528,7 @@ def _unprotected(requirement: Protected, world: World, limit: SearchLimit) -> Wi
     return Witness((min(uses, key=_better),)) if uses else None
 
 
-def _assumed(requirement: Requirement, world: World, limit: SearchLimit) -> str:
+def _assumed_protection(requirement: Requirement, world: World, limit: SearchLimit) -> str:
     """Return the shortest name whose protection is only assumed, or ""."""
     if not isinstance(requirement, Protected) or world.demanded is None:
         return ""
@@ -556,9 +556,9 @@ def _topics_of_names(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
 
 def _influence(requirement: Apart, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with a shortest chain from a source to a target, not through ``through``."""
-    through = _matching(requirement.through, world.enclaves)
-    sources = sorted(_matching(requirement.sources, world.enclaves) - through)
-    targets = _matching(requirement.targets, world.enclaves) - through
+    through = _matching_enclaves(requirement.through, world.enclaves)
+    sources = sorted(_matching_enclaves(requirement.sources, world.enclaves) - through)
+    targets = _matching_enclaves(requirement.targets, world.enclaves) - through
     chain = _shortest_chain(world, sources, targets, through, limit)
     if not chain:
         return None
@@ -598,7 +598,7 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
             for right, names in sides:
                 for name in names:
                     if not _anybody(world, _sufficient_parts(right), name, limit):
-                        yield f"no enclave may {right} {_named(right, name)}"
+                        yield f"no enclave may {right} {_named_right(right, name)}"
         case Nobody():
             for right, names in requirement.rights:
                 other = OTHER_SIDE[right]
@@ -606,7 +606,7 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
                     if not _anybody(
                         world, (*_sufficient_parts(other), *_sufficient_parts(right)), name, limit
                     ):
-                        yield f"no enclave may use {_named(right, name)}"
+                        yield f"no enclave may use {_named_right(right, name)}"
         case Protected():
             for kind, name in requirement.names:
                 parts = [part for right in RIGHTS[kind] for part in _sufficient_parts(right)]
@@ -622,7 +622,7 @@ def _always(requirement: Requirement, world: World) -> str:
     count = len(world.enclaves)
     match requirement:
         case Only(enclaves=enclaves) if any(map(is_expression, enclaves)):
-            if len(_matching(enclaves, world.enclaves)) == count:
+            if len(_matching_enclaves(enclaves, world.enclaves)) == count:
                 return f"all {count} enclaves are among them"
         case AtMost(most=most) if most >= count:
             return f"there are only {count} enclaves"
@@ -630,15 +630,15 @@ def _always(requirement: Requirement, world: World) -> str:
             if all(any(covers(name, "/*") for name in names) for _, names in rights):
                 return "wildcards may match every name"
         case Apart():
-            through = _matching(requirement.through, world.enclaves)
-            sources = _matching(requirement.sources, world.enclaves) - through
-            targets = _matching(requirement.targets, world.enclaves) - through
+            through = _matching_enclaves(requirement.through, world.enclaves)
+            sources = _matching_enclaves(requirement.sources, world.enclaves) - through
+            targets = _matching_enclaves(requirement.targets, world.enclaves) - through
             if not any(sources - {target} for target in targets):
                 return "no two enclaves are left to keep apart"
     return ""
 
 
-def _named(right: str, name: str) -> str:
+def _named_right(right: str, name: str) -> str:
     return f"{KIND_OF[right].removesuffix('s')} {name}"
 
 

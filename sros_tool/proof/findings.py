@@ -268,7 +268,7 @@ def _fact(violation: Violation) -> str:
         case Protected():
             return "its messages are not"
         case AtMost():
-            return f"{_together(steps)}{_others(violation)}"
+            return f"{_joined_steps(steps)}{_others(violation)}"
         case NotBoth():
             return f"may {steps[0].does()} and {steps[1].does()}{_others(violation)}"
         case _:
@@ -283,7 +283,7 @@ def _chain(steps: Sequence[Step]) -> str:
     )
 
 
-def _together(steps: Sequence[Step]) -> str:
+def _joined_steps(steps: Sequence[Step]) -> str:
     """Return text such as ``/a and /b may publish /x``; different uses are listed one by one."""
     if len({step.does() for step in steps}) > 1:
         return _listed([step.text() for step in steps])

@@ -279,7 +279,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         tuple(replace(change, effect=Effect.TIGHTER) for change in more),
         tuple(world.title for world in worlds),
         tuple(sorted({domain for world in worlds for domain in world.domains})),
-        tuple(_assumed(base, head)),
+        tuple(_assumptions(base, head)),
         tuple(_left_out(base, head)),
         unclear,
     )
@@ -307,14 +307,16 @@ def _not_compared(base: AccessSource, head: AccessSource) -> Iterator[str]:
         return
     for side, vendor in product((base, head), TESTED):
         for name, certified in side.certified.items():
-            if name in side.permissions and not _fits(vendor, side, name, certified.subject):
+            if name in side.permissions and not _permissions_fit(
+                vendor, side, name, certified.subject
+            ):
                 yield (
                     f"on {vendor.title} the permissions of {name} in '{side.shown}' do not fit its "
                     "certificate, so it is not certain what it can do"
                 )
 
 
-def _fits(vendor: Vendor, side: AccessSource, name: str, subject: str) -> bool:
+def _permissions_fit(vendor: Vendor, side: AccessSource, name: str, subject: str) -> bool:
     """Return whether a vendor accepts the permissions of an enclave for a certificate's subject."""
     text = certified_text(vendor.traits, subject)
     with suppress(ComparisonCrash):
@@ -436,7 +438,7 @@ def _access_on_vendor(vendor: Vendor, fitting_others: _FittingOthers) -> _Access
         them.
         """
         granted = (grant.subject for grant in side.permissions[name].grants[:1])
-        subject = subject if _fits(vendor, side, name, subject) else next(granted, "")
+        subject = subject if _permissions_fit(vendor, side, name, subject) else next(granted, "")
         governed = GovernedDomain(vendor, governance, at)
         access = Access(governed, side.permissions[name], subject, at=AT)
         if access.join().reason in ("no-grant", "malformed") or access.join().outcome == "crashes":
@@ -456,7 +458,7 @@ def _access_on_vendor(vendor: Vendor, fitting_others: _FittingOthers) -> _Access
             access_by(side, governance, name, subject, domain)
             for name in (enclave, *fitting_others(side, enclave))
         ]
-        return _joined(usable)
+        return _joined_access(usable)
 
     return access
 
@@ -592,7 +594,7 @@ def _each_gain(
     names.update(*(enforcer.names() for enforcer in new.enforcers))
     for enclave in sorted(names if scope is None else names.intersection(scope)):
         for world in worlds:
-            if _same(old, new, enclave, world):
+            if _has_same_access(old, new, enclave, world):
                 continue
             for domain in world.domains:
                 before, after = (world.access(side, enclave, domain) for side in (old, new))
@@ -662,7 +664,7 @@ class AccessByVendors:
             lambda side, enclave, domain: _NO_ACCESS,
             longest=vendor.traits.longest_topic_name,
         )
-        sides = _joined(before), _joined(after)
+        sides = _joined_access(before), _joined_access(after)
         topics = {}
         for verb in _VERBS:
             old, new = (
@@ -679,7 +681,7 @@ class AccessByVendors:
         yield from _more(self._stated, enclave, topics, sides, world, domain, SearchLimit())
 
 
-def _joined(usable: Sequence[Access]) -> _Access:
+def _joined_access(usable: Sequence[Access]) -> _Access:
     """Return what several permissions, which an enclave can all use, give together."""
     return _Access(
         {verb: NameSet.union([access.topics(verb) for access in usable]) for verb in _VERBS},
@@ -688,7 +690,7 @@ def _joined(usable: Sequence[Access]) -> _Access:
     )
 
 
-def _same(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> bool:
+def _has_same_access(old: AccessSource, new: AccessSource, enclave: str, world: _World) -> bool:
     """Return whether an enclave certainly has the same access on both sides; False may be wrong."""
     if world.title == _ZENOH:
         return None not in (old.zenoh, new.zenoh) and old.enforcers == new.enforcers
@@ -924,10 +926,10 @@ def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach
     for source, of in after.items():
         for target, hop in of.items():
             backwards[target][source] = hop
-    sources = changed.union(*(_reached(backwards, name) for name in sorted(changed)))
+    sources = changed.union(*(_reached_with_hops(backwards, name) for name in sorted(changed)))
     for source in sorted(sources):
-        known = _reached(before, source).keys()
-        reached = _reached(after, source)
+        known = _reached_with_hops(before, source).keys()
+        reached = _reached_with_hops(after, source)
         for target in sorted(reached.keys() - known - {source}):
             path: list[Hop] = []
             at = target
@@ -997,7 +999,7 @@ def _edges(side: AccessSource, fitting_pairs: Iterable[tuple[str, str]]) -> _Edg
     return edges
 
 
-def _reached(edges: _Edges, start: str) -> dict[str, Hop]:
+def _reached_with_hops(edges: _Edges, start: str) -> dict[str, Hop]:
     """Return the enclaves that can be reached from ``start``, each with the last hop to it."""
     reached: dict[str, Hop] = {}
     row = [start]
@@ -1127,7 +1129,7 @@ def _controlling(governance: Governance | None, more: DomainSet) -> Governance |
     return Governance(rules)
 
 
-def _assumed(base: AccessSource, head: AccessSource) -> Iterator[str]:
+def _assumptions(base: AccessSource, head: AccessSource) -> Iterator[str]:
     """Yield, as clauses, what is assumed about a side that does not state everything."""
     if "zenoh" not in (base.kind, head.kind):
         if base.governance is None and head.governance is None:

@@ -355,10 +355,10 @@ def added_crossing(
             yield SettingChange(
                 Effect.LOOSER, f"crossing of router {router}", _text(one), _text(other), meaning
             )
-    yield from _moved(before, after, {*new.permissions, *new.certified, *kept}, limit)
+    yield from _moved_enclaves(before, after, {*new.permissions, *new.certified, *kept}, limit)
 
 
-def _moved(
+def _moved_enclaves(
     before: ZenohNetwork, after: ZenohNetwork, enclaves: set[str], limit: SearchLimit
 ) -> Iterator[SettingChange]:
     """Yield moves of enclaves to another router that lets more of their names pass."""
@@ -371,9 +371,9 @@ def _moved(
         for there, later in places:
             if there == one:
                 continue
-            has = () if later == other else _both(after, other, later)
-            if name := _more(_both(before, one, there), has, limit):
-                crossing = _text(_both(before, one, there))
+            has = () if later == other else _crossing_of_both(after, other, later)
+            if name := _more(_crossing_of_both(before, one, there), has, limit):
+                crossing = _text(_crossing_of_both(before, one, there))
                 yield SettingChange(
                     Effect.LOOSER,
                     f"router of {enclave}",
@@ -440,7 +440,7 @@ def _expressions(network: ZenohNetwork, router: str) -> _Crossing:
     return tuple(dict.fromkeys(filter(None, (network.crossing, own))))
 
 
-def _both(network: ZenohNetwork, one: str, other: str) -> _Crossing:
+def _crossing_of_both(network: ZenohNetwork, one: str, other: str) -> _Crossing:
     return tuple(dict.fromkeys((*_expressions(network, one), *_expressions(network, other))))
 
 

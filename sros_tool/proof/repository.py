@@ -172,7 +172,7 @@ class Repository:
         if _ABBREVIATED.match(name) or (_ABBREVIATED.match(described) and not candidates):
             digits = name if _ABBREVIATED.match(name) else described
             ids = self._ask("rev-parse", f"--disambiguate={digits.lower()}").split()
-            kinds = {each: kind for each, (kind, _) in self._described(ids).items()}
+            kinds = {each: kind for each, (kind, _) in self._types_and_sizes(ids).items()}
             candidates |= {
                 object_id: object_id
                 for object_id in ids
@@ -200,7 +200,7 @@ class Repository:
         if not wanted:
             return {}
         lines = self._ask("for-each-ref", "--format=%(objectname) %(refname)", "--", *wanted)
-        targets = {name: digits for digits, _, name in map(_parted, lines.splitlines())}
+        targets = {name: digits for digits, _, name in map(_split_at_blank, lines.splitlines())}
         return {each: targets[each] for each in wanted if each in targets}
 
     def _peeled(self, digits: str, name: str) -> str:
@@ -298,9 +298,9 @@ class Repository:
 
     def sizes(self, ids: Iterable[str]) -> dict[str, int]:
         """Return the sizes of objects in bytes, by id; missing objects are left out."""
-        return {each: size for each, (_, size) in self._described(ids).items()}
+        return {each: size for each, (_, size) in self._types_and_sizes(ids).items()}
 
-    def _described(self, ids: Iterable[str]) -> dict[str, tuple[str, int]]:
+    def _types_and_sizes(self, ids: Iterable[str]) -> dict[str, tuple[str, int]]:
         """Return the type and the size in bytes of objects, by id, as git reports them."""
         asked = "".join(f"{object_id}\n" for object_id in ids).encode()
         lines = self._git(["cat-file", "--batch-check"], stdin=asked).decode().splitlines()
@@ -614,7 +614,7 @@ def _either(candidates: Iterable[str]) -> str:
     return " and ".join(f"'{candidate}'" for candidate in candidates)
 
 
-def _parted(line: str) -> tuple[str, str, str]:
+def _split_at_blank(line: str) -> tuple[str, str, str]:
     return line.partition(" ")
 
 

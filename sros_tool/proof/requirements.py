@@ -183,7 +183,7 @@ def demand(requirement: Requirement) -> str:
         case Only(rights=rights, enclaves=enclaves):
             but = [name[len(EXCEPT) :] for name in enclaves if name.startswith(EXCEPT)]
             if but and {*enclaves} == {"*", *(EXCEPT + name for name in but)}:
-                return f"{_listed(but)} may not {_rights_text(rights)}"
+                return f"{_listed_names(but)} may not {_rights_text(rights)}"
             return f"only {_enclaves_text(enclaves)} may {_rights_text(rights)}"
         case Nobody(rights=rights):
             return f"nobody may {_rights_text(rights)}"
@@ -201,7 +201,7 @@ def demand(requirement: Requirement) -> str:
         case NotBoth(first=first, second=second):
             return f"nobody may both {_rights_text(first)} and {_rights_text(second)}"
         case Protected(names=names, level=level):
-            shown = _listed([f"{kind.removesuffix('s')} {name}" for kind, name in names])
+            shown = _listed_names([f"{kind.removesuffix('s')} {name}" for kind, name in names])
             return f"{shown} has to be {'encrypted' if level is Level.ENCRYPT else 'signed'}"
         case Apart(sources=sources, targets=targets, through=through):
             past = f" except through {_enclaves_text(through)}" if through else ""
@@ -213,7 +213,7 @@ def demand(requirement: Requirement) -> str:
 def _rights_text(rights: RightNames, link: str = "or") -> str:
     """Return rights in words, such as ``publish /cmd_vel or call action /dock``."""
     texts = (
-        f"{right}{' action' if KIND_OF[right] == 'actions' else ''} {_listed(names)}"
+        f"{right}{' action' if KIND_OF[right] == 'actions' else ''} {_listed_names(names)}"
         for right, names in rights
     )
     return f" {link} ".join(texts)
@@ -223,11 +223,11 @@ def _enclaves_text(enclaves: Iterable[str]) -> str:
     """Return a list of enclaves in words, with its exceptions."""
     names = list(enclaves)
     excepted = [name[len(EXCEPT) :] for name in names if name.startswith(EXCEPT)]
-    text = _listed(name for name in names if not name.startswith(EXCEPT))
-    return f"{text} (but not {_listed(excepted)})" if excepted else text
+    text = _listed_names(name for name in names if not name.startswith(EXCEPT))
+    return f"{text} (but not {_listed_names(excepted)})" if excepted else text
 
 
-def _listed(names: Iterable[str]) -> str:
+def _listed_names(names: Iterable[str]) -> str:
     """Return names in words; a long list is shortened."""
     return first_few(list(names), 4) or "nothing"
 
@@ -275,7 +275,7 @@ def parse_requirements(
         DocumentError: a part of it is not valid.
     """
     stated = _stated_tables(data, file)
-    filled = (table for one in stated for table in _filled(one, fleet))
+    filled = (table for one in stated for table in _filled_tables(one, fleet))
     requirements = []
     left = _MOST_PAIRS
     for table in filled:
@@ -499,7 +499,7 @@ class _Table:
 # ── placeholders ───────────────────────────────────────────────────────────────────────────
 
 
-def _filled(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
+def _filled_tables(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
     """Yield a table with its placeholders filled in: once, or for each of the robots it is about.
 
     Raises:
@@ -509,7 +509,7 @@ def _filled(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
     if not used:
         yield table
         return
-    members = _members(table, used, fleet())
+    members = _group_members(table, used, fleet())
     singular = [placeholder for placeholder in used if not placeholder.plural]
     groups = list(dict.fromkeys(placeholder.group for placeholder in singular if placeholder.group))
     if len(groups) > 1:
@@ -552,7 +552,7 @@ def _placeholders(table: _Table) -> dict[Placeholder, str]:
     return used
 
 
-def _members(
+def _group_members(
     table: _Table, used: Mapping[Placeholder, str], fleet: Fleet | None
 ) -> dict[str, tuple[Robot, ...]]:
     """Map the groups of placeholders to their robots; "" stands for the whole fleet."""

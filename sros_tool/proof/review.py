@@ -332,32 +332,34 @@ class _Review:
                 ]
         named = " ".join(asked.policies)
         findings = partial(self._findings, of_head, head_fleet)
-        yield from self._checked("policy", named, findings, if_any=bool(of_head))
+        yield from self._step_result("policy", named, findings, if_any=bool(of_head))
         keystores = yield from self._keystores(self.head)
         yield from self._requirements(of_head, head_fleet, base_fleet, keystores)
         if self.base:
             before = cache(partial(load_policies, of_base, _BASE, base_fleet))
             after = cache(partial(load_policies, of_head, _HEAD, head_fleet))
-            yield from self._checked(
+            yield from self._step_result(
                 "new-access",
                 named,
                 lambda: self._access(of_base, base_fleet, before, after),
                 if_any=bool(asked.policies),
             )
-            yield from self._checked(
+            yield from self._step_result(
                 "rights", named, partial(self._rights, before, after), if_any=bool(of_base)
             )
         for path, keystore in keystores.items():
             yield from self._keystore(path, keystore)
         if self.base:
-            yield from self._checked("files", "", partial(self._others, of_head, head_fleet))
+            yield from self._step_result(
+                "files", "", partial(self._unreviewed_step, of_head, head_fleet)
+            )
             if head_fleet:
-                where = partial(self._places, (of_base, base_fleet), (of_head, head_fleet))
-                yield from self._checked("new-access", asked.fleet, where)
+                where = partial(self._delivery_step, (of_base, base_fleet), (of_head, head_fleet))
+                yield from self._step_result("new-access", asked.fleet, where)
         for error in self.head.refused + (self.base.refused if self.base else []):
             yield ReviewStep("files", "", _UNDECIDED, error)
 
-    def _checked(
+    def _step_result(
         self,
         kind: str,
         subject: str,
@@ -434,7 +436,7 @@ class _Review:
         became = ""
         if entry:
             became = "The change deletes it."
-            for name, tree_entry in self._changed(self.head, self.base):
+            for name, tree_entry in self._changed_files(self.head, self.base):
                 if tree_entry.id == entry.id:
                     became = f"The change renames it to '{name}'."
         return DocumentError(
@@ -442,25 +444,30 @@ class _Review:
         )
 
     @staticmethod
-    def _changed(side: CommitFiles, other: CommitFiles | None) -> Iterator[tuple[str, TreeEntry]]:
+    def _changed_files(
+        side: CommitFiles, other: CommitFiles | None
+    ) -> Iterator[tuple[str, TreeEntry]]:
         """Yield path and entry of files of a commit that are missing or different in the other."""
         tree = side.repository.tree(side.commit)
         before = other.repository.tree(other.commit) if other else ""
         return walk(side.repository, tree, most=_MOST_ENTRIES, other=before)
 
-    def _places(
+    def _delivery_step(
         self, base: tuple[list[Path], Fleet | None], head: tuple[list[Path], Fleet]
     ) -> tuple[int, Content] | None:
         """Return the step on robots whose keys would go to another place, or in another way."""
         lines: list[tuple[str, str]] = []
         robots = base[1].robots if base[1] else {}
         for name, new in head[1].robots.items():
-            if name in robots and _place(robots[name]) != _place(new):
-                lines.append((f"gets its keys at another address: {_place(new)}", name))
+            if name in robots and _delivery_place(robots[name]) != _delivery_place(new):
+                lines.append((f"gets its keys at another address: {_delivery_place(new)}", name))
         earlier = _holders(*base)
         for enclave, robot in _holders(*head).items():
             old = earlier.get(enclave, robot)
-            if robot and (not old or (old.name != robot.name and _place(old) != _place(robot))):
+            if robot and (
+                not old
+                or (old.name != robot.name and _delivery_place(old) != _delivery_place(robot))
+            ):
                 had = old.name if old else "no robot"
                 lines.append((f"gets the keys of {enclave}, which {had} had", robot.name))
         if base[1] and self.base:
@@ -472,12 +479,14 @@ class _Review:
                     lines.append((f"{said} can change which keys Ansible delivers, and how", where))
         return (_FOUND, Facts(tuple(lines))) if lines else None
 
-    def _others(self, reviewed: Sequence[Path], fleet: Fleet | None) -> tuple[int, Content] | None:
+    def _unreviewed_step(
+        self, reviewed: Sequence[Path], fleet: Fleet | None
+    ) -> tuple[int, Content] | None:
         """Return the step on policy files that were changed or renamed, but are not reviewed."""
         assert self.base
         lines: list[tuple[str, str]] = []
         status = _OK
-        changed = list(self._changed(self.head, self.base))
+        changed = list(self._changed_files(self.head, self.base))
         if len(changed) > _MOST_CHANGED:
             raise DocumentError(f"the change has more than {_MOST_CHANGED} files")
         names = {entry.id: name for name, entry in changed}
@@ -502,7 +511,7 @@ class _Review:
                 status = _FOUND
         gone = [
             (path, entry)
-            for path, entry in self._changed(self.base, self.head)
+            for path, entry in self._changed_files(self.base, self.head)
             if not self._has(self.head, path)
         ]
         for path in self._policies_among(gone, self.base, known=False):
@@ -757,10 +766,10 @@ class _Review:
                 continue
             wanted = yield from _read(files, system.fleet)
             earlier = yield from _read(base_files, partial(_still_there, before, system.fleet))
-            yield from self._checked("requirements", subject, partial(_decided, wanted, system))
+            yield from self._step_result("requirements", subject, partial(_decided, wanted, system))
             if dropped_requirements(earlier, wanted):
                 decide = partial(self._dropped, earlier, wanted, system)
-                yield from self._checked("requirements-before", subject, decide)
+                yield from self._step_result("requirements-before", subject, decide)
 
     def _keystore_fleet(self, path: str) -> Fleet | None:
         """Return the fleet of a keystore in BASE; None if it has none."""
@@ -804,10 +813,10 @@ class _Review:
             new = (("is new, so that all of its access is new", path),)
             return _FOUND, Facts(new)
 
-        yield from self._checked("keystore", path, findings)
+        yield from self._step_result("keystore", path, findings)
         if self.base:
-            yield from self._checked("new-access", path, access)
-        yield from self._checked("expiry", path, lambda: self._expiry(before or folder, folder))
+            yield from self._step_result("new-access", path, access)
+        yield from self._step_result("expiry", path, lambda: self._expiry(before or folder, folder))
 
     def _expiry(self, settings_of: Path, folder: Path) -> tuple[int, Content]:
         settings = Keystore(settings_of).template
@@ -823,7 +832,7 @@ def _decisive_first(where: str) -> tuple[bool, str]:
     return not any(part in where for part in ("ansible_", "sros_")), where
 
 
-def _place(robot: Robot) -> str:
+def _delivery_place(robot: Robot) -> str:
     """Return where the keys of a robot are delivered, in words: user and address, or its name."""
     return f"{robot.user}@{robot.address}" if robot.user else robot.address or "its name"
 

@@ -58,12 +58,12 @@ def suggest(
     for requirement in islice(_candidates(_Stated(rights), worlds), most):
         verdicts = all_worlds.decide(requirement, limit)
         if not any(verdict.witness or verdict.empty or verdict.always for _, verdict in verdicts):
-            last = _joined(requirements[-1], requirement) if requirements else None
+            last = _joined_requirement(requirements[-1], requirement) if requirements else None
             requirements[-1:] = [last] if last else [*requirements[-1:], requirement]
     return tuple(_for_each_robot(requirements, fleet) if fleet else requirements)
 
 
-def _joined(requirement: Requirement, other: Requirement) -> Requirement | None:
+def _joined_requirement(requirement: Requirement, other: Requirement) -> Requirement | None:
     """Return a requirement that demands the same as two, or None if they cannot be joined."""
     match requirement, other:
         case (
@@ -97,7 +97,7 @@ class _Stated:
 
 def _candidates(stated: _Stated, worlds: Sequence[World]) -> Iterator[Requirement]:
     for right in ("publish", "call", "request"):
-        yield from _alone(stated, right)
+        yield from _sole_holders(stated, right)
     yield from _unused_services(stated)
     yield from _limits(stated)
     yield from _gates(worlds[0])
@@ -109,7 +109,7 @@ def _candidates(stated: _Stated, worlds: Sequence[World]) -> Iterator[Requiremen
         yield Widest(source=_NOWHERE, rights=((right, wild),), enclaves=("*",))
 
 
-def _alone(stated: _Stated, right: str) -> Iterator[Only]:
+def _sole_holders(stated: _Stated, right: str) -> Iterator[Only]:
     """Yield a requirement for each enclave that is the only one with a right to a received name."""
     other = OTHER_SIDE[right]
     names: dict[str, list[str]] = defaultdict(list)
@@ -157,14 +157,14 @@ def _for_each_robot(requirements: Iterable[Requirement], fleet: Fleet) -> Iterat
     alike: dict[Requirement, dict[str, Requirement]] = {}
     for requirement in stated:
         robot = _robot_of(requirement, fleet)
-        kind = _placed(requirement, robot) if robot else requirement
+        kind = _with_robot_placeholders(requirement, robot) if robot else requirement
         alike.setdefault(kind, {})[robot.name if robot else ""] = requirement
     for kind, of_robots in alike.items():
         if "" in of_robots:
             yield _with_lists(kind, lambda names, value: _joined_names(names, value, fleet))
         elif (group := _group_of(of_robots, fleet)) is not None:
             first = next(iter(of_robots))
-            yield _placed(of_robots[first], fleet.robots[first], group)
+            yield _with_robot_placeholders(of_robots[first], fleet.robots[first], group)
         else:
             yield from of_robots.values()
 
@@ -191,7 +191,9 @@ def _robot_of(requirement: Requirement, fleet: Fleet) -> Robot | None:
     return fleet.robots[named.pop()] if len(named) == 1 else None
 
 
-def _placed(requirement: Requirement, robot: Robot, group: str = "") -> Requirement:
+def _with_robot_placeholders(
+    requirement: Requirement, robot: Robot, group: str = ""
+) -> Requirement:
     """Return a requirement with placeholders for a robot of a group."""
     return _with_lists(
         requirement,

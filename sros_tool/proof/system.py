@@ -294,7 +294,9 @@ def _weak(access: Iterable[Access]) -> dict[Level, NameSet]:
     different = dict.fromkeys(each.protection() for each in access)
     return {
         level: NameSet.union(
-            NameSet.first((names, _rank(domain, rule) < rank) for names, domain, rule in rules)
+            NameSet.first(
+                (names, _strongest_protection(domain, rule) < rank) for names, domain, rule in rules
+            )
             for rules in different
         )
         for level, rank in _RANK.items()
@@ -309,7 +311,7 @@ def _demanded(protections: Iterable[StatedProtection]) -> dict[Level, NameSet]:
     return {level: NameSet.union(map(named, topic)) for level, topic in topics.items()}
 
 
-def _rank(domain: DomainRule, rule: TopicRule) -> int:
+def _strongest_protection(domain: DomainRule, rule: TopicRule) -> int:
     """Return the strongest protection of data, of its submessage, or of the whole message."""
     kinds = (
         domain.rtps_protection_kind,

@@ -228,7 +228,7 @@ def check_upgrade(
     else:
         files = _planned_files(read_policy_for(path, at.fleet), at=at.now, domain=at.domain)
     findings: list[Finding] = []
-    by_distribution = _present(files, present, here, later)
+    by_distribution = _present_distributions(files, present, here, later)
     for before, enclaves in by_distribution.items():
         findings += _upgrade(files.only(enclaves), before, later, vendor)
         findings += _vulnerabilities(before, later, vendor, at.advisories)
@@ -239,7 +239,7 @@ def check_upgrade(
     return UpgradeFindings(found, len(compared), len(files.enclaves))
 
 
-def _present(
+def _present_distributions(
     files: DecidedFiles,
     named: Distribution | None,
     here: Distribution | None,

@@ -177,13 +177,13 @@ class Side:
             limit.spend(len(self._wild))
             own = _wild(expression)
             self._found[expression] = (
-                tuple(self._matching(own, limit))
+                tuple(self._accepted_topics(own, limit))
                 if own
                 else ((expression,) if expression in self.exact else ())
             )
         return self._found[expression]
 
-    def _matching(self, own: Automaton, limit: SearchLimit) -> Iterator[str]:
+    def _accepted_topics(self, own: Automaton, limit: SearchLimit) -> Iterator[str]:
         """Yield the exact topics that an automaton accepts."""
         forwards = _starting(self._topics, own.prefix)
         backwards = _starting(self._backwards, own.suffix[::-1])
@@ -213,7 +213,7 @@ class Side:
     def _meeting(self, own: Automaton, limit: SearchLimit) -> frozenset[str]:
         limit.spend(len(self._wild) // _OF_A_STEP)
         met: set[str] = set()
-        for topic in self._matching(own, limit):
+        for topic in self._accepted_topics(own, limit):
             met.update(self.exact[topic])
         for automaton, enclaves in self._wild.items():
             if automaton.may_meet(own):

@@ -132,7 +132,7 @@ def overlay(
     ]
     known = Known(rights[0] | rights[1])
     sides = [_edges_of(own, known, context.common) for own in rights]
-    edges = _marked(*sides, allowed_by=kind == "use")
+    edges = _marked_rights(*sides, allowed_by=kind == "use")
     normal = [folded(own) for own in rights]
     stated = {
         right: OverlaySide.BOTH
@@ -341,7 +341,9 @@ def namespace_of(name: str) -> str:
 # ── overlays of two sources ────────────────────────────────────────────────────────────
 
 
-def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) -> list[Edge]:
+def _marked_rights(
+    first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool
+) -> list[Edge]:
     """Return the rights of both sources, marked with the source that has them.
 
     Args:

@@ -281,8 +281,8 @@ class _System:
             influencing = self._influences(self._network.influencing({name}))
             influenced = self._influences(self._network.influenced({name}), 0)
             sentence = (
-                f"{name} can influence {_several(influenced, 1)}, "
-                f"and {_several(influencing, 2)} can influence it"
+                f"{name} can influence {_counted_influences(influenced, 1)}, "
+                f"and {_counted_influences(influencing, 2)} can influence it"
             )
             return Focus(kind, name, sentence, (), (), influencing, influenced)
         topics = tuple(_commands(kind, name))
@@ -404,7 +404,7 @@ def _sentence(
     return f"{text}; {counted(near, 'other enclave')} influence{s} {them} directly{over}"
 
 
-def _several(influences: Sequence[Influence], direct: int) -> str:
+def _counted_influences(influences: Sequence[Influence], direct: int) -> str:
     """Return the number of enclaves in words, and how many of them are ``direct`` hops away."""
     near = sum(influence.hops == direct for influence in influences)
     text = counted(len(influences), "enclave") if influences else "no enclave"

@@ -368,7 +368,7 @@ class _Draft:
     def _by_name(self, unit: int) -> tuple[object, ...]:
         return name_order(self._units[unit].name)
 
-    def _members(self, units: Iterable[int]) -> tuple[str, ...]:
+    def _unit_names(self, units: Iterable[int]) -> tuple[str, ...]:
         """Return the names of equal units, also of those that were not read in full."""
         names = [self._units[unit].name for unit in units]
         unread = (self._unread.get(name, ()) for name in names)
@@ -419,7 +419,7 @@ class _Draft:
             EqualUnits(
                 self._label(members[0]),
                 self._units[members[0]].what,
-                self._members(members),
+                self._unit_names(members),
                 self._domains(members[0]) if len(shown_domains) > 1 else "",
             )
             for members in self._classes.values()
@@ -483,7 +483,7 @@ class _Draft:
 
             shown = name.fill(word)
             if shown != edge.name and (edge.kind, shown) not in self._names:
-                self._names[edge.kind, shown] = tuple(self._named(edge.kind, name))
+                self._names[edge.kind, shown] = tuple(self._real_names(edge.kind, name))
             by = tuple(dict.fromkeys(self._text(wildcard).fill(word) for wildcard in edge.by))
             path = self._path(edge.enclave)
             yield replace(edge, enclave=path, name=shown, by=by, differs=edge in differing_parts)
@@ -526,7 +526,7 @@ class _Draft:
 
         return several
 
-    def _named(self, kind: str, name: UnitText) -> Iterable[str]:
+    def _real_names(self, kind: str, name: UnitText) -> Iterable[str]:
         """Yield the real names that a drawn name with labels stands for."""
         if len(name.named) == 1 and name.units[0] in self._inside:
             return self._per_unit(name, self._inside[name.units[0]])
@@ -555,7 +555,7 @@ class _Draft:
             elif self._is_drawn(unit):
                 note = "differs" if enclave.path in differing else ""
                 if unit in self._inside and self._units[unit].alone:
-                    equal = self._members(self._classes[self._inside[unit]])
+                    equal = self._unit_names(self._classes[self._inside[unit]])
                     note = f"{len(equal)} equal enclaves"
                 path, group = self._path(enclave.path), self._text(enclave.group).fill(self._label)
                 yield replace(enclave, path=path, group=group, note=note)

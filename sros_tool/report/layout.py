@@ -286,7 +286,7 @@ class _Draft:
         self._own: dict[str, list[Bundle]] = defaultdict(list)
         self._bundles: list[Bundle] = []
         for bundle in bundles:
-            alone = self._alone(bundle) if len(bundles) > _FEW_BUNDLES else ""
+            alone = self._only_node(bundle) if len(bundles) > _FEW_BUNDLES else ""
             if alone:
                 self._own[alone].append(bundle)
             else:
@@ -307,7 +307,7 @@ class _Draft:
         """Return whether a right is drawn as a letter on the card of the name, not as a line."""
         return is_plain(tie) and (tie.node, tie.right) in self._looking
 
-    def _alone(self, bundle: Bundle) -> str:
+    def _only_node(self, bundle: Bundle) -> str:
         """Return the only node, apart from onlookers, with a right to these names, or ""."""
         looking = {tie.node for tie in bundle.ties if self._looks(tie)}
         drawn = {tie.node for tie in bundle.ties if not self._looks(tie)}
@@ -670,14 +670,14 @@ def order_columns(
     inner, outer = range(1, len(columns), 2), range(0, len(columns), 2)
     for sweep in range(_SWEEPS):
         for moved in (*inner, *(outer if sweep % 2 else reversed(outer))):
-            current[moved] = _by_barycentre(current[moved], near, _places(current))
+            current[moved] = _by_barycentre(current[moved], near, _relative_positions(current))
         crossings = _crossings(current, lines)
         if crossings < fewest:
             best, fewest = [list(column) for column in current], crossings
     return best
 
 
-def _places(columns: Sequence[Sequence[ColumnItem]]) -> dict[str, float]:
+def _relative_positions(columns: Sequence[Sequence[ColumnItem]]) -> dict[str, float]:
     """Map items to their relative position in their column, from 0 to 1."""
     return {
         item.id: (number + 0.5) / len(column)

@@ -82,7 +82,7 @@ def sample_of(
     few = {
         n: number
         for number, (first, *more) in enumerate(alike.values())
-        if len(more) > 1 and _named(keystore, enclaves[first], names) <= {first}
+        if len(more) > 1 and _named_units(keystore, enclaves[first], names) <= {first}
         for n in (first, *more)
     }
     others = [path for path in paths if names.of.get(path) not in few]
@@ -166,7 +166,7 @@ def _replaced(text: str, word: str, mark: str) -> str:
     return "".join(parts)[:-1]
 
 
-def _named(keystore: Keystore, enclaves: Iterable[str], names: UnitNames) -> set[int]:
+def _named_units(keystore: Keystore, enclaves: Iterable[str], names: UnitNames) -> set[int]:
     """Return the units whose names are in the permissions of enclaves."""
     texts = (_signed_text(keystore, path) or "" for path in enclaves)
     lines = {line for text in texts for line in text.splitlines()}

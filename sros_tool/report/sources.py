@@ -146,7 +146,7 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     if drawing.observed:
         seen = union([read_source(path, now=drawing.now) for path in drawing.observed])
         read.append(seen.in_enclaves(enclaves_of_nodes(seen.nodes, read[0].nodes)))
-    picture = _compared(read, context, use=bool(drawing.observed))
+    picture = _compared_picture(read, context, use=bool(drawing.observed))
     if len(domains := {enclave.domains for enclave in picture.enclaves} - {""}) > 1:
         several = enumerated(sorted(domains))
         text = f"enclaves are for different ROS domains ({several}), and a name is drawn once for "
@@ -179,7 +179,7 @@ def _routers(keystore: Keystore | None) -> int:
     return sum((keystore.folder(name) / ROUTER_FILE).exists() for name in keystore.names)
 
 
-def _compared(read: Sequence[PictureSource], context: Context, *, use: bool) -> Picture:
+def _compared_picture(read: Sequence[PictureSource], context: Context, *, use: bool) -> Picture:
     """Return the picture of one source, or the comparison of two sources.
 
     The comparison is "use" if the second source was observed, "change" for two sources of the same
@@ -454,7 +454,7 @@ def read_source(
         source = _with_keystore(source, sample, now)
     elif read.kind == "enclave":
         source = _with_enclave(source, path, now)
-    places = _places(path)
+    places = _file_names(path)
     return replace(
         _with_findings(replace(source, findings=()), path, source.findings),
         enclaves=tuple(
@@ -476,7 +476,7 @@ def _with_findings(
     known = {enclave.path for enclave in source.enclaves} | {
         right.enclave for right in source.rights
     }
-    places = _places(path)
+    places = _file_names(path)
     found = tuple(_without_paths(_placed(finding, known), places) for finding in findings)
     return replace(source, findings=tuple(dict.fromkeys((*source.findings, *found))))
 
@@ -636,7 +636,7 @@ def _without_paths(finding: PicturedFinding, places: Mapping[str, str]) -> Pictu
     return replace(finding, text=text, remedy=remedy)
 
 
-def _places(path: Path) -> Mapping[str, str]:
+def _file_names(path: Path) -> Mapping[str, str]:
     """Map the path of a source, as given, absolute and resolved, to its file name.
 
     Longer paths come first, so that they are replaced before paths that they contain.

@@ -194,7 +194,7 @@ class Participant:
         if reader < 0:
             raise self._failure(reader, "cannot read what was discovered")
         try:
-            return _take(self._library, reader, 1000, copy)
+            return _take_samples(self._library, reader, 1000, copy)
         finally:
             self._library.api.dds_delete(reader)
 
@@ -322,11 +322,11 @@ class Reader:
 
     def take(self) -> tuple[str, ...]:
         """Return the messages received since the last call, oldest first."""
-        return tuple(_take(self._library, self.handle, 64, _string_of))
+        return tuple(_take_samples(self._library, self.handle, 64, _string_of))
 
     def count(self) -> int:
         """Return how many messages were received since the last call."""
-        return len(_take(self._library, self.handle, 64, lambda _: None))
+        return len(_take_samples(self._library, self.handle, 64, lambda _: None))
 
     def matched(self) -> int:
         """Return the number of writers that this reader receives from."""
@@ -380,7 +380,7 @@ def _qos(library: CycloneLibrary) -> Iterator[Any]:
         library.api.dds_delete_qos(qos)
 
 
-def _take(
+def _take_samples(
     library: CycloneLibrary, handle: int, limit: int, copy: Callable[[int], _Value]
 ) -> list[_Value]:
     """Take up to ``limit`` samples; ``copy`` converts each before DDS gets its memory back."""

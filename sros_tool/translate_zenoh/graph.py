@@ -125,7 +125,7 @@ class _Tokens:
     def __init__(self, enclave: str, domain: int, nodes: Iterable[NodeName]) -> None:
         self._begin = f"{GRAPH}/{domain}/*/*/*"
         self._enclave = _part(enclave)
-        self._nodes = _places(nodes)
+        self._nodes = _token_names(nodes)
         self._of_names = {
             f"{'' if ns == '%' else ns}%{name}": f"{ns}/{name}"
             for ns, _, name in (place.partition("/") for place in self._nodes)
@@ -141,9 +141,11 @@ class _Tokens:
         denied: list[str] = []
         for right, names in sides[True].items():
             without = dict.fromkeys(
-                e for name in sides[False].get(right, ()) for e in _listed(name)
+                e for name in sides[False].get(right, ()) for e in _listed_expressions(name)
             )
-            stated = dict.fromkeys(expression for name in names for expression in _listed(name))
+            stated = dict.fromkeys(
+                expression for name in names for expression in _listed_expressions(name)
+            )
             if without:
                 never = Names(without)
                 stated = {n: None for n in stated if is_expression(n) or not never.meets(n)}
@@ -166,7 +168,7 @@ class _Tokens:
             else node
             for node in nodes
         )
-        return tuple(self._key(_EVERY_KIND, place, ANY_CHUNKS) for place in _places(named))
+        return tuple(self._key(_EVERY_KIND, place, ANY_CHUNKS) for place in _token_names(named))
 
     def _announced(self, right: str, names: Mapping[str, None]) -> list[str]:
         """Return key expressions for the tokens of names, for each node that may use the name."""
@@ -190,7 +192,7 @@ class _Tokens:
         return "/".join((self._begin, kind, self._enclave, node, *rest))
 
 
-def _listed(name: str) -> list[str]:
+def _listed_expressions(name: str) -> list[str]:
     """Return expressions with ``*`` as only wildcard; a single wider one if there are too many."""
     try:
         return listed(name, _MOST_TOKENS)
@@ -209,13 +211,13 @@ def _parts(name: str) -> tuple[str, ...]:
     return (_part(name),)
 
 
-def _places(nodes: Iterable[NodeName]) -> tuple[str, ...]:
+def _token_names(nodes: Iterable[NodeName]) -> tuple[str, ...]:
     """Return namespace and name of nodes in the form that tokens have."""
     places = (
         f"{_part(ns)}/{_part(name)}"
         for node in nodes
-        for ns in _listed(node.ns)
-        for name in _listed(node.name)
+        for ns in _listed_expressions(node.ns)
+        for name in _listed_expressions(node.name)
         if "/" not in name
     )
     return tuple(dict.fromkeys(places))
@@ -280,7 +282,7 @@ def shared_nodes(announced: Mapping[str, AnnouncedNodes]) -> Iterator[SharedNode
     for number, (nodes_of_group, group) in enumerate(groups):
         others = {
             owner: None
-            for node in _included(nodes_of_group, in_order)
+            for node in _included_nodes(nodes_of_group, in_order)
             for owner in owners[node]
             if owner not in group and owner not in told.get(group[0], ())
         }
@@ -300,7 +302,7 @@ def _is_wide(node: str) -> bool:
     return "*" in node
 
 
-def _included(nodes: AnnouncedNodes, in_order: Sequence[str]) -> Iterator[str]:
+def _included_nodes(nodes: AnnouncedNodes, in_order: Sequence[str]) -> Iterator[str]:
     """Yield the nodes without wildcards in ``in_order`` that ``nodes`` include."""
     never = KeyExpressions(nodes.denied)
     for wide in nodes.allowed:

@@ -294,7 +294,7 @@ def _forms(places: Mapping[str, Source]) -> frozenset[Chunks]:
     return frozenset(
         chunks
         for name, place in places.items()
-        for listed_name in _listed(name, place)
+        for listed_name in _names_of_expression(name, place)
         for chunks in chunks_of(listed_name)
     )
 
@@ -349,7 +349,7 @@ def _with_what_is_below(names: frozenset[Chunks] | set[Chunks]) -> set[Chunks] |
     }
 
 
-def _listed(name: str, place: Source) -> list[str]:
+def _names_of_expression(name: str, place: Source) -> list[str]:
     """Return the names of an expression, for each choice of its ``?`` and sets of characters.
 
     Raises:

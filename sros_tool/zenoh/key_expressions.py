@@ -65,12 +65,12 @@ class KeyExpressions:
 
     @cached_property
     def _by_begin(self) -> Mapping[str, Mapping[str, Mapping[str, list[str]]]]:
-        """The expressions with wildcards, by the text before the wildcard, `_landmark`, `_form`."""
+        """Expressions with wildcards, by the text before these, `_landmark`, `_wildcard_form`."""
         groups: dict[str, dict[str, dict[str, list[str]]]] = {}
         for expression in self.all:
             if (begin := _fixed_begin(expression)) != expression:
                 by_form = groups.setdefault(begin, {}).setdefault(_landmark(expression), {})
-                by_form.setdefault(_form(expression), []).append(expression)
+                by_form.setdefault(_wildcard_form(expression), []).append(expression)
         return groups
 
     @cached_property
@@ -90,7 +90,7 @@ class KeyExpressions:
 
     def needed(self) -> list[str]:
         """Return the expressions that no other one includes, sorted; all if there are too many."""
-        forms = {expression: _form(expression) for expression in self.all}
+        forms = {expression: _wildcard_form(expression) for expression in self.all}
         if len(set(forms.values())) == 1:
             return sorted(self.all)
         wider = {expression: self._beginning_as(expression) for expression in self.all}
@@ -131,7 +131,7 @@ class KeyExpressions:
 
 
 @lru_cache(maxsize=_MANY)
-def _form(expression: str) -> str:
+def _wildcard_form(expression: str) -> str:
     """Return the wildcards of an expression and their positions, as text."""
     return _LITERAL.sub("", expression)
 
@@ -306,7 +306,7 @@ def common(one: str, other: str) -> list[str]:
         return [one]
     if not intersects(one, other):
         return []
-    shared = _common(one.split("/"), other.split("/"), ANY_CHUNKS, common_chunks)
+    shared = _common_parts(one.split("/"), other.split("/"), ANY_CHUNKS, common_chunks)
     return KeyExpressions(canonical(chunks) for chunks in shared).needed()
 
 
@@ -329,7 +329,7 @@ def common_chunks(one: str, other: str) -> tuple[str, ...]:
     left, right = (chunk.replace(ANY_PART, _ANY_LETTERS) for chunk in (one, other))
     shared = {
         "".join(letters).replace(_ANY_LETTERS, ANY_PART)
-        for letters in _common(left, right, _ANY_LETTERS, _common_letters)
+        for letters in _common_parts(left, right, _ANY_LETTERS, _common_letters)
     }
     return tuple(sorted(shared))
 
@@ -340,7 +340,7 @@ def _common_letters(one: str, other: str) -> tuple[str, ...]:
     return (one,) if one == other else ()
 
 
-def _common(
+def _common_parts(
     one: Sequence[str],
     other: Sequence[str],
     many: str,

@@ -92,7 +92,7 @@ def _not_covered(some: frozenset[Chunks]) -> list[Chunks]:
 
 def _subtract(wide: Chunks, denied: Iterable[Chunks]) -> set[Chunks]:
     """Return expressions for the keys that ``wide`` includes and ``denied`` does not."""
-    without = frozenset(expression for expression in denied if _meet(expression, wide))
+    without = frozenset(expression for expression in denied if _keys_meet(expression, wide))
     if not without:
         return {wide}
     if any(_covers(expression, wide) for expression in without):
@@ -100,13 +100,13 @@ def _subtract(wide: Chunks, denied: Iterable[Chunks]) -> set[Chunks]:
     left: set[Chunks] = set()
     for part in _parts(wide, without):
         left |= _less(
-            part, frozenset(expression for expression in without if _meet(expression, part))
+            part, frozenset(expression for expression in without if _keys_meet(expression, part))
         )
         _check_number(len(left))
-    return _joined(left)
+    return _joined_expressions(left)
 
 
-def _meet(first: Chunks, second: Chunks) -> bool:
+def _keys_meet(first: Chunks, second: Chunks) -> bool:
     """Return whether both expressions include a common key."""
     for end in (0, -1) if first and second else ():
         if first[end] != second[end] and "*" not in first[end] + second[end]:
@@ -133,10 +133,10 @@ def _covers(wide: Chunks, narrow: Chunks) -> bool:
     """Return whether ``wide`` includes all keys of ``narrow``; only True is certain."""
     if wide.count(ANY_CHUNKS) != 1:
         return sequence_includes(wide, narrow)
-    before, after = _around(wide)
+    before, after = _around_wildcards(wide)
     if len(narrow) - narrow.count(ANY_CHUNKS) < len(before) + len(after):
         return False
-    first, last = _around(narrow) if ANY_CHUNKS in narrow else (narrow, narrow)
+    first, last = _around_wildcards(narrow) if ANY_CHUNKS in narrow else (narrow, narrow)
     return _begins_as(first, before) and _begins_as(last[::-1], after[::-1])
 
 
@@ -147,7 +147,7 @@ def _begins_as(chunks: Chunks, wide: Chunks) -> bool:
     )
 
 
-def _around(chunks: Chunks) -> tuple[Chunks, Chunks]:
+def _around_wildcards(chunks: Chunks) -> tuple[Chunks, Chunks]:
     """Return the chunks before the first ``**`` and the chunks after the last ``**``."""
     end = len(chunks) - chunks[::-1].index(ANY_CHUNKS)
     return chunks[: chunks.index(ANY_CHUNKS)], chunks[end:]
@@ -165,8 +165,8 @@ def _parts(wide: Chunks, denied: Iterable[Chunks]) -> Iterator[Chunks]:
     if ANY_CHUNKS not in wide:
         yield wide
         return
-    before, after = _around(wide)
-    wild = [_around(expression) for expression in denied if ANY_CHUNKS in expression]
+    before, after = _around_wildcards(wide)
+    wild = [_around_wildcards(expression) for expression in denied if ANY_CHUNKS in expression]
     fixed = max(
         (len(expression) for expression in denied if ANY_CHUNKS not in expression), default=-1
     )
@@ -244,7 +244,7 @@ def _by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]
     tails: dict[str, set[Chunks]] = {}
     for expression in denied:
         for chunk, tail in _openings(expression):
-            if common_chunks(first, chunk) and _meet(tail, rest):
+            if common_chunks(first, chunk) and _keys_meet(tail, rest):
                 tails.setdefault(chunk, set()).add(tail)
     always = {chunk for chunk in tails if _matches(chunk, first)}
     some = tuple(sorted(tails.keys() - always))
@@ -467,7 +467,7 @@ def _after(letter: str, chunks: Iterable[str]) -> tuple[str, ...]:
 # ── fewer expressions ──────────────────────────────────────────────────────────────────────
 
 
-def _joined(expressions: set[Chunks]) -> set[Chunks]:
+def _joined_expressions(expressions: set[Chunks]) -> set[Chunks]:
     """Return fewer expressions for the same keys: one with ``**`` replaces others.
 
     It replaces those that differ from it only in their number of chunks.
@@ -480,7 +480,9 @@ def _joined(expressions: set[Chunks]) -> set[Chunks]:
         joined -= {_one_shorter(expression) for expression in longer}
         joined.difference_update(longer)
         joined |= {_or_shorter(expression) for expression in longer}
-    wild = {_around(expression) for expression in joined if expression.count(ANY_CHUNKS) == 1}
+    wild = {
+        _around_wildcards(expression) for expression in joined if expression.count(ANY_CHUNKS) == 1
+    }
     begins = _Beginnings({before for before, _ in wild})
     ends = _Beginnings({after[::-1] for _, after in wild})
     return {
@@ -562,7 +564,7 @@ class Difference(NamedTuple):
             begin == self.begin
             and _common_end(end, self.end) == end
             and any(_covers(expression, name) for expression in self.allowed)
-            and not any(_meet(expression, name) for expression in self.denied)
+            and not any(_keys_meet(expression, name) for expression in self.denied)
         )
 
     def common(self, other: Difference) -> list[str]:
@@ -575,7 +577,9 @@ class Difference(NamedTuple):
         end = _common_end(self.end, other.end)
         if self.begin != other.begin or end is None:
             return []
-        names = subtract_all(_common(self.allowed, other.allowed), self.denied | other.denied)
+        names = subtract_all(
+            _common_expressions(self.allowed, other.allowed), self.denied | other.denied
+        )
         return [canonical((self.begin, *name)) + end for name in names]
 
 
@@ -591,7 +595,7 @@ def _searched(expressions: frozenset[Chunks]) -> KeyExpressions:
 
 
 @lru_cache(maxsize=_FEW)
-def _common(some: frozenset[Chunks], others: frozenset[Chunks]) -> frozenset[Chunks]:
+def _common_expressions(some: frozenset[Chunks], others: frozenset[Chunks]) -> frozenset[Chunks]:
     """Return expressions for what some expressions and others match."""
     if some == others:
         return some
@@ -627,7 +631,7 @@ class RuleKeys:
 
     def include(self, key: str) -> bool:
         """Return whether the differences of the rule have all keys of an expression."""
-        begin, name, end = _parted(key)
+        begin, name, end = _expression_parts(key)
         chunks = tuple(name.split("/"))
         return any(difference.include_all(begin, chunks, end) for difference in self.differences)
 
@@ -672,7 +676,7 @@ _TYPE = "/$*::$*/*"
 _ENDS = re.compile(rf"{re.escape(_TYPE)}(?:/\*\*)?(?:/@adv/\*\*)?\Z")
 
 
-def _parted(expression: str) -> tuple[str, str, str]:
+def _expression_parts(expression: str) -> tuple[str, str, str]:
     """Return the parts of a key expression before, in and after the name."""
     begin, _, rest = expression.partition("/")
     name, of_type, below = rest.partition(_TYPE)
@@ -684,7 +688,7 @@ def _differences(expressions: Iterable[str]) -> tuple[Difference, ...]:
     names: dict[tuple[str, str], set[Chunks]] = {}
     for expression in expressions:
         if not expression.startswith("@"):
-            begin, name, end = _parted(expression)
+            begin, name, end = _expression_parts(expression)
             names.setdefault((begin, end), set()).add(tuple(name.split("/")))
     return tuple(
         Difference(*place, frozenset(of), frozenset()) for place, of in sorted(names.items())
@@ -695,7 +699,7 @@ def _differences(expressions: Iterable[str]) -> tuple[Difference, ...]:
 def _plain_in(plain: frozenset[str], wide: RuleKeys) -> frozenset[str]:
     keys: set[str] = set()
     for key in plain:
-        begin, name, end = _parted(key)
+        begin, name, end = _expression_parts(key)
         if begin.startswith("@"):
             keys.update([key] if wide.tokens.include(key) else _common_with_all(key, wide.tokens))
             continue

@@ -125,7 +125,7 @@ def keystore_findings(
     names = keystore.names if checked is None else tuple(checked)
     wanted = wanted_rights(keystore)
     asked = asked_vendors(vendors)
-    stated = {} if vendors else _stated(keystore, names)
+    stated = {} if vendors else _stated_distributions(keystore, names)
     deciding = {name: _vendors_of(each) for name, each in stated.items()}
     if stated:
         union = {vendor for each in deciding.values() for vendor in each}
@@ -193,7 +193,9 @@ def keystore_findings(
     return _with_cause_of_expiry(_with_cause_of_ros2(found, opened), root)
 
 
-def _stated(keystore: CheckedKeystore, names: Sequence[str]) -> dict[str, tuple[Distribution, ...]]:
+def _stated_distributions(
+    keystore: CheckedKeystore, names: Sequence[str]
+) -> dict[str, tuple[Distribution, ...]]:
     """Map the enclaves that are for certain ROS 2 distributions to these distributions."""
     by_enclave = {}
     for name in names:
@@ -325,7 +327,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list
     if keystore.is_of_ros2:
         chosen = [finding for finding in findings if finding.kind in _OF_A_KEYSTORE]
         text = f"It has neither sros.toml nor ledger.jsonl. Found: {_kinds(chosen)}."
-        return _with(
+        return _with_cause(
             findings,
             chosen,
             root,
@@ -345,7 +347,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list
     ]
     shown = " ".join(map(quote, names)) if len(names) <= _MOST_NAMED else "ENCLAVE..."
     command = f"sros create_permission {quote(str(root))} {shown} POLICY_FILE --revoke-old"
-    return _with(
+    return _with_cause(
         findings,
         chosen,
         root,
@@ -368,7 +370,7 @@ def _with_cause_of_expiry(findings: Sequence[Finding], root: Path) -> list[Findi
     enclaves = len({finding.subject for finding in soon})
     first = min(soon, key=lambda finding: finding.text.rpartition(" ")[2])
     published = publish_command(root)
-    return _with(
+    return _with_cause(
         findings,
         soon,
         root,
@@ -385,7 +387,7 @@ def _is_plain(findings: Sequence[Finding], name: str) -> bool:
     return sum(finding.kind is UNEXPLAINED and finding.subject == name for finding in findings) > 1
 
 
-def _with(
+def _with_cause(
     findings: Sequence[Finding],
     chosen: Sequence[Finding],
     root: Path,

@@ -73,16 +73,16 @@ _SHOWN = 3
 def check_topic_names(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
     """Yield findings about topic names in the rules of a grant."""
     if not is_for_ros(grant):
-        names = [repr(topic) for topic in dict.fromkeys(_stated(grant, allow=True))]
+        names = [repr(topic) for topic in dict.fromkeys(_rule_topics(grant, allow=True))]
         yield NOT_FOR_ROS.found(enclave.name, f"they name only {some_names(names)}", file)
         return
-    named = dict.fromkeys((*_stated(grant, allow=True), *_stated(grant, allow=False)))
+    named = dict.fromkeys((*_rule_topics(grant, allow=True), *_rule_topics(grant, allow=False)))
     problems = [text for name in named if (text := ros_name_problem(name))]
     if problems:
         text = first_few(problems, _SHOWN, "; ", "; and ")
         yield NO_ROS_NAME.found(enclave.name, text, file)
     relayed = {topic for rule in grant.rules for topic in _topics(rule.relay) if rule.allow}
-    if relayed and (only := sorted(relayed.difference(_stated(grant, allow=True)))):
+    if relayed and (only := sorted(relayed.difference(_rule_topics(grant, allow=True)))):
         text = f"{some_names(only)} {'is' if len(only) == 1 else 'are'} allowed only in <relay>"
         yield RELAY_ONLY.found(enclave.name, text, file)
 
@@ -104,12 +104,12 @@ def check_capitals(enclaves: Mapping[str, frozenset[str]]) -> Iterator[Finding]:
 
 def names_without_wildcards(grant: Grant) -> frozenset[str]:
     """Return the topics that the rules of a grant allow by name, without wildcards."""
-    return frozenset(topic for topic in _stated(grant, allow=True) if not is_expression(topic))
+    return frozenset(topic for topic in _rule_topics(grant, allow=True) if not is_expression(topic))
 
 
 def is_for_ros(grant: Grant) -> bool:
     """Return whether a grant allows a ROS name, or has no allow rule with a name at all."""
-    named = tuple(_stated(grant, allow=True))
+    named = tuple(_rule_topics(grant, allow=True))
     return not named or any(
         overlap(wanted, name.strip())
         for name in named
@@ -130,10 +130,10 @@ def ros_name_problem(text: str) -> str:
         return _character_problem(name)
     if is_expression(name):
         possible = "//" not in name and any(overlap(name, known) for known in _OF_ROS)
-        return "" if possible else f"{name!r} matches no valid ROS name{_meant(name)}"
+        return "" if possible else f"{name!r} matches no valid ROS name{_intended_name_hint(name)}"
     if _TYPE.match(name):
         return f"{name!r} is the name of a type: write the name of the topic"
-    return f"{name!r} is not a valid ROS name{_meant(name)}"
+    return f"{name!r} is not a valid ROS name{_intended_name_hint(name)}"
 
 
 def has_invalid_characters(name: str) -> bool:
@@ -160,7 +160,7 @@ def _character_problem(name: str) -> str:
     return f"{name!r} has characters that no ROS name has ({shown}){advice}"
 
 
-def _meant(name: str) -> str:
+def _intended_name_hint(name: str) -> str:
     """Return a hint with the probably intended name, such as ``: write rt/chatter``, or ""."""
     begin, slash, rest = name.partition("/")
     parts = [part for part in (rest if begin in _PREFIXES else name).split("/") if part]
@@ -173,7 +173,7 @@ def _meant(name: str) -> str:
     return f": write {meant}" if parts and _ROS_NAME.match(plain) else ""
 
 
-def _stated(grant: Grant, *, allow: bool) -> Iterator[str]:
+def _rule_topics(grant: Grant, *, allow: bool) -> Iterator[str]:
     """Yield the published and subscribed topics of the allow rules, or of the deny rules."""
     for rule in grant.rules:
         if rule.allow is allow:

@@ -504,7 +504,7 @@ def _denial(participant: VendorParticipant, grant: Grant, *, described: bool) ->
     if described and not _offers_types(access, grant):
         wanted.append(f"offer ~/{_TYPES}")
     is_tool = not set(denied).intersection(_OF_TOOLS)
-    if not wanted or (is_tool and not any(map(_is_own, _written(grant)))):
+    if not wanted or (is_tool and not any(map(_is_own, _allowed_to_publish(grant)))):
         return None
     text = f"no node may {' or '.join(wanted)}"
     for verb, topic in denied:
@@ -550,7 +550,7 @@ def _nodes_to_try(grant: Grant, wanted: str) -> Iterator[str]:
     """Yield a node that no rule names, and a node for each expression that meets ``wanted``."""
     yield _SOME_NODE
     with suppress(DocumentError):  # too many wildcards
-        for expression in _written(grant):
+        for expression in _allowed_to_publish(grant):
             if not overlap(expression, wanted):
                 continue
             # Where only the service has a wildcard, its node is the example.
@@ -564,7 +564,7 @@ def _nodes_to_try(grant: Grant, wanted: str) -> Iterator[str]:
                 yield service_of(example)[0].removesuffix(f"/{_TYPES}")
 
 
-def _written(grant: Grant) -> Iterator[str]:
+def _allowed_to_publish(grant: Grant) -> Iterator[str]:
     """Yield the topic expressions that allow rules let the enclave publish."""
     for rule in grant.rules:
         for criteria in rule.publish if rule.allow else ():

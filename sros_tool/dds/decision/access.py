@@ -387,7 +387,9 @@ class _GrantRules:
             group = list(entries)
             fits = self._fits(group[0], _DEFAULT_PARTITION)
             if fits or self._traits.topic_decides:
-                rules += [(names, allowed and fits) for names, allowed in self._deciding(group)]
+                rules += [
+                    (names, allowed and fits) for names, allowed in self._decisions_by_topic(group)
+                ]
                 continue
             if crashing := self._crashing(group):
                 rules.append((crashing, False))
@@ -397,9 +399,9 @@ class _GrantRules:
         """Return the topics that `ask_topic` allows."""
         from sros_tool.automata import NameSet
 
-        return NameSet.first(self._deciding(self._entries), self._otherwise.allowed)
+        return NameSet.first(self._decisions_by_topic(self._entries), self._otherwise.allowed)
 
-    def _deciding(self, entries: Iterable[_Entry]) -> Iterator[tuple[NameSet, bool]]:
+    def _decisions_by_topic(self, entries: Iterable[_Entry]) -> Iterator[tuple[NameSet, bool]]:
         """Yield pairs of topics and whether they are allowed, in the order of the rules.
 
         Entries in a row with the same verdict are joined.
@@ -418,10 +420,10 @@ class _GrantRules:
         if entry.allow:
             if wanted is _DEFAULT_PARTITION is named:
                 return True
-            return all(_named(style, named, each) for each in wanted)
+            return all(_any_matches(style, named, each) for each in wanted)
         if self._traits.deny_partitions is DenyPartitions.IGNORED:
             return True
-        return any(_named(style, named, each) for each in wanted)
+        return any(_any_matches(style, named, each) for each in wanted)
 
 
 @lru_cache(maxsize=8192)  # several vendors, and several enclaves, have the same names
@@ -431,7 +433,7 @@ def _cached_names(style: Style, texts: tuple[str, ...]) -> NameSet:
     return names_of(style, texts)
 
 
-def _named(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
+def _any_matches(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
     return any(matches(style, expression, partition) for expression in expressions)
 
 

@@ -28,7 +28,7 @@ def _matcher(style: Style, expression: str) -> _Matcher | None:
             segments[-1] += pattern
         elif segments[-1] or len(segments) == 1:
             segments.append("")
-    return re.compile(_joined(segments) + r"\Z", re.DOTALL).match
+    return re.compile(_joined_regex(segments) + r"\Z", re.DOTALL).match
 
 
 def _patterns(style: Style, expression: str) -> Iterable[str]:
@@ -44,7 +44,7 @@ def _patterns(style: Style, expression: str) -> Iterable[str]:
     return ["" if char == "*" else "." if char == "?" else re.escape(char) for char in expression]
 
 
-def _joined(segments: list[str]) -> str:
+def _joined_regex(segments: list[str]) -> str:
     """Return one regular expression for parts of an expression that ``*`` separates.
 
     Each part matches a fixed number of characters, so its first match is as good as a later one.

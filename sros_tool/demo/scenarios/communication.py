@@ -40,7 +40,7 @@ LISTENER = Identity(OWN, "listener")
 TALKER_DENIED = Identity(OWN, "talker without permission")
 
 
-def _refused(name: str, mechanism: str, intruder: Party, rightful: Party) -> Row:
+def _refused_process_row(name: str, mechanism: str, intruder: Party, rightful: Party) -> Row:
     """Return a row with a process that is refused; in another enclave, its program runs."""
     return Row(
         name,
@@ -102,13 +102,13 @@ ROWS: tuple[Row, ...] = (
         (_SECURED_HEARS_NOT,),
         (_OPEN_HEARS,),
     ),
-    _refused(
+    _refused_process_row(
         "secured listener without permission",
         "its DDS refuses the DataReader: the signed permissions do not allow the topic",
         _DENIED_LISTENER,
         _SECURED_LISTENER,
     ),
-    _refused(
+    _refused_process_row(
         "secured talker without permission",
         "its DDS refuses the DataWriter: the signed permissions do not allow the topic",
         _DENIED_TALKER,
@@ -236,13 +236,13 @@ def _rows_of(kind: _Interface, both: str) -> tuple[Row, ...]:
             (answered(client.name, open_server.name, holds=False),),
             (answered(open_client.name, open_server.name),),
         ),
-        _refused(
+        _refused_process_row(
             f"client that poses as the {kind.server}",
             may_not.format(kind.asks, kind.answers),
             posing,
             server,
         ),
-        _refused(
+        _refused_process_row(
             f"{kind.server} that poses as the {kind.client}",
             may_not.format(kind.answers, kind.asks),
             calling,
@@ -349,7 +349,7 @@ COMPOSITION = Scenario(
             (hears("unsecured listener", "container", holds=False),),
             (hears("listener", "container"),),
         ),
-        _refused(
+        _refused_process_row(
             "container in the enclave of one of its nodes",
             "the enclave lacks the rights of the other nodes in the process",
             Party("container as a listener", Role.COMPOSED, LISTENER),
@@ -368,7 +368,7 @@ COMPOSITION = Scenario(
             "one process is one participant with one enclave",
             "run nodes that must not share rights in separate processes and enclaves",
         ),
-        _refused(
+        _refused_process_row(
             "listener node in a separate enclave publishes",
             "its enclave has only the rights of the listener",
             Party("listener that talks", Role.TALKER, LISTENER),
@@ -394,7 +394,7 @@ _KINDS = {
 """Maps the name of a protection kind to a keystore that has this protection."""
 
 
-def _protected(name: str, kind: str, expected: RowStatus, mechanism: str) -> Row:
+def _payload_row(name: str, kind: str, expected: RowStatus, mechanism: str) -> Row:
     """Return a row that looks for payload in packets with a protection kind."""
     return Row(
         f"{name} under {kind}",
@@ -408,10 +408,10 @@ def _protected(name: str, kind: str, expected: RowStatus, mechanism: str) -> Row
     )
 
 
-def _changed(kind: str, expected: RowStatus, mechanism: str) -> Row:
+def _changed_packets_row(kind: str, expected: RowStatus, mechanism: str) -> Row:
     """Return a row that changes packets with a protection kind."""
     return replace(
-        _protected("changed packets", kind, RowStatus.READABLE, mechanism),
+        _payload_row("changed packets", kind, RowStatus.READABLE, mechanism),
         expected=expected,
         claims=(Claim(Relation.BELIEVES, "listener", "talker").expecting(expected),),
         wire=False,
@@ -424,21 +424,23 @@ GOVERNANCE = Scenario(
     "governance",
     "the same messages unprotected, signed and encrypted, on the wire",
     (
-        _protected(
+        _payload_row(
             _PAYLOAD,
             "none",
             RowStatus.READABLE,
             "access is controlled, but messages are neither signed nor encrypted",
         ),
-        _protected(
+        _payload_row(
             _PAYLOAD,
             "sign",
             RowStatus.READABLE,
             "messages carry a message authentication code, but are not encrypted",
         ),
-        _protected(_PAYLOAD, "encrypt", RowStatus.NOT_READABLE, "messages are encrypted"),
-        _changed("none", RowStatus.DECEIVED, "nothing in the packet proves who sent it"),
-        _changed(
+        _payload_row(_PAYLOAD, "encrypt", RowStatus.NOT_READABLE, "messages are encrypted"),
+        _changed_packets_row(
+            "none", RowStatus.DECEIVED, "nothing in the packet proves who sent it"
+        ),
+        _changed_packets_row(
             "sign",
             RowStatus.NOT_DECEIVED,
             "the message authentication code of a changed packet is wrong",

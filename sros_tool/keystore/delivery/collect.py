@@ -230,7 +230,7 @@ def collect(
                     keep(root, message.received)
             taken.append(message.without_confirmation())
         if not dry_run:
-            keep_refusals(root, refused_before, _refused(refused_before, taken), now=now)
+            keep_refusals(root, refused_before, _refusals(refused_before, taken), now=now)
         not_signed, notes, signed = _revoke_again(
             root, forgotten, telling, taken, now=now, keyring=keyring, dry_run=dry_run
         )
@@ -256,7 +256,7 @@ def collect(
     )
 
 
-def _refused(
+def _refusals(
     before: Mapping[str, RefusedMessage], taken: Sequence[_ReceivedMessage]
 ) -> dict[str, str]:
     """Map robots to why their last messages were refused; a missing message changes nothing."""

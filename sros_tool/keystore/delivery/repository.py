@@ -379,7 +379,7 @@ class Composer:
             else:
                 self._add(name, Targets(targets=content), self._signers[_TARGETS][:1])
         delegations = Delegations({key.keyid: key}, succinct_roles=roles)
-        if before and before.signed.delegations == delegations and self._kept(before):
+        if before and before.signed.delegations == delegations and self._can_stay(before):
             self._expires[_TARGETS] = before.signed.expires
         else:
             self._add(_TARGETS, Targets(delegations=delegations), self._signers[_TARGETS])
@@ -403,7 +403,7 @@ class Composer:
         signed = metadata.signed
         return signed.expires - self._now > self._expiry.of(signed.type) / 2
 
-    def _kept(self, metadata: Metadata[_Content]) -> bool:
+    def _can_stay(self, metadata: Metadata[_Content]) -> bool:
         """Return whether top-level metadata can stay: it lasts, and each signer has signed it."""
         signers = self._signers[metadata.signed.type]
         signed = all(signer.public_key.keyid in metadata.signatures for signer in signers)
@@ -432,7 +432,7 @@ class Composer:
         # Names of bins that are no longer used stay: robots refuse a snapshot that lacks any.
         meta = {f"{name}.json": MetaFile(self.versions[name]) for name in parts}
         before = self._present.snapshot
-        if before and before.signed.meta == meta and self._kept(before):
+        if before and before.signed.meta == meta and self._can_stay(before):
             self._expires[_SNAPSHOT] = before.signed.expires
             data = self._present.snapshot_file
         else:

@@ -142,19 +142,21 @@ def refuse_stopping(
     notes = [
         Note(
             "vendor.refuses",
-            f"{vendor.title} refuses {_some(refusals.enclaves)} from now on: "
+            f"{vendor.title} refuses {_names_text(refusals.enclaves)} from now on: "
             f"{'; '.join(refusals.reasons)}. Running nodes continue until they are restarted.",
         )
         for vendor, refusals in stopped.items()
     ]
     if revoked:
         text = (
-            f"the folder of {_some(revoked)} is in the keystore again with a certificate that "
-            "was revoked: whoever gets the new revocation list refuses it"
+            f"the folder of {_names_text(revoked)} is in the keystore again with a certificate "
+            "that was revoked: whoever gets the new revocation list refuses it"
         )
         notes.append(Note("keystore.revoked-put-back", text))
     if unseen := transaction.not_kept():
-        text = f"{_some(unseen)} not checked against vendors: this dry run makes too many files"
+        text = (
+            f"{_names_text(unseen)} not checked against vendors: this dry run makes too many files"
+        )
         notes.append(Note("vendor.not-asked", text))
     return tuple(notes)
 
@@ -233,7 +235,7 @@ def _would_stop(root: Path, refused: Mapping[Vendor, _Refusals], remedy: str) ->
     whose = "its" if len(names) == 1 else "their"
     options = " ".join(f"--allow-refusal {word}" for word in words_of(refused))
     return KeystoreError(
-        f"no node could start in {_some(names)} of '{root}'",
+        f"no node could start in {_names_text(names)} of '{root}'",
         f"{_clauses(why, f'{whose} files after the change')}. Nothing was changed.",
         f"{remedy or 'Replace the file that the error names.'} If no node runs on "
         f"{enumerated(together(vendor.title for vendor in refused))}, add {options}.",
@@ -290,7 +292,7 @@ def _clauses(refused: Mapping[Vendor, str], what: str) -> str:
     )
 
 
-def _some(names: Sequence[str]) -> str:
+def _names_text(names: Sequence[str]) -> str:
     return first_few(names, _SHOWN)
 
 
@@ -407,7 +409,10 @@ class _FilesOfChange:
         entries = self._keystore.ledger_with("what", "revocation").entries
         of_ledger = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
         has_list = self._keystore.has(CRL)
-        return _listed(self._keystore.read(CRL, "revocation list") if has_list else b"") | of_ledger
+        return (
+            _listed_serials(self._keystore.read(CRL, "revocation list") if has_list else b"")
+            | of_ledger
+        )
 
     def with_a_newer_list(self) -> set[str] | None:
         """Return the enclaves to evaluate if a newer revocation list is the only change.
@@ -421,7 +426,7 @@ class _FilesOfChange:
         recorded = ledger.recorded_enclaves()
         if recorded is None or not before or _form_of_list(before) != _form_of_list(after):
             return None
-        added = [f"{serial:x}" for serial in _listed(after) - _listed(before)]
+        added = [f"{serial:x}" for serial in _listed_serials(after) - _listed_serials(before)]
         entries = ledger.with_values("serial", added).entries
         listed = {entry.enclave for entry in entries if entry.enclave}
         there = (name for name in recorded if has_enclave(self.transaction.root, name))
@@ -511,7 +516,7 @@ def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
                 continue  # it is revoked, or its request is not answered yet
             crl = places[CRL_FILE]
             if crl not in lists:
-                lists[crl] = _listed(files.content_after(crl))
+                lists[crl] = _listed_serials(files.content_after(crl))
             is_new = CERTIFICATE_FILE in own
             before = files.content(f"{folder}/{CERTIFICATE_FILE}") if is_new else b""
             signed = documents or PERMISSIONS_FILE in own
@@ -537,7 +542,7 @@ def _certificate_kind(data: bytes, listed: frozenset[int], now: datetime) -> tup
     return (form.common, holds_at(form, now), form.serial in listed)
 
 
-def _listed(crl: bytes) -> frozenset[int]:
+def _listed_serials(crl: bytes) -> frozenset[int]:
     """Return the serial numbers on a revocation list."""
     try:
         return frozenset(entry.serial_number for entry in read_list(crl, ""))

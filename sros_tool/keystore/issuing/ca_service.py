@@ -181,7 +181,7 @@ def _bounded_output(process: subprocess.Popen[bytes]) -> tuple[bytes | None, byt
         ready.register(said)
         answers = True
         try:
-            while len(answer) <= _MOST_BYTES and _left(end) and not ended:
+            while len(answer) <= _MOST_BYTES and _seconds_left(end) and not ended:
                 for file, _ in ready.poll(_LOOK * 1000):
                     part = os.read(file, _MOST_BYTES)
                     if not part:
@@ -199,7 +199,7 @@ def _bounded_output(process: subprocess.Popen[bytes]) -> tuple[bytes | None, byt
     return answer if ended or len(answer) > _MOST_BYTES else None, errors
 
 
-def _left(end: float) -> float:
+def _seconds_left(end: float) -> float:
     return max(0.0, end - time.monotonic())
 
 

@@ -253,7 +253,7 @@ def differences(
             topics.update(filter(None, names))
     disagreements = []
     for vendor in vendors:
-        for domain in _ends(domains):
+        for domain in _range_ends(domains):
             access = _access(vendor, permissions, domain)
             for topic in sorted(topics):
                 for verb in (_OUT, _IN):
@@ -275,13 +275,13 @@ def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
     wild = [expression for expression in known if is_expression(expression)]
     found: set[str | None] = {name for name in known if not is_expression(name)}
     for index, one in enumerate(wild):
-        found.add(_only(one, known))
+        found.add(_only_match(one, known))
         found.add(_matched(one))
         for other in wild[index + 1 :]:
             if overlap(one, other):
                 found.add(common_name([one, other], absolute=False))
     for prefix in ("rt/*", "rq/*Request", "rr/*Reply", "*"):
-        found.add(_only(prefix, known))
+        found.add(_only_match(prefix, known))
     return tuple(sorted(topic for topic in found if topic))
 
 
@@ -292,7 +292,7 @@ def _matched(expression: str) -> str | None:
     return common_name([expression], absolute=False) if is_expression(name) else name
 
 
-def _only(expression: str, known: list[str]) -> str | None:
+def _only_match(expression: str, known: list[str]) -> str | None:
     """Return a name that only ``expression`` matches, or None if no simple name is such."""
     for letter in ("never_mentioned", "n", "0", ""):
         name = _SET.sub(_member, expression).replace("*", letter).replace("?", "n")
@@ -308,7 +308,7 @@ def _member(found: re.Match[str]) -> str:
     return next((c for c in _CHARACTERS if matches(found[0], c)), "")
 
 
-def _ends(domains: DomainSet) -> tuple[int, ...]:
+def _range_ends(domains: DomainSet) -> tuple[int, ...]:
     """Return the first and the last domain of each range in ``domains``, sorted."""
     ends = ((part.first, part.last) for part in domains.closed().ranges)
     return tuple(sorted({end for pair in ends for end in pair if end is not None}))

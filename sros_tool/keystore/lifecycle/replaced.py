@@ -79,7 +79,7 @@ class ReplacedRights:
         return self._text(self.gained, self.gained_domains, fleet)
 
     def _text(self, rights: Sequence[Right], domains: str, fleet: Fleet | None) -> str:
-        described = folded(fleet, ((self.enclave, text) for text in _described(rights)))
+        described = folded(fleet, ((self.enclave, text) for text in _described_rights(rights)))
         texts = (
             first_few(list(described), _RIGHTS_SHOWN),
             f"domain {domains}" if domains else "",
@@ -216,10 +216,10 @@ def rights_text(rights: Sequence[Right]) -> str:
 
     An added or removed denial is marked with "(by a DENY)".
     """
-    return first_few(_described(rights), _RIGHTS_SHOWN)
+    return first_few(_described_rights(rights), _RIGHTS_SHOWN)
 
 
-def _described(rights: Sequence[Right]) -> list[str]:
+def _described_rights(rights: Sequence[Right]) -> list[str]:
     return [
         right.describe() + ("" if right.qualifier is ALLOW else " (by a DENY)") for right in rights
     ]
