@@ -94,7 +94,7 @@ def test_an_enclave_that_ros2_adds_later_is_one_finding(tmp_path: Path) -> None:
     ended = sros("check", root, "--severity", "warning")
     assert paragraphs(ended.out) == 2, ended.out
     assert "an enclave that the keystore never issued" in " ".join(ended.out.split())
-    assert "backup" not in ended.out and "Find out where" not in ended.out
+    assert "backup" not in ended.out and "Find out the source" not in ended.out
     policy = tmp_path / "POLICY_FILE"
     policy.write_text(policy_text({"/b/c": publish("x")}))
     said = ended.out[ended.out.index("enclave that the keystore") :]

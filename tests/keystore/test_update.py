@@ -375,7 +375,7 @@ def test_the_command_of_the_second_stage(root: Path) -> None:
     first = sros("update_keystore", root, "--template", "production", "--next", "--revoke-old").ok()
     assert "renewed /free, /robot" in first.out
     forgotten = sros("update_keystore", root, "--next")
-    assert (forgotten.status, "Name the goal again" in forgotten.err) == (2, True)
+    assert (forgotten.status, "Repeat the options of the first stage" in forgotten.err) == (2, True)
     second = sros(*printed(first.err)).ok()
     assert "renewed" not in second.out
     assert Keystore(root).template == load_template("production")
