@@ -227,6 +227,8 @@ class ObservedProcesses(NamedTuple):
     """Processes on this machine whose nodes are not known; they are not closed."""
     elsewhere: Sequence[str] = ()
     """Enclaves with nodes whose process sros did not find on this machine."""
+    ended: Sequence[str] = ()
+    """Enclaves whose processes ended while sros watched."""
 
     @property
     def units(self) -> dict[str, str]:
@@ -853,12 +855,14 @@ class OpenRobot:
         running = ProcessTable().look(self._shell.now()).processes
         of_cyclone = [process.pid for process in running if "libddsc" in process.libraries]
         told = _process_ids_of_cyclone(of_cyclone, self.domain)
-        observed = assign(nodes, running, self.domain, told)
+        learned = json.loads(document)
+        stayed = [node for node in nodes if node.participant not in learned["ended"]]
+        observed = assign(stayed, running, self.domain, told)
+        ended = {node.enclaves[0] for node in nodes} - {node.enclaves[0] for node in stayed}
         processes = [_as_its_unit_starts(process) for process in observed.processes]
-        self._write_processes(observed._replace(processes=processes))
+        self._write_processes(observed._replace(processes=processes, ended=sorted(ended)))
         number = counted(len(processes), "process", "processes")
         self._shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
-        learned = json.loads(document)
         lacking = learned["added"] if learned["dry_run"] else ()
         if not lacking:
             return ""
@@ -1016,7 +1020,8 @@ class OpenRobot:
         lines = [*lines, *_commands(due)] if due else []
         for name in closing.new:
             start = shlex.join(("sros", "run", str(self.export.absolute()), name))
-            lines += ["", f"# {name} is new: COMMAND is what starts it", f"{start} -- COMMAND"]
+            why = "has ended" if name in closing.observed.ended else "is new"
+            lines += ["", f"# {name} {why}: COMMAND is what starts it", f"{start} -- COMMAND"]
         if rest:
             lines += ["", "# These processes run closed, with the present files."]
         return [*lines, *_commands(rest)]

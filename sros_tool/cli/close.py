@@ -185,7 +185,8 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
         echo(f"  {process.enclave}: {pid}{nodes}: {how}")
     export = shlex.quote(str(robot.export.absolute()))
     for name in closed.new:
-        echo(f"  {name}: new, start it with: sros run {export} {name} -- COMMAND")
+        why = "has ended" if name in closed.observed.ended else "new"
+        echo(f"  {name}: {why}, start it with: sros run {export} {name} -- COMMAND")
     for right in closed.newly_denied:
         echo(f"used when sros watched, and denied now: {right}")
     if closed.newly_denied:
@@ -241,6 +242,8 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
         if closed.secured:
             stop = "" if closed.stopped.issuperset(closed.left) else "stop them, "
             steps = f"{stop}start them by the first commands in {robot.start / COMMANDS}"
+        if stopped := sorted(closed.stopped.intersection(closed.left) if closed.secured else ()):
+            ask += f"; what does not always run: --without {stopped[0]}"
         if not closed.left:
             following = ask
         elif any(name in observed.units for name in closed.left):

@@ -462,7 +462,9 @@ def generate_policy(
         report,
         then="the result is shown" if dry_run else "the policy is written",
     )
-    seen = named(snapshot.observation)
+    seen = named(snapshot.observation if watch is None else snapshot.everything)
+    stayed = {node.participant for node in snapshot.observation.nodes}
+    ended = sorted({node.participant for node in seen.observation.nodes} - stayed)
     learned = learn(seen.observation, None if flat else common).noting(seen.notes)
     if not learned.profiles:
         if as_json:
@@ -475,10 +477,11 @@ def generate_policy(
     if not dry_run:
         write(plan)
     if as_json:
-        print_json(_printed(plan, file, learned, seen.observation, dry_run))
+        print_json(_printed(plan, file, learned, seen.observation, dry_run)._replace(ended=ended))
     else:
         _show(plan, learned, written=not dry_run)
-    if gone := sorted(node for node in snapshot.gone if not is_tool_name(node.rpartition("/")[2])):
+    gone = sorted(node for node in snapshot.gone if not is_tool_name(node.rpartition("/")[2]))
+    if gone and watch is None:
         text = f"left out, because these nodes ended while the graph was observed: {listed(gone)}"
         echo(f"{text}; --watch keeps them.", err=True)
     if not snapshot.settled:
@@ -529,6 +532,7 @@ def _printed(
         changed=plan is not None and plan.changes,
         dry_run=dry_run,
         observation=observation,
+        ended=(),
         added=plan.added if plan else sorted(policy_rights(learned.policy()), key=order),
         copied=copied,
         accepted=None,

@@ -725,6 +725,8 @@ class LearnedPolicy(NamedTuple):
     dry_run: DryRun
     observation: Observation
     """The nodes that were observed; empty for a log."""
+    ended: Sequence[str]
+    """The participants of these nodes that ended while they were observed (`--watch`)."""
     added: Sequence[Right]
     """The rights that are added to the policy."""
     copied: Sequence[str]

@@ -301,13 +301,13 @@ def watch(
     ``patience`` seconds after the union has grown.
     """
     begin = clock()
-    union = reported = Observation()
+    seen = union = reported = Observation()
     grown = changed = begin
     while not stop() and (seconds is None or clock() - begin < seconds):
         news = source.next(_TICK)
         now = clock()
         if news is not None:
-            both = union.union(news)
+            seen, both = news, union.union(news)
             if both != union:
                 if reported is union:
                     grown = now
@@ -317,7 +317,7 @@ def watch(
             reported = union
     if union is not reported:
         report(union)
-    return Snapshot(union, union, clock() - begin, True)
+    return Snapshot(seen, union, clock() - begin, True)
 
 
 # ── the process and the enclave of each node ────────────────────────────────────────────

@@ -363,6 +363,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     assert "\nros2 launch --secured " in commands
     assert "except for /listener (not running), its files" in ended.err
     assert "; next: start them by the first commands in robot/start/commands.txt" in ended.err
+    assert ended.err.endswith("--proof; what does not always run: --without /listener\n")
     robot.absent = set()
     assert "start it with" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
@@ -685,6 +686,25 @@ def test_a_program_that_gives_its_processes_their_enclaves(
     run = f"sros run {robot.folder / 'robot/export'} /listener -- python3 pumps.py\n"
     assert f"stop process 4700, and start it with:\n  cd /opt && {run}" in said
     assert said.count("pumps.py") == 1
+
+
+def test_a_tool_that_ended_while_sros_watched(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tool = ros_node("tool", "010f0000070000000000", "publish rt/map")
+    run, left = close._run, f'"ended": ["{tool[3]}0000"]'
+
+    def ran(words: Any, live: bool) -> tuple[int, str, str]:
+        status, output, messages = run(words, live)
+        return status, output.replace('"ended": []', left), messages
+
+    monkeypatch.setattr(close, "_run", ran)
+    robot.nodes = (TALKER, LISTENER, tool)
+    ended = robot.close("--for", "1s")
+    run_it = f"sros run {robot.folder / 'robot/export'} /tool -- COMMAND\n"
+    assert f"  /tool: has ended, start it with: {run_it}" in ended.out
+    commands = (robot.folder / "robot/start/commands.txt").read_text()
+    assert f"# /tool has ended: COMMAND is what starts it\n{run_it}" in commands
 
 
 def test_a_policy_with_an_error_closes_nothing(robot: Robot) -> None:

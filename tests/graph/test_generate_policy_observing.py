@@ -58,6 +58,7 @@ def test_json_has_a_stable_shape(program: Program) -> None:
                 "subscribe": [],
             }
         ],
+        "ended": [],
         "added": [
             {
                 "enclave": "/talker",

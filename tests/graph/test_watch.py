@@ -80,7 +80,8 @@ def test_a_watch_keeps_what_was_gone_and_tells_it_once() -> None:
     script = Script([(0.1, ONE), (3.0, ONE.union(passing)), (5.0, ONE), (7.0, TWO)])
     told: list[Observation] = []
     snapshot = watch(script, 10.0, script.clock, stop=lambda: False, report=told.append)
-    assert snapshot.observation == TWO.union(passing)
+    assert snapshot.everything == TWO.union(passing)
+    assert snapshot.observation == TWO
     assert told == [ONE, ONE.union(passing), TWO.union(passing)]
 
 
