@@ -667,8 +667,9 @@ class OpenRobot:
         only_errors = ("--fail-on", "error")
         both, created = ("-p", policy, str(self.observer)), ("--template", _TEMPLATE)
         on_zenoh = self._shell.environment.get(RMW) == RMW_ZENOH
+        watched = self.policy.exists() and not duration
         return [
-            _Step((*learn, "--json"), None if duration else self.processes, self.seen),
+            _Step((*learn, "--json"), self.processes if watched else None, self.seen),
             _Step(("check", policy, "--suggest"), self.requirements, self.requirements),
             _Step(("check", policy, "--requirements", needed, *created, *only_errors), guards=True),
             _Step(("create_keystore", keystore, *created, *domain), self.keystore),

@@ -630,7 +630,7 @@ def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
     assert both in robot.close("--apply", status=1).out
     robot.nodes, robot.more = robot.nodes[:2], ()
     (robot.folder / "robot/policy.xml").unlink()
-    robot.close("--for", "1s")
+    robot.close()
     assert "cmd_vel" not in (robot.folder / "robot/policy.xml").read_text()
 
 
