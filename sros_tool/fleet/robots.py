@@ -453,6 +453,7 @@ def _candidates(fleet: Fleet, pattern: _Pattern, enclave: str) -> Iterator[Robot
 
 
 _SHOWN = 20  # robots that a line names; --json has all
+_MOST_TARGETS = 5  # lines about pairs of robots with one text; more become one line
 
 
 def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[str]:
@@ -460,31 +461,65 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
 
     That line has placeholders for the robot's name and namespace, and lists the robots at its end.
     The robot of a line is that of the enclave; if the enclave has none, the only one that the text
-    names.
+    names.  If more lines differ only in the one *other* robot that they name, that is ``{other}``;
+    many lines that differ in both robots become one with the number of pairs.
 
     Args:
         fleet: the robots; None leaves every line as it is.
         lines: pairs of an enclave and a text about it.
     """
-    kinds: dict[str, list[tuple[str, str]]] = {}
-    for enclave, text in lines:
-        robot = _robot_of_line(fleet, enclave, text) if fleet else None
-        # Another text that has such words of its own is not mixed up with a folded one.
-        kind = _with_placeholders(text, enclave, robot) if robot else f"\0{text}"
-        kinds.setdefault(kind, []).append((robot.name if robot else "", text))
-    for kind, same in kinds.items():
+    if fleet is None:
+        yield from (text for _, text in lines)
+        return
+    read = [(text, _foldings(fleet, enclave, text)) for enclave, text in lines]
+    robots: dict[_Folding, set[str]] = {}
+    for _, foldings in read:
+        for folding, robot in foldings:
+            robots.setdefault(folding, set()).add(robot)
+    chosen = [max(foldings[:2], key=lambda each: len(robots[each[0]])) for _, foldings in read]
+    targets: dict[_Folding, set[_Folding]] = {}
+    for (_, foldings), (folding, _) in zip(read, chosen, strict=True):
+        for pair, _ in foldings[2:]:
+            targets.setdefault(pair, set()).add(folding)
+    groups: dict[_Folding, list[tuple[str, str]]] = {}
+    for (text, foldings), (folding, robot) in zip(read, chosen, strict=True):
+        if foldings[2:] and len(targets[foldings[2][0]]) > _MOST_TARGETS:
+            folding, robot = foldings[2]
+        groups.setdefault(folding, []).append((robot, text))
+    for folding, same in groups.items():
         names = list(dict.fromkeys(name for name, _ in same))
-        if fleet is None or len(names) == 1:
+        if len(names) == 1:
             yield from (text for _, text in same)
         else:
-            yield f"{kind}  ({_named(fleet, names)})"
+            yield f"{folding.text}  ({_named(fleet, names, folding)})"
 
 
-def _robot_of_line(fleet: Fleet, enclave: str, text: str) -> Robot | None:
-    if robot := robot_of(fleet, enclave):
-        return robot
-    named = named_robots(fleet, "", text)
-    return named[0] if len(named) == 1 else None
+class _Folding(NamedTuple):
+    """A text for several robots: for each one, for those other than ``own``, or for pairs."""
+
+    text: str
+    own: str = ""
+    pairs: bool = False
+
+
+def _foldings(fleet: Fleet, enclave: str, text: str) -> list[tuple[_Folding, str]]:
+    """Return a line folded by its robot, by the one other robot, by both; with the robot's name."""
+    own = robot_of(fleet, enclave)
+    named = [robot for robot in named_robots(fleet, "", text) if robot != own]
+    other = named[0] if len(named) == 1 else None
+    if own is None and other:
+        own, other = other, None
+    if own is None:
+        # Another text that has such words of its own is not mixed up with a folded one.
+        return [(_Folding(f"\0{text}"), "")]
+    any_own = _with_placeholders(text, enclave, own)
+    if other is None:
+        return [(_Folding(any_own), own.name)]
+    return [
+        (_Folding(any_own), own.name),
+        (_Folding(_with_other(text, other), own.name), other.name),
+        (_Folding(_with_other(any_own, other), pairs=True), f"{own.name} and {other.name}"),
+    ]
 
 
 def named_robots(fleet: Fleet, enclave: str, text: str) -> tuple[Robot, ...]:
@@ -516,6 +551,12 @@ def _with_placeholders(text: str, enclave: str, robot: Robot) -> str:
     return own.join(parts)
 
 
+def _with_other(text: str, robot: Robot) -> str:
+    if robot.namespace != "/":
+        text = _whole(robot.namespace).sub("/{other}", text)
+    return _whole(robot.name).sub("{other}", text)
+
+
 @lru_cache(maxsize=4096)
 def _whole(value: str) -> re.Pattern[str]:
     """Return a regular expression that matches ``value`` only as a whole name."""
@@ -523,12 +564,18 @@ def _whole(value: str) -> re.Pattern[str]:
     return re.compile(f"{before}{re.escape(value)}(?![A-Za-z0-9_}}])")
 
 
-def _named(fleet: Fleet, names: Sequence[str]) -> str:
+def _named(fleet: Fleet, names: Sequence[str], folding: _Folding) -> str:
     """Return a list of robots in words, such as "r1, r2 and 3 more robots"."""
-    count = f"{len(names)} robots"
-    if len(names) == len(fleet.robots):
+    if folding.pairs:
+        sources = list(dict.fromkeys(pair.split()[0] for pair in names))
+        if len(names) == len(sources) * (len(sources) - 1):
+            return f"{_named(fleet, sources, _Folding(''))}, each with each other one"
+        return f"{len(names)} pairs of robots, such as {names[0]}"
+    own = folding.own
+    count = f"{len(names)}{' other' if own else ''} robots"
+    if set(names) == fleet.robots.keys() - {own}:
         return f"all {count}"
     for group, members in fleet.groups.items():
-        if set(names) == set(members):
-            return f"the {count} of {group}"
+        if set(names) == set(members) - {own}:
+            return f"the {count if own in members else f'{len(names)} robots'} of {group}"
     return f"{count}: {first_few(names, _SHOWN)}"

@@ -59,6 +59,38 @@ def test_an_enclave_of_no_robot_has_the_only_robot_that_its_line_names() -> None
     assert list(folded(FLEET, several)) == [text for _, text in several]
 
 
+def test_an_enclave_of_a_robot_is_folded_by_the_only_other_robot_of_its_lines() -> None:
+    one = [("/x/base", f"/x/base may publish {names}/go") for names in ("/hall/r1", "/hall/r10")]
+    assert list(folded(FLEET, one)) == [
+        "/x/base may publish /{other}/go  (the 2 robots of carriers)"
+    ]
+    every = [*one, ("/x/base", "/x/base may publish /r2/go"), ("/x/base", "/x/base may join")]
+    assert list(folded(FLEET, every)) == [
+        "/x/base may publish /{other}/go  (all 3 other robots)", "/x/base may join",
+    ]  # fmt: skip
+    both = [*one, ("/r2/base", "/r2/base may publish /hall/r1/go")]
+    assert list(folded(FLEET, both)) == [
+        "/{robot}/base may publish /hall/r1/go  (2 robots: x, r2)",
+        "/x/base may publish /hall/r10/go",
+    ]
+
+
+def test_many_lines_that_differ_in_two_robots_are_one() -> None:
+    names = [f"r{number}" for number in range(8)]
+    fleet = Fleet.of([Robot(name, f"/{name}") for name in names], enclaves=["/{robot}/base"])
+    every = [(a, b) for a in names for b in names if a != b]
+
+    def told(pairs: list[tuple[str, str]]) -> list[str]:
+        lines = ((f"/{one}/base", f"/{one}/base publish /{other}/go") for one, other in pairs)
+        return list(folded(fleet, lines))
+
+    text = "/{robot}/base publish /{other}/go  "
+    assert told(every) == [f"{text}(all 8 robots, each with each other one)"]
+    assert told(every[1:]) == [f"{text}(55 pairs of robots, such as r0 and r2)"]
+    to_two = [pair for pair in every if pair[1] in ("r6", "r7")]
+    assert len(told(to_two)) == 2
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("folding")
