@@ -15,7 +15,14 @@ from hypothesis import HealthCheck, settings, strategies
 
 from sros_tool.pki import keys
 from tests.support.children import LONG
-from tests.support.harness import copy_of, policy_text, publish, sros
+from tests.support.harness import (
+    copy_of,
+    environment,
+    policy_text,
+    publish,
+    restore_environment,
+    sros,
+)
 from tests.support.long_form import SEED
 
 POLICY = policy_text({"/a": publish("old_a"), "/b": publish("old_b")})
@@ -107,12 +114,12 @@ _BEFORE = pytest.StashKey[tuple[dict[bytes, bytes], str]]()
 
 
 def _surroundings() -> tuple[dict[bytes, bytes], str]:
-    """Return the environment, in bytes because decoding them takes longer, and working folder."""
+    """Return the environment and the working folder."""
     try:
         folder = os.getcwd()
     except FileNotFoundError:
         folder = "a folder that was removed"
-    return os.environ._data.copy(), folder  # type: ignore[attr-defined]
+    return environment(), folder
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
@@ -131,8 +138,7 @@ def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
     if (now, there) == (variables, folder):
         return result
     changed = {name for name in variables.keys() | now if variables.get(name) != now.get(name)}
-    os.environ.clear()
-    os.environ.update({os.fsdecode(name): os.fsdecode(text) for name, text in variables.items()})
+    restore_environment(variables)
     os.chdir(folder)
     left = [*sorted(map(os.fsdecode, changed)), *({there} - {folder})]
     pytest.fail(f"it leaves variables or a working folder of its own: {', '.join(left)}")
