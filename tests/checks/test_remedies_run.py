@@ -110,7 +110,7 @@ def test_no_remedy_names_a_command_that_refuses(
     def run(words: list[str]) -> Ended:
         return sros(*words, env=ENVIRONMENT, cwd=tmp_path)
 
-    for words in commands(found[0], policy, tmp_path / "target"):
+    for words in commands(found[0], policy, tmp_path / "target", KEYSTORE=root):
         ended = run(words)
         if ended.status > 1:  # perhaps the other choice was carried out before
             shutil.rmtree(root)

@@ -440,6 +440,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("fleet", 1),
         Case("fleet --robot a", before=("fleet confirm fleet a.json --robot a",)),
         Case("fleet", 1, before=("fleet confirm fleet b.json --robot b",)),
+        Case("fresh", 1, before=("fleet publish fresh pub",)),
     ),
     "env": (
         Case("ks /a"),
