@@ -191,8 +191,8 @@ class ClosedProcess(NamedTuple):
     def secured_command(self, folder: Path, of_launch: str = "") -> str:
         """Return the shell command that starts the process, its launch or containers with security.
 
-        ``folder`` is that of the closed robot, and ``of_launch`` the enclave of the node that its
-        `ros2 launch` has.
+        ``folder`` is the folder of the closed robot, and ``of_launch`` the enclave of the node of
+        `ros2 launch` itself.
         """
         if self.container:
             overlay = shlex.quote(str(folder / "start" / _SERVICES))
@@ -240,7 +240,7 @@ class ObservedProcesses(NamedTuple):
         pids = {process.pid for process in self.processes}
         commands = {tuple(process.command) for process in self.processes}
         unknown = [
-            _described(process)
+            _process_text(process)
             for process in running.processes
             if _is_in_domain(process, self.domain)
             and not (process.is_daemon or process.asks_for_security)
@@ -441,7 +441,7 @@ def assign(
         sorted(
             each._replace(shares=sorted(of_program[each.pid] - {each.enclave})) for each in assigned
         ),
-        [_described(process) for process in left.values() if process.pid not in of_program],
+        [_process_text(process) for process in left.values() if process.pid not in of_program],
         sorted(
             enclave
             for enclave, of_enclave in by_enclave.items()
@@ -455,7 +455,7 @@ def _is_in_domain(process: Process, domain: int) -> bool:
     return process.domain == str(domain) and not process.network
 
 
-def _described(process: Process) -> str:
+def _process_text(process: Process) -> str:
     return f"{process.label}: {shlex.join(process.command)}"
 
 
@@ -1211,7 +1211,7 @@ class OpenRobot:
                 how = f"start it open: {process.open_command}"
                 self._shell.say(f"{process.enclave} does not run; {how}")
         for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
-            yield f"{name} runs in an enclave, too; restart it open: {_described(secured[name])}"
+            yield f"{name} runs in an enclave, too; restart it open: {_process_text(secured[name])}"
 
     # ── the proof ───────────────────────────────────────────────────────────────────────────
 

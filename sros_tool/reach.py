@@ -334,11 +334,11 @@ def _in_common(
     """Return the ROS domains that two sets have in common, in a tuple; () if there are none."""
     if one is None or other is None or one is other:
         return (other if one is None else one,)
-    return _both(one, other)
+    return _common_domains(one, other)
 
 
 @lru_cache(maxsize=4096)
-def _both(one: DomainSet, other: DomainSet) -> tuple[DomainSet] | tuple[()]:
+def _common_domains(one: DomainSet, other: DomainSet) -> tuple[DomainSet] | tuple[()]:
     common = one & other
     return (common,) if common.ranges else ()
 

@@ -1117,13 +1117,13 @@ class _IncludeGraph:
             paths: set[Path] = set()
             waiting = [file]
             while waiting and len(paths) < _MANY:
-                new = self._included(waiting.pop()) - paths
+                new = self._files_included_by(waiting.pop()) - paths
                 paths |= new
                 waiting += new
             self._reached[file] = frozenset(paths - {file})
         return self._reached[file]
 
-    def _included(self, file: Path) -> frozenset[Path]:
+    def _files_included_by(self, file: Path) -> frozenset[Path]:
         if file not in self._direct:
             try:
                 includes = list(self._includer.load(file).iter(*_INCLUDES))

@@ -298,7 +298,7 @@ _NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."
 """The message of ros2/sros2; scripts look for it."""
 
 
-class _Words(Watching):
+class _ObservingCommand(Watching):
     """A command whose ``--watch`` needs no value, and whose ``--from-log`` takes several values."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -316,7 +316,7 @@ class _Words(Watching):
         return super().parse_args(ctx, words)
 
 
-@verb("generate_policy", cls=_Words)
+@verb("generate_policy", cls=_ObservingCommand)
 @click.argument("file", type=PATH, required=False)
 @observing_options("Observe in this enclave; with --from-log, the enclave of the node.")
 @click.option(
@@ -417,7 +417,7 @@ def generate_policy(
 
         texts = {log: _log_text(log) for log in logs}
         learned, lines, denied = learned_from_logs(
-            texts, file=file, enclave=enclave or "", place=_place(node), present=present
+            texts, file=file, enclave=enclave or "", place=_profile_place(node), present=present
         )
         if not learned.profiles:
             print_notes(learned.notes)
@@ -639,7 +639,7 @@ def _log_text(log: Path) -> str:
     return read_log(str(log))
 
 
-def _place(node: str | None) -> tuple[str, str] | None:
+def _profile_place(node: str | None) -> tuple[str, str] | None:
     from sros_tool.names import check_namespace, expression_problem
 
     if node is None:

@@ -392,13 +392,13 @@ def outside(
                 kept_from = "subscribing" if other == "subscribe" else "publishing"
                 yield (
                     "portable.deny-blocks-topic",
-                    f"denying to {direction} {_some(blocked)} also keeps the enclave from "
+                    f"denying to {direction} {_topics_text(blocked)} also keeps the enclave from "
                     f"{kept_from} there",
                 )
         sets = [t for r in grant.rules for c in (*r.publish, *r.subscribe) for t in c.topics]
         sets = sorted({topic for topic in sets if "[" in topic})
         if sets:
-            yield "portable.character-set", f"{_some(sets)} uses a [set] of characters"
+            yield "portable.character-set", f"{_topics_text(sets)} uses a [set] of characters"
 
 
 def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
@@ -470,5 +470,5 @@ def _contained(
             yield from by_parts.get(frozenset(subset), ())
 
 
-def _some(topics: list[str]) -> str:
+def _topics_text(topics: list[str]) -> str:
     return first_few(topics, _SHOWN)

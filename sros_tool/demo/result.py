@@ -463,7 +463,7 @@ def _why_not_running(name: str, record: PartyRecord) -> _Finding | None:
     ready = any(event.kind is EventKind.READY for event in record.events)
     for event in record.events:
         if event.kind is EventKind.REFUSED:
-            return _refused(name, event.stage, _own_denial(record, "") or event.text)
+            return _refusal_finding(name, event.stage, _own_denial(record, "") or event.text)
         if event.kind is EventKind.FAILED:
             return _failure(name, record, event)
     if record.status is not None:
@@ -479,12 +479,12 @@ def _failure(name: str, record: PartyRecord, event: Event) -> _Finding:
     if lacking := missing_security(reported):
         return _Finding(RowStatus.NOT_STARTED, f"{name}: {lacking}")
     if event.stage is ProcessStage.ENDPOINT and (refusal := _own_denial(record, event.text)):
-        return _refused(name, ProcessStage.ENDPOINT, refusal)
+        return _refusal_finding(name, ProcessStage.ENDPOINT, refusal)
     if event.stage in (ProcessStage.PARTICIPANT, ProcessStage.ENDPOINT):
         # A ROS node has standard topics and services: if one is denied, it does not start.
         refusal = participant_refusal(reported) or endpoint_refusal(reported)
         if refusal:
-            return _refused(name, ProcessStage.PARTICIPANT, refusal)
+            return _refusal_finding(name, ProcessStage.PARTICIPANT, refusal)
     return _Finding(RowStatus.CRASHED, f"{name} failed: {reason}")
 
 
@@ -500,7 +500,7 @@ def _is_about(line: str, topic: str) -> bool:
     return bool(re.search(name, line)) or "not allowed by security" in line.lower()
 
 
-def _refused(name: str, stage: ProcessStage | None, reason: str) -> _Finding:
+def _refusal_finding(name: str, stage: ProcessStage | None, reason: str) -> _Finding:
     reason = plain_refusal(reason)
     if stage is ProcessStage.ENDPOINT:
         return _Finding(RowStatus.REFUSED, f"{name}: {reason}")

@@ -421,13 +421,13 @@ def _notes(missing: MissingRights) -> tuple[Note, ...]:
     }
     several = len(missing.rights) > 1
     return (_SEVERAL,) * several + tuple(
-        Note(name, text.format(", ".join(dict.fromkeys(map(_shown, denials)))))
+        Note(name, text.format(", ".join(dict.fromkeys(map(_denial_text, denials)))))
         for name, (denials, text) in texts.items()
         if denials
     )
 
 
-def _shown(denial: Denial) -> str:
+def _denial_text(denial: Denial) -> str:
     return f"{denial.direction} {denial.topic}".strip() + (
         f" in {denial.enclave}" if denial.enclave else ""
     )

@@ -109,7 +109,7 @@ class FleetPolicy(Mapping[str, Enclave]):
             yield enclave.path, None
             return
         parts = parts_of(enclave.path)
-        for robot in self._members(group_of(parts), enclave.source):
+        for robot in self._group_members(group_of(parts), enclave.source):
             try:
                 yield check_enclave_name(path_for(parts, robot)), robot
             except InvalidNameError as error:
@@ -119,7 +119,7 @@ class FleetPolicy(Mapping[str, Enclave]):
                     error.remedy,
                 ) from error
 
-    def _members(self, group: str, source: Source) -> tuple[Robot, ...]:
+    def _group_members(self, group: str, source: Source) -> tuple[Robot, ...]:
         try:
             return self.fleet.members(group)
         except DocumentError as error:
@@ -187,7 +187,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         return names
 
     def _for_each(self, parts: Parts, source: Source) -> Iterator[str]:
-        for robot in self._members(placeholders_of(parts)[0].group, source):
+        for robot in self._group_members(placeholders_of(parts)[0].group, source):
             name = "".join(map(str, fill(parts, robot.name, robot.namespace, plural=True)))
             if problem := _name_problem(name):
                 raise _invalid_name(name, problem, source)

@@ -147,7 +147,7 @@ class _Reader:
                 raise self._refused("routers", routers, text)
         if both := sorted(fleet.robots.keys() & fleet.groups.keys()):
             raise self._error(
-                f"{_short(both[0])} is a robot and a group",
+                f"{_short_value(both[0])} is a robot and a group",
                 "Ansible would confuse them.",
                 "Give one of them another name.",
             )
@@ -250,19 +250,19 @@ class _Reader:
                 raise self._error(f"{where} is not a known key", f"There are {', '.join(known)}.")
 
     def _refused(self, at: str, value: object, problem: str) -> DocumentError:
-        return self._error(f"{at} has {_short(value)}, which is not valid", problem)
+        return self._error(f"{at} has {_short_value(value)}, which is not valid", problem)
 
     def _error(self, what: str, why: str = "", remedy: str = "") -> DocumentError:
         return DocumentError(f"{self._what}: {what}", why, remedy)
 
 
-def _short(value: object) -> str:
+def _short_value(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:80]}..."
 
 
 def _key(text: str) -> str:
-    return text if text.isidentifier() and len(text) <= 80 else _short(text)
+    return text if text.isidentifier() and len(text) <= 80 else _short_value(text)
 
 
 # ── writing ────────────────────────────────────────────────────────────────────────────────

@@ -404,7 +404,7 @@ class CommonParts:
         """
         chosen, rest = [], rights
         for part, names in self.rights.items():
-            node_rights = _expanded(names, ns, node)
+            node_rights = _expanded_rights(names, ns, node)
             if node_rights <= rights and node_rights & rest:
                 chosen.append(part)
                 rest -= node_rights
@@ -412,7 +412,7 @@ class CommonParts:
 
     def given(self, parts: Iterable[str], ns: str, node: str) -> frozenset[NodeRight]:
         """Return the rights, with absolute names, that ``parts`` give to a node."""
-        return frozenset().union(*(_expanded(self.rights[part], ns, node) for part in parts))
+        return frozenset().union(*(_expanded_rights(self.rights[part], ns, node) for part in parts))
 
     def to_copy(self, parts: Iterable[str]) -> dict[str, bytes]:
         """Return the content, by path, of files that ``parts`` need and the folder lacks."""
@@ -440,7 +440,7 @@ def common_parts(folder: Path, shipped: Path) -> CommonParts:
     return CommonParts(rights, missing)
 
 
-def _expanded(rights: Iterable[NodeRight], ns: str, node: str) -> frozenset[NodeRight]:
+def _expanded_rights(rights: Iterable[NodeRight], ns: str, node: str) -> frozenset[NodeRight]:
     return frozenset(NodeRight(right.right, expand(right.name, ns, node)) for right in rights)
 
 

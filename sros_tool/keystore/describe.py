@@ -512,7 +512,7 @@ _NOT_SIGNED = SignatureFacts(signed=False, signature_verified=False, signer=None
 # ── describing ─────────────────────────────────────────────────────────────────────────────
 
 
-def _one_below(folder: Path) -> str:
+def _remedy_naming_enclaves(folder: Path) -> str:
     """Return a remedy that names the enclaves in a folder of enclaves, "" if it has none."""
     with suppress(SrosError):
         root, name = locate_enclave(folder)
@@ -558,7 +558,7 @@ def describe(
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
             "It has no enclaves folder, and neither cert.pem nor permissions.p7s.",
-            _one_below(path),
+            _remedy_naming_enclaves(path),
         )
     data = files.read(path, "file")
     try:

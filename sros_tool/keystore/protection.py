@@ -149,15 +149,15 @@ class _Raising:
                 value = self._raised(self._value(number), stated.level)
                 self._named[number] = replace(self._named[number], protection=value)
             elif self._raised(self._value(number), stated.level) != self._value(number):
-                raise self._parted(name, stated)
+                raise self._overlap_error(name, stated)
         return self._owner[min(wide, key=self._rank.__getitem__)] if wide else None
 
     def _refuse_parted(self, topic: str, stated: StatedProtection) -> None:
         for name in self._topics.meeting(topic):
             if not covers(name, topic) and not covers(topic, name):
-                raise self._parted(name, stated)
+                raise self._overlap_error(name, stated)
 
-    def _parted(self, topic: str, stated: StatedProtection) -> PolicyError:
+    def _overlap_error(self, topic: str, stated: StatedProtection) -> PolicyError:
         other = self._named[self._owner[topic]]
         return PolicyError(
             f'{stated.source}: {stated} has protect="{stated.word}", but the settings of the '

@@ -360,7 +360,7 @@ def drifted(
     def compare(paths: Sequence[str]) -> list[Drifted]:
         differing = []
         for path in paths:
-            document, present = wanted.files[path], _present(keystore, path)
+            document, present = wanted.files[path], _present_file(keystore, path)
             kind = None
             if present is None:
                 kind = Drift.MISSING
@@ -753,7 +753,7 @@ class _RightsReader:
             verified, lambda name: self._grant(name, signed[name].document, certificates[name])
         )
         grants |= {name: rights.grant for name, rights in issued.items()}
-        joined = for_each(grants, lambda name: self._joined(grants[name]))
+        joined = for_each(grants, lambda name: self._domains_of_grant(grants[name]))
         stated = {
             name: {domain: rights_in_domain(name, grants[name], domain) for domain in domains}
             for name, domains in joined.items()
@@ -816,7 +816,7 @@ class _RightsReader:
             raise KeystoreError(f"its permissions expired at {grant.not_after}")
         return grant
 
-    def _joined(self, grant: Grant) -> tuple[int, ...]:
+    def _domains_of_grant(self, grant: Grant) -> tuple[int, ...]:
         domains = joined_domains(grant, self._domains)
         if not domains:
             raise KeystoreError("its permissions are for no domain of the network")
@@ -969,7 +969,7 @@ def _examples(name: str) -> Iterable[str]:
 # ── files ──────────────────────────────────────────────────────────────────────────────────
 
 
-def _present(keystore: Keystore, path: str) -> bytes | None:
+def _present_file(keystore: Keystore, path: str) -> bytes | None:
     if not os.path.lexists(keystore.root / path):
         return None
     try:

@@ -470,7 +470,7 @@ def propose_wildcards(
     """
     own = [right for right in rights if right.enclave == enclave and right.qualifier is ALLOW]
     rules = Rules(own)
-    foreign = _foreign(enclave, rules, known)
+    foreign = _names_without_right(enclave, rules, known)
     present = Rules(right for right in own if is_expression(right.name))
     # A large document does not list the names that its wildcards match, so these save nothing.
     listed = (right for right in own if not present.cover(right))
@@ -524,7 +524,7 @@ def _wider(name: str) -> Iterator[str]:
         yield _DIGITS.sub("*", name)
 
 
-def _foreign(enclave: str, own: Rules, known: Iterable[Right]) -> dict[str, list[str]]:
+def _names_without_right(enclave: str, own: Rules, known: Iterable[Right]) -> dict[str, list[str]]:
     """Map rights to the known names for which the enclave lacks the right; actions are split."""
     by_service: dict[bool, set[str]] = {True: set(), False: set()}
     for part in unfolded(known):

@@ -179,7 +179,7 @@ def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
     first, *others = verdicts
     empty = [name for name in first.empty if all(name in other.empty for other in others)]
     if empty:
-        yield _listed(empty)
+        yield _listed_names(empty)
     if all(verdict.always for verdict in verdicts):
         yield first.always
 
@@ -202,7 +202,7 @@ def decided_findings(decided: Decided, system: System) -> list[Finding]:
     """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violated(violation) for violation in decided.violations]
     findings += [_vacuous(requirement, why) for requirement, why in decided.vacuous]
-    findings += [_assumed(*each) for each in decided.assumed]
+    findings += [_assumption_finding(*each) for each in decided.assumed]
     findings += [_not_crossing(*each) for each in decided.kept]
     if system.left_out:
         error = system.left_out
@@ -286,21 +286,21 @@ def _chain(steps: Sequence[Step]) -> str:
 def _joined_steps(steps: Sequence[Step]) -> str:
     """Return text such as ``/a and /b may publish /x``; different uses are listed one by one."""
     if len({step.does() for step in steps}) > 1:
-        return _listed([step.text() for step in steps])
-    return f"{_listed([step.use.enclave for step in steps])} may {steps[0].does()}"
+        return _listed_names([step.text() for step in steps])
+    return f"{_listed_names([step.use.enclave for step in steps])} may {steps[0].does()}"
 
 
 def _others(violation: Violation) -> str:
     """Return clauses on the further enclaves that break a requirement; "" for none."""
     alike, differing = violation.alike, violation.differing
-    text = f", and so may {_listed(alike)}" if alike else ""
+    text = f", and so may {_listed_names(alike)}" if alike else ""
     for steps in differing:
         text += f"; {steps[0].use.enclave} may {' and '.join(step.does() for step in steps)}"
     more = len(violation.witness.others) - len(alike) - len(differing)
     return text + (f"; {more} more break it in their own ways" if more else "")
 
 
-def _listed(names: Sequence[str]) -> str:
+def _listed_names(names: Sequence[str]) -> str:
     if len(names) > _SHOWN:
         names = (*names[:_SHOWN], f"{len(names) - _SHOWN} more")
     *first, last = names
@@ -313,14 +313,14 @@ def _vacuous(requirement: Requirement, why: Sequence[str]) -> Finding:
     return VACUOUS.found(own.file, text, own.file, own.line)
 
 
-def _assumed(requirement: Requirement, name: str) -> Finding:
+def _assumption_finding(requirement: Requirement, name: str) -> Finding:
     own = requirement.source
     text = f"{demand(requirement)}: {assumption_text(name)}"
     return ASSUMED.found(own.file, text, own.file, own.line)
 
 
 def _not_crossing(requirement: Requirement, kept: KeptUse) -> Finding:
-    own, use, others = requirement.source, kept.use, _listed(kept.others)
+    own, use, others = requirement.source, kept.use, _listed_names(kept.others)
     ends = f"from {use.enclave} to {others}" if use.writes else f"from {others} to {use.enclave}"
     text = f"{use.name} does not pass between routers {ends}: {demand(requirement)}"
     return NOT_CROSSING.found(own.file, text, own.file, own.line)

@@ -289,12 +289,12 @@ def _no_longer_stated(
             if other.kind == protection.kind
             and (other.level, protection.level) != (Level.SIGN, Level.ENCRYPT)
         ]
-        names = _named((protection.name,)) - _named(enough)
+        names = _set_of_names((protection.name,)) - _set_of_names(enough)
         example = names.example(limit)
         if example is not None:
             valid = names & _ABSOLUTE
             name = example if example in _ABSOLUTE else valid.example(limit) or example
-            less = "sign" if name in _named(_signed(later, protection.kind)) else "nothing"
+            less = "sign" if name in _set_of_names(_signed(later, protection.kind)) else "nothing"
             yield SettingChange(
                 Effect.LOOSER,
                 f"protect {protection}",
@@ -308,7 +308,7 @@ def _signed(stated: Iterable[StatedProtection], kind: str) -> list[str]:
     return [right.name for right in stated if right.kind == kind]
 
 
-def _named(names: Iterable[str]) -> NameSet:
+def _set_of_names(names: Iterable[str]) -> NameSet:
     return NameSet.union(map(named, names))
 
 
@@ -350,7 +350,7 @@ def added_crossing(
     kept = {*before.router_names()} & {*after.router_names()}
     for router in sorted(kept):
         one, other = _expressions(before, router), _expressions(after, router)
-        if one != other and (name := _more(one, other, limit)):
+        if one != other and (name := _newly_passing_name(one, other, limit)):
             meaning = f"{name} may pass between this router and others"
             yield SettingChange(
                 Effect.LOOSER, f"crossing of router {router}", _text(one), _text(other), meaning
@@ -372,7 +372,7 @@ def _moved_enclaves(
             if there == one:
                 continue
             has = () if later == other else _crossing_of_both(after, other, later)
-            if name := _more(_crossing_of_both(before, one, there), has, limit):
+            if name := _newly_passing_name(_crossing_of_both(before, one, there), has, limit):
                 crossing = _text(_crossing_of_both(before, one, there))
                 yield SettingChange(
                     Effect.LOOSER,
@@ -405,7 +405,7 @@ def looser_router_rules(
             if right.enclave not in old.passing:
                 continue
             known = [r.name for r in had if r[:-1] == right[:-1]]
-            if name := _more(((right.name,), tuple(known)), ((right.name,),), limit):
+            if name := _newly_passing_name(((right.name,), tuple(known)), ((right.name,),), limit):
                 routers[router, right.enclave].append(name)
     for (router, other), names in routers.items():
         yield SettingChange(
@@ -421,7 +421,7 @@ _Crossing = tuple[tuple[str, ...], ...]
 """Lists of expressions; a name may pass if it matches an expression of every list."""
 
 
-def _more(before: _Crossing, after: _Crossing, limit: SearchLimit) -> str:
+def _newly_passing_name(before: _Crossing, after: _Crossing, limit: SearchLimit) -> str:
     """Return a name that may pass by ``after`` but not by ``before``; "" if there is none."""
     names = _names(after) - _names(before)
     return (names & _ABSOLUTE).example(limit) or names.example(limit) or ""

@@ -699,9 +699,9 @@ class _Review:
                 self.base.policies(path, placeholders=base_fleet is not None)
             new = (("is new, so that all of its access is new", " ".join(self.request.policies)),)
             return _FOUND, Facts(new)
-        return self._compared(before(), head)
+        return self._compared_access(before(), head)
 
-    def _compared(self, before: AccessSource, after: AccessSource) -> tuple[int, Content]:
+    def _compared_access(self, before: AccessSource, after: AccessSource) -> tuple[int, Content]:
         growth = compare_access(before, after)
         return (_FOUND if growth else _OK), AccessChange(before, after, growth)
 
@@ -766,7 +766,9 @@ class _Review:
                 continue
             wanted = yield from _read(files, system.fleet)
             earlier = yield from _read(base_files, partial(_still_there, before, system.fleet))
-            yield from self._step_result("requirements", subject, partial(_decided, wanted, system))
+            yield from self._step_result(
+                "requirements", subject, partial(_decided_requirements, wanted, system)
+            )
             if dropped_requirements(earlier, wanted):
                 decide = partial(self._dropped, earlier, wanted, system)
                 yield from self._step_result("requirements-before", subject, decide)
@@ -795,7 +797,7 @@ class _Review:
             except SrosError as error:
                 yield ReviewStep("new-access", path, _UNDECIDED, error)
         settings = f"{path}/{SETTINGS}"
-        same = before is not None and _same(self.base, self.head, settings)
+        same = before is not None and _is_same_file(self.base, self.head, settings)
 
         def findings() -> tuple[int, Content]:
             findings = (
@@ -809,7 +811,7 @@ class _Review:
 
         def access() -> tuple[int, Content]:
             if before:
-                return self._compared(load_side(before), load_side(folder))
+                return self._compared_access(load_side(before), load_side(folder))
             new = (("is new, so that all of its access is new", path),)
             return _FOUND, Facts(new)
 
@@ -849,7 +851,7 @@ def _is_below(path: str, folders: Iterable[str]) -> bool:
     return any(f"{path}/".startswith(f"{folder}/") for folder in folders)
 
 
-def _same(base: CommitFiles | None, head: CommitFiles, path: str) -> bool:
+def _is_same_file(base: CommitFiles | None, head: CommitFiles, path: str) -> bool:
     return base is not None and base.files.get(path) == head.files.get(path)
 
 
@@ -871,7 +873,9 @@ def _status(chosen: ChosenFindings) -> int:
     return _FOUND if chosen.fails(WARNING) else _OK
 
 
-def _decided(requirements: Sequence[Requirement], system: System) -> tuple[int, ChosenFindings]:
+def _decided_requirements(
+    requirements: Sequence[Requirement], system: System
+) -> tuple[int, ChosenFindings]:
     chosen = FindingFilter().choose(requirement_findings(requirements, system))
     return _status(chosen), chosen
 

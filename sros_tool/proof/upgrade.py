@@ -92,7 +92,7 @@ _KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 class DecidedFiles:
     """The enclaves of a keystore or policy, with what is needed to decide on them.
 
-    ``domains`` are the ROS domains to decide for, None for examples of those in the documents of
+    ``domains`` are the ROS domains to decide for; None for example domains from the documents of
     each enclave.  ``keystore`` is None for a policy, whose file is ``file``.  ``chosen`` are the
     enclaves to decide on; None for all.
     """

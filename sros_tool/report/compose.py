@@ -149,7 +149,7 @@ def overlay(
     return replace(
         picture,
         overlay=_OVERLAYS[kind],
-        differences=_unused(edges) if kind == "use" else _changed(*rights),
+        differences=_unused(edges) if kind == "use" else _overlay_differences(*rights),
         enclaves=tuple(replace(e, observed=e.path not in unseen) for e in picture.enclaves),
     )
 
@@ -376,7 +376,9 @@ def _identity(edge: Edge) -> tuple[object, ...]:
     return edge.enclave, edge.kind, edge.name, edge.right, edge.qualifier, edge.parts
 
 
-def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[OverlayDifference, ...]:
+def _overlay_differences(
+    first: frozenset[Right], second: frozenset[Right]
+) -> tuple[OverlayDifference, ...]:
     difference = compare(first, second)
     return tuple(
         OverlayDifference(
@@ -447,7 +449,7 @@ class Known:
             return (name,)
         key = (kind, name)
         if key not in self._matched:
-            self._matched[key] = tuple(self._matching(kind, name))
+            self._matched[key] = tuple(self._matching_names(kind, name))
         return self._matched[key]
 
     def drawn(self, right: Right) -> tuple[str, ...]:
@@ -462,7 +464,7 @@ class Known:
         wild = opened.drawn(right.qualifier, right.name) if opened else ()
         return (*self.reached(right.kind, right.name), *wild)
 
-    def _matching(self, kind: str, expression: str) -> Iterable[str]:
+    def _matching_names(self, kind: str, expression: str) -> Iterable[str]:
         if kind == "actions":
             return sorted(action for action in self.actions if matches(expression, action))
         names, prefix = self._names.get(kind, ()), literal_prefix(expression)

@@ -379,10 +379,10 @@ class _Draft:
         views: list[Counter[object]] = [Counter() for _ in self._units]
         for kind, units, _what in self._seen:
             for unit in set(units):
-                views[unit][kind, self._around(units, unit)] += 1
+                views[unit][kind, self._symbols_around(units, unit)] += 1
         return views
 
-    def _around(self, units: Sequence[int], unit: int) -> tuple[int, ...]:
+    def _symbols_around(self, units: Sequence[int], unit: int) -> tuple[int, ...]:
         return tuple(_SELF if other == unit else self._symbols[other] for other in units)
 
     def _named_by(self, families: Container[int]) -> Counter[int]:
@@ -504,7 +504,12 @@ class _Draft:
         def key(edge: Edge, unit: int, other: int) -> object:
             name = self._text(edge.name)
             rest = replace(edge, name="", by=())
-            return rest, name.form, self._around(name.units, unit), self._units[other].family
+            return (
+                rest,
+                name.form,
+                self._symbols_around(name.units, unit),
+                self._units[other].family,
+            )
 
         for edge in self._picture.edges:
             unit = self._of.get(edge.enclave)
@@ -534,10 +539,10 @@ class _Draft:
             self._alike = defaultdict(list)
             for real in self._picture.names:
                 if (text := self._text(real.name)).named:
-                    self._alike[real.kind, self._form(text)].append(real.name)
-        return self._alike[kind, self._form(name)]
+                    self._alike[real.kind, self._text_form(text)].append(real.name)
+        return self._alike[kind, self._text_form(name)]
 
-    def _form(self, text: UnitText) -> object:
+    def _text_form(self, text: UnitText) -> object:
         return text.form, tuple(self._symbols[unit] for unit in text.units)
 
     def _folded_names(self, edges: Sequence[Edge]) -> Iterator[Name]:
@@ -597,7 +602,7 @@ class _Draft:
         seen: dict[int, dict[object, Edge | str]] = {n: {} for n in (*near.keys(), *near.values())}
         for kind, units, what in self._seen:
             for unit in seen.keys() & set(units):
-                seen[unit].setdefault((kind, self._around(units, unit)), what)
+                seen[unit].setdefault((kind, self._symbols_around(units, unit)), what)
         different: list[DifferentUnit] = []
         differing_parts: set[Edge | str] = set()
         for n in sorted(near, key=self._by_name):

@@ -372,7 +372,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
     for number, link in enumerate(scene.links):
         arrow = _MERMAID_ARROWS[link.level.value] if link.qualifier is ALLOW else "--x"
         text = _entities(_link_label(picture, link))
-        lines.append(f'  {_end(link.source)} {arrow}|"{text}"| {_end(link.target)}')
+        lines.append(f'  {_node_id(link.source)} {arrow}|"{text}"| {_node_id(link.target)}')
         red = link.violates or link.qualifier is not ALLOW
         color = _DENIED if red else _COLOURS[link.mark]
         styles[color].append(number)
@@ -464,7 +464,7 @@ def _key(card: str) -> str:
 
 def _texts(scene: Scene, card: Card) -> Iterable[str]:
     if card.kind:
-        yield KIND_NAMES[card.kind] + _protected(card)
+        yield KIND_NAMES[card.kind] + _level_text(card)
     yield from card.members if len(card.members) <= len(card.lines) else card.lines
     yield from card.notes
     for onlooker in scene.onlookers:
@@ -473,7 +473,7 @@ def _texts(scene: Scene, card: Card) -> Iterable[str]:
             yield f"{onlooker.tag}: {ONLOOKERS[onlooker.right]} {enclave}"
 
 
-def _protected(card: Card) -> str:
+def _level_text(card: Card) -> str:
     return "" if card.level is WireLevel.UNKNOWN else f", {LEVEL_NAMES[card.level]}"
 
 
@@ -536,7 +536,7 @@ def _label(scene: Scene, card: Card) -> str:
     return "<br/>".join(map(_entities, _texts(scene, card)))
 
 
-def _end(card: str) -> str:
+def _node_id(card: str) -> str:
     return _id(_key(card))
 
 

@@ -603,7 +603,7 @@ def fold(
             kind,
             protection,
             tuple(sorted(members)),
-            tuple(sorted(bundle_ties, key=_order)),
+            tuple(sorted(bundle_ties, key=_tie_order)),
             asks=asking,
             lacks=lacks,
         )
@@ -623,17 +623,17 @@ def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
         senders = frozenset((tie.node, tie.right) for tie in bundle.ties if tie.sends)
         apart = None if plain and senders else bundle.ties
         alike[bundle.kind, bundle.protection, senders, apart, bundle.lacks].append(bundle)
-    return tuple(_joined(bundles) for bundles in alike.values())
+    return tuple(_joined_bundles(bundles) for bundles in alike.values())
 
 
-def _joined(bundles: Sequence[Bundle]) -> Bundle:
-    ties = sorted({tie for bundle in bundles for tie in bundle.ties}, key=_order)
+def _joined_bundles(bundles: Sequence[Bundle]) -> Bundle:
+    ties = sorted({tie for bundle in bundles for tie in bundle.ties}, key=_tie_order)
     names = sorted(name for bundle in bundles for name in bundle.names)
     partial = any(bundle.ties != bundles[0].ties for bundle in bundles)
     return replace(bundles[0], names=tuple(names), ties=tuple(ties), partial=partial, asks=False)
 
 
-def _order(tie: Tie) -> tuple[object, ...]:
+def _tie_order(tie: Tie) -> tuple[object, ...]:
     right = RIGHT_ORDER[tie.right]
     marks = tie.mark, tie.common, tie.violates, tie.differs
     return right, tie.node, tie.qualifier, tie.by, tie.parts, *marks

@@ -477,7 +477,7 @@ def _with_findings(
         right.enclave for right in source.rights
     }
     places = _file_names(path)
-    found = tuple(_without_paths(_placed(finding, known), places) for finding in findings)
+    found = tuple(_without_paths(_on_known_enclave(finding, known), places) for finding in findings)
     return replace(source, findings=tuple(dict.fromkeys((*source.findings, *found))))
 
 
@@ -545,7 +545,7 @@ def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime
     for name in sample.enclaves:
         opened = keystore.enclave(name, now=now)
         evaluation = evaluated(name, keystore.folder(name), opened, at=now)
-        enclaves.append(_described(name, evaluation.state, evaluation.problems))
+        enclaves.append(_pictured_enclave(name, evaluation.state, evaluation.problems))
         validities |= set(_validities_of(name, evaluation.state))
     try:
         validities |= set(_authorities(keystore))
@@ -568,13 +568,15 @@ def _with_enclave(source: PictureSource, folder: Path, now: datetime) -> Picture
     state = evaluation.state
     return replace(
         source,
-        enclaves=(_described(name, state, evaluation.problems_here),),
+        enclaves=(_pictured_enclave(name, state, evaluation.problems_here),),
         governance=state.governance,
         validities=tuple(sorted(_validities_of(name, state))),
     )
 
 
-def _described(name: str, state: OpenedEnclave, problems: tuple[str, ...]) -> PicturedEnclave:
+def _pictured_enclave(
+    name: str, state: OpenedEnclave, problems: tuple[str, ...]
+) -> PicturedEnclave:
     certificate = state.certificate
     if certificate is None:
         return PicturedEnclave(name, "", problems=problems)
@@ -625,7 +627,7 @@ def _authorities(keystore: Keystore) -> Iterator[Validity]:
 # ── removing paths of this machine ─────────────────────────────────────────────────────────
 
 
-def _placed(finding: PicturedFinding, known: Set[str]) -> PicturedFinding:
+def _on_known_enclave(finding: PicturedFinding, known: Set[str]) -> PicturedFinding:
     if not finding.enclave or finding.enclave in known:
         return finding
     return replace(finding, enclave="", text=f"{finding.enclave}: {finding.text}")

@@ -396,8 +396,8 @@ class Container:
 def object_name(enclave: str) -> str:
     """Return a name of at most 58 characters (RFC 1123) that only this enclave has.
 
-    Names of enclaves distinguish capitals and have "_" and "/".  If the new name loses that, "--"
-    and the first 64 bits of the enclave's SHA-256 follow, so that it is unique.
+    Names of enclaves may have capitals, "_" and "/". A name that loses one of these ends with "--"
+    and the first 64 bits of the enclave's SHA-256, so that it is unique.
     """
     words = "-".join(re.findall(r"[a-z0-9]+", enclave.lower()))
     if _PLAIN.match(enclave) and len(words) <= _LONGEST_PLAIN:

@@ -555,7 +555,7 @@ class Enforcement:
         """Return the subjects that match a remote process, in the order of the file."""
         ids = {
             subject_id
-            for combination in self._matching(remote)
+            for combination in self._matching_subjects(remote)
             for subject_id in self._combinations[combination]
         }
         return tuple(subject for subject in self.subjects if subject.id in ids)
@@ -623,7 +623,7 @@ class Enforcement:
         if not subjects:
             return self._by_default((), f"no subject matches, and the default is {default}")
         denying: list[str] = []
-        for combination in self._matching(remote):
+        for combination in self._matching_subjects(remote):
             applying = [
                 rule
                 for rule in self._in_force[combination].get((flow, message), ())
@@ -674,7 +674,7 @@ class Enforcement:
         everything = ~NameSet()
         if not self.enabled:
             return everything
-        combinations = self._matching(remote)
+        combinations = self._matching_subjects(remote)
         if not self._rules_of or not combinations:
             return everything if self.allows_by_default else NameSet()
         passing = []
@@ -731,7 +731,7 @@ class Enforcement:
             by_name.setdefault(combination[0], []).append(combination)
         return {name: tuple(of) for name, of in by_name.items()}
 
-    def _matching(self, remote: Remote) -> list[_Combination]:
+    def _matching_subjects(self, remote: Remote) -> list[_Combination]:
         values: tuple[tuple[str | None, ...], ...] = (
             (remote.common_name,),
             (remote.username,),

@@ -320,12 +320,12 @@ def render_rights(remote: RemoteRights) -> RenderedRights:
 def _rendered(rule: AccessRule) -> str:
     return (
         f'"permission": "{_PERMISSIONS[rule.allows]}", "flows": ["{rule.flow}"], '
-        f'"messages": {_known(rule.messages)}, "key_exprs": {_known(rule.key_expressions)}}}'
+        f'"messages": {_listed(rule.messages)}, "key_exprs": {_listed(rule.key_expressions)}}}'
     )
 
 
 @lru_cache(maxsize=4096)  # several rules have the same, and in peer mode many files
-def _known(texts: tuple[str, ...]) -> str:
+def _listed(texts: tuple[str, ...]) -> str:
     return _list(texts)
 
 
@@ -484,7 +484,7 @@ def check_network(network: ZenohNetwork) -> None:
     if network.routers:
         _check_routers(network)
     connect, listen = (
-        {_place(endpoint) for endpoint in endpoints}
+        {_host_and_port(endpoint) for endpoint in endpoints}
         for endpoints in (network.endpoints, network.listen)
     )
     hosts = {host for host, _ in connect}
@@ -537,8 +537,10 @@ def _check_routers(network: ZenohNetwork) -> None:
 
 def _far(router: ZenohRouter) -> tuple[str, ...]:
     """Return the endpoints at which processes of other hosts reach a router."""
-    listens = {_place(endpoint)[0] for endpoint in router.listening()}
-    far = tuple(endpoint for endpoint in router.endpoints if _place(endpoint)[0] != _LOOPBACK)
+    listens = {_host_and_port(endpoint)[0] for endpoint in router.listening()}
+    far = tuple(
+        endpoint for endpoint in router.endpoints if _host_and_port(endpoint)[0] != _LOOPBACK
+    )
     return () if listens == {_LOOPBACK} else far
 
 
@@ -546,7 +548,7 @@ _LOOPBACK = "localhost"
 _LOOPBACKS = ("localhost", "[::1]", "ip6-localhost")
 
 
-def _place(endpoint: str) -> tuple[str, int]:
+def _host_and_port(endpoint: str) -> tuple[str, int]:
     host, _, port = endpoint.rpartition(":")
     is_here = host.lower() in _LOOPBACKS or host.startswith("127.")
     return _LOOPBACK if is_here else host, int(port)

@@ -236,10 +236,10 @@ def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
     if len(permissions.grants) > 1:
         yield SEVERAL_GRANTS.found(name, f"it has {len(permissions.grants)} grants", file)
     for grant in permissions.grants:
-        yield from _form(grant, name, file)
+        yield from _form_findings(grant, name, file)
     if own := grant_of(enclave):
         yield from _times(enclave, own, file)
-        yield from _order(own, name, file)
+        yield from _order_findings(own, name, file)
         yield from check_topic_names(enclave, own, file)
         yield from _domains(enclave, own, file)
 
@@ -255,7 +255,7 @@ def _domain_problems(domains: DomainSet) -> Iterator[str]:
             yield f"{part} goes beyond {MAX_DOMAIN}"
 
 
-def _form(grant: Grant, name: str, file: str) -> Iterator[Finding]:
+def _form_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
     if not grant.name:
         yield GRANT_NAME.found(name, f"the grant for {grant.subject} has no name", file)
     if not (_SUBJECT.match(grant.subject) and grant.subject.isascii()):
@@ -339,7 +339,7 @@ def _utc(seconds: float) -> str:
     return iso(datetime.fromtimestamp(seconds, UTC)) if isfinite(seconds) else "never"
 
 
-def _order(grant: Grant, name: str, file: str) -> Iterator[Finding]:
+def _order_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
     limit = ComparisonLimit()
     stated = {
         (direction, allow): _Topics(grant, direction, allow, limit)

@@ -157,7 +157,7 @@ def _types_and_values(name: str) -> list[tuple[str, str]]:
         kind, rest = rest[: equals or None], rest[equals + 1 :]
         comma = _outside_quotes(rest, ",")
         value = rest if comma < 0 else rest[: comma or None]
-        pairs.append((_plain(kind), _plain(value)))
+        pairs.append((_plain_subject(kind), _plain_subject(value)))
         rest = "" if comma < 0 else rest[comma + 1 :].lstrip(" ")
     return pairs
 
@@ -183,12 +183,12 @@ def _attributes(name: str) -> list[tuple[str, str]]:
         kind = _EQUALS.match(text)
         if not text or not kind or kind.end() >= len(text):
             break
-        attributes.append((_plain(kind[0]), _plain(text[kind.end() + 1 :])))
+        attributes.append((_plain_subject(kind[0]), _plain_subject(text[kind.end() + 1 :])))
         index += len(part[0]) + 1 if part else 1
     return attributes
 
 
-def _plain(text: str) -> str:
+def _plain_subject(text: str) -> str:
     return text.strip(" ").replace("\\", "").replace('"', "")
 
 

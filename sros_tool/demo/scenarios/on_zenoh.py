@@ -307,7 +307,7 @@ _WIRE_ROWS = tuple(
 _LARGE = 64 * 1024
 
 
-def _shared(name: str, keystore: KeystoreChoice, *, readable: bool) -> Row:
+def _shared_memory_row(name: str, keystore: KeystoreChoice, *, readable: bool) -> Row:
     wide, talker, listener = _topic_pair(keystore)
     return Row(
         name,
@@ -325,8 +325,8 @@ def _shared(name: str, keystore: KeystoreChoice, *, readable: bool) -> Row:
 
 _MEMORY_ROWS = tries(
     "large messages in shared memory",
-    _shared("large messages in shared memory", OWN, readable=False),
-    _shared(
+    _shared_memory_row("large messages in shared memory", OWN, readable=False),
+    _shared_memory_row(
         "large messages in shared memory, switched on",
         zenoh_forger.in_shared_memory,
         readable=True,

@@ -439,7 +439,7 @@ class _Rotator:
             self._retire()
             return stage
         if self._rotation.stage is RotationStage.NONE:
-            successors = self._begin(
+            successors = self._begin_rotation(
                 roles, new_keys, validity, next_to=stage is RotationStage.DISTRIBUTE
             )
             if stage is RotationStage.DISTRIBUTE:
@@ -458,7 +458,7 @@ class _Rotator:
 
     # ── the stages ─────────────────────────────────────────────────────────────────────────
 
-    def _begin(
+    def _begin_rotation(
         self, roles: Sequence[str], new_keys: Keyring, validity: Span | None, *, next_to: bool
     ) -> list[_Successor]:
         successors = _make_successors(
