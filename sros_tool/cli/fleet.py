@@ -702,7 +702,10 @@ def _facts(compared: ComparedFleet) -> Iterator[str]:
 
 def _expiry_facts(compared: ComparedFleet) -> Iterator[str]:
     """Yield when the first file on a robot expires, if that is soon, and what to do."""
+    from datetime import timedelta
+
     from sros_tool.keystore.fleet import publish_command
+    from sros_tool.validity import iso
 
     soon = [
         robot
@@ -715,13 +718,16 @@ def _expiry_facts(compared: ComparedFleet) -> Iterator[str]:
         (end, robot.robot, kind) for robot in soon for kind, end in robot.expiry.items()
     )
     root = compared.status.keystore
+    left = end - compared.at
+    when = f"{end:%Y-%m-%d}" if left > timedelta(days=1) else iso(end)
+    what = "first expiry on a robot" if left > timedelta(0) else "expired on a robot since"
     command = f"`sros renew {quote(str(root))} --all-expiring 30d`, then "
     if kind == "crl":
         command = f"`sros crl {quote(str(root))} --refresh`, then "
     if not any("current" in robot.files.get(kind, ()) for robot in soon):
         command = ""  # the keystore has renewed them
     yield (
-        f"first expiry on a robot: {end:%Y-%m-%d} ({first}, {_KINDS.get(kind, kind)}), within 30 "
+        f"{what}: {when} ({first}, {_KINDS.get(kind, kind)}), within 30 "
         f"days on {counted(len(soon), 'robot')}: {command}{publish_command(root) or 'deliver'}"
     )
 
@@ -758,7 +764,8 @@ def _groups(compared: ComparedFleet, robots: Sequence[str]) -> list[_Group]:
     whats: dict[str, str] = {}
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
         if robots or robot.state not in ("current", "none") or robot.notes or robot.problems:
-            what = _unnamed("; ".join(_summary(robot, status.stage)), robot.robot)
+            clauses = (*_expired(robot, compared.at), *_summary(robot, status.stage))
+            what = _CLOCK.sub("", _unnamed("; ".join(clauses), robot.robot))
             whats[robot.robot] = what
             row = (robot.state.value, robot.to_do, _DURATION.sub("", what))
             alike.setdefault((*row, robot.robot if robots else ""), []).append(robot)
@@ -812,6 +819,8 @@ _ROBOT = "{robot}"
 
 _DURATION = re.compile(r"(?<![\w.])\d+ (?:d|h|min|s)(?: \d+ (?:h|min|s))?(?![\w.])")
 """A duration as `elapsed` writes it."""
+_CLOCK = re.compile(r" The clock here shows \S+\.")
+"""The time at which a robot reported a problem, which the row shows as well."""
 _UNITS = {"d": 86400, "h": 3600, "min": 60, "s": 1}
 
 
@@ -910,6 +919,15 @@ def _dds_counts(compared: ComparedFleet) -> Iterator[str]:
         severities = Counter(finding.severity.word for finding in compared.findings)
         words = ", ".join(counted(number, word) for word, number in severities.items())
         yield f"on the DDS of robots: {words}; see --robot NAME, or --json"
+
+
+def _expired(robot: RobotStatus, at: datetime) -> Iterator[str]:
+    """Yield a clause for each kind of file on a robot that has expired."""
+    from sros_tool.validity import elapsed
+
+    for kind, end in robot.expiry.items() if robot.state == "expired" else ():
+        if end <= at:
+            yield f"{_KINDS.get(kind, kind)} expired {elapsed(at - end)} ago"
 
 
 def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:

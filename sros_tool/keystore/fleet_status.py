@@ -83,6 +83,8 @@ class State(StrEnum):
     DIFFERENT = "different"
     """A Zenoh file that is not the present one; the ledger does not record earlier Zenoh files."""
     MISSING = "missing"
+    EXPIRED = "expired"
+    """A file that the robot has, also if it is the present one, has expired."""
     OFFLINE = "offline"
     """The robot has sent nothing for too long, whatever files it had then."""
     BROKEN = "broken"
@@ -197,6 +199,7 @@ class RobotStatus:
     state: State
     """The worst state of the robot's files; ``revoked`` also if all its enclaves were revoked
     (``enclaves`` is 0); ``restart``: they are current, but processes still run with earlier ones;
+    ``expired``: one of its files has expired (`expiry`);
     ``offline``: its last confirmation is too old (`overdue`); ``later``: it says that it has a
     later release than was ever published for it, so that nothing in its message is reliable;
     ``refused``: its last message was refused; ``never``: it sent no confirmation; ``none``: it has
@@ -289,24 +292,37 @@ class RobotStatus:
         state = max(self.state, State.OFFLINE, key=_BADNESS.__getitem__)
         return replace(self.without_list(), state=state)
 
+    def expired(self, now: datetime) -> RobotStatus:
+        """Return the status at ``now``, when files of the robot may have expired."""
+        if not self.enclaves or all(end > now for end in self.expiry.values()):
+            return self
+        return replace(self, state=max(self.state, State.EXPIRED, key=_BADNESS.__getitem__))
+
     def without_list(self) -> RobotStatus:
         """Return the status if it is not known whether the last revocation list is in force."""
         known = None if self.crl_in_force is None else False
         return replace(self, crl_in_force=known, has_list=False)
 
-    def with_to_do(self, now: datetime) -> RobotStatus:
-        """Return the status with what is to be done at ``now``."""
-        return replace(self, to_do=self._to_do(now))
+    def with_to_do(self, now: datetime, *, is_accepted: bool) -> RobotStatus:
+        """Return the status with what is to be done at ``now``.
 
-    def _to_do(self, now: datetime) -> str:
+        ``is_accepted`` says whether robots accept what was published.
+        """
+        return replace(self, to_do=self._to_do(now, is_accepted))
+
+    def _to_do(self, now: datetime, is_accepted: bool) -> str:
         if self.state is State.REVOKED and not self.enclaves:
             return "take it out of the fleet file"
         if self.state in (State.CURRENT, State.NONE):
             return "look into it" if self.problems else ""
         if self.state in _TO_DO:
             return _TO_DO[self.state]
+        if self.state is State.EXPIRED and not self.pending:
+            return "renew"
         if not self.fetches:
             return "deliver"
+        if not is_accepted:
+            return "publish"
         if (self.published or 0) == (self.release or 0):
             return "find out why" if self.is_published else "publish"
         is_silent = self.received is None or now - self.received > _SILENCE
@@ -399,9 +415,12 @@ class FleetStatus:
             and (max_age or robot.fetches)
             and now - heard > (max_age or _LONGEST_SILENCE)
         )
-        robots = (robot.offline() if robot.robot in late else robot for robot in self.robots)
-        to_do = tuple(robot.with_to_do(now) for robot in robots)
+        robots = (
+            robot.offline() if robot.robot in late else robot.expired(now) for robot in self.robots
+        )
         publication = self.publication and self.publication.at(now)
+        is_accepted = publication is None or bool(publication.accepted)
+        to_do = tuple(robot.with_to_do(now, is_accepted=is_accepted) for robot in robots)
         return replace(self, robots=to_do, overdue=late, publication=publication)
 
 

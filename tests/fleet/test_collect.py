@@ -822,6 +822,10 @@ def test_what_was_published_expires(home: Home) -> None:
         ended = sros(*status, cwd=home.folder)
         assert ended.status == 1 and "3 robots: 3 current" in ended.out
         assert said in ended.out and f"`sros fleet publish ks {home.folder}/pub`" in ended.out
+        assert ended.out.count("`sros fleet publish") == 1
         text = sros(*status, "--prometheus", cwd=home.folder).out
         sample = "sros_fleet_publication_expiry_timestamp_seconds{"
         assert (sample in text) == bool(until)
+    home.run("renew", "ks", "/r1/base")
+    robots = json.loads(sros(*status, "--json", cwd=home.folder).out)["robots"]
+    assert {robot["robot"]: robot["to_do"] for robot in robots}["r1"] == "publish"

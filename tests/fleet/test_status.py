@@ -15,7 +15,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from sros_tool.cli import fleet as fleet_verbs
-from sros_tool.cli.fleet import ComparedFleet, _facts, _joined, _robot_names
+from sros_tool.cli.fleet import ComparedFleet, _facts, _joined, _lines, _robot_names
 from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
     RobotDds,
@@ -24,7 +24,7 @@ from sros_tool.keystore.confirmation import (
     Seen,
     parse_confirmation,
 )
-from sros_tool.keystore.fleet_status import fleet_status
+from sros_tool.keystore.fleet_status import State, fleet_status
 from sros_tool.keystore.layout import ENCLAVES, REFUSED
 from sros_tool.keystore.reader import Keystore, read_certificate
 from sros_tool.pki.certificates import digest
@@ -469,6 +469,24 @@ def test_robots_with_files_that_expire_soon_are_named(field: Field) -> None:
     (line,) = (line for line in lines[24] if "expiry" in line)
     assert f"{end:%Y-%m-%d} (r1, {kind}), within 30 days on 3 robots: `sros renew" in line
     assert line.endswith("--all-expiring 30d`, then deliver")
+
+
+def test_a_robot_whose_files_have_expired_is_not_in_order(field: Field) -> None:
+    """Whether or not the keystore has renewed them."""
+    status = fleet_status(Keystore(field.root))
+    kind, end = min(status.robots[0].expiry.items(), key=lambda item: item[1])
+    before = status.with_overdue(end - timedelta(seconds=1))
+    assert before.complete and before.counts == {State.CURRENT: 3}
+    late = end + timedelta(minutes=17)
+    expired = status.with_overdue(late)
+    assert not expired.complete and expired.counts == {State.EXPIRED: 3}
+    assert {robot.to_do for robot in expired.robots} == {"renew"}
+    lines = [*_lines(ComparedFleet(late, expired, [], []), (), findings=False)]
+    assert lines[0] == "3 robots: 3 expired" and lines[1].startswith("expired on a robot since: ")
+    assert f"{kind} expired 17 min ago" in lines[-1]
+    field.run("renew", "ks", "--robot", "r1")
+    renewed = fleet_status(Keystore(field.root), ["r1"]).with_overdue(late)
+    assert [(robot.state, robot.to_do) for robot in renewed.robots] == [("expired", "deliver")]
 
 
 def samples(text: str, metric: str, *labels: str) -> list[tuple[tuple[str, ...], float]]:
