@@ -63,7 +63,7 @@ class Window:
         return self.not_before <= moment <= self.not_after
 
     def expires_soon_from(self) -> datetime:
-        """Return from when the window expires soon.
+        """Return the time from which the window counts as expiring soon.
 
         This is 30 days before it expires, or a third of its length if that is shorter.
         """

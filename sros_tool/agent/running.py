@@ -122,7 +122,8 @@ def still_due(due: Iterable[str], seen: EnclaveProcesses) -> tuple[str, ...]:
 
 
 def robot_dds(running: RunningProcesses) -> RobotDds:
-    """Return the DDS libraries that processes of this machine have loaded, or that it has."""
+    """Return the DDS libraries that processes of this machine have loaded, or that are
+    installed."""
     loaded = [library for process in running.processes for library in process.dds]
     seen = dict.fromkeys(installed_dds(), Seen.INSTALLED)
     seen |= dict.fromkeys((library._replace(replaced=False) for library in loaded), Seen.PROCESS)

@@ -528,7 +528,7 @@ def ros_names(key: str) -> tuple[str, ...]:
 
 
 def _without_type(chunks: list[str]) -> list[str]:
-    """Return the chunks of the name; wildcards can stand for type and hash.
+    """Return the chunks of the name, without the type and hash, which can be wildcards.
 
     In the canonical form, ``*`` stands before ``**``.
     """
