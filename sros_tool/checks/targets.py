@@ -127,6 +127,7 @@ def _keystore(root: Path, at: Circumstances, only: str | None) -> list[Finding]:
         zone=at.zone,
         domain=at.domain,
         policies=at.policies,
+        fleet=at.fleet,
         distribution=at.distribution,
         vendors=at.vendors,
         only=None if only is None else (only,),

@@ -301,7 +301,7 @@ def check(
 
         _watch_processes(_environment(domain_of(domain)), selection, known, as_json=form == "json")
         return 0
-    at = _circumstances(domain, moment, policies, fleet_file)
+    at = _circumstances(domain, moment, policies, fleet_file, paths)
     nodes_of = _nodes_of(distro, all_distros=all_distros)
     at = replace(at, distribution=nodes_of, vendors=vendors, advisories=known)
     if upgrade_to:
@@ -477,19 +477,33 @@ def _circumstances(
     moment: str | None,
     policies: Sequence[Path],
     fleet_file: Path | None = None,
+    paths: Sequence[Path] = (),
 ) -> Circumstances:
+    """Return the options; placeholders are for the fleet of its file, or of the only keystore."""
     from sros_tool.checks.targets import Circumstances
     from sros_tool.cli.common import local_zone
+    from sros_tool.keystore.layout import is_keystore
 
     fleet, read = None, []
     if fleet_file:
         from sros_tool.fleet.fleet_file import read_fleet
 
         fleet = read_fleet(fleet_file)
-    for policy in policies:
-        from sros_tool.fleet.expansion import read_policy_for
+    elif policies and len(paths) == 1 and is_keystore(paths[0]):
+        from sros_tool.keystore.fleet import load_fleet
+        from sros_tool.keystore.reader import Keystore
 
-        read.append(read_policy_for(policy, fleet))
+        fleet = load_fleet(Keystore(paths[0]))
+    for policy in policies:
+        from sros_tool.fleet.expansion import FleetPolicy
+        from sros_tool.policy.document import read_policy
+
+        if fleet is None:
+            read.append(read_policy(policy))
+        else:
+            expanded = FleetPolicy(read_policy(policy, placeholders=True), fleet)
+            read.append(expanded.policy())
+            fleet = fleet.with_enclaves(expanded.patterns)
     zone, wanted = local_zone(os.environ), domain_of(domain)
     return Circumstances(moment_of(moment), zone, wanted, tuple(read), fleet=fleet)
 
@@ -564,6 +578,7 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
                 zone=at.zone,
                 domain=at.domain,
                 policies=at.policies,
+                fleet=at.fleet,
                 distribution=at.distribution,
                 vendors=at.vendors,
             )

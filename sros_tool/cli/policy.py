@@ -245,13 +245,18 @@ def diff_policy(
         echo_lines(rights_markdown(first, second, compared))
     else:
         lines = difference_lines(difference, first.fleet, second.fleet)
+        lines += domain_lines(compared, first.fleet or second.fleet)
         unanswered = unanswered_lines(compared, second.fleet)
         for line in (*lines, *_protection_lines(protections), *unanswered):
             echo(line)
         count = len(difference.only_first) + len(difference.only_second)
         of = f" of {', '.join(sorted(compared.scope))}" if compared.scope else ""
         differ = f"1 right{of} differs" if count == 1 else f"{count} rights{of} differ"
-        echo(differ if count else f"the rights{of} are the same", err=True)
+        if count or not compared.domains:
+            echo(differ if count else f"the rights{of} are the same", err=True)
+        if compared.domains:
+            number = counted(len(compared.domains), "enclave")
+            echo(f"the ROS domains of {number} differ", err=True)
         if protections:
             echo("what the policies say about protection differs", err=True)
     print_notes((*first.notes, *second.notes))
@@ -274,6 +279,7 @@ def rights_markdown(first: RightsSource, second: RightsSource, compared: Sources
         first, second, compared.rights, letters=_MOST_PICTURE, arrows=_MOST_LINKS
     )
     lines = difference_lines(compared.rights, first.fleet, second.fleet)
+    lines += domain_lines(compared, first.fleet or second.fleet)
     lines += _protection_lines(compared.protections)
     parts = []
     rest = "which `sros diff_policy` shows"
@@ -296,6 +302,17 @@ def rights_markdown(first: RightsSource, second: RightsSource, compared: Sources
     elif lines and drawn:
         parts.append(fenced(drawn, "mermaid"))
     return "\n\n".join((title, *parts)) + "\n"
+
+
+def domain_lines(compared: SourcesDifference, fleet: Fleet | None) -> list[str]:
+    """Return the lines for enclaves whose ROS domains differ; equal lines of robots are merged."""
+    from sros_tool.fleet.robots import folded
+
+    sides = [
+        [(each.enclave, f"- {each.enclave} in domain {each.a}") for each in compared.domains],
+        [(each.enclave, f"+ {each.enclave} in domain {each.b}") for each in compared.domains],
+    ]
+    return [text for lines in sides for text in folded(fleet, lines)]
 
 
 def unanswered_lines(compared: SourcesDifference, fleet: Fleet | None) -> Iterator[str]:

@@ -407,7 +407,7 @@ def _reasons(step: ReviewStep) -> list[str]:
     allowed; rights that nobody answers any more; the findings of a failed step.
     """
     from sros_tool.checks.registry import ChosenFindings
-    from sros_tool.cli.policy import added_lines, difference_lines, unanswered_lines
+    from sros_tool.cli.policy import added_lines, difference_lines, domain_lines, unanswered_lines
     from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange
 
     match step.content:
@@ -418,6 +418,7 @@ def _reasons(step: ReviewStep) -> list[str]:
             differing = difference_lines(
                 compared.rights, before.fleet, after.fleet, ("BASE", "HEAD")
             )
+            differing += domain_lines(compared, after.fleet or before.fleet)
             return [*unanswered, *_absolute_lines(step.content), *differing]
         case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen) if (
             step.status or step.allowed

@@ -545,11 +545,22 @@ class DifferentProtection(NamedTuple):
     protection: StatedProtection
 
 
+class DifferentDomains(NamedTuple):
+    """The ROS domains of an enclave that differ between A and B."""
+
+    enclave: str
+    """Name of the enclave."""
+    a: str
+    """The domains of its rights in A, such as ``10`` or ``10,20``."""
+    b: str
+    """The domains of its rights in B."""
+
+
 class PolicyDifference(NamedTuple):
     """The rights that differ between A and B."""
 
     equal: bool
-    """Whether A and B give the same rights, and demand the same protection."""
+    """Whether A and B give the same rights in the same domains, and demand the same protection."""
     a: RightsSource
     """The source A."""
     b: RightsSource
@@ -561,6 +572,8 @@ class PolicyDifference(NamedTuple):
     unanswered: Sequence[Right]
     """Rights of B to subscribe, request or call, whose counterpart an enclave of A has, and no
     enclave of B."""
+    domains: Sequence[DifferentDomains]
+    """Enclaves of both sides whose ROS domains differ; only where both sides state them."""
 
 
 class SourcesDifference(NamedTuple):
@@ -573,9 +586,11 @@ class SourcesDifference(NamedTuple):
     """Protections that only one of two policies states, with "-" for the first or "+"."""
     unanswered: Sequence[Right]
     """As in `PolicyDifference`; empty if only some enclaves were compared."""
+    domains: Sequence[DifferentDomains] = ()
+    """As in `PolicyDifference`."""
 
     def __bool__(self) -> bool:
-        return bool(self.rights or self.protections)
+        return bool(self.rights or self.protections or self.domains)
 
 
 def compare_sources(first: RightsSource, second: RightsSource) -> SourcesDifference:
@@ -589,7 +604,35 @@ def compare_sources(first: RightsSource, second: RightsSource) -> SourcesDiffere
     difference = compare(first.rights, second.rights, scope)
     unanswered = _unanswered(first.rights, second.rights, difference) if scope is None else ()
     protections = _protection_differences(first, second)
-    return SourcesDifference(scope, difference, protections, unanswered)
+    domains = _domain_differences(first, second, scope)
+    return SourcesDifference(scope, difference, protections, unanswered, domains)
+
+
+def _domain_differences(
+    first: RightsSource, second: RightsSource, scope: Collection[str] | None
+) -> list[DifferentDomains]:
+    """Return the enclaves of both sources that have rights in different ROS domains."""
+    before, after = _stated_domains(first), _stated_domains(second)
+    return [
+        DifferentDomains(enclave, before[enclave], after[enclave])
+        for enclave in sorted(before.keys() & after.keys())
+        if before[enclave] != after[enclave] and (scope is None or enclave in scope)
+    ]
+
+
+def _stated_domains(source: RightsSource) -> dict[str, str]:
+    """Map the enclaves of a source to the ROS domains that it states for their rights."""
+    if source.kind == "zenoh":
+        return {}
+    ranges: dict[str, list[tuple[int, int]]] = defaultdict(list)
+    every = set()
+    for domains, rights in rights_by_domains(source).items():
+        for enclave in {right.enclave for right in rights}:
+            if domains is None:
+                every.add(enclave)
+            else:
+                ranges[enclave] += ((domain, domain) for domain in domains)
+    return {name: str(DomainSet.of(*of)) for name, of in ranges.items() if name not in every}
 
 
 def _unanswered(
@@ -665,6 +708,7 @@ def policy_difference(
         ],
         [DifferentProtection(_SIDES[sign], stated) for sign, stated in compared.protections],
         compared.unanswered,
+        compared.domains,
     )
 
 

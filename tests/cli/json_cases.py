@@ -70,6 +70,8 @@ def make_folder(folder: Path) -> None:
     half_over = f'"{datetime.now(UTC).year - 8}-01-01T00:00:00Z/15y"'
     (folder / "old.toml").write_text(re.sub('"[0-9]+[05][yd]"|"5y"', half_over, settings))
     (folder / "crew.toml").write_text('[robots.a]\nrenewal = "allowed"\n[robots.b]\n')
+    for name, domain in (("near.toml", 1), ("far.toml", 2)):
+        (folder / name).write_text(f"[robots.a]\ndomain = {domain}\n")
     (folder / "required.toml").write_text('[[nobody]]\npublish = ["/x"]\n')
     (folder / "quiet.log").write_text("nothing to see\n")
     for line in (
@@ -314,6 +316,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks/enclaves/a/permissions.xml ks/enclaves/a", 0),
         Case("wild.xml policy.xml", 1),
         Case("protected.xml policy.xml", 1),
+        Case("crew.xml crew.xml --fleet near.toml --fleet far.toml", 1),
         Case("--no-new-access policy.xml policy.xml"),
         Case("--no-new-access policy.xml wild.xml", 1),
         Case("--no-new-access ks wild.xml", 1),

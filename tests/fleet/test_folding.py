@@ -131,6 +131,27 @@ def test_what_a_change_takes_away_is_folded(made: Path) -> None:
     assert "`sros renew ks ENCLAVE... --revoke-old`" in said[4]
 
 
+def test_a_robot_in_another_domain_is_a_difference(made: Path) -> None:
+    for name, domains in (("here.toml", (1, 1, 1)), ("moved.toml", (1, 7, 7))):
+        robots = (f"r{number} = {{domain = {of}}}" for number, of in enumerate(domains, 1))
+        (made / name).write_text("\n".join(("[robots]", *robots)))
+    words = ("diff_policy", "p.xml", "p.xml", "--fleet", "here.toml", "--fleet")
+    assert sros(*words, "here.toml", cwd=made).ok().out == ""
+    moved = sros(*words, "moved.toml", cwd=made)
+    assert moved.status == 1 and moved.err.strip() == "the ROS domains of 2 enclaves differ"
+    assert moved.out.splitlines() == [
+        "- /{robot}/base in domain 1  (2 robots: r2, r3)",
+        "+ /{robot}/base in domain 7  (2 robots: r2, r3)",
+    ]
+    found = json.loads(sros(*words, "moved.toml", "--json", cwd=made).out)
+    assert not found["equal"]
+    assert found["domains"][0] == {"enclave": "/r2/base", "a": "1", "b": "7"}
+    words = ("check", "ks", "--policy", "p.xml", "--include", "enclave.stale-permissions")
+    sros(*words, cwd=made).ok()  # its own fleet fills in the placeholders
+    drift = sros(*words, "--fleet", "moved.toml", cwd=made)
+    assert drift.status == 1 and "the fleet has r2 in domain 7, the permissions in 0" in drift.out
+
+
 def test_who_and_reach_are_folded(made: Path) -> None:
     said = sros("explain", "ks", "--who", "join", cwd=made).ok().out
     assert said.splitlines() == [

@@ -14,9 +14,11 @@ from sros_tool.checks.keystores.documents import DIFFERS as GOVERNANCE_DIFFERS
 from sros_tool.checks.keystores.enclaves import grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
+from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import Grant, mistaken_names, some_pairs
 from sros_tool.errors import SrosError
+from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.layout import (
     CRL_FILE,
     IDENTITY_CA_FILE,
@@ -378,6 +380,9 @@ def _ledger(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> I
             yield OLD_PERMISSIONS.found(summary.name, text, f"{place}/permissions.p7s")
 
 
+_SIGN_FOR_THE_FLEET = "Run `sros generate_artifacts -k KEYSTORE -p POLICY_FILE --fleet FLEET_FILE`."
+
+
 def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -> Iterator[Finding]:
     """Yield a finding if the rights of an enclave differ from the rights in the policies."""
     if not wanted:
@@ -390,6 +395,14 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
         return
     if grant is None:
         return
+    robot = robot_of(enclave.keystore.robots, name) if enclave.keystore.robots else None
+    if robot and robot.domain is not None:
+        signed, stated = grant.domains().closed(), DomainSet.of((robot.domain, robot.domain))
+        if signed != stated:
+            text = f"the fleet has {robot.name} in domain {stated}, the permissions in {signed}"
+            yield STALE.found(
+                name, text, enclave.file("permissions.p7s"), remedy=_SIGN_FOR_THE_FLEET
+            )
     difference = compare(grant_rights(name, grant), wanted[name])
     if difference:
         shown = [

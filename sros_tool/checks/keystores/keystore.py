@@ -57,6 +57,7 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE, in_original_keystore
+from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import publish_command, stated_distributions
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
@@ -88,6 +89,7 @@ def keystore_findings(
     zone: tzinfo = UTC,
     domain: int | None = None,
     policies: tuple[Policy, ...] = (),
+    fleet: Fleet | None = None,
     only: Sequence[str] | None = None,
     sample: Sequence[str] | None = None,
     on_robot: bool = False,
@@ -102,6 +104,7 @@ def keystore_findings(
         zone: the time zone of the host on which its enclaves run.
         domain: the ROS domain that its enclaves have to join.
         policies: policies with which its permissions are compared.
+        fleet: the robots that the policies are for, whose domains are compared, too.
         only: the enclaves to check; None for all of them and the keystore itself.
         sample: without ``only``, the enclaves to check with the keystore itself; None for all.
         on_robot: whether the keystore is on a robot, where it must not have a CA key.
@@ -118,6 +121,7 @@ def keystore_findings(
         now=now,
         zone=zone,
         policies=policies,
+        robots=fleet,
         on_robot=on_robot,
         distribution=distribution,
     )

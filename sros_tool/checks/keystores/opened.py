@@ -66,6 +66,7 @@ class CheckedKeystore:
         now: the moment to check for.
         zone: the time zone of the host on which its enclaves run.
         policies: policies with which its permissions are compared.
+        robots: the robots that the policies are for, whose domains are compared, too.
         on_robot: whether the keystore is on a robot, where it must not have a CA key.
         distribution: the ROS 2 distribution of its nodes; "" is the latest.
     """
@@ -74,6 +75,7 @@ class CheckedKeystore:
     now: datetime
     zone: tzinfo = UTC
     policies: tuple[Policy, ...] = ()
+    robots: Fleet | None = None
     on_robot: bool = False
     distribution: str = ""
     _unread: dict[str, UnreadablePart] = field(default_factory=dict)
