@@ -22,9 +22,10 @@ from sros_tool.files import staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.published import MOST_NUMBER
 from sros_tool.keystore.delivery.release import sealed_robot
-from sros_tool.keystore.layout import RELEASE_SEAL
+from sros_tool.keystore.layout import RELEASE_SEAL, enclave_names, enclave_path
+from sros_tool.keystore.reader import open_enclave
 from sros_tool.names import check_enclave_name
-from sros_tool.validity import parse_iso
+from sros_tool.validity import iso, parse_iso
 from sros_tool.values import DryRun, FileChanges, Notes, as_plain, parse_json
 from sros_tool.xml import read_bytes
 
@@ -218,6 +219,7 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
         moment is not None and abs(now - moment) <= oldest for moment in (state.fetched, state.sent)
     )
     whole = 0 < state.release == state.accepted
+    problems = (*state.problems, *_expired_since(folder, state, now))
     return AgentStatus(
         folder,
         settings.robot,
@@ -229,6 +231,16 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
         state.sent,
         state.due,
         state.unseen,
-        state.problems,
-        recent and whole and not state.due and not state.problems,
+        problems,
+        recent and whole and not state.due and not problems,
     )
+
+
+def _expired_since(folder: Path, state: AgentState, now: datetime) -> Iterator[str]:
+    """Yield sentences on enclaves of which a file has expired since the last round."""
+    known = {problem.partition(" could not start")[0] for problem in state.problems}
+    for name in enclave_names(folder):
+        with suppress(SrosError, OSError):
+            until = open_enclave(enclave_path(folder, name), now=now).valid_until()
+            if until and until <= now and name not in known:
+                yield f"{name} has expired, at {iso(until)}: no process starts in it."

@@ -24,7 +24,7 @@ from sros_tool.agent.settings import (
     read_settings,
     write_settings,
 )
-from sros_tool.agent.state import only_agent, read_state
+from sros_tool.agent.state import agent_status, only_agent, read_state
 from sros_tool.errors import DocumentError, KeystoreError, UnavailableError
 from sros_tool.keystore.confirmation import (
     Confirmation,
@@ -196,6 +196,10 @@ def test_rounds_follow_what_home_publishes(home: Home, r1: Robot) -> None:
     r1.round()
     assert r1.asked == [0, 1, 3]
     sros("agent", "status", r1.folder).ok()
+    end = validity_of(read_certificate(r1.folder / "enclaves/r1/a/cert.pem")).not_after
+    late = agent_status(r1.folder, now=end + timedelta(minutes=1), oldest=timedelta(days=9999))
+    assert not late.well
+    assert sum("has expired, at" in problem for problem in late.problems) == len(NAMES)
 
 
 def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None:
