@@ -6,11 +6,13 @@ The change itself goes to standard output, or what ``--json`` prints; all else t
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
 
 from sros_tool.cli.common import print_json, print_notes
+from sros_tool.errors import SrosError
 from sros_tool.terminal import echo
 from sros_tool.wording import counted, first_few
 
@@ -107,11 +109,40 @@ def _tell(lines: Iterable[str]) -> None:
 
 
 def print_plan(root: Path, changes: Sequence[Change]) -> None:
-    """Print the files that a dry run would change."""
+    """Print the files that a dry run would change; robots of a fleet in one, many files in short.
+
+    If steps are logged, all files are printed.
+    """
+    import logging
+
+    every = logging.getLogger("sros_tool").isEnabledFor(logging.INFO)
+    plan: dict[str, list[str]] = {}
     for change in changes:
-        echo(f"would {change.action} {root / change.path}")
+        plan.setdefault(change.action, []).append(change.path)
+    for action, paths in plan.items():
+        shown = paths if every else list(_folded_files(root, paths))
+        if len(shown) > MAX_NAMES and not every:
+            places = [str(root / path) for path in paths]
+            shown_files = first_few(places, _NAMES_SHOWN)
+            echo(f"would {action} {counted(len(paths), 'file')}: {shown_files} (-v lists all)")
+            continue
+        for path in shown:
+            echo(f"would {action} {root / path}")
     if not changes:
         echo("nothing would change")
+
+
+def _folded_files(root: Path, paths: Sequence[str]) -> Iterator[str]:
+    """Yield the paths of files; those that differ only in the robot of a fleet are one."""
+    from sros_tool.fleet.robots import folded
+    from sros_tool.keystore.fleet import load_fleet
+    from sros_tool.keystore.reader import Keystore
+
+    fleet = None
+    with suppress(SrosError):  # in a new keystore, and in an export, there is none
+        fleet = load_fleet(Keystore(root))
+    lines = ((f"/{path.partition('/')[2].rpartition('/')[0]}", path) for path in paths)
+    yield from folded(fleet, lines)
 
 
 def _print_closed(root: Path, changes: Sequence[Change]) -> None:

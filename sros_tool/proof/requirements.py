@@ -23,11 +23,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import DROPPED
@@ -61,6 +61,19 @@ _WORDS = ("name", "why")
 _LEVELS = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
 
 
+class RobotNames(NamedTuple):
+    """The names that a name with ``{robots}`` or ``{namespaces}`` stands for, one for each robot.
+
+    ``own`` is that of the requirement's own robot; ``pattern`` has ``{other}`` for another robot;
+    ``group`` is "" for the whole fleet.
+    """
+
+    names: tuple[str, ...]
+    own: str
+    pattern: str
+    group: str
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Requirement:
     """Base class of requirements: place of its table in the file, its name and reason (or "").
@@ -74,6 +87,7 @@ class Requirement:
     name: str = ""
     why: str = ""
     robot: str = ""
+    of_robots: tuple[RobotNames, ...] = field(default=(), compare=False, repr=False)
 
     def __str__(self) -> str:
         """Return the requirement's own name, or the sentence with its demand."""
@@ -179,12 +193,13 @@ class Apart(Requirement):
 
 def demand(requirement: Requirement) -> str:
     """Return a requirement's demand as a clause, such as ``nobody may publish /x``."""
+    enclaves_text = partial(_enclaves_text, of_robots=requirement.of_robots)
     match requirement:
         case Only(rights=rights, enclaves=enclaves):
             but = [name[len(EXCEPT) :] for name in enclaves if name.startswith(EXCEPT)]
             if but and {*enclaves} == {"*", *(EXCEPT + name for name in but)}:
                 return f"{_listed_names(but)} may not {_rights_text(rights)}"
-            return f"only {_enclaves_text(enclaves)} may {_rights_text(rights)}"
+            return f"only {enclaves_text(enclaves)} may {_rights_text(rights)}"
         case Nobody(rights=rights):
             return f"nobody may {_rights_text(rights)}"
         case Must(rights=rights, enclave=enclave):
@@ -194,18 +209,18 @@ def demand(requirement: Requirement) -> str:
         case Widest(rights=rights, enclaves=enclaves):
             if not any(names for _, names in rights):
                 what = _rights_text(rights).replace(" nothing", "")
-                return f"no wildcard may let {_enclaves_text(enclaves)} {what}"
-            return f"wildcards may let {_enclaves_text(enclaves)} only {_rights_text(rights)}"
+                return f"no wildcard may let {enclaves_text(enclaves)} {what}"
+            return f"wildcards may let {enclaves_text(enclaves)} only {_rights_text(rights)}"
         case NothingBut(rights=rights, enclaves=enclaves):
-            return f"{_enclaves_text(enclaves)} may do nothing but {_rights_text(rights)}"
+            return f"{enclaves_text(enclaves)} may do nothing but {_rights_text(rights)}"
         case NotBoth(first=first, second=second):
             return f"nobody may both {_rights_text(first)} and {_rights_text(second)}"
         case Protected(names=names, level=level):
             shown = _listed_names([f"{kind.removesuffix('s')} {name}" for kind, name in names])
             return f"{shown} has to be {'encrypted' if level is Level.ENCRYPT else 'signed'}"
         case Apart(sources=sources, targets=targets, through=through):
-            past = f" except through {_enclaves_text(through)}" if through else ""
-            return f"{_enclaves_text(sources)} must not influence {_enclaves_text(targets)}{past}"
+            past = f" except through {enclaves_text(through)}" if through else ""
+            return f"{enclaves_text(sources)} must not influence {enclaves_text(targets)}{past}"
         case _:
             raise AssertionError(requirement)
 
@@ -219,11 +234,22 @@ def _rights_text(rights: RightNames, link: str = "or") -> str:
     return f" {link} ".join(texts)
 
 
-def _enclaves_text(enclaves: Iterable[str]) -> str:
+def _enclaves_text(enclaves: Iterable[str], of_robots: Iterable[RobotNames]) -> str:
     """Return a list of enclaves in words, with its exceptions."""
-    names = list(enclaves)
-    excepted = [name[len(EXCEPT) :] for name in names if name.startswith(EXCEPT)]
-    text = _listed_names(name for name in names if not name.startswith(EXCEPT))
+    every = list(enclaves)
+    excepted = [name.removeprefix(EXCEPT) for name in every if name.startswith(EXCEPT)]
+    names = [name for name in every if not name.startswith(EXCEPT)]
+    shown = list(names)
+    for of in of_robots:
+        if of.own in excepted and of.names.count(of.own) == 1 and {*of.names} <= {*shown}:
+            robots = f"the other robots of {of.group}" if of.group else "all other robots"
+            shown[shown.index(of.names[0])] = f"{of.pattern} of {robots}"
+            shown = [name for name in shown if name not in of.names]
+            names.remove(of.own)
+    # An exception is said already, unless it is one from other names, too.
+    own = {of.own for of in of_robots} - {*names}
+    excepted = [e for e in excepted if e not in own or any(overlap(e, name) for name in names)]
+    text = _listed_names(shown)
     return f"{text} (but not {_listed_names(excepted)})" if excepted else text
 
 
@@ -382,6 +408,7 @@ class _Table:
     source: Source
     lines: Mapping[str, int]
     robot: str = ""
+    of_robots: tuple[RobotNames, ...] = ()
 
     def known(self, *keys: str) -> dict[str, Any]:
         """Return the arguments that all requirements have.
@@ -398,7 +425,8 @@ class _Table:
                     (f"There are {', '.join(every)}."),
                 )
         texts = {key: self.text(key) if key in self.values else "" for key in _WORDS}
-        return {"source": self.source, "robot": self.robot, **texts}
+        robots = {"robot": self.robot, "of_robots": self.of_robots}
+        return {"source": self.source, **robots, **texts}
 
     def text(self, key: str) -> str:
         value = self.values.get(key)
@@ -529,7 +557,8 @@ def _filled_tables(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
             for key in _WORDS
             if key in own.values
         }
-        yield replace(own, values={**own.values, **words}, robot=robot.name)
+        of_robots = tuple(_of_robots(table, members, robot))
+        yield replace(own, values={**own.values, **words}, robot=robot.name, of_robots=of_robots)
 
 
 def _placeholders(table: _Table) -> dict[Placeholder, str]:
@@ -608,6 +637,24 @@ def _filled_names(
         else [parts]
     )
     return [begin + "".join(map(str, each)) for each in filled]
+
+
+def _of_robots(
+    table: _Table, several: Mapping[str, Sequence[Robot]], robot: Robot
+) -> Iterator[RobotNames]:
+    """Yield what the names of a table stand for that have a plural placeholder."""
+    values = [value for key, value in table.values.items() if key not in _WORDS]
+    for name in filter(has_placeholder, _names_in(values)):
+        if name.startswith(EXCEPT):
+            continue
+        parts = fill(parts_of(name), robot.name, robot.namespace)
+        if plural := placeholders_of(parts):
+            yield RobotNames(
+                tuple(_filled_names(name, several, robot)),
+                "".join(map(str, fill(parts, robot.name, robot.namespace, plural=True))),
+                "".join(map(str, fill(parts, "{other}", "/{other}", plural=True))),
+                plural[0].group,
+            )
 
 
 def _filled_words(text: object, used: Iterable[Placeholder], robot: Robot) -> object:

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.cli.changed import print_plan
 from sros_tool.fleet.robots import Fleet, Robot, folded
+from sros_tool.keystore.transaction.stage import Change
 from tests.support.harness import policy_text, publish, sros
 
 FLEET = Fleet.of(
@@ -120,13 +122,15 @@ def test_what_a_change_takes_away_is_folded(made: Path) -> None:
     text = (made / "p.xml").read_text()
     (made / "less.xml").write_text(text.replace("/go<", "/gone<").replace("/odom<", "/odometry<"))
     words = ("generate_artifacts", "-k", "ks", "-p", "less.xml", "--fleet", "f.toml", "--dry-run")
-    said = sros(*words, cwd=made).ok().err.splitlines()
+    ended = sros(*words, cwd=made).ok()
+    said = ended.err.splitlines()
     assert set(said[:4]) == {
         "/d would lose: publish topic {namespace}/go  (all 3 robots)",
         "/d would gain: publish topic {namespace}/gone  (all 3 robots)",
         "/{robot}/base would lose: publish topic {namespace}/odom  (all 3 robots)",
         "/{robot}/base would gain: publish topic {namespace}/odometry  (all 3 robots)",
     }
+    assert "would replace ks/enclaves/{robot}/base/permissions.p7s  (all 3 robots)" in ended.out
     assert "base and 1 more: the rights that they lost still" in said[4]
     assert "`sros renew ks ENCLAVE... --revoke-old`" in said[4]
 
@@ -150,6 +154,16 @@ def test_a_robot_in_another_domain_is_a_difference(made: Path) -> None:
     sros(*words, cwd=made).ok()  # its own fleet fills in the placeholders
     drift = sros(*words, "--fleet", "moved.toml", cwd=made)
     assert drift.status == 1 and "the fleet has r2 in domain 7, the permissions in 0" in drift.out
+
+
+def test_many_files_of_a_plan_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
+    plan = [Change("create", f"enclaves/e{number}/key.pem") for number in range(21)]
+    print_plan(Path("ks"), plan)
+    first = ", ".join(f"ks/{change.path}" for change in plan[:5])
+    said = f"would create 21 files: {first} and 16 more (-v lists all)\n"
+    assert capsys.readouterr().out == said
+    print_plan(Path("ks"), plan[:20])
+    assert len(capsys.readouterr().out.splitlines()) == 20
 
 
 def test_who_and_reach_are_folded(made: Path) -> None:

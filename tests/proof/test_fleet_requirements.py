@@ -89,9 +89,24 @@ def test_names_of_several_robots_are_in_one_requirement() -> None:
     names = "/stop, /hall/r1/stop, /hall/r2/stop, /r1/*/stop, /r2/*/stop, /plain"
     assert dict(getattr(one, "rights"))["publish"] == tuple(names.split(", "))  # noqa: B009
     assert [demand(each) for each in read(FROM_OTHERS)] == [
-        "/arm/*, /r1/*, /r2/* (but not /r1/*) must not influence /r1/base",
-        "/arm/*, /r1/*, /r2/* (but not /r2/*) must not influence /r2/base",
+        "/{other}/* of all other robots must not influence /r1/base",
+        "/{other}/* of all other robots must not influence /r2/base",
     ]
+
+
+def test_the_other_robots_are_named_as_such_only_where_the_list_is_that() -> None:
+    cases = {
+        '["/{robots:carriers}/*", "!/{robot:carriers}/*"]': "/{other}/* of the other robots of "
+        "carriers",
+        '["/desk", "{namespaces}/x", "!{namespace:carriers}/x"]': "/desk, /{other}/x of all other "
+        "robots",
+        '["/{robots}/*", "!/{robot:carriers}/mux"]': "/arm/*, /r1/*, /r2/* (but not /r1/mux)",
+        '["/{robots}/*", "/{robots}/mux", "!/{robot:carriers}/*"]': "/{other}/* of all other "
+        "robots, /arm/mux, /r1/mux, /r2/mux (but not /r1/*)",
+    }
+    for sources, said in cases.items():
+        first = read(f'[[apart]]\nfrom = {sources}\nto = ["/x"]')[0]
+        assert demand(first) == f"{said} must not influence /x"
 
 
 WRONG = {
