@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -19,6 +19,7 @@ from urllib.parse import quote
 from sros_tool.checks.kind import Finding, FindingKind, Severity, by_cause
 from sros_tool.checks.registry import ChosenFindings
 from sros_tool.errors import SrosError
+from sros_tool.fleet.robots import Fleet, for_any_robot, named_robots
 from sros_tool.keystore.expiry import Lifetime, survey
 from sros_tool.keystore.layout import (
     CRL_FILE,
@@ -33,21 +34,92 @@ from sros_tool.markdown import bounded, code, plain
 from sros_tool.pki.certificates import validity_of
 from sros_tool.pki.crl import load_crl
 from sros_tool.prometheus import Metric, Sample
+from sros_tool.wording import counted, first_few
 
 _MOST = 20_000  # characters: a comment on GitHub has at most 65,536
 _SIGNS = {"error": "🔴", "warning": "🟠", "note": "🔵"}
 
 
-def findings_markdown(chosen: ChosenFindings) -> str:
-    """Return the findings as Markdown, under a heading with their numbers."""
+_Kinds = Mapping[str, tuple[Hashable, Hashable]]
+
+
+def by_robot(
+    groups: Iterable[tuple[Finding, ...]], fleet: Fleet | None
+) -> Iterator[tuple[tuple[Finding, ...], str]]:
+    """Merge single findings that differ only in one robot; yield the first of each kind.
+
+    The text that comes with it names the other robots; it is "" if there are none.  A finding that
+    names several robots is merged with those that differ in the robot in which most others do; many
+    that also differ in their further robots are merged, too.  Findings that share a cause stay as
+    they are, and without ``fleet``, all do.
+    """
+    read = [(group, _kinds(group, fleet) if fleet else {}) for group in groups]
+    robots: dict[Hashable, set[str]] = defaultdict(set)
+    for _, kinds in read:
+        for robot, same_and_similar in kinds.items():
+            for kind in same_and_similar:
+                robots[kind].add(robot)
+
+    def largest(kinds: _Kinds, which: int, otherwise: Hashable) -> tuple[Hashable, str]:
+        every = ((kind[which], robot) for robot, kind in kinds.items())
+        return max(every, key=lambda one: len(robots[one[0]]), default=(otherwise, ""))
+
+    chosen = [(group, largest(kinds, 0, group), largest(kinds, 1, group)) for group, kinds in read]
+    parts: dict[Hashable, set[Hashable]] = defaultdict(set)
+    for _, (same, _), (similar, _) in chosen:
+        parts[similar].add(same)
+    merged: dict[tuple[Hashable, bool], dict[str, list[tuple[Finding, ...]]]] = {}
+    for group, of_same, of_similar in chosen:
+        many = len(parts[of_similar[0]]) > _MOST_SIMILAR
+        kind, of = of_similar if many else of_same
+        merged.setdefault((kind, many), {}).setdefault(of, []).append(group)
+    for (_, many), of_robot in merged.items():
+        (first, *more), *others = of_robot.values()
+        if others:
+            count = counted(len(others), "more robot")
+            names = first_few(list(of_robot)[1:], _MOST_ROBOTS, joint=", and ")
+            same = "the same, about other robots," if many else "the same"
+            yield first, f"{same} for {count}: {names}"
+        else:
+            yield from ((alone, "") for alone in (first, *more))
+
+
+_MOST_ROBOTS = 10
+_MOST_SIMILAR = 5  # findings that differ in further robots; more become one
+
+
+def _kinds(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:
+    """Map each robot that a finding names to what is the same for others, all and without names."""
+    first, *more = group
+    named = () if more else named_robots(fleet, first.subject, first.text)
+    kinds: dict[str, tuple[Hashable, Hashable]] = {}
+    for robot in named:
+        texts = [
+            for_any_robot(text, robot)
+            for text in (first.subject, first.text, first.file, first.remedy)
+        ]
+        same = (first.id, first.line, first.accepted, *texts)
+        for other in named:
+            texts = [for_any_robot(text, other, "other") for text in texts]
+        kinds[robot.name] = same, (first.id, first.line, first.accepted, *texts)
+    return kinds
+
+
+def findings_markdown(chosen: ChosenFindings, fleet: Fleet | None = None) -> str:
+    """Return the findings as Markdown, under a heading with their numbers.
+
+    Findings that differ only in one robot of ``fleet`` are one item.
+    """
     rest = "which `sros check` shows"
-    listed = bounded(map(_item, by_cause(chosen.shown)), _MOST, rest)
+    groups = by_robot(by_cause(chosen.shown), fleet)
+    listed = bounded((_item(group, others) for group, others in groups), _MOST, rest)
     title = f"### Findings: {plain(chosen.summary())}"
     return "\n\n".join(part for part in (title, listed) if part) + "\n"
 
 
-def _item(findings: Sequence[Finding]) -> str:
-    return "<br>".join(_lines(findings[0]) if len(findings) == 1 else _cause_lines(findings))
+def _item(findings: Sequence[Finding], others: str) -> str:
+    lines = _lines(findings[0]) if len(findings) == 1 else _cause_lines(findings)
+    return "<br>".join((*lines, *([code(others)] if others else [])))
 
 
 def _cause_lines(findings: Sequence[Finding]) -> Iterator[str]:

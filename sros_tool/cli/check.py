@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -54,7 +54,7 @@ from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines, visible, visible_json
 from sros_tool.values import file_change, shows, versioned
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import counted
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
@@ -346,6 +346,8 @@ def check(
     chosen = selection.choose(findings)
     if form == "text":
         _print_text(chosen, _fleet_of(at, paths))
+    elif form == "markdown":
+        _print_markdown(chosen, _fleet_of(at, paths))
     else:
         _SHOW[form](chosen, selection)
     return _status(chosen, fail_on)
@@ -683,10 +685,10 @@ def renewal_markdown(lines: Sequence[str], none: str, text: str) -> str:
     return f"### Certificates: {count} to be renewed {plain(f'({text})')}\n\n{listed}\n"
 
 
-def _print_markdown(chosen: ChosenFindings, _selection: FindingFilter) -> None:
+def _print_markdown(chosen: ChosenFindings, fleet: Fleet | None) -> None:
     from sros_tool.checks.formats import findings_markdown
 
-    echo_lines(findings_markdown(chosen))
+    echo_lines(findings_markdown(chosen, fleet))
 
 
 def _fleet_of(at: Circumstances, paths: Sequence[Path]) -> Fleet | None:
@@ -694,54 +696,21 @@ def _fleet_of(at: Circumstances, paths: Sequence[Path]) -> Fleet | None:
 
     It is None if there is none, or if it cannot be read.
     """
-    from sros_tool.fleet.expansion import FleetPolicy
+    from sros_tool.fleet.expansion import fleet_with_enclaves
     from sros_tool.keystore.fleet import load_fleet
-    from sros_tool.policy.document import policy_files, read_policy
+    from sros_tool.policy.document import policy_files
 
     if at.fleet is None:
         opened = [at.opened[path] for path in paths if path in at.opened]
         with suppress(SrosError):  # what is wrong with it is a finding
             return load_fleet(opened[0]) if len(opened) == 1 else None
         return None
-    patterns: list[str] = []
+    files: list[Path] = []
     for path in paths:
-        if path in at.opened:
-            continue
-        with suppress(SrosError):  # what is wrong with it is a finding
-            for file in policy_files(path):
-                patterns += FleetPolicy(read_policy(file, placeholders=True), at.fleet).patterns
-    return at.fleet.with_enclaves(patterns)
-
-
-def _by_robot(findings: Iterable[Finding], fleet: Fleet) -> Iterator[tuple[Finding, str]]:
-    """Merge findings that differ only in one robot; yield the first of each group.
-
-    The text that comes with it names the other robots; it is "" if there are none.  A finding that
-    names several robots is merged with those that differ in the robot in which most others do.
-    """
-    from sros_tool.fleet.robots import for_any_robot, named_robots
-
-    kinds: list[tuple[Finding, dict[str, Hashable]]] = []
-    for finding in findings:
-        texts = (finding.subject, finding.text, finding.file, finding.remedy)
-        same = (finding.id, finding.line, finding.accepted)
-        robots = named_robots(fleet, finding.subject, finding.text)
-        of_robot: dict[str, Hashable] = {
-            robot.name: (*same, *(for_any_robot(text, robot) for text in texts)) for robot in robots
-        }
-        kinds.append((finding, of_robot))
-    sizes = Counter(kind for _, of_robot in kinds for kind in of_robot.values())
-    groups: dict[Hashable, list[tuple[Finding, str]]] = {}
-    for finding, of_robot in kinds:
-        robot, kind = max(of_robot.items(), key=lambda one: sizes[one[1]], default=("", finding))
-        groups.setdefault(kind, []).append((finding, robot))
-    for (first, _), *others in groups.values():
-        robots_text = first_few([robot for _, robot in others], _MOST_ROBOTS, joint=", and ")
-        count = counted(len(others), "more robot")
-        yield first, f"the same for {count}: {robots_text}" if others else ""
-
-
-_MOST_ROBOTS = 10
+        if path not in at.opened:
+            with suppress(SrosError):  # what is wrong with it is a finding
+                files += policy_files(path)
+    return fleet_with_enclaves(at.fleet, files)
 
 
 def _print_all(chosen: ChosenFindings, _selection: FindingFilter) -> None:
@@ -749,17 +718,12 @@ def _print_all(chosen: ChosenFindings, _selection: FindingFilter) -> None:
 
 
 def _print_text(chosen: ChosenFindings, fleet: Fleet | None = None) -> None:
+    from sros_tool.checks.formats import by_robot
     from sros_tool.checks.kind import by_cause
 
-    groups = list(by_cause(chosen.shown))
-    for group in groups:
-        if len(group) > 1:
-            echo_findings(group)
-    single = [group[0] for group in groups if len(group) == 1]
-    for finding, others in (
-        _by_robot(single, fleet) if fleet else ((finding, "") for finding in single)
-    ):
-        echo_findings([finding])
+    groups = sorted(by_cause(chosen.shown), key=lambda group: len(group) == 1)
+    for group, others in by_robot(groups, fleet):
+        echo_findings(group)
         if others:
             echo(f"    {others}")
     for choice in dict.fromkeys(finding.accepted for finding in chosen.accepted):
@@ -811,7 +775,7 @@ _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
     "text": _print_all,
     "json": _print_json,
     "sarif": _print_sarif,
-    "markdown": _print_markdown,
+    "markdown": lambda chosen, _selection: _print_markdown(chosen, None),
 }
 """The function that prints findings, for each value of --format."""
 

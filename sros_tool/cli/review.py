@@ -406,6 +406,7 @@ def _reasons(step: ReviewStep) -> list[str]:
     """Return what a reviewer has to read: new access and dropped requirements, also if they are
     allowed; rights that nobody answers any more; the findings of a failed step.
     """
+    from sros_tool.checks.formats import by_robot
     from sros_tool.checks.registry import ChosenFindings
     from sros_tool.cli.policy import added_lines, difference_lines, domain_lines, unanswered_lines
     from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange
@@ -423,7 +424,11 @@ def _reasons(step: ReviewStep) -> list[str]:
         case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen) if (
             step.status or step.allowed
         ):
-            return [_finding_line(finding) for finding in chosen.shown]
+            singly = ((finding,) for finding in chosen.shown)
+            return [
+                f"{_finding_line(finding)}{others and f' ({others})'}"
+                for (finding, *_), others in by_robot(singly, step.fleet)
+            ]
     return []
 
 
@@ -439,11 +444,17 @@ def _finding_line(finding: Finding) -> str:
 
 def _absolute_lines(change: RightsChange) -> Iterator[str]:
     """Yield a line for each name that does not move with the namespace of its node any more."""
-    for right, _, source, _, _ in change.absolute:
-        yield (
+    from sros_tool.fleet.robots import folded
+
+    lines = (
+        (
+            right.enclave,
             f"~ {right.enclave} {right.describe()} has a / at its beginning now, so that it does "
-            f"not move with the namespace of its node any more  ({source})"
+            f"not move with the namespace of its node any more  ({source})",
         )
+        for right, _, source, _, _ in change.absolute
+    )
+    yield from folded(change.after.fleet, lines)
 
 
 def _verdict(result: Review) -> str:
@@ -520,7 +531,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     def findings(chosen: ChosenFindings) -> str:
         shown = tuple(map(result.shown_finding, chosen.shown))
         chosen = ChosenFindings(shown, chosen.accepted, chosen.hidden)
-        return findings_markdown(chosen)
+        return findings_markdown(chosen, step.fleet)
 
     rest = "which `sros review` prints"
     match step.content:
@@ -531,7 +542,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
         case RightsChange(before=before, after=after, compared=compared) as change:
             parts = [rights_markdown(before, after, compared)] if compared else []
             if lines := list(_absolute_lines(change)):
-                title = f"### {counted(len(lines), 'name')} made absolute"
+                title = f"### {counted(len(change.absolute), 'name')} made absolute"
                 parts += [title, bounded(map(code, lines), 6000, rest)]
             return "\n\n".join(part.rstrip("\n") for part in parts)
         case DroppedRequirements(chosen=chosen):

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
+from sros_tool.errors import DocumentError, InvalidNameError, PolicyError, SrosError
 from sros_tool.fleet.robots import MAX_ENCLAVES, Fleet, Robot, group_of, path_for
 from sros_tool.names import check_enclave_name, check_namespace, expression_problem, is_expression
 from sros_tool.policy.document import PolicyFiles, read_policy
@@ -205,6 +206,18 @@ def read_policy_for(path: Path, fleet: Fleet | None, read: PolicyFiles | None = 
     if fleet is None:
         return read_policy(path, read=read)
     return FleetPolicy(read_policy(path, placeholders=True, read=read), fleet).policy()
+
+
+def fleet_with_enclaves(fleet: Fleet, files: Iterable[Path]) -> Fleet:
+    """Return the fleet with the paths of enclaves that policies have; unreadable ones are left out.
+
+    It says which robot an enclave belongs to, where only that is shown.
+    """
+    patterns: list[str] = []
+    for file in files:
+        with suppress(SrosError):
+            patterns += FleetPolicy(read_policy(file, placeholders=True), fleet).patterns
+    return fleet.with_enclaves(patterns)
 
 
 def _name_problem(name: str) -> str:

@@ -530,12 +530,12 @@ def named_robots(fleet: Fleet, enclave: str, text: str) -> tuple[Robot, ...]:
     return tuple(dict.fromkeys((*([owner] if owner else []), *named)))
 
 
-def for_any_robot(text: str, robot: Robot) -> str:
-    """Return a text with ``{robot}`` in place of a robot's namespace, and of its name.
+def for_any_robot(text: str, robot: Robot, word: str = "robot") -> str:
+    """Return a text with ``{robot}``, or another word, in place of a robot's namespace and name.
 
     The name can also be a part of a name, as in ``r1_lift``.
     """
-    any_robot = str(Placeholder("robot"))
+    any_robot = f"{{{word}}}"
     if robot.namespace != "/":
         text = _whole(robot.namespace).sub(f"/{any_robot}", text)
     return re.sub(rf"(?<![A-Za-z0-9]){robot.name}(?![A-Za-z0-9])", any_robot, text)

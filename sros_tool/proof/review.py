@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
 from functools import cache, partial
 from pathlib import Path
@@ -24,11 +24,12 @@ from sros_tool.checks.targets import Circumstances, path_findings, policy_findin
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import policies_dir
-from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
+from sros_tool.fleet.expansion import FleetPolicy, fleet_with_enclaves, read_policy_for
 from sros_tool.fleet.fleet_file import read_connections, read_fleet
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import Lifetime, Threshold, UnreadableEnclave, due_enclaves
+from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import FLEET, KEY_FILE, SETTINGS, is_keystore
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
@@ -171,7 +172,7 @@ class ReviewStep:
     ``kind`` is "files", "policy", "requirements", "requirements-before", "new-access", "rights",
     "keystore" or "expiry"; ``subject`` is the path that the step is about.  If the result is an
     error, it says why the step could not be decided.  ``allowed``: the step found something that
-    the request allows, so that its status is 0.
+    the request allows, so that its status is 0.  ``fleet`` are the robots of what was examined.
     """
 
     kind: str
@@ -179,6 +180,7 @@ class ReviewStep:
     status: int
     content: Content
     allowed: bool = False
+    fleet: Fleet | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,6 +304,8 @@ class _Review:
     request: ReviewRequest
     head: CommitFiles
     base: CommitFiles | None
+    robots: dict[str, Fleet | None] = field(default_factory=dict)
+    """The robots of what the steps with a subject examine."""
 
     def _allows(self, kind: str) -> bool:
         """Return whether the request allows what steps of this kind find."""
@@ -332,8 +336,13 @@ class _Review:
                 ]
         named = " ".join(asked.policies)
         findings = partial(self._findings, of_head, head_fleet)
+        if head_fleet:
+            self.robots[named] = fleet_with_enclaves(head_fleet, of_head)
         yield from self._step_result("policy", named, findings, if_any=bool(of_head))
         keystores = yield from self._keystores(self.head)
+        for path, keystore in keystores.items():
+            with suppress(SrosError):  # what is wrong with it is a finding
+                self.robots[path] = load_fleet(Keystore(keystore))
         yield from self._requirements(of_head, head_fleet, base_fleet, keystores)
         if self.base:
             before = cache(partial(load_policies, of_base, _BASE, base_fleet))
@@ -379,7 +388,14 @@ class _Review:
         if decided:
             status, content = decided
             allowed = status == _FOUND and self._allows(kind)
-            yield ReviewStep(kind, subject, _OK if allowed else status, content, allowed)
+            yield ReviewStep(
+                kind,
+                subject,
+                _OK if allowed else status,
+                content,
+                allowed,
+                self.robots.get(subject),
+            )
 
     # ── files ──────────────────────────────────────────────────────────────────────────────
 

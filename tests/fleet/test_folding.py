@@ -7,10 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.checks.formats import by_robot
+from sros_tool.checks.requirements import VIOLATED
 from sros_tool.cli.changed import print_plan
 from sros_tool.fleet.robots import Fleet, Robot, folded
-from sros_tool.keystore.transaction.stage import Change
-from tests.support.harness import policy_text, publish, sros
+from sros_tool.keystore.transaction import stage
+from tests.proof.test_review import Change
+from tests.support.harness import policy_text, publish, sros, subscribe
 
 FLEET = Fleet.of(
     [
@@ -93,6 +96,13 @@ def test_many_lines_that_differ_in_two_robots_are_one() -> None:
     assert len(told(to_two)) == 2
 
 
+APART = """\
+[[apart]]
+from = ["/{robots}/*", "!/{robot}/*"]
+to = ["/{robot}/*"]
+"""
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("folding")
@@ -156,8 +166,45 @@ def test_a_robot_in_another_domain_is_a_difference(made: Path) -> None:
     assert drift.status == 1 and "the fleet has r2 in domain 7, the permissions in 0" in drift.out
 
 
+def test_findings_that_also_differ_in_other_robots_are_one_if_they_are_many() -> None:
+    names = [f"r{number}" for number in range(8)]
+    fleet = Fleet.of([Robot(name, f"/{name}") for name in names])
+
+    def told(pairs: list[tuple[str, str]]) -> list[str]:
+        found = ((VIOLATED.found(f"/{a}/nav", f"may publish /{b}/go"),) for a, b in pairs)
+        return [f"{group[0].subject} {others}" for group, others in by_robot(found, fleet)]
+
+    assert told([("r0", name) for name in names[1:]]) == [
+        "/r0/nav the same for 6 more robots: r2, r3, r4, r5, r6, r7"
+    ]
+    assert told([("r1", "r2"), ("r3", "r4")]) == ["/r1/nav ", "/r3/nav "]
+    assert told([*zip(names, names[1:] + names[:1], strict=True)]) == [
+        "/r0/nav the same, about other robots, for 7 more robots: r1, r2, r3, r4, r5, r6, r7"
+    ]
+
+
+def test_a_review_is_folded(tmp_path: Path) -> None:
+    change = Change(tmp_path)
+    wide = policy_text(
+        {"/{robot}/nav": publish("{namespace}/go"), "/{robot}/base": subscribe("{namespace}/go")}
+    ).replace('ns="/"', 'ns="{namespace}"')
+    robots = "".join(f"r{number} = {{}}\n" for number in range(6))
+    files = {"fleet.toml": f"[robots]\n{robots}", "r.toml": APART}
+    change.commit({"p.xml": wide.replace("{namespace}/go", "go"), **files})
+    change.commit({"p.xml": wide.replace("{namespace}/go", "{namespaces}/go", 1)})
+    words = ("--policy", "p.xml", "--fleet", "fleet.toml", "--requirements", "r.toml")
+    ended = change.review(*words, "--summary", str(tmp_path.parent / "review.md"))
+    each = "(all 6 robots, each with each other one)"
+    for text in (ended.out, (tmp_path.parent / "review.md").read_text()):
+        assert each in text and "/{robot}/nav publish topic /{other}/go" in text
+        assert text.count("influences /r") == 2, text
+        assert "the same for 4 more robots: r2, r3, r4, r5" in text
+        assert "has a / at its beginning now" in text and "(all 6 robots)" in text
+    assert len(ended.out.splitlines()) == 20, ended.out
+
+
 def test_many_files_of_a_plan_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
-    plan = [Change("create", f"enclaves/e{number}/key.pem") for number in range(21)]
+    plan = [stage.Change("create", f"enclaves/e{number}/key.pem") for number in range(21)]
     print_plan(Path("ks"), plan)
     first = ", ".join(f"ks/{change.path}" for change in plan[:5])
     said = f"would create 21 files: {first} and 16 more (-v lists all)\n"
