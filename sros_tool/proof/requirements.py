@@ -836,10 +836,14 @@ def dropped_requirements(
     All other requirements of ``before`` hold wherever all requirements of ``after`` hold.
     """
     now = [(part, whole) for whole in after for part in _parts(whole)]
+    kept_as_they_are = {_only_demand(part) for part, _ in now}  # most are, and it is fast
     dropped = []
     for requirement in before:
         parts = tuple(_parts(requirement))
-        if all(any(_implies(each, part) for each, _ in now) for part in parts):
+        if all(
+            _only_demand(part) in kept_as_they_are or any(_implies(each, part) for each, _ in now)
+            for part in parts
+        ):
             continue
         kept = (whole for each, whole in now if any(_is_alike(each, part) for part in parts))
         dropped.append(DroppedRequirement(requirement, tuple(dict.fromkeys(kept))))
@@ -920,6 +924,14 @@ def _one_by_one(enclaves: Sequence[str]) -> Iterator[tuple[str, ...]]:
 def _single_rights(rights: RightNames) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield pairs of a right and a single name."""
     yield from ((right, (name,)) for right, names in rights for name in names)
+
+
+def _only_demand(part: Requirement) -> Requirement:
+    """Return a requirement without its place and words, to compare what it demands."""
+    return replace(part, source=_NOWHERE, name="", why="", robot="")
+
+
+_NOWHERE = Source("", 0)
 
 
 def _implies(new: Requirement, old: Requirement) -> bool:
