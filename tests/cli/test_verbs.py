@@ -352,7 +352,7 @@ def test_modes_under_any_umask(umask: int, tmp_path: Path) -> None:
 def test_a_dry_run_tells_what_the_verb_then_does(line: str, keystore: Path, tmp_path: Path) -> None:
     (tmp_path / "p.xml").write_text(policy_text({"/a": publish("new"), "/e": publish("new")}))
     before = snapshot(tmp_path)
-    said = sros(*line.split(), "--dry-run", cwd=tmp_path).ok().out
+    said = sros(*line.split(), "--dry-run", "-v", cwd=tmp_path).ok().out
     assert snapshot(tmp_path) == before
     sros(*line.split(), cwd=tmp_path).ok()
     after = snapshot(tmp_path)
