@@ -189,8 +189,10 @@ def test_every_decision_is_that_of_brute_force() -> None:
                     if old in broken and new not in broken:
                         different.append(f"{number}, {world.title}: {new} does not imply {old}")
     assert different == []
-    assert len({title for title, _, _ in seen}) == len(TESTED) + 1  # and Zenoh
+    titles = {title for title, _, _ in seen}
+    assert titles >= {vendor.title for vendor in TESTED}
     if LONG:
+        assert "Zenoh" in titles  # some policies are not for Zenoh, and the short form draws few
         assert min(seen.values()) > COUNT / 1000
         assert implied > COUNT / 100
     print(seen)
