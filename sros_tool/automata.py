@@ -502,9 +502,9 @@ class NameSet:
             (cls.union(names for names, _ in same)._node, kept)
             for kept, same in groupby(rules, key=lambda pair: pair[1])
         ]
-        if joined and joined[-1][1] is otherwise:
-            joined.pop()  # it changes nothing
-        if len(joined) == 1 and not otherwise:
+        if not otherwise and joined and not joined[-1][1]:
+            joined.pop()  # it takes away what nothing accepts
+        if not otherwise and len(joined) == 1:
             return cls._of(joined[0][0])
         return cls._of(_First(tuple(joined), otherwise))
 

@@ -495,7 +495,8 @@ def _circumstances(
         from sros_tool.keystore.fleet import load_fleet
         from sros_tool.keystore.reader import Keystore
 
-        fleet = load_fleet(Keystore(paths[0]))
+        with suppress(SrosError):  # what is wrong with it is a finding
+            fleet = load_fleet(Keystore(paths[0]))
     for policy in policies:
         from sros_tool.fleet.expansion import FleetPolicy
         from sros_tool.policy.document import read_policy

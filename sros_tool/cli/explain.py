@@ -285,9 +285,10 @@ def explain(
     _refuse_ignored(mode)
     check_one_decider()
     root, rest = _split(words, keystore, verb=0 if who else 1)
-    if root and root.is_file() and not (policy or logs):
+    is_file = root is not None and root.is_file()
+    if is_file and not (policy or logs or reach):
         policy, root = root, None
-    if fleet_file and not policy:
+    if fleet_file and not (policy or is_file):
         raise UsageError("--fleet goes with a policy only", "", "Leave it out.")
     if reach:
         if vendor not in (None, _ZENOH):

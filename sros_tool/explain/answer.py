@@ -503,16 +503,20 @@ class Answer(NamedTuple):
         if self.enclave.has_placeholders:
             recorded = keystore and (keystore / FLEET).exists()
             robots = f"{root}/{FLEET}" if recorded else "FLEET_FILE"
-            return [f"sros generate_artifacts -k {root} -p {file} --fleet {robots}"]
+            sign = f"sros generate_artifacts -k {root} -p {file} --fleet {robots}"
+            return [sign, *self._exporting(root)]
         commands = []
         if self.change and self.change.document:
             commands.append(f"sros merge_policy {file} {ADDITION} --in-place")
         if robot:
             return [*commands, f"sros close {robot}"]
-        commands.append(f"sros create_permission {root} {self.enclave.name} {file}")
-        if self.is_of_export:
-            commands.append(f"sros distribute_key {root} {self.enclave.name} TARGET --force")
-        return commands
+        sign = f"sros create_permission {root} {self.enclave.name} {file}"
+        return [*commands, sign, *self._exporting(root)]
+
+    def _exporting(self, root: str) -> list[str]:
+        """Return the command that exports an exported enclave again; none for other enclaves."""
+        export = f"sros distribute_key {root} {self.enclave.name} TARGET --force"
+        return [export] if self.is_of_export else []
 
 
 _CREATED = {

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import lru_cache
 from ipaddress import ip_address
+from itertools import permutations
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -568,7 +569,7 @@ def _named(fleet: Fleet, names: Sequence[str], folding: _Folding) -> str:
     """Return a list of robots in words, such as "r1, r2 and 3 more robots"."""
     if folding.pairs:
         sources = list(dict.fromkeys(pair.split()[0] for pair in names))
-        if len(names) == len(sources) * (len(sources) - 1):
+        if {*names} == {f"{one} and {two}" for one, two in permutations(sources, 2)}:
             return f"{_named(fleet, sources, _Folding(''))}, each with each other one"
         return f"{len(names)} pairs of robots, such as {names[0]}"
     own = folding.own

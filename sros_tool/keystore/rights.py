@@ -631,7 +631,7 @@ def _stated_domains(source: RightsSource) -> dict[str, str]:
             if domains is None:
                 every.add(enclave)
             else:
-                ranges[enclave] += ((domain, domain) for domain in domains)
+                ranges[enclave] += ((part.first or 0, part.last or 0) for part in domains.ranges)
     return {name: str(DomainSet.of(*of)) for name, of in ranges.items() if name not in every}
 
 

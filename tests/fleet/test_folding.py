@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import permutations, product
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from sros_tool.cli.changed import print_plan
 from sros_tool.fleet.robots import Fleet, Robot, folded
 from sros_tool.keystore.transaction import stage
 from tests.proof.test_review import Change
-from tests.support.harness import policy_text, publish, sros, subscribe
+from tests.support.harness import copy_of, policy_text, publish, sros, subscribe
 
 FLEET = Fleet.of(
     [
@@ -101,6 +102,22 @@ APART = """\
 from = ["/{robots}/*", "!/{robot}/*"]
 to = ["/{robot}/*"]
 """
+
+
+def test_pairs_are_said_to_be_all_only_if_they_are_all() -> None:
+    sources, targets = ([f"{letter}{n}" for n in range(7)] for letter in "ab")
+    robots = [Robot(name, f"/{name}") for name in (*sources, *targets)]
+    fleet = Fleet.of(robots, enclaves=["/{robot}/x"])
+
+    def told(pairs: list[tuple[str, str]]) -> list[str]:
+        return list(folded(fleet, [(f"/{one}/x", f"/{one}/x to /{two}/y") for one, two in pairs]))
+
+    each_other = told([*permutations(sources, 2)])
+    (line,) = each_other
+    assert line.endswith("a6, each with each other one)")
+    # As many pairs as of seven robots with each other, but with other robots.
+    (line,) = told([*product(sources, targets[1:])])
+    assert line == "/{robot}/x to /{other}/y  (42 pairs of robots, such as a0 and b1)"
 
 
 @pytest.fixture(scope="module")
@@ -211,6 +228,22 @@ def test_many_files_of_a_plan_are_counted(capsys: pytest.CaptureFixture[str]) ->
     assert capsys.readouterr().out == said
     print_plan(Path("ks"), plan[:20])
     assert len(capsys.readouterr().out.splitlines()) == 20
+
+
+def test_an_exported_enclave_of_a_fleet_is_exported_again(made: Path) -> None:
+    sros("distribute_key", "ks", "/r1/base", "out", cwd=made).ok()
+    words = ("explain", "out", "/r1/base", "publish", "/no", "--policy", "p.xml")
+    said = sros(*words, "--fleet", "f.toml", cwd=made).out.splitlines()
+    assert said[-2].endswith("sros generate_artifacts -k KEYSTORE -p p.xml --fleet FLEET_FILE")
+    assert said[-1].strip() == "sros distribute_key KEYSTORE /r1/base TARGET --force"
+
+
+def test_a_damaged_fleet_is_a_finding_also_next_to_a_policy(made: Path, tmp_path: Path) -> None:
+    ks, policy = copy_of(made / "ks", tmp_path / "ks"), tmp_path / "d.xml"
+    (ks / "fleet.toml").write_text("[robots")
+    policy.write_text(policy_text({"/d": publish("/go")}))
+    ended = sros("check", ks, "--policy", policy)
+    assert ended.status == 1 and "fleet.toml" in ended.out
 
 
 def test_who_and_reach_are_folded(made: Path) -> None:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from functools import lru_cache
-from itertools import permutations
+from itertools import count, permutations
 
 from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.names import dds_names, expand
@@ -160,8 +160,8 @@ def levels(policy: Policy) -> Callable[[str], int]:
 
 
 def cases() -> Iterator[tuple[int, Policy, list[Requirement]]]:
-    """Yield policies, each with several requirements: ``COUNT`` of these in all."""
-    for number in range(COUNT // OF_EACH):
+    """Yield policies, each with several requirements."""
+    for number in count():
         draw = random.Random(f"{SEED}.{number}")
         yield number, draw_policy(draw), [draw_requirement(draw) for _ in range(OF_EACH)]
 
@@ -188,11 +188,12 @@ def test_every_decision_is_that_of_brute_force() -> None:
                     implied += 1
                     if old in broken and new not in broken:
                         different.append(f"{number}, {world.title}: {new} does not imply {old}")
+        # ``COUNT`` requirements in all, and more where no policy was for Zenoh.
+        if number + 1 >= COUNT // OF_EACH and any(title == "Zenoh" for title, _, _ in seen):
+            break
     assert different == []
-    titles = {title for title, _, _ in seen}
-    assert titles >= {vendor.title for vendor in TESTED}
+    assert len({title for title, _, _ in seen}) == len(TESTED) + 1  # and Zenoh
     if LONG:
-        assert "Zenoh" in titles  # some policies are not for Zenoh, and the short form draws few
         assert min(seen.values()) > COUNT / 1000
         assert implied > COUNT / 100
     print(seen)
