@@ -93,15 +93,12 @@ class KeyExpressions:
         forms = {expression: _wildcard_form(expression) for expression in self.all}
         if len(set(forms.values())) == 1:
             return sorted(self.all)
-        wider = {expression: self._beginning_as(expression) for expression in self.all}
-        compared = sum(
-            len(same_form)
-            for candidates in wider.values()
-            for by_form in candidates
-            for same_form in by_form.values()
-        )
-        if compared > _MOST_COMPARED:
-            return sorted(self.all)
+        wider, compared = {}, 0
+        for expression in self.all:
+            wider[expression] = candidates = self._beginning_as(expression)
+            compared += sum(len(same) for by_form in candidates for same in by_form.values())
+            if compared > _MOST_COMPARED:
+                return sorted(self.all)
         return sorted(
             expression
             for expression, own_form in forms.items()
