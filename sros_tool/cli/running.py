@@ -424,10 +424,24 @@ class _WithCommandAfterDashes(_WithCommand):
     multiple=True,
     type=click.Choice([job.value for job in Job]),
     help="renew: renew enclaves that expire within 30 days. check: check the keystore "
-    "daily. metrics: write the keystore's metrics every 15 minutes. fleet: write these metrics "
-    "and the metrics of `sros fleet status`. guard: watch all ROS processes of the machine "
+    "daily. metrics: write the keystore's metrics every 15 minutes. fleet: write the metrics of "
+    "`sros fleet status` every 15 minutes. collect: run `sros fleet collect KEYSTORE INBOX "
+    "--publish PUB` every 5 minutes. guard: watch all ROS processes of the machine "
     "(runs as root, without a timer). agent: run `sros agent` for the security folder KEYSTORE of "
     "a robot every 5 minutes.  Can be repeated.",
+)
+@click.option(
+    "--inbox",
+    type=PATH,
+    metavar="INBOX",
+    help="With --job collect: folder with the messages of robots.",
+)
+@click.option(
+    "--publish",
+    "publishing",
+    type=PATH,
+    metavar="PUB",
+    help="With --job collect: folder in which to publish releases.",
 )
 @click.option(
     "--target",
@@ -452,8 +466,8 @@ class _WithCommandAfterDashes(_WithCommand):
     "--passphrase-file",
     "passphrase",
     metavar="FILE",
-    help="With --job renew: file with the passphrase of the CA keys, on the machine that "
-    "runs the job.",
+    help="With --job renew and --job collect: file with the passphrase of the CA keys, on the "
+    "machine that runs the job.",
 )
 @_DOMAIN
 @_RMW
@@ -469,6 +483,8 @@ def units(
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
     jobs: tuple[str, ...],
+    inbox: Path | None,
+    publishing: Path | None,
     there: str | None,
     user: str | None,
     program: str | None,
@@ -494,6 +510,7 @@ def units(
       $ sudo systemctl enable --now sros@talker
       $ sros units keystore --match '/arm/*' units  # /etc/sros/nodes/arm/...
       $ sros units keystore --job renew --job check --job metrics units
+      $ sros units keystore --job collect --inbox inbox --publish pub units
       $ sros units /etc/sros/keystore --job agent units  # on a robot
     """
     from sros_tool.runtime.units import (
@@ -509,8 +526,10 @@ def units(
     if not rest or not (rest[1:] or several or jobs):
         raise UsageError("units takes a keystore, enclaves or --job, and a folder")
     folder = PATH.convert(rest[-1], None, None)
-    if passphrase is not None and Job.RENEW not in jobs:
-        raise UsageError("--passphrase-file is for --job renew only")
+    if passphrase is not None and not {Job.RENEW, Job.COLLECT}.intersection(jobs):
+        raise UsageError("--passphrase-file is only for --job renew and --job collect")
+    if {inbox is not None, publishing is not None} != {Job.COLLECT in jobs}:
+        raise UsageError("--job collect needs --inbox INBOX and --publish PUB; no other job does")
     if user is not None and Job.GUARD in jobs:
         raise UsageError(
             "--user is not for --job guard",
@@ -557,6 +576,8 @@ def units(
             passphrase=passphrase or "",
             domain=domain_of(domain) or 0,
             writable=_inbox(root) if job == Job.AGENT else (),
+            inbox=str(inbox.absolute()) if inbox else "",
+            publishing=str(publishing.absolute()) if publishing else "",
         )
     changes = unit_changes(folder, files, force=force)
     if not dry_run:

@@ -77,13 +77,28 @@ class Job(StrEnum):
     CHECK = "check"
     METRICS = "metrics"
     FLEET = "fleet"
+    COLLECT = "collect"
     GUARD = "guard"
     AGENT = "agent"
 
 
 _OFTEN = "*:0/15"
-_WHEN = {Job.RENEW: "daily", Job.CHECK: "daily", Job.METRICS: _OFTEN, Job.FLEET: _OFTEN}
-_SPREAD = {Job.RENEW: "1h", Job.CHECK: "1h", Job.METRICS: "30s", Job.FLEET: "30s"}
+_WHEN = {
+    Job.RENEW: "daily",
+    Job.CHECK: "daily",
+    Job.METRICS: _OFTEN,
+    Job.FLEET: _OFTEN,
+    Job.COLLECT: "*:0/5",
+}
+_SPREAD = {
+    Job.RENEW: "1h",
+    Job.CHECK: "1h",
+    Job.METRICS: "30s",
+    Job.FLEET: "30s",
+    Job.COLLECT: "30s",
+}
+_SIGNING = frozenset({Job.RENEW, Job.COLLECT})
+"""The jobs that need the keys of the CAs."""
 _RENEWED_WITHIN = "30d"
 
 
@@ -229,6 +244,8 @@ def job_units(
     passphrase: str = "",
     domain: int = 0,
     writable: Sequence[str] = (),
+    inbox: str = "",
+    publishing: str = "",
 ) -> dict[str, str]:
     """Return the service and the timer of a job by their names; the guard has no timer.
 
@@ -240,6 +257,8 @@ def job_units(
         passphrase: the path of the file with the passphrase of the CA keys, or "".
         domain: the ROS domain in which the guard takes open nodes for mistakes.
         writable: folders besides the keystore in which the agent writes.
+        inbox: the path of the folder with the messages of robots, for `Job.COLLECT`.
+        publishing: the path of the folder in which `Job.COLLECT` publishes releases.
 
     Raises:
         UsageError: a path cannot be written in a unit.
@@ -280,8 +299,16 @@ def job_units(
                 "SuccessExitStatus=1",
             ],
         ),
+        Job.COLLECT: (
+            f"Collect the messages of the fleet of {root}, and publish its releases",
+            ("fleet", "collect", root, inbox, "--publish", publishing),
+            [f"ReadWritePaths={root} -{publishing}", "UMask=0022"],
+        ),
     }[job]
-    if passphrase and job is Job.RENEW:
+    if job is Job.COLLECT:
+        _check_path(inbox, "the inbox")
+        _check_path(publishing, "the publishing folder")
+    if passphrase and job in _SIGNING:
         _check_path(passphrase, "the file")
         own += [
             f"LoadCredential=ca-passphrase:{passphrase}",

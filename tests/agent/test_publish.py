@@ -518,6 +518,7 @@ def test_a_keystore_that_was_restored(publisher: Home) -> None:
     (publisher.pub / "targets/robots").rename(archives)
     with pytest.raises(KeystoreError, match="which revocations the keystore lacks"):
         publisher.publish(restored=True)
+    (publisher.pub / "targets/robots").mkdir()
     # Whoever can write to the folder has earlier archives, with an earlier revocation list.
     for path in archives.iterdir():
         of_robot = (data for before, data in earlier.items() if before.name[64:] == path.name[64:])
@@ -822,6 +823,14 @@ def test_keystore_and_folder_in_one_another(publisher: Home) -> None:
         with pytest.raises(KeystoreError, match="overlap"):
             publishing.publish(publisher.root, pub, now=publisher.now)
     assert not (publisher.root / "pub").exists()
+
+
+def test_what_is_refused_leaves_no_folder(publisher: Home, tmp_path: Path) -> None:
+    publisher.publish()
+    other = tmp_path / "a" / "b"
+    with pytest.raises(KeystoreError, match="has nothing that the keystore"):
+        publishing.publish(publisher.root, other, now=publisher.now)
+    assert not other.parent.exists()
 
 
 # ── releases ───────────────────────────────────────────────────────────────────────────────

@@ -90,6 +90,20 @@ def test_jobs_are_of_this_keystore_and_its_owner(made: Path, tmp_path: Path) -> 
     assert "\nSuccessExitStatus=1\n" in fleet
 
 
+def test_messages_are_collected_and_releases_published(made: Path, tmp_path: Path) -> None:
+    folders = ("--inbox", tmp_path / "in", "--publish", tmp_path / "pub")
+    sros(
+        *("units", made, "--job", "collect", *folders, tmp_path / "units"),
+        *("--sros", "/usr/bin/sros", "--passphrase-file", "/etc/sros/pass"),
+    ).ok()
+    lines = (tmp_path / "units/sros-collect.service").read_text().splitlines()
+    command = f"/usr/bin/sros fleet collect {made} {tmp_path}/in --publish {tmp_path}/pub"
+    assert f"ExecStart={command}" in lines
+    assert f"ReadWritePaths={made} -{tmp_path}/pub" in lines
+    assert "LoadCredential=ca-passphrase:/etc/sros/pass" in lines
+    assert (tmp_path / "units/sros-collect.timer").exists()
+
+
 def test_the_guard_watches_with_the_keystore_and_its_domain(made: Path, tmp_path: Path) -> None:
     words = ("--job", "guard", "--sros", "/usr/bin/sros", "--domain", "3", "--target", "/srv/k")
     sros("units", made, *words, tmp_path / "units").ok()
@@ -130,7 +144,9 @@ def test_the_agent_is_of_the_owner_and_may_write_into_its_inbox(made: Path, tmp_
         (("/leg",), "units takes"),
         (("--job", "check", "F", "--", "/bin/true"), "no enclave is named"),
         (("/leg", "--job", "check", "F"), "One folder of units is for one machine"),
-        (("--job", "check", "F", "--passphrase-file", "/x"), "--job renew only"),
+        (("--job", "check", "F", "--passphrase-file", "/x"), "only for --job renew"),
+        (("--job", "collect", "F", "--inbox", "/in"), "needs --inbox INBOX and --publish PUB"),
+        (("--job", "check", "F", "--publish", "/pub"), "no other job does"),
         (("/leg", "F", "--target", "/a b"), "cannot be written in a unit"),
         (("/leg", "F", "--target", "k"), "--target 'k'"),
         (("/leg", "F", "--user", "a b"), "name of a user"),

@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -92,8 +93,9 @@ def test_a_node_is_closed_for_the_analysis_of_systemd(tmp_path: Path) -> None:
 @pytest.mark.parametrize("passphrase", ["", "/etc/sros/passphrase"])
 def test_systemd_finds_nothing_wrong_in_the_jobs(passphrase: str, tmp_path: Path) -> None:
     files: dict[str, str] = {}
+    make = partial(job_units, user="root", sros="/bin/true", passphrase=passphrase)
     for job in Job:
-        files |= job_units(job, "/srv/ks", user="root", sros="/bin/true", passphrase=passphrase)
+        files |= make(job, "/srv/ks", inbox="/srv/in", publishing="/srv/pub")
     assert len(files) == 2 * len(Job) - 1  # the guard has no timer
     said = verified(tmp_path, files, *files)
     lines = set(re.findall(r"Command Line: (/bin/true .*)", said))
@@ -104,12 +106,13 @@ def test_systemd_finds_nothing_wrong_in_the_jobs(passphrase: str, tmp_path: Path
         "/bin/true check runtime --watch",
         f"/bin/true metrics /srv/ks -o {METRICS_FILE}",
         f"/bin/true fleet status /srv/ks --prometheus -o {FLEET_FILE}",
+        "/bin/true fleet collect /srv/ks /srv/in --publish /srv/pub",
     }
     renew = files["sros-renew.service"]
     assert ("LoadCredential=ca-passphrase:/etc/sros/passphrase\n" in renew) == bool(passphrase)
     assert "ReadWritePaths=/srv/ks\n" in renew
     writing = {name for name in files if "ReadWritePaths" in files[name]}
-    assert writing == {"sros-renew.service", "sros-agent.service"}
+    assert writing == {f"sros-{job}.service" for job in (Job.RENEW, Job.COLLECT, Job.AGENT)}
     env = {**os.environ, "SYSTEMD_UNIT_PATH": f"{tmp_path}:"}
     command = ["systemd-analyze", "security", "--offline=true", "--no-pager", "--threshold=30"]
     run([*command, "sros-agent.service"], env=env)

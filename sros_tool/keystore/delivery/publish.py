@@ -27,7 +27,7 @@ from sros_tool import __version__
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.files import remove_file, staged_file
 from sros_tool.fleet.robots import Fleet
-from sros_tool.folders import Folder, make_folders
+from sros_tool.folders import Folder, make_folders, remove_folders
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, listed_digests
 from sros_tool.keystore.delivery.export import released_enclave, released_files
 from sros_tool.keystore.delivery.published import (
@@ -188,16 +188,18 @@ def publish(
     """
     check_tuf()
     keystore = Keystore(root)
-    keystore.check()
+    recorded_fleet(keystore)
     checked_fleet(keystore)
     _check_apart(root, folder)
     with ExitStack() as stack:
         if not dry_run:
-            make_folders(folder)
+            made = make_folders(folder)
+            stack.callback(remove_folders, made)  # of these, the empty ones
             opened = stack.enter_context(Folder(folder))
             for part in (_METADATA, _TARGETS, _ARCHIVES):
                 if not opened.is_folder(part):
                     opened.mkdir(part, 0o755)
+                    made.insert(0, folder / part)
             lock = KeystoreLock(opened, "publishing folder")
             stack.callback(lock.release)
             lock.acquire()
