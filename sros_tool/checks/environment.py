@@ -424,11 +424,11 @@ def secured_by(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
         yield from _said_in(_CYCLONE_SECURITY, "CYCLONEDDS_URI", part.encode() if inline else path)
     for name in (*_PROFILES, "FASTDDS_ENVIRONMENT_FILE"):
         if text := environment.get(name, ""):
-            sought = rb"dds\.sec\." if name in _PROFILES else rb"_PROFILES_FILE"
+            sought = _PROFILE_SECURITY if name in _PROFILES else _NAMES_PROFILES
             yield from _said_in(sought, name, folder / text)
     for path in map(folder.joinpath, _DEFAULT_PROFILES):
         if path.exists():
-            yield from _said_in(rb"dds\.sec\.", f"'{path.name}' in this folder", path)
+            yield from _said_in(_PROFILE_SECURITY, f"'{path.name}' in this folder", path)
 
 
 def _secured_by_zenoh(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
@@ -463,6 +463,10 @@ def _said_in(sought: bytes, name: str, place: bytes | Path) -> Iterator[str]:
 
 _CYCLONE_SECURITY = rb"(?i)<(?:\w+:)?(?:dds)?security\b"
 """The element that secures every participant (Cyclone DDS 0.10, ``cfgelems.h``)."""
+_PROFILE_SECURITY = rb"dds\.sec\.|&#"
+"""The properties that secure a participant of Fast DDS, or a character that may be one of theirs."""
+_NAMES_PROFILES = rb"_PROFILES_FILE|\\u"
+"""The variables that name profiles, in a file of variables, or an escape that may hide them."""
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 _DEFAULT_PROFILES = ("DEFAULT_FASTRTPS_PROFILES.xml", "DEFAULT_FASTDDS_PROFILES.xml")
 """The files that Fast DDS reads from its working directory (Fast DDS 2.14, ``XMLProfileManager``).

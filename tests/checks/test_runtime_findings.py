@@ -402,7 +402,9 @@ WITH_KEY = 'transport/link/tls/connect_private_key="/key.pem"'
         ({PROFILES: "plain"}, ""),
         ({PROFILES: "secured"}, f"{PROFILES} has security"),
         ({PROFILES: "none"}, f"{PROFILES} is set, and sros cannot read it"),
+        ({PROFILES: "hidden"}, f"{PROFILES} has security"),
         ({"FASTDDS_ENVIRONMENT_FILE": "secured"}, "FASTDDS_ENVIRONMENT_FILE has security"),
+        ({"FASTDDS_ENVIRONMENT_FILE": "hidden"}, "FASTDDS_ENVIRONMENT_FILE has security"),
         ({**ON_ZENOH, PROFILES: "secured"}, ""),
         ({**ON_ZENOH, SESSION: "session"}, ""),
         ({**ON_ZENOH, SESSION: "plain"}, f"{SESSION} is set, and sros cannot read it"),
@@ -424,6 +426,7 @@ def test_what_secures_the_nodes_of_a_shell(
             "session",
             '{transport: {auth: {usrpwd: {user: null}}}, connect: {endpoints: ["tcp/a:1"]}}',
         ),
+        ("hidden", "<name>d&#100;s.sec</name> FASTDDS_DEFAULT\\u005fPROFILES"),
         ("password", '{transport: {auth: {usrpwd: {user: "me"}}}}'),
     ):
         (tmp_path / name).write_text(text)
