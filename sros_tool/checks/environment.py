@@ -464,7 +464,7 @@ def _said_in(sought: bytes, name: str, place: bytes | Path) -> Iterator[str]:
 _CYCLONE_SECURITY = rb"(?i)<(?:\w+:)?(?:dds)?security\b"
 """The element that secures every participant (Cyclone DDS 0.10, ``cfgelems.h``)."""
 _PROFILE_SECURITY = rb"dds\.sec\.|&#"
-"""The properties that secure a participant of Fast DDS, or a character that may be one of theirs."""
+"""The properties that secure a participant of Fast DDS, or an escape that may hide them."""
 _NAMES_PROFILES = rb"_PROFILES_FILE|\\u"
 """The variables that name profiles, in a file of variables, or an escape that may hide them."""
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
