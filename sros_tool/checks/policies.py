@@ -324,10 +324,29 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
         ]
         # A node has, say, a topic and a service of one name.
         candidates = [one for one in candidates if one.profile is not statement.profile]
+        same_end = [
+            one
+            for name in near.with_same_end(statement.name)
+            for one in offered[name][:1]
+            if one.right.right == other and one.profile is not statement.profile
+        ]
+        if not candidates and len(same_end) == 1 and _is_namespace_apart(statement, same_end[0]):
+            candidates = same_end
         if candidates:
             yield _misspelt(statement, other, candidates)
         else:
-            yield statement.found(NO_COUNTERPART, f"no enclave may {other} {statement.name}")
+            hint = f"; {_meant(same_end)}" if same_end else ""
+            yield statement.found(NO_COUNTERPART, f"no enclave may {other} {statement.name}{hint}")
+
+
+def _is_namespace_apart(one: _Statement, other: _Statement) -> bool:
+    """Return whether one of two names is the other one with a namespace before it."""
+    return one.name.endswith(other.name) or other.name.endswith(one.name)
+
+
+def _meant(candidates: Sequence[_Statement]) -> str:
+    names = " or ".join(f"{one.name} ({one.right.right})" for one in candidates[:_NAMES_SHOWN])
+    return f"perhaps you mean {names}, which nobody uses"
 
 
 def _is_of_a_node(name: str) -> bool:
@@ -358,9 +377,7 @@ def _offered_by_others(unused: Iterable[_Statement]) -> Iterator[Finding]:
 def _misspelt(each: _Statement, other: str, candidates: Sequence[_Statement]) -> Finding:
     """Return the finding on a name without counterpart, which suggests similar names."""
     shown, remedy = candidates[:_NAMES_SHOWN], ""
-    names = " or ".join(f"{one.name} ({one.right.right})" for one in shown)
-    hint = f"perhaps you mean {names}, which nobody uses"
-    first = shown[0]
+    hint, first = _meant(shown), shown[0]
     if first.name == each.name:
         kind = first.right.kind.removesuffix("s")
         article = "an" if kind == "action" else "a"
@@ -1148,14 +1165,19 @@ _DIGITS = re.compile(r"\d+")
 _SHORTEST = 4  # letters of a part: /arm_l and /arm_r are two arms, and min and max two words
 
 
+_MOST_SAME_ENDS = 8
+
+
 class NearNames:
     """An index of names that finds similar names in constant time."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self._by_key: dict[str, list[str]] = defaultdict(list)
         self._by_end: dict[str, list[str]] = defaultdict(list)
+        self._by_last: dict[str, list[str]] = defaultdict(list)
         self._names = dict.fromkeys(names)
         for name in self._names:
+            self._by_last[name.rpartition("/")[2]].append(name)
             for end in _name_ends(name):
                 self._by_end[end].append(name)
             for key in set(_keys(name)):
@@ -1174,11 +1196,19 @@ class NearNames:
     def in_other_namespace(self, name: str) -> list[str]:
         """Return the sorted names that are ``name`` with a namespace more, or less, before it.
 
-        Names of one part, such as /scan, are too common to be meant by others.
+        Names of one part, such as /scan, are left out: they may stand in several namespaces.
         """
         shorter = (end for end in _name_ends(name) if end in self._names)
         longer = self._by_end.get(name, ()) if name.count("/") > 1 else ()
         return sorted({*shorter, *longer} - {name})
+
+    def with_same_end(self, name: str) -> list[str]:
+        """Return the sorted names with the same last part as ``name``, except itself.
+
+        None if there are many: then the part means nothing, or each robot of a fleet has it.
+        """
+        names = self._by_last.get(name.rpartition("/")[2], ())
+        return sorted({*names} - {name}) if len(names) <= _MOST_SAME_ENDS else []
 
 
 def _name_ends(name: str) -> Iterator[str]:

@@ -110,8 +110,29 @@ def test_a_name_in_another_namespace(tmp_path: Path) -> None:
     }
     said = found(file, services("request", one) + OTHER + topics("publish", other))
     assert set(said) == {"policy.no-counterpart"}, "of another kind"
+    assert "/left" not in said["policy.no-counterpart"]
     both = services("reply", other) + services("request", other)
     assert set(found(file, services("request", one) + OTHER + both)) == {"policy.no-counterpart"}
+
+
+@pytest.mark.parametrize(
+    ("heard", "sent", "warns"),
+    [
+        ("/cmd_vel", ["/nav/cmd_vel"], True),
+        ("/nav/cmd_vel", ["/cmd_vel"], True),
+        ("/cmd_vel", ["/nav/cmd_vel", "/ui/cmd_vel"], False),
+        ("/r1/scan", ["/r2/scan"], False),
+    ],
+)
+def test_one_part_in_another_namespace(
+    heard: str, sent: list[str], warns: bool, tmp_path: Path
+) -> None:
+    """Where several names may be meant, they are named in a note."""
+    said = found(tmp_path / "p.xml", topics("subscribe", heard) + OTHER + topics("publish", *sent))
+    kind = "policy.name-misspelt" if warns else "policy.no-counterpart"
+    meant = " or ".join(f"{name} (publish)" for name in sent)
+    text = f"no enclave may publish {heard}; perhaps you mean {meant}, which nobody uses"
+    assert said == {kind: text}
 
 
 def test_a_name_with_a_counterpart_is_no_typing_error(tmp_path: Path) -> None:
