@@ -687,6 +687,14 @@ CHARACTER_SET = FindingKind(
     "Fast DDS 2.6 to 3.6 (fnmatch), Cyclone DDS 0.10 and 11.0 (its own matching); tested.",
     "Use * or ?, or write the names out.",
 )
+NOT_ON_ZENOH = FindingKind(
+    "policy.not-on-zenoh",
+    ERROR,
+    "a policy that Zenoh rules cannot express",
+    "`sros zenoh` refuses a keystore with such permissions. This is checked with --vendor zenoh.",
+    "zenoh.io, Access Control; sros (docs/zenoh.md).",
+    "List names in place of wildcards.",
+)
 ENCLAVE_NAMES = FindingKind(
     "portable.enclave-names",
     WARNING,
@@ -1002,7 +1010,11 @@ def findings_in(policies: Sequence[Policy], distribution: str = "") -> Iterator[
 
 
 def policy_file_findings(
-    *paths: Path, distribution: str = "", fleet: Fleet | None = None, policy: Policy | None = None
+    *paths: Path,
+    distribution: str = "",
+    fleet: Fleet | None = None,
+    policy: Policy | None = None,
+    on_zenoh: bool = False,
 ) -> Iterator[Finding]:
     """Yield all findings in policy files; a file that cannot be read is a finding too.
 
@@ -1011,6 +1023,7 @@ def policy_file_findings(
         distribution: the ROS 2 distribution of their nodes, such as ``humble``; "" is the latest.
         fleet: the robots that their placeholders stand for.
         policy: the policy in the only file, if it is parsed already.
+        on_zenoh: whether their nodes use Zenoh.
     """
     read: list[Policy] = []
     for path in paths:
@@ -1024,6 +1037,22 @@ def policy_file_findings(
         if fleet and (shared := [*_shared_namespaces(fleet)]):
             yield SHARED_NAMESPACE.found(str(path), first_few(shared, 3, "; "), str(path))
     yield from findings_in(read, distribution)
+    if on_zenoh:
+        yield from _check_zenoh(enclave for policy in read for enclave in policy.enclaves)
+
+
+def _check_zenoh(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
+    """Yield findings about enclaves whose rights Zenoh rules cannot express."""
+    from sros_tool.translate_zenoh.rights import remote_rights
+
+    for enclave in enclaves:
+        try:
+            remote_rights(enclave, domain=0)
+        except PolicyError as error:
+            file, line, text = _placed(error)
+            yield NOT_ON_ZENOH.found(
+                enclave.path, f"{text}. {error.why}", file, line, remedy=error.remedy
+            )
 
 
 def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
@@ -1070,12 +1099,17 @@ def _unreadable(path: Path, error: SrosError) -> Iterator[Finding]:
         yield DUPLICATE.found(name, f"{name} is defined here again", str(path), line)
     if found:
         return
-    match = _PLACE.match(error.what)
-    file, line, text = (match["file"], int(match["line"]), match["text"]) if match else ("", 0, "")
-    if not match and (syntax := _SYNTAX.search(error.why)):
+    file, line, text = _placed(error)
+    if not file and (syntax := _SYNTAX.search(error.why)):
         line = int(syntax["line"])
-    why = " ".join(part for part in (f"{text or error.what}.", error.why) if part)
+    why = " ".join(part for part in (f"{text}.", error.why) if part)
     yield MALFORMED.found(str(path), why, file or str(path), line, error.remedy)
+
+
+def _placed(error: SrosError) -> tuple[str, int, str]:
+    """Return the file and line that an error begins with ("" and 0 if none), and its text."""
+    match = _PLACE.match(error.what)
+    return (match["file"], int(match["line"]), match["text"]) if match else ("", 0, error.what)
 
 
 def _duplicates(path: Path) -> Iterator[tuple[str, int]]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
 from sros_tool.dds.advisories import Advisory
+from sros_tool.dds.decision.vendors import ZENOH
 from sros_tool.errors import DocumentError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import (
@@ -101,7 +102,9 @@ def policy_findings(paths: Iterable[Path], at: Circumstances) -> list[Finding]:
     from sros_tool.checks.policies import policy_file_findings
 
     files = [file for path in paths for file in _policies_at(path)]
-    findings = policy_file_findings(*files, distribution=at.distribution, fleet=at.fleet)
+    findings = policy_file_findings(
+        *files, distribution=at.distribution, fleet=at.fleet, on_zenoh=ZENOH in at.vendors
+    )
     return list(dict.fromkeys(findings))
 
 

@@ -50,7 +50,7 @@ from sros_tool.cli.common import (
     taken_secrets,
     verb,
 )
-from sros_tool.dds.decision.vendors import TESTED
+from sros_tool.dds.decision.vendors import TESTED, ZENOH
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines, visible, visible_json
 from sros_tool.values import file_change, shows, versioned
@@ -68,7 +68,6 @@ if TYPE_CHECKING:
     from sros_tool.proof.system import System
     from sros_tool.runtime.processes import MappedLibrary, RunningProcesses
 
-_ZENOH = "zenoh"
 _FAMILIES = ("policy", "keystore", "runtime")
 _LEVELS = click.Choice(["note", "warning", "error"])
 
@@ -80,7 +79,7 @@ def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: s
     return [kind_id for kind_id in all_kinds() if kind_id.startswith(incomplete)]
 
 
-_VENDORS = (*(vendor.value for vendor in TESTED), _ZENOH)
+_VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
 
 
 @verb("check")
@@ -539,7 +538,7 @@ def _vendors(
     """Return the DDS vendors, or ``zenoh``, that options select; () for all."""
     from sros_tool.distributions import SUPPORTED, selected_vendors
 
-    if vendor == _ZENOH:
+    if vendor == ZENOH:
         return (vendor,)
     return selected_vendors(vendor or "", SUPPORTED if all_distros else (distro,) if distro else ())
 

@@ -33,7 +33,7 @@ from sros_tool.cli.common import (
     ros_domain,
     verb,
 )
-from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.decision.vendors import ZENOH, Vendor
 from sros_tool.errors import Note, SrosError, UsageError
 from sros_tool.names import is_expression
 from sros_tool.terminal import Coloured, echo
@@ -62,10 +62,9 @@ _KINDS = {
     **dict.fromkeys(("call", "serve", "request", "reply"), "services"),
     "execute": "actions",
 }
-_ZENOH = "zenoh"
 """The word of --vendor for Zenoh, which is not DDS."""
 _ZENOH_TITLE = "Zenoh"
-_VENDORS = (*(vendor.value for vendor in Vendor), _ZENOH)
+_VENDORS = (*(vendor.value for vendor in Vendor), ZENOH)
 
 
 # ── options ────────────────────────────────────────────────────────────────────────────────
@@ -291,7 +290,7 @@ def explain(
     if fleet_file and not (policy or is_file):
         raise UsageError("--fleet goes with a policy only", "", "Leave it out.")
     if reach:
-        if vendor not in (None, _ZENOH):
+        if vendor not in (None, ZENOH):
             text = "It follows the rights, which are the same for all DDS vendors."
             raise UsageError("--reach takes only --vendor zenoh", text, "Leave it out.")
         stated = policy, fleet_file
@@ -301,7 +300,7 @@ def explain(
     asking = _circumstances(moment, domain, time_zone, fleet_file)
     if logs:
         return _show_log(logs[0], root, rest, asking, as_json)
-    if vendor == _ZENOH and distro:
+    if vendor == ZENOH and distro:
         text = "Zenoh decides alike in every distribution."
         raise UsageError("--vendor zenoh takes no --distro", text, "Leave it out.")
     why_zenoh = "" if all_vendors or all_distros else _why_zenoh(vendor, root)
@@ -329,7 +328,7 @@ def explain(
     else:
         from sros_tool.explain.vendors import Compared, explain_on_dds
 
-        chosen = chosen_vendor(None if vendor == _ZENOH else vendor, distro, os.environ)
+        chosen = chosen_vendor(None if vendor == ZENOH else vendor, distro, os.environ)
         every = Compared.VENDORS if all_vendors else Compared.DISTRIBUTIONS if all_distros else None
         explanation = explain_on_dds(asked, question, chosen, context, kind=kind, every=every)
         lines = _vendor_lines(explanation)
@@ -384,7 +383,7 @@ def _why_zenoh(vendor: str | None, root: Path | None) -> str:
     from sros_tool.keystore.layout import has_zenoh_files, is_keystore
     from sros_tool.runtime.rmw import RMW
 
-    if vendor == _ZENOH:
+    if vendor == ZENOH:
         return "as asked"
     rmw = os.environ.get(RMW, "")
     keystore = root or Path(os.environ.get(KEYSTORE_VARIABLE, ""))

@@ -32,6 +32,7 @@ FOUND_OTHERWISE = {
     "portable.enclave-names",
     "policy.root-enclave",
     "policy.shared-namespace",
+    "policy.not-on-zenoh",
 }
 """These are about more than the content of one profile; they have tests of their own here."""
 HEAD = 3
@@ -284,3 +285,11 @@ def test_robots_that_share_a_namespace(
     found = [each.text for each in policy_file_findings(file, fleet=fleet)]
     shared = [each for each in found if "namespace" in each]
     assert shared == ([text] if text else [])
+
+
+def test_what_zenoh_cannot_express_is_found_where_zenoh_is_named(tmp_path: Path) -> None:
+    text = policy(enclave(topics("publish", "/x*") + deny("publish", "/x*y*")))
+    assert "policy.not-on-zenoh" not in ids(tmp_path, text)
+    file = tmp_path / "policy.xml"
+    found = {each.id: each for each in policy_file_findings(file, on_zenoh=True)}
+    assert "DENY publish /x*y* cannot be expressed" in found["policy.not-on-zenoh"].text

@@ -352,7 +352,7 @@ def test_an_answer_is_taken_where_a_vendor_takes_it(
         ("fastdds", set()),
         ("fastdds-2.9", {"enclave.refused"}),
         ("cyclonedds", {"enclave.refused"}),
-        ("zenoh", set()),
+        ("zenoh", {"zenoh.missing"}),
     ],
 )
 def test_a_refusal_by_the_only_vendor_that_is_used_is_an_error(

@@ -49,6 +49,10 @@ def test_nothing_where_the_files_are_in_step(mode: str, folder: Path) -> None:
 def test_a_keystore_without_a_network_needs_no_files(folder: Path) -> None:
     sros("zenoh", "ks", "--off", cwd=folder).ok()
     assert found(folder, "ks") == []
+    sros("distribute_key", "ks", "/a", "other", cwd=folder).ok()
+    for place in ("ks", "other"):
+        missing = [("zenoh.missing", f"{place}/enclaves/a/session.json5")]
+        assert found(folder, place, "--vendor", "zenoh") == missing
 
 
 def test_a_change_that_is_also_signed_is_found_by_comparison_with_the_keystore(

@@ -13,6 +13,7 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.checks import upgrade
+from sros_tool.checks.keystores import zenoh_files
 from sros_tool.checks.keystores.authorities import ONE_AUTHORITY, check_authorities
 from sros_tool.checks.keystores.documents import (
     DIFFERS,
@@ -50,9 +51,8 @@ from sros_tool.checks.keystores.vendors import (
     evaluate,
     with_causes,
 )
-from sros_tool.checks.keystores.zenoh_files import check_network, check_own_zenoh
 from sros_tool.checks.kind import WARNING, Cause, Finding, some_names
-from sros_tool.dds.decision.vendors import TESTED, Vendor
+from sros_tool.dds.decision.vendors import TESTED, ZENOH, Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
@@ -76,7 +76,13 @@ _NAMES_SHOWN = 3
 _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id, TIME_FORMAT.id})
 """Ids of findings with one cause in all enclaves: a setting, or the signer of their files."""
 _OF_SEVERAL_FILES = frozenset(
-    {REFUSED.id, SOME_REFUSE.id, CRL_MISSING.id, *(kind.id for kind in upgrade.OF_ENCLAVES)}
+    {
+        REFUSED.id,
+        SOME_REFUSE.id,
+        CRL_MISSING.id,
+        zenoh_files.MISSING.id,
+        *(kind.id for kind in upgrade.OF_ENCLAVES),
+    }
 )
 """Ids of findings that have one cause if their texts are equal, such as a shared CA or list."""
 
@@ -124,6 +130,7 @@ def keystore_findings(
         robots=fleet,
         on_robot=on_robot,
         distribution=distribution,
+        on_zenoh=ZENOH in vendors,
     )
     checked = sample if only is None else only
     names = keystore.names if checked is None else tuple(checked)
@@ -178,7 +185,7 @@ def keystore_findings(
         found = [*check_files(keystore, names), *found]
     topics = {name: names for *_, share in outcomes for name, names in share.items()}
     found += check_capitals(topics)
-    found += check_network(keystore, only)
+    found += zenoh_files.check_network(keystore, only)
     if policies:
         from sros_tool.checks.policies import findings_in
 
@@ -229,7 +236,7 @@ def _enclave_findings(
     yield from check_documents(enclave)
     yield from check_governance(enclave, governance, vendors)
     yield from check_policy(enclave, wanted)
-    yield from check_own_zenoh(enclave)
+    yield from zenoh_files.check_own_zenoh(enclave)
 
 
 def joined(findings: Sequence[Finding]) -> list[Finding]:

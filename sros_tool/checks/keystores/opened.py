@@ -69,6 +69,7 @@ class CheckedKeystore:
         robots: the robots that the policies are for, whose domains are compared, too.
         on_robot: whether the keystore is on a robot, where it must not have a CA key.
         distribution: the ROS 2 distribution of its nodes; "" is the latest.
+        on_zenoh: whether its nodes use Zenoh.
     """
 
     opened: Keystore
@@ -78,6 +79,7 @@ class CheckedKeystore:
     robots: Fleet | None = None
     on_robot: bool = False
     distribution: str = ""
+    on_zenoh: bool = False
     _unread: dict[str, UnreadablePart] = field(default_factory=dict)
 
     def _part(self, path: str, read: Callable[[], _Part], otherwise: _Part) -> _Part:

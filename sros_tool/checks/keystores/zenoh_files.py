@@ -14,7 +14,7 @@ from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE, Fault
-from sros_tool.keystore.layout import PERMISSIONS, SETTINGS, ZENOH_FILES
+from sros_tool.keystore.layout import PERMISSIONS, SESSION_FILE, SETTINGS, ZENOH_FILES
 
 if TYPE_CHECKING:
     from sros_tool.keystore.zenoh_files import Drifted, OpenedZenoh
@@ -117,6 +117,8 @@ def check_own_zenoh(enclave: CheckedEnclave) -> Iterator[Finding]:
     if settings and settings.zenoh:
         return
     if not any(os.path.lexists(enclave.folder / file) for file in ZENOH_FILES):
+        if enclave.keystore.on_zenoh:
+            yield _found(MISSING, enclave, f"{SESSION_FILE} is missing", SESSION_FILE)
         return
     from sros_tool.keystore.zenoh_files import open_zenoh  # most keystores have no such files
 
@@ -129,11 +131,15 @@ def _configuration_findings(enclave: CheckedEnclave, opened: OpenedZenoh) -> Ite
     for problem in opened.problems:
         if kind := _KINDS.get(problem.fault.value):
             text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
-            remedy = kind.remedy
-            if not enclave.keystore.is_original:
-                remedy = f"In the {ORIGINAL_KEYSTORE}: run `sros zenoh KEYSTORE`."
-                remedy += " Then export the enclave again."
-            yield kind.found(enclave.name, text, enclave.file(problem.file), remedy=remedy)
+            yield _found(kind, enclave, text, problem.file)
+
+
+def _found(kind: FindingKind, enclave: CheckedEnclave, text: str, file: str) -> Finding:
+    remedy = kind.remedy
+    if not enclave.keystore.is_original:
+        remedy = f"In the {ORIGINAL_KEYSTORE}: run `sros zenoh KEYSTORE`."
+        remedy += " Then export the enclave again."
+    return kind.found(enclave.name, text, enclave.file(file), remedy=remedy)
 
 
 def check_network(

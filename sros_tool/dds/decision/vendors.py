@@ -375,6 +375,9 @@ class Vendor(StrEnum):
 TESTED = tuple(vendor for vendor in Vendor if vendor.traits.tested)
 """The vendors whose decisions were compared with the real library."""
 
+ZENOH = "zenoh"
+"""The word for Zenoh where options and checks take the names of vendors."""
+
 PRINCIPAL = tuple({vendor.traits.product: vendor for vendor in reversed(TESTED)}.values())[::-1]
 """For each tested product, the release that is meant if an option names no version."""
 
