@@ -19,6 +19,7 @@ from sros_tool.errors import Note, PolicyError, UsageError
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
+    from sros_tool.explain.answer import Question
     from sros_tool.explain.asking import AskedEnclave, AskingContext
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.keystore.fleet_status import FleetStatus
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.change import Changed
     from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.lifecycle.revoke import Revocation
+    from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
     from sros_tool.proof.growth import Growth
@@ -60,13 +62,14 @@ class Keystore:
 
 @dataclass(frozen=True, slots=True)
 class AccessAnswer:
-    """One DDS vendor's decision on an access, and the reason.
+    """The decision of one DDS vendor, or of Zenoh, on an access, and the reason.
 
-    ``outcome`` is "allowed", "denied" (the endpoint is not created), "peer-denies" (the endpoint is
-    created, and no peer matches it), "refused" (no node of the enclave starts) or "crashes".
+    ``outcome`` is "allowed", "denied" (the endpoint is not created), "peer denies" (the endpoint is
+    created, and no peer matches it), "refused" (no node of the enclave starts) or "crashes"; of
+    Zenoh, "allowed", "dropped" (messages vanish) or "refused" (the process opens no session).
     ``reason`` is a clause for people.  ``expression`` is the DDS topic expression of the deciding
-    rule, or "".  ``policy_lines`` are the places ``FILE:LINE`` in the given policy that the rule
-    comes from.  ``until`` is the first expiry among the enclave's files, in UTC.  ``remedy`` says
+    rule, or for Zenoh the key expression with a wildcard that allows it, or "".  ``policy_lines``
+    are the places ``FILE:LINE`` in the given policy that the rule comes from.  ``until`` is the first expiry among the enclave's files, in UTC.  ``remedy`` says
     what to do if the cause of a denial is not the policy.
     """
 
@@ -496,6 +499,8 @@ def explain_access(
 ) -> AccessAnswer:
     """Return how a DDS vendor decides on an access, by the signed documents of the enclave.
 
+    Zenoh decides by the files that `sros zenoh` has written into the keystore.
+
     Args:
         keystore: The keystore, or its path; or a policy, or its file, by which sros decides as it
             would be signed.
@@ -506,7 +511,7 @@ def explain_access(
         kind: The kind of ``name``; without it, "call" and "serve" mean an action if the rights of
             the enclave, the policy or the keystore have an action and no service of that name.
         vendor: "fastdds" (2.14, or that of ``distribution``), "cyclonedds" (0.10, likewise), or
-            another name that `sros explain --vendor` takes, such as "fastdds-3.2".
+            another name that `sros explain --vendor` takes, such as "fastdds-3.2" or "zenoh".
         distribution: A ROS 2 distribution, such as "lyrical", whose release of ``vendor``
             decides.
         policy: The policy of the enclave, or its file, in which to find the ``policy_lines``.
@@ -517,8 +522,8 @@ def explain_access(
     Raises:
         KeystoreError: The keystore or the enclave does not exist.
         PolicyError: The policy does not have the enclave.
-        UsageError: The action is unknown or does not fit ``kind``, or the name, vendor,
-            distribution or domain is not valid.
+        UsageError: The action is unknown or does not fit ``kind``, the name, vendor,
+            distribution or domain is not valid, or Zenoh is asked by a policy alone.
 
     Example:
         >>> answer = sros_tool.explain_access(keystore, "/talker", "publish", "/chatter")
@@ -532,13 +537,18 @@ def explain_access(
 
     question = ask(action, name, kind)
     domain = _domain(domain)
-    vendors = [known.value for known in Vendor]
+    vendors = [*(known.value for known in Vendor), "zenoh"]
     if vendor not in vendors:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
+    if vendor == "zenoh" and distribution:
+        text = "Zenoh decides alike in every distribution."
+        raise UsageError("vendor 'zenoh' takes no distribution", text, "Leave it out.")
     (vendor,) = _vendors(vendor, distribution)
     asking = AskingContext(_time_or_now(now), zone, domain)
     asked = _enclave_to_ask(keystore, enclave, policy, asking)
     context = asking.context(asked.enclave.joined_domains)
+    if vendor == "zenoh":
+        return _access_on_zenoh(asked, question, context, kind)
     evaluator = Evaluator(Vendor(vendor), asked.enclave, context)
     question, _ = question_meant(evaluator, asked, question, kind)
     answer = explain(evaluator, question)
@@ -552,6 +562,25 @@ def explain_access(
         tuple(str(line.source) for line in answer.lines),
         answer.until,
         answer.remedy,
+    )
+
+
+def _access_on_zenoh(
+    asked: AskedEnclave, question: Question, context: JoinContext, kind: str | None
+) -> AccessAnswer:
+    from sros_tool.explain.zenoh import explain_on_zenoh
+
+    explanation = explain_on_zenoh(asked, question, "as asked", context, kind=kind)
+    answer = explanation.answer
+    return AccessAnswer(
+        answer.allowed,
+        answer.outcome.value,
+        answer.text,
+        "zenoh",
+        answer.wildcard,
+        tuple(str(line.source) for line in explanation.stated.lines),
+        answer.until,
+        explanation.remedy,
     )
 
 
@@ -593,6 +622,7 @@ def check(
     fleet: AnyPath | None = None,
     severity: Literal["note", "warning", "error"] = "warning",
     strict: bool = False,
+    distribution: str = "",
     domain: int | None = None,
     now: datetime | None = None,
     zone: tzinfo = UTC,
@@ -605,6 +635,9 @@ def check(
         fleet: The file with the robots that the placeholders of policy files stand for.
         severity: The lowest severity that is returned.
         strict: Include the weaknesses that a keystore's template accepts.
+        distribution: The ROS 2 distribution, such as "lyrical", whose nodes and DDS the findings
+            are for; by default the latest for nodes in policies, and the distributions in the
+            keystore's settings.
         domain: The ROS domain id that the enclaves have to join.
         now: The time at which validities are checked; the current time by default.
         zone: The time zone of the robot, in which some vendors read dates.
@@ -615,7 +648,8 @@ def check(
 
     Raises:
         DocumentError: A path is neither a policy, nor a keystore, nor an enclave.
-        UsageError: No path is given, the severity is unknown, or ``domain`` is not a domain id.
+        UsageError: No path is given, the severity or the distribution is unknown, or ``domain`` is
+            not a domain id.
 
     Example:
         >>> for finding in sros_tool.check("ks"):
@@ -624,6 +658,7 @@ def check(
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import FindingFilter
     from sros_tool.checks.targets import Circumstances, path_findings
+    from sros_tool.distributions import find_distribution
     from sros_tool.fleet.expansion import read_policy_for
     from sros_tool.fleet.fleet_file import read_fleet
 
@@ -639,9 +674,18 @@ def check(
         else _policy(policy)
         for policy in _no_string("policies", policies)
     )
-    at = Circumstances(_time_or_now(now), zone, _domain(domain), read, fleet=robots)
+    at = Circumstances(
+        _time_or_now(now),
+        zone,
+        _domain(domain),
+        read,
+        find_distribution(distribution).named if distribution else "",
+        _vendors("", distribution),
+        robots,
+    )
     findings = path_findings(map(Path, paths), at)
-    return FindingFilter(severity=levels[severity], strict=strict).choose(findings).shown
+    chosen = FindingFilter(severity=levels[severity], strict=strict, vendors=at.vendors)
+    return chosen.choose(findings).shown
 
 
 def check_requirements(
@@ -727,7 +771,7 @@ def new_access(
     Args:
         base: The state before the change: a policy, a folder of policies, a keystore, an exported
             enclave, permissions, a Zenoh configuration, or policies at a git revision, such as
-            "git:main:policies/robot.xml".
+            "git:main:policies/robot.xml", of the repository that the working directory is in.
         head: The state after the change: any of these.
         fleet: The file with the robots that the placeholders of policies stand for.
         base_fleet: The fleet file for ``base``, if it differs from ``fleet``.

@@ -16,7 +16,7 @@ import sros_tool
 from sros_tool import DocumentError, KeystoreError, PolicyError, UsageError
 from sros_tool.files import policies_dir
 from tests.support.children import apart
-from tests.support.harness import policy_text, publish
+from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.long_form import sometimes
 
 PROJECT = Path(__file__).parents[1]
@@ -132,6 +132,37 @@ def test_an_answer_says_by_which_line_and_until_when(keystore: sros_tool.Keystor
     later = sros_tool.explain_access(keystore, TALKER, "join", now=yes.until + timedelta(days=1))
     assert later.outcome == "refused"
     assert later.remedy
+
+
+def test_zenoh_answers_by_the_files_in_the_keystore(
+    keystore: sros_tool.Keystore, tmp_path: Path
+) -> None:
+    ask = partial(sros_tool.explain_access, vendor="zenoh")
+    with pytest.raises(KeystoreError, match="no Zenoh configurations"):
+        ask(keystore, TALKER, "publish", "/chatter")
+    made = copy_of(keystore.path, tmp_path / "ks")
+    sros("zenoh", made).ok()
+    yes = ask(made, TALKER, "publish", "/chatter", policy=POLICY)
+    assert yes and (yes.outcome, yes.vendor) == ("allowed", "zenoh") and yes.until
+    assert [line.rpartition(":")[0] for line in yes.policy_lines] == [str(POLICY)]
+    no = ask(made, TALKER, "subscribe", "/chatter")
+    assert not no and no.outcome == "dropped"
+    with pytest.raises(UsageError, match="needs a keystore"):
+        ask(POLICY, TALKER, "publish", "/chatter")
+    with pytest.raises(UsageError, match="takes no distribution"):
+        ask(made, TALKER, "publish", "/chatter", distribution="lyrical")
+
+
+def test_findings_are_for_the_nodes_of_a_distribution(tmp_path: Path) -> None:
+    policy = tmp_path / "robot.xml"
+    policy.write_text(policy_text({"/a": publish("/x")}))
+    ids = [
+        {each.id for each in sros_tool.check(policy, severity="note", distribution=name)}
+        for name in ("humble", "lyrical", "")
+    ]
+    assert ids[1] - ids[0] == {"policy.no-type-description"} and ids[1] == ids[2]
+    with pytest.raises(UsageError, match="It knows ardent"):
+        sros_tool.check(policy, distribution="lunar")
 
 
 def test_an_action_is_found_out_as_on_the_command_line(tmp_path: Path) -> None:
