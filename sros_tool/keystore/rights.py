@@ -792,8 +792,12 @@ class RecordedRights:
 
     def nodes(self, name: str) -> str:
         """Return the nodes of an enclave's last permissions, as text from the ledger."""
-        last = self._ledger_part(name).last
-        return last[name].nodes if name in last else ""
+        last = self.last(name)
+        return last.nodes if last else ""
+
+    def last(self, name: str) -> Entry | None:
+        """Return the ledger entry of an enclave's last permissions, or None."""
+        return self._ledger_part(name).last.get(name)
 
     def latest(self, name: str, digest: str) -> Entry | None:
         """Return the last ledger entry of an enclave; None unless it records these permissions.
@@ -802,7 +806,7 @@ class RecordedRights:
         """
         with suppress(KeystoreError):
             self.policy(name, digest)
-            return self._ledger_part(name).last.get(name)
+            return self.last(name)
         return None
 
     def unproven(self) -> dict[str, Entry]:

@@ -193,7 +193,8 @@ LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "files-missing", _ROS, r"couldn't find all security files",
         "a file of the enclave is missing or a broken link; the message does not say which",
-        "Restore it: `sros create_enclave KEYSTORE ENCLAVE`, or export the enclave again.", _FILES,
+        "`sros explain KEYSTORE ENCLAVE join` names the file and the command that restores it; on "
+        "a robot, export the enclave again.", _FILES,
         refuses=Refused.PARTICIPANT,
     ),
     _text(

@@ -448,6 +448,16 @@ def test_generate_artifacts_tells_each_enclave(keystore: Path, tmp_path: Path) -
     assert (keystore / "enclaves/b/governance.p7s").exists()
 
 
+def test_lost_permissions_are_said_to_be_replaced_by_the_default_ones(keystore: Path) -> None:
+    sros("create_enclave", keystore, "/c").ok()  # never has other rights than the default ones
+    for name in "ac":
+        (keystore / f"enclaves/{name}/permissions.p7s").unlink()
+    ended = sros("create_enclave", keystore, "/a", "/c").ok()
+    assert ended.out == "completed enclave /a\ncompleted enclave /c\n"
+    assert "no longer the rights of its policy" in ended.err
+    assert f"`sros create_permission {keystore} /a POLICY`" in ended.err and "/c" not in ended.err
+
+
 def test_a_lost_certificate_is_issued_for_the_same_key(keystore: Path) -> None:
     folder = keystore / "enclaves/a"
     (folder / "cert.pem").unlink()

@@ -833,8 +833,26 @@ class _EnclaveMaker:
                 return _EnclaveOutcome("changed", notes, replaced)
             superseded = Superseded.by(name, old, issued.certificate, change.now)
             return _EnclaveOutcome("changed", notes, replaced and replaced.revoked(), superseded)
+        if rights and policy is None:
+            notes += tuple(self._lost_rights(rights.enclave, present))
         completed = len(change.transaction.changes) > before
         return _EnclaveOutcome("completed" if completed else "kept", notes)
+
+    def _lost_rights(self, default: Enclave, present: set[str]) -> Iterator[Note]:
+        """Yield a note if an enclave had other rights than the default ones that it gets.
+
+        The unsigned copy of lost permissions shows that an enclave had some which the ledger does
+        not record.
+        """
+        name, last = default.path, self._change.recorded.last(default.path)
+        if last.policy == default.digest if last else "permissions.xml" not in present:
+            return
+        text = (
+            f"enclave {name} had lost its {PERMISSIONS_FILE}: it now has the default permissions "
+            "of the keystore's template, and no longer the rights of its policy. To give it these "
+            f"again: `sros create_permission {quote(str(self._root))} {quote(name)} POLICY`."
+        )
+        yield Note("keystore.rights-lost", text)
 
     def _is_kept(self, certificate: x509.Certificate, rights: StatedRights) -> bool:
         """Return whether an enclave's permissions can stay, because they already state ``rights``.
