@@ -69,8 +69,9 @@ class AccessAnswer:
     Zenoh, "allowed", "dropped" (messages vanish) or "refused" (the process opens no session).
     ``reason`` is a clause for people.  ``expression`` is the DDS topic expression of the deciding
     rule, or for Zenoh the key expression with a wildcard that allows it, or "".  ``policy_lines``
-    are the places ``FILE:LINE`` in the given policy that the rule comes from.  ``until`` is the first expiry among the enclave's files, in UTC.  ``remedy`` says
-    what to do if the cause of a denial is not the policy.
+    are the places ``FILE:LINE`` in the given policy that the rule comes from.  ``until`` is the
+    first expiry among the enclave's files, in UTC.  ``remedy`` says what to do if the cause of a
+    denial is not the policy.
     """
 
     allowed: bool
