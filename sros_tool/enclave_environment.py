@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -11,8 +12,10 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from sros_tool.errors import KeystoreError, Note, UsageError
+from sros_tool.keystore.layout import PERMISSIONS_FILE
 from sros_tool.keystore.reader import of_one_state
 from sros_tool.owners import other_writers
+from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
     from datetime import datetime, tzinfo
@@ -703,14 +706,73 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
             "KEYSTORE ENCLAVE -- COMMAND`.",
         )
     ns, name = node
-    full = f"/{ns.strip('/')}/{name}".replace("//", "/")
-    enclaves = read_policy(file).enclaves_of_node(ns, name)
-    if len(enclaves) != 1:
+    policy, full = read_policy(file), _full_name(ns, name)
+    enclaves = policy.enclaves_of_node(ns, name)
+    if len(enclaves) == 1:
+        return enclaves[0].path
+    why = "A process runs in one enclave."
+    remedy = f'Give it a profile in one enclave: `<profile ns="{ns}" node="{name}">`.'
+    if enclaves:
         names = ", ".join(enclave.path for enclave in enclaves[:3])
-        what = f"in {len(enclaves)} enclaves, such as {names}" if enclaves else "in no enclave"
-        raise UsageError(
-            f"the policy '{file}' has the node {full} {what}",
-            "A process runs in one enclave.",
-            f'Give it a profile in one enclave: `<profile ns="{ns}" node="{name}">`.',
-        )
-    return enclaves[0].path
+        where = f"in {len(enclaves)} enclaves, such as {names}"
+    else:
+        where = "in no enclave"
+        every = {known for nodes in policy.nodes().values() for known in nodes}
+        if alike := sorted(known for known in every if known.endswith(f"/{name}")):
+            why = f"It has the node {first_few(alike, 3)}."
+            other = quote(alike[0].rpartition("/")[0] or "/")
+            remedy = (
+                f"Name the namespace: `-r __ns:={other}` after --ros-args. Or, if {full} is right, "
+                f'give it a profile: `<profile ns="{ns}" node="{name}">`.'
+            )
+    raise UsageError(f"the policy '{file}' has the node {full} {where}", why, remedy)
+
+
+def other_node(
+    root: Path, enclave: str, command: Sequence[str], *, now: datetime
+) -> tuple[Note, ...]:
+    """Return a note if a command gives its nodes a name that the enclave's permissions lack.
+
+    Without a ledger with the permissions, only nodes show that offer their standard services: then
+    a node is missed only if the permissions have its name in another namespace.
+    """
+    from sros_tool.keystore.reader import Keystore
+    from sros_tool.keystore.rights import RecordedRights
+    from sros_tool.policy.patterns import overlap
+    from sros_tool.policy.rights import nodes_from_text, nodes_of_rights
+    from sros_tool.runtime.environment import node_rules
+    from sros_tool.translate import grant_rights
+
+    ns, name = node_rules(command)
+    if not (ns or name):
+        return ()
+    keystore = Keystore(root)
+    state = keystore.enclave(enclave, now=now)
+    grant = state.permissions.grant_of(state.subject) if state.permissions else None
+    if grant is None or grant.default_allow:
+        return ()
+    known = nodes_of_rights(grant_rights(enclave, grant))
+    digest = hashlib.sha256(state.files.get(PERMISSIONS_FILE, b"")).hexdigest()
+    if recorded := RecordedRights(keystore).latest(enclave, digest):
+        known += nodes_from_text(recorded.nodes)
+    else:
+        known = tuple(node for node in known if name and overlap(node.name, name))
+    if not known or any(
+        (not ns or overlap(node.ns, f"/{ns.strip('/')}")) and (not name or overlap(node.name, name))
+        for node in known
+    ):
+        return ()
+    started = f"the node {_full_name(ns, name)}" if ns and name else f"a node in the namespace {ns}"
+    if not ns:
+        started = f"a node with the name {name}"
+    nodes = first_few([_full_name(*node) for node in known], 3)
+    text = (
+        f"the command starts {started}, which may not offer its parameter services: the "
+        f"permissions of enclave {enclave} are for the node{'s' * (len(known) > 1)} {nodes}. "
+        "Correct `__ns:=` or `__node:=`, or name the enclave of this node."
+    )
+    return (Note("run.other-node", text),)
+
+
+def _full_name(ns: str, name: str) -> str:
+    return f"/{ns.strip('/')}/{name}".replace("//", "/")

@@ -229,9 +229,18 @@ _NODE_RULES, _NAMESPACE_RULE = ("__node", "__name"), "__ns"
 def node_argument(command: Sequence[str]) -> tuple[str, str] | None:
     """Return namespace and name that a command gives its node, or None if it gives no name.
 
+    Without a rule for the namespace it is "/".  `node_rules` says what counts.
+    """
+    ns, name = node_rules(command)
+    return (ns or "/", name) if name else None
+
+
+def node_rules(command: Sequence[str]) -> tuple[str, str]:
+    """Return the namespace and the name that a command gives its nodes; "" for what it leaves out.
+
     They are the first rules ``-r __ns:=NAMESPACE`` and ``-r __node:=NAME`` behind ``--ros-args``,
-    as rcl takes them (``remap.c``); without a namespace it is "/".  Rules for one of several nodes
-    (``-r talker:__node:=NAME``) are passed over: they name no enclave of the process.
+    as rcl takes them (``remap.c``).  Rules for one of several nodes (``-r talker:__node:=NAME``)
+    are passed over: they name no enclave of the process.
     """
     rules: dict[str, str] = {}
     of_ros = False
@@ -244,8 +253,7 @@ def node_argument(command: Sequence[str]) -> tuple[str, str] | None:
             rule, mark, value = word.partition(":=")
             if mark:
                 rules.setdefault("__node" if rule in _NODE_RULES else rule, value)
-    name = rules.get("__node")
-    return (rules.get(_NAMESPACE_RULE) or "/", name) if name else None
+    return rules.get(_NAMESPACE_RULE, ""), rules.get("__node", "")
 
 
 def _is_ros2_run(command: Sequence[str]) -> bool:

@@ -9,13 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.harness import Ended, forked
+from sros_tool.cli.common import now
+from sros_tool.enclave_environment import other_node
+from tests.support.harness import Ended, forked, sros
 
 SHOW = "import json, os, sys; print(json.dumps([dict(os.environ), sys.argv]))"
 POLICY = """<policy version="0.2.0"><enclaves>
 <enclave path="/line/talker"><profiles>
   <profile ns="/" node="talker"><topics publish="ALLOW"><topic>/chatter</topic></topics></profile>
   <profile ns="/left/arm" node="talker"><topics publish="ALLOW"><topic>/a</topic></topics></profile>
+  <profile ns="/left" node="hidden"><services reply="ALLOW"><service>~/get_parameters</service>
+  </services></profile>
 </profiles></enclave>
 <enclave path="/line/listener"><profiles>
   <profile ns="/" node="listener"><topics subscribe="ALLOW"><topic>/a</topic></topics></profile>
@@ -77,6 +81,7 @@ def test_the_keystore_may_come_from_the_environment(made: Path) -> None:
         (("-r", "__node:="), "names no node"),
         (("-r", "__node:=nobody"), "has the node /nobody in no enclave"),
         (("-r", "__node:=talker", "-r", "__ns:=/left"), "node /left/talker in no enclave"),
+        (("-r", "__node:=hidden"), "the node /left/hidden. Name the namespace: `-r __ns:=/left`"),
         (("-r", "__node:=both"), "in 2 enclaves, such as /line/listener, /line/other"),
         (("-r", "__node:=\x1b[2Jtalker"), "\\x1b[2Jtalker in no enclave"),
     ],
@@ -87,6 +92,27 @@ def test_what_is_in_no_single_enclave_is_not_started(
     ended = run(made, *ros_args)
     assert (ended.status, ended.out) == (2, "")
     assert why in ended.err and "\x1b" not in ended.err and ended.err.count("\n") == 1
+
+
+def test_a_node_that_the_permissions_lack_is_named_before_it_starts(
+    made: Path, tmp_path: Path
+) -> None:
+    export = tmp_path / "export"  # which has no ledger with the nodes that offer no service
+    sros("distribute_key", made / "ks", "/line/talker", export).ok()
+    for root, ros_args, missed in (
+        (made / "ks", "-r __ns:=/right", "a node in the namespace /right"),
+        (made / "ks", "-r __node:=hidden -r __ns:=/right", "the node /right/hidden"),
+        (made / "ks", "-r __node:=other", "a node with the name other"),
+        (made / "ks", "-r __node:=talker -r __ns:=/left/arm", ""),
+        (made / "ks", "-r __node:=hidden", ""),  # its program may choose the namespace
+        (made / "ks", "-r __ns:=/left", ""),
+        (export, "-r __node:=hidden -r __ns:=/right", "the node /right/hidden"),
+        (export, "-r __node:=talker -r __ns:=/left/arm", ""),
+        (export, "-r __ns:=/right", ""),
+    ):
+        words = ("true", "--ros-args", *ros_args.split())
+        said = [note.text for note in other_node(root, "/line/talker", words, now=now())]
+        assert [f"starts {missed}, which" in text for text in said] == [True] * bool(missed), said
 
 
 def test_a_policy_and_an_enclave_exclude_each_other(made: Path) -> None:

@@ -27,7 +27,6 @@ from sros_tool.runtime.variables import DOMAIN
 from sros_tool.validity import Window
 from tests.support.children import run, wait_for
 from tests.support.harness import (
-    Ended,
     Running,
     check_whole,
     forked,
@@ -796,8 +795,10 @@ def test_run_names_the_enclave_of_a_ros_node(keystore: Path, tmp_path: Path) -> 
     done = forked("run", keystore, "/a", "--", node, "--fast").ok()
     assert done.out == "--fast --ros-args --enclave /a\n"
     assert done.err.startswith("added --ros-args --enclave /a, so that the ROS graph shows")
-    done = forked("run", "--no-ros-args", keystore, "/a", "--", node, "--fast")
-    assert done == Ended(0, "--fast\n", "")
+    words = (node, "--ros-args", "-r", "__ns:=/other")
+    done = forked("run", "--no-ros-args", keystore, "/a", "--", *words).ok()
+    assert done.out == "--ros-args -r __ns:=/other\n"
+    assert done.err.startswith("note [run.other-node]: the command starts a node in the namespace")
 
 
 @pytest.mark.parametrize(
