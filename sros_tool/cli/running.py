@@ -608,7 +608,10 @@ def _inbox(root: Path) -> tuple[str, ...]:
 
 def _owner(root: Path) -> str:
     """Return the name of the owner of a keystore.  Raises `UsageError`."""
-    number = root.stat().st_uid
+    try:
+        number = root.stat().st_uid
+    except FileNotFoundError:
+        raise UsageError(f"keystore '{root}' does not exist here", "", "Add --user NAME.") from None
     try:
         return pwd.getpwuid(number).pw_name
     except KeyError:

@@ -293,6 +293,9 @@ CASES |= {
     "keystore.allow-everything": lambda b: b.permissions(
         ("<topic>ros_discovery_info</topic>", "<topic>*</topic>")
     ),
+    "enclave.any-node": lambda b: b.permissions(
+        ("rr/base/set_parametersReply", "rr/*/set_parametersReply")
+    ),
     "keystore.only-denials": lambda b: b.permissions(
         (ALLOW, DENY_ALL.replace("rt/*", "rt/stop") + ALLOW),
         ("<topic>ros_discovery_info</topic>", "<topic>*</topic>"),

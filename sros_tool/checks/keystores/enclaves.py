@@ -22,7 +22,7 @@ from sros_tool.checks.kind import (
     some_names,
 )
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.dds.permissions import Grant
+from sros_tool.dds.permissions import Grant, Rule
 from sros_tool.errors import SrosError
 from sros_tool.faults import VENDOR_FAULTS, Fault
 from sros_tool.keystore.layout import (
@@ -175,6 +175,16 @@ EVERYTHING = FindingKind(
     "ros2/sros2 0.13 grants this to every enclave without a policy.",
     "Give the enclave a policy, with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
 )
+ANY_NODE = FindingKind(
+    "enclave.any-node",
+    NOTE,
+    "an enclave that may offer the parameter services of every node",
+    "An enclave without a policy may start nodes of any name. So a process in it can read and "
+    "answer requests to the parameter services of other enclaves' nodes.",
+    "ROS 2 design, ROS 2 DDS-Security Integration; sros (template production).",
+    EVERYTHING.remedy,
+)
+_ANY_NODES_SERVICE = "rr/*/set_parametersReply"
 ONLY_DENIALS = FindingKind(
     "keystore.only-denials",
     NOTE,
@@ -352,6 +362,9 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
             # No template accepts it: whoever checks a keystore asks whether its robot is closed.
             accepted = keystore.accepts(EVERYTHING, lambda _: False)
             yield EVERYTHING.found(enclave.name, text, file, accepted=accepted)
+    elif any(_ANY_NODES_SERVICE in _published(rule) for rule in grant.rules if rule.allow):
+        text = f"the permissions allow publishing {_ANY_NODES_SERVICE}"
+        yield ANY_NODE.found(enclave.name, text, file)
     unique = "," in grant.subject or "+" in grant.subject
     window = grant.validity
     length = window.not_after - window.not_before
@@ -361,6 +374,11 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
         )
         text = f"they are valid from {iso(window.not_before)} to {iso(window.not_after)}"
         yield LONG_PERMISSIONS.found(enclave.name, text, file, accepted=accepted)
+
+
+def _published(rule: Rule) -> set[str]:
+    """Return the topic expressions that a rule names to publish."""
+    return {topic for criteria in rule.publish for topic in criteria.topics}
 
 
 def _denied_before_everything(grant: Grant) -> list[str]:

@@ -24,6 +24,7 @@ from sros_tool.checks.keystores.documents import (
     governance_findings,
 )
 from sros_tool.checks.keystores.enclaves import (
+    ANY_NODE,
     CRL_MISSING,
     EVERYTHING,
     EXPIRES_SOON,
@@ -73,7 +74,7 @@ from sros_tool.policy.rights import Right
 from sros_tool.wording import counted, first_few
 
 _NAMES_SHOWN = 3
-_OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id, TIME_FORMAT.id})
+_OF_THE_KEYSTORE = frozenset({EVERYTHING.id, ANY_NODE.id, LONG_PERMISSIONS.id, TIME_FORMAT.id})
 """Ids of findings with one cause in all enclaves: a setting, or the signer of their files."""
 _OF_SEVERAL_FILES = frozenset(
     {
