@@ -50,6 +50,12 @@ if TYPE_CHECKING:
 @verb("merge_policy")
 @click.argument("policy", metavar="POLICY", type=PATH)
 @click.argument("others", metavar="OTHER...", type=PATH, nargs=-1, required=True)
+@click.option(
+    "--namespace",
+    metavar="NS",
+    help="Put the enclaves and nodes of OTHER into this namespace, such as /left, with all names "
+    "that do not begin with '/'.",
+)
 @output_option("Write the result to FILE.")
 @click.option("--in-place", is_flag=True, help="Overwrite POLICY with the result.")
 @force_option
@@ -58,6 +64,7 @@ if TYPE_CHECKING:
 def merge_policy(
     policy: Path,
     others: tuple[Path, ...],
+    namespace: str | None,
     output: Path | None,
     in_place: bool,
     force: bool,
@@ -79,9 +86,12 @@ def merge_policy(
         /talker ALLOW subscribe topic /tf
       note [merge.still-denied]: /talker DENY publish topic /cmd_vel stays ...
       replaced 'robot.xml'
+      $ sros merge_policy robot.xml gripper.xml --namespace /left --in-place
     """
+    from sros_tool.fleet.robots import namespace_problem
     from sros_tool.policy.document import read_policy
     from sros_tool.policy.merge import EditedText, MergedPolicy, merge_all
+    from sros_tool.policy.model import in_namespace
 
     if in_place and output:
         raise UsageError("--in-place and --output exclude each other")
@@ -89,6 +99,10 @@ def merge_policy(
     if output:
         check_output(output, force=force)
     additions = [read_policy(path) for path in others]
+    if namespace is not None:
+        if problem := namespace_problem(namespace):
+            raise UsageError(f"--namespace {namespace!r}: {problem}", "", "Write it as /left.")
+        additions = [in_namespace(other, namespace) for other in additions]
     merged = merge_all(policy, additions)
     if merged.added and (output is None or output.parent.resolve() == policy.parent.resolve()):
         from sros_tool.graph.learn import with_common_parts

@@ -120,6 +120,25 @@ class Enclave:
         return replace(self, profiles=tuple(blocks))
 
 
+def in_namespace(policy: Policy, namespace: str) -> Policy:
+    """Return a policy with its enclaves and nodes below a namespace, such as ``/left``.
+
+    Names that are written with a ``/`` at their beginning stay.
+    """
+
+    def below(path: str) -> str:
+        return f"{namespace.rstrip('/')}/{path.lstrip('/')}".rstrip("/") or "/"
+
+    enclaves = (
+        replace(
+            enclave.with_profiles(lambda profile: replace(profile, ns=below(profile.ns))),
+            path=below(enclave.path),
+        )
+        for enclave in policy.enclaves
+    )
+    return replace(policy, enclaves=tuple(enclaves))
+
+
 def instances(enclaves: Iterable[Enclave]) -> dict[tuple[str, str], tuple[Profile, ...]]:
     """Map each enclave and node that has several namespaces to its profiles, one of each namespace.
 

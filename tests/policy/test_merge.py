@@ -10,7 +10,16 @@ from hypothesis import given
 
 from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.merge import merge_all, merge_into, merge_notes, plan_merge
-from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles
+from sros_tool.policy.model import (
+    ALLOW,
+    DENY,
+    Enclave,
+    Group,
+    Policy,
+    Profile,
+    Profiles,
+    in_namespace,
+)
 from sros_tool.policy.rights import Right, policy_rights
 from tests.policy.drawn_policies import PATHS, effective, meant, policies
 
@@ -54,6 +63,16 @@ def test_merging_with_itself_adds_nothing(policy: Policy) -> None:
     plan = plan_merge(policy, policy)
     assert plan.entries == {}
     assert plan.added == ()
+
+
+@pytest.mark.parametrize(
+    ("namespace", "path", "relative"), [("/left", "/left/a", "/left/x"), ("/", "/a", "/x")]
+)
+def test_a_policy_in_a_namespace(namespace: str, path: str, relative: str) -> None:
+    moved = in_namespace(one(group("topics", "x ~/y /z", publish="ALLOW")), namespace)
+    assert [enclave.path for enclave in moved.enclaves] == [path]
+    names = {right.name for right in policy_rights(moved)}
+    assert names == {relative, f"{relative[:-1]}n/y", "/z"}
 
 
 TOPICS = group("topics", "/x /cam/*", publish="ALLOW")
