@@ -321,8 +321,8 @@ def renew(
     Args:
         keystore: The keystore, or its path.
         enclaves: The names of enclaves.
-        expiring: Also renew the enclaves that expire within this time, but for those with a
-            validity of their own.
+        expiring: Also renew the enclaves that expire within this time, except those with a validity
+        of their own.
         new_key: Give the enclaves new keys.
         revoke_old: Revoke the earlier certificates, which otherwise work until they expire.
         secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
@@ -425,7 +425,7 @@ def fleet_status(
         keystore: A keystore with a fleet, or its path.
         robots: The names of some robots; all by default.
         max_age: Robots whose last confirmation is older are ``overdue`` and ``offline``; without
-            it, robots that fetch and were not heard of for more than a day.
+        it, robots that fetch are, after more than a day without a message.
         now: The time from which ages count; the current time by default.
 
     Returns:

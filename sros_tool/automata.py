@@ -298,7 +298,7 @@ def _moved_places(reached: int, moves: _Moves) -> int:
 
 _Truth = bool | None
 """Whether a name is in a set; None while that depends on the rest of the name."""
-_Ask = Callable[["_Some"], _Truth]
+_Test = Callable[["_Some"], _Truth]
 
 
 @dataclass(frozen=True)
@@ -355,7 +355,7 @@ class _Some:
     def parts(self) -> tuple[_Node, ...]:
         return ()
 
-    def truth(self, ask: _Ask) -> _Truth:
+    def truth(self, ask: _Test) -> _Truth:
         return ask(self)
 
 
@@ -368,13 +368,13 @@ class _Not:
     def parts(self) -> tuple[_Node, ...]:
         return (self.of,)
 
-    def truth(self, ask: _Ask) -> _Truth:
+    def truth(self, ask: _Test) -> _Truth:
         inner = self.of.truth(ask)
         return None if inner is None else not inner
 
 
 @dataclass(frozen=True)
-class _Every:
+class _Intersection:
     """The intersection of the sets ``of``."""
 
     of: tuple[_Node, ...]
@@ -382,7 +382,7 @@ class _Every:
     def parts(self) -> tuple[_Node, ...]:
         return self.of
 
-    def truth(self, ask: _Ask) -> _Truth:
+    def truth(self, ask: _Test) -> _Truth:
         result: _Truth = True
         for part in self.of:
             inner = part.truth(ask)
@@ -406,7 +406,7 @@ class _First:
     def parts(self) -> tuple[_Node, ...]:
         return tuple(part for part, _ in self.of)
 
-    def truth(self, ask: _Ask) -> _Truth:
+    def truth(self, ask: _Test) -> _Truth:
         possible: set[bool] = set()
         for part, kept in self.of:
             inner = part.truth(ask)
@@ -429,7 +429,7 @@ class _AtLeast:
     def parts(self) -> tuple[_Node, ...]:
         return self.of
 
-    def truth(self, ask: _Ask) -> _Truth:
+    def truth(self, ask: _Test) -> _Truth:
         sure = 0
         left = len(self.of)
         for part in self.of:
@@ -443,7 +443,7 @@ class _AtLeast:
         return None
 
 
-_Node = _Some | _Not | _Every | _First | _AtLeast
+_Node = _Some | _Not | _Intersection | _First | _AtLeast
 
 
 class SearchLimit:
@@ -548,12 +548,12 @@ class NameSet:
         for name_set, two in ((self, other), (other, self)):
             if isinstance(name_set._node, _Some) and not name_set._node.automata:
                 return NameSet(name for name in name_set._node.exact if name in two)
-        return NameSet._of(_Every((self._node, other._node)))
+        return NameSet._of(_Intersection((self._node, other._node)))
 
     def __sub__(self, other: NameSet) -> NameSet:
         if isinstance(self._node, _Some) and not self._node.automata:
             return NameSet(name for name in self._node.exact if name not in other)
-        return NameSet._of(_Every((self._node, _Not(other._node))))
+        return NameSet._of(_Intersection((self._node, _Not(other._node))))
 
     def __invert__(self) -> NameSet:
         return NameSet._of(_Not(self._node))
@@ -626,8 +626,8 @@ def _between(node: _Node, begin: str, end: str) -> _Node:
             )
         case _Not():
             return _Not(_between(node.of, begin, end))
-        case _Every():
-            return _Every(tuple(_between(part, begin, end) for part in node.of))
+        case _Intersection():
+            return _Intersection(tuple(_between(part, begin, end) for part in node.of))
         case _First():
             of = tuple((_between(part, begin, end), kept) for part, kept in node.of)
             return _First(of, node.last)
@@ -652,7 +652,7 @@ def _including_set(
             return Surroundings(node.exact, node.automata)
         case _Not():
             return None
-        case _Every():
+        case _Intersection():
             parts = (_including_set(part, best) for part in node.of)
             return min(filter(None, parts), key=best, default=None)
         case _First():
@@ -710,7 +710,7 @@ def _reduced(
     if isinstance(node, _Not):
         inner = _reduced(node.of, sure, possible)
         return not inner if isinstance(inner, bool) else _Not(inner)
-    if isinstance(node, _Every):
+    if isinstance(node, _Intersection):
         kept: list[_Node] = []
         for part in node.of:
             inner = _reduced(part, sure, possible)
@@ -718,7 +718,7 @@ def _reduced(
                 return False
             if not isinstance(inner, bool):
                 kept.append(inner)
-        return (kept[0] if len(kept) == 1 else _Every(tuple(kept))) if kept else True
+        return (kept[0] if len(kept) == 1 else _Intersection(tuple(kept))) if kept else True
     if isinstance(node, _AtLeast):
         parts = [_reduced(part, sure, possible) for part in node.of]
         count = node.count - parts.count(True)
@@ -792,7 +792,7 @@ def _needed(node: _Node) -> frozenset[Automaton]:
             return node.automata if len(node.automata) == 1 else frozenset()
         case _Not():
             return _excepted(node.of)
-        case _Every():
+        case _Intersection():
             return frozenset[Automaton]().union(*map(_needed, node.of))
         case _AtLeast():
             counts = Counter(need for part in node.of for need in _needed(part))
@@ -808,7 +808,7 @@ def _excepted(node: _Node) -> frozenset[Automaton]:
     match node:
         case _Not():
             return _needed(node.of)
-        case _Every():
+        case _Intersection():
             return _in_all(map(_excepted, node.of))
         case _First(last=True):
             return _in_all(_needed(part) for part, says in node.of if not says)
@@ -824,7 +824,7 @@ def _in_all(sets: Iterable[frozenset[Automaton]]) -> frozenset[Automaton]:
 def _accepted_names(own: Automaton, left: _Node | bool) -> _Node:
     """Return the names of the set ``left`` that ``own`` accepts; True stands for all names."""
     node = _Some(automata=frozenset((own,)))
-    return node if isinstance(left, bool) else _Every((node, left))
+    return node if isinstance(left, bool) else _Intersection((node, left))
 
 
 def _automaton_order(automaton: Automaton) -> tuple[str, str, str]:
@@ -843,7 +843,7 @@ class _Search:
         found = {automaton for leaf in _leaves(node) for automaton in leaf.automata}
         self._machine = _machine(tuple(sorted(found, key=_automaton_order)))
         self._needed = _needed(node)
-        self._taken = _ExcludedNames(name for name in taken if node.truth(_asked_of(name)))
+        self._taken = _ExcludedNames(name for name in taken if node.truth(_contains_test(name)))
 
     def shortest(self, limit: SearchLimit, longest: int | None) -> str | None:
         """Return a shortest name of the set, or None if the set is empty."""
@@ -862,7 +862,7 @@ class _Search:
             if cost > costs[state]:
                 continue
             reached, place = state
-            if place not in taken.ends and self._node.truth(machine.ended(reached)):
+            if place not in taken.ends and self._node.truth(machine.accepting(reached)):
                 return _spelt(state, before)
             ways = taken.ways(place, machine.classes)
             limit.spend(len(ways) * (1 + machine.size // 1024))
@@ -885,10 +885,10 @@ class _Search:
             if some is None:
                 return None
             left = max(left, some)
-        return None if self._node.truth(self._machine.going_on(reached)) is False else left
+        return None if self._node.truth(self._machine.accepting_longer(reached)) is False else left
 
 
-def _asked_of(name: str) -> _Ask:
+def _contains_test(name: str) -> _Test:
     return lambda some: some.accepts(name)
 
 
@@ -941,11 +941,11 @@ class _Machine:
             for at, letters, to in a.edges
         )
 
-    def ended(self, reached: int) -> _Ask:
+    def accepting(self, reached: int) -> _Test:
         """Return a test whether an automaton of a set accepts the text read so far."""
         return lambda some: any(reached & self._ends[automaton] for automaton in some.automata)
 
-    def going_on(self, reached: int) -> _Ask:
+    def accepting_longer(self, reached: int) -> _Test:
         """Return a test whether an automaton of a set may accept a longer text."""
 
         def ask(some: _Some) -> _Truth:

@@ -1,8 +1,8 @@
-"""From an open robot to a closed one: the steps, what each process needs, the proof, the way back.
+"""Close an open robot: the steps, what each process needs, the proof, and the way back.
 
 A process of Fast DDS shows its process id in the identifier of its DDS participant (two bytes of
-the GUID prefix; Fast DDS 2.6 to 3.6, ``GuidUtils.hpp``), and one of Cyclone DDS says it in a
-property of its participant (``__Pid``; Cyclone DDS 0.10 to 11.0).  Other processes are known by
+the GUID prefix; Fast DDS 2.6 to 3.6, ``GuidUtils.hpp``), and a process of Cyclone DDS states it in
+a property of its participant (``__Pid``; Cyclone DDS 0.10 to 11.0).  Other processes are known by
 the name that their command gives the node, or by the name of their program.  A wrong guess is safe:
 the middleware denies the process what its enclave may not do.
 
@@ -170,8 +170,9 @@ class ClosedProcess(NamedTuple):
     def as_it_runs(self, running: RunningProcesses) -> ClosedProcess:
         """Return a copy with the id that a process with this command has now.
 
-        With or without the enclave that ``sros run`` adds to the command.  A process that may run,
-        but could not be examined, keeps its id, and so does a process that its unit restarts.
+        The command may have the argument for the enclave that ``sros run`` adds.  A process that
+        may run, but could not be examined, keeps its id, and so does a process that its unit
+        restarts.
         """
         commands = ((*self.command,), (*self.command, ROS_ARGS, "--enclave", self.enclave))
         programs = [process.program for process in running.processes]
@@ -236,7 +237,7 @@ class ObservedProcesses(NamedTuple):
         return {process.enclave: process.unit for process in self.processes if process.unit}
 
     def as_they_run(self, running: RunningProcesses) -> ObservedProcesses:
-        """Return a copy with the ids and the unknown processes of now."""
+        """Return a copy with the present ids and the present unknown processes."""
         pids = {process.pid for process in self.processes}
         commands = {tuple(process.command) for process in self.processes}
         unknown = [
@@ -265,7 +266,7 @@ class ObservedProcesses(NamedTuple):
     def started_in(self, process: ClosedProcess) -> str:
         """Return the enclave in which the command of a process is started.
 
-        Another one than that of the process if the program gives the process its enclave.
+        It differs from the enclave of the process if the program itself chooses that enclave.
         """
         names = {process.enclave, *process.shares}
         program = [each for each in self.processes if each.enclave in names]
@@ -334,13 +335,13 @@ class Closing(NamedTuple):
     """The enclaves in which a process of the robot runs now, and whether with the present files;
     otherwise it has to be restarted."""
     new: Sequence[str]
-    """The enclaves of the policy of which no process was observed, and none runs."""
+    """The enclaves of the policy without a process: none was observed, and none runs now."""
     without: Sequence[str]
-    """The enclaves of which no process has to run: those of `--without`."""
+    """The enclaves of `--without`, of which no process has to run."""
     valid_until: datetime | None
     """When the first enclave of the export expires, in UTC; null without an export."""
     denied: Sequence[str]
-    """What the observed nodes do and the keystore denies them, as sentences."""
+    """What the observed nodes do although the keystore denies it, as sentences."""
     newly_denied: Sequence[str]
     """The part of `denied` that the keystore did not deny before this command."""
     problems: Sequence[str]
@@ -362,7 +363,7 @@ class Closing(NamedTuple):
 
     @property
     def left(self) -> Sequence[str]:
-        """The enclaves of which no process runs with the present files, and one should."""
+        """The enclaves that should have a process with the present files, and have none."""
         names = {process.enclave for process in self.observed.processes} | {*self.new}
         names = names.difference(self.without) | self.secured.keys()
         return sorted(name for name in names if not self.secured.get(name))
@@ -375,7 +376,7 @@ class Closing(NamedTuple):
 
     @property
     def left_by_hand(self) -> Mapping[str, Sequence[ClosedProcess]]:
-        """The commands by hand of these enclaves, with their processes."""
+        """The commands to run by hand for the enclaves in ``left``, with their processes."""
         by_hand = self.observed.by_hand(self.folder.absolute())
         return {
             command: processes
@@ -391,12 +392,12 @@ def assign(
     nodes: Iterable[ObservedNode],
     running: Iterable[Process],
     domain: int,
-    told: Mapping[str, int] | None = None,
+    process_ids: Mapping[str, int] | None = None,
 ) -> ObservedProcesses:
     """Return the enclave of each running process, by the nodes that the graph shows of it.
 
-    Processes of other domains or networks are left out.  ``told`` maps participants of Cyclone DDS
-    to the process ids that they say.
+    Processes of other domains or networks are left out.  ``process_ids`` maps participants of
+    Cyclone DDS to the process ids that they state.
     """
     left = {
         process.pid: process
@@ -428,7 +429,7 @@ def assign(
             processes = [
                 process
                 for process in left.values()
-                if any(shows_node(process, node, told or {}) for node in of_enclave)
+                if any(shows_node(process, node, process_ids or {}) for node in of_enclave)
             ]
             if len(processes) <= len({node.participant for node in of_enclave}):
                 for process in processes:
@@ -465,19 +466,19 @@ def _process_of(node: ObservedNode) -> str:
     return node.participant[:12] if is_fast else node.participant
 
 
-def _shows_its_id(process: Process, node: ObservedNode, told: Mapping[str, int]) -> bool:
+def _shows_its_id(process: Process, node: ObservedNode, process_ids: Mapping[str, int]) -> bool:
     if not node.participant.startswith(_FAST_DDS):
-        return told.get(node.participant) == process.pid
+        return process_ids.get(node.participant) == process.pid
     low, high = process.pid & 0xFF, process.pid >> 8 & 0xFF
     is_fast = bool(process.libraries & {"libfastrtps", "libfastdds"})
     return is_fast and node.participant[8:12] == f"{low:02x}{high:02x}"
 
 
-def _is_named(process: Process, node: ObservedNode, _told: object) -> bool:
+def _is_named(process: Process, node: ObservedNode, _process_ids: object) -> bool:
     return node_argument(process.command) == (node.ns, node.name)
 
 
-def _has_program_named_alike(process: Process, node: ObservedNode, _told: object) -> bool:
+def _has_program_named_alike(process: Process, node: ObservedNode, _process_ids: object) -> bool:
     return program_of(process.command).removesuffix(".py") == node.name
 
 
@@ -485,7 +486,7 @@ _KNOWN_BY: dict[str, Callable[[Process, ObservedNode, Mapping[str, int]], bool]]
     "process id": _shows_its_id,
     "node name": _is_named,
     "program": _has_program_named_alike,
-    "elimination": lambda _process, _node, _told: True,
+    "elimination": lambda _process, _node, _process_ids: True,
 }
 
 
@@ -532,7 +533,7 @@ def read_processes(path: Path) -> ObservedProcesses:
 def access_lines(policy: Policy, folder: Path) -> list[str]:
     """Return a line for each name in a policy, with who uses it on either side.
 
-    Names that nobody uses but as every node does are left out: those of the common parts.
+    Names that are used only as every node uses them (the common parts) are left out.
     """
     common = common_parts(folder, policies_dir())
     parts = [part for part in _NODE_PARTS if part in common.rights]
@@ -753,9 +754,10 @@ class OpenRobot:
     def _with_later(
         self, observed: ObservedProcesses, running: RunningProcesses
     ) -> ObservedProcesses:
-        """Return a copy with the processes that were started in other enclaves since.
+        """Return a copy with the processes that were started later, in other enclaves.
 
-        Only of users who can read the enclaves: the command of a process is proposed to be run.
+        Only processes of users who can read the enclaves count, because sros proposes to run their
+        commands.
         """
         known = {_OBSERVER, *(process.enclave for process in observed.processes)}
         later = []
@@ -814,7 +816,7 @@ class OpenRobot:
         return "done", self._keep_processes(output) if watches else ""
 
     def _check_shell(self) -> None:
-        """Raise `UsageError` if an observer that this shell starts may not be an open one."""
+        """Raise `UsageError` if an observer that this shell starts might run secured."""
         if secured := [*secured_by(self._shell.environment, Path.cwd())]:
             raise UsageError(
                 f"{' and '.join(secured)}, so this shell does not see an open robot",
@@ -849,16 +851,16 @@ class OpenRobot:
     def _keep_processes(self, document: str) -> str:
         """Write which process has which nodes, and the policy of the observer.
 
-        Return what an earlier policy lacks of what was seen, as a sentence.
+        Return, as a sentence, which of the observed rights an earlier policy lacks.
         """
         replace_file(self.observer, (policies_dir() / "observer.xml").read_bytes())
         nodes = [node for node in self._observation().nodes if not is_tool(node)]
         running = ProcessTable().look(self._shell.now()).processes
         of_cyclone = [process.pid for process in running if "libddsc" in process.libraries]
-        told = _process_ids_of_cyclone(of_cyclone, self.domain)
+        process_ids = _process_ids_of_cyclone(of_cyclone, self.domain)
         learned = json.loads(document)
         stayed = [node for node in nodes if node.participant not in learned["ended"]]
-        observed = assign(stayed, running, self.domain, told)
+        observed = assign(stayed, running, self.domain, process_ids)
         ended = {node.enclaves[0] for node in nodes} - {node.enclaves[0] for node in stayed}
         processes = [_as_its_unit_starts(process) for process in observed.processes]
         self._write_processes(observed._replace(processes=processes, ended=sorted(ended)))
@@ -877,7 +879,8 @@ class OpenRobot:
         )
 
     def _programs(self) -> Iterator[str]:
-        """Yield which programs start processes of several enclaves, which would all have one."""
+        """Yield which programs start processes of several enclaves, which would all run in one
+        enclave."""
         observed = (self.observed or ObservedProcesses(self.domain)).within(
             read_policy(self.policy)
         )
@@ -898,7 +901,8 @@ class OpenRobot:
                 )
 
     def _twins(self) -> Iterator[str]:
-        """Yield which processes have nodes of the same names: one enclave has the rights of all."""
+        """Yield which processes have nodes of the same names: one enclave would have the rights of
+        all."""
         by_enclave: dict[str, list[ClosedProcess]] = {}
         for process in self.observed.processes if self.observed else ():
             by_enclave.setdefault(process.enclave, []).append(process)
@@ -907,10 +911,10 @@ class OpenRobot:
             if len({twin.pid for twin in twins}) > 1:
                 commands = [f"process {twin.pid} ({shlex.join(twin.command)})" for twin in twins]
                 yield (
-                    f"{enumerated(commands)} call themselves {enclave}, and its enclave would have "
-                    "the rights of all; nothing was signed; if one is not of the robot, stop it, "
-                    f"remove '{self.policy}', and watch again: sros close {folder} --for 1m; "
-                    "if all are, accept it: --partial"
+                    f"{enumerated(commands)} call themselves {enclave}, and the enclave of this "
+                    "name would have the rights of all; nothing was signed; if one is not of the "
+                    f"robot, stop it, remove '{self.policy}', and watch again: sros close {folder} "
+                    "--for 1m; if all are, accept it: --partial"
                 )
 
     def _write_processes(self, observed: ObservedProcesses) -> None:
@@ -1189,7 +1193,7 @@ class OpenRobot:
         return closing._replace(problems=[*self._not_open(observed)])
 
     def _not_open(self, observed: ObservedProcesses) -> Iterator[str]:
-        """Yield how each process is started open that runs in an enclave, or does not run.
+        """Yield, for each process that runs in an enclave or does not run, how to start it open.
 
         Processes of enclaves that were taken out of the policy are left out.
         """
@@ -1283,7 +1287,7 @@ class OpenRobot:
         status, output, messages = self._shell.run(step.words, False)
         if status:
             self._shell.say(f"{output}{messages}".rstrip())
-        reasons = {0: "as the file says", 1: "one is violated", 2: "they could not be decided"}
+        reasons = {0: "all of them", 1: "one is violated", 2: "they could not be decided"}
         holds = {0: True, 1: False}.get(status)
         yield Proof("the requirements hold", holds, f"{reasons[status]}: {self.requirements}")
 
@@ -1417,7 +1421,8 @@ class OpenRobot:
 
 
 def _needs_enclave_argument(process: ClosedProcess) -> bool:
-    """Return whether the command has to name the enclave: on Zenoh others look at that alone."""
+    """Return whether the command must name the enclave: on Zenoh, others look only at its
+    argument."""
     is_node = bool(process.rmw) and process.enclave != _ROUTER
     return is_node and named_enclave(process.command) != process.enclave
 
@@ -1425,7 +1430,7 @@ def _needs_enclave_argument(process: ClosedProcess) -> bool:
 def _as_its_unit_starts(process: ClosedProcess) -> ClosedProcess:
     """Return a process with the command of its unit, to which an argument can be added.
 
-    Without the unit if it starts another command, such as a script.
+    If the unit starts another command, such as a script, return the process without its unit.
     """
     if not (process.unit and _needs_enclave_argument(process)):
         return process

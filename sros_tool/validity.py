@@ -70,11 +70,12 @@ class Window:
         return self.not_after - min(_SOON, (self.not_after - self.not_before) / 3)
 
     def life(self, made: datetime | None = None) -> timedelta:
-        """Return how long a document with this validity is valid from when it was made.
+        """Return how long a document with this validity is valid after it was made.
 
-        ``made`` is when that was, or when its file came here.  What sros makes is valid from
-        `BACKDATE` before; other programs may do without, which only ``made`` tells, unless it is
-        long before.  A validity that is not longer than that was not made by sros.
+        ``made`` is when it was made, or when its file came here; a time long before the validity
+        does not count.  A document that sros makes is valid from `BACKDATE` before that time; a
+        document of another program may be valid from that time on, which only ``made`` shows.
+        sros makes no document whose validity is not longer than `BACKDATE`.
         """
         latest = self.not_before + BACKDATE
         if latest >= self.not_after:

@@ -1,7 +1,7 @@
 """A round of a robot's agent: fetch, install, restart, look, and send what it finds.
 
-Each part that fails is a problem of the round, and does not keep the other parts from their work:
-a robot whose source is away still confirms, and one whose inbox is away still installs.
+A part that fails is reported as a problem of the round, and the other parts still run: a robot that
+cannot reach its source still confirms, and a robot that cannot reach its inbox still installs.
 """
 
 from __future__ import annotations
@@ -106,8 +106,8 @@ class Round(NamedTuple):
     restart: Sequence[str]
     """Enclaves whose processes were not yet seen with the installed files."""
     unseen: Sequence[str]
-    """Enclaves of ``restart`` of which no process was seen, although not all processes here can be
-    seen. ``--restarted`` says that these restarts are done.
+    """Enclaves of ``restart`` without a process that was seen; some processes here cannot be seen.
+    ``--restarted`` says that these restarts are done.
     """
     requests: int
     """Number of signing requests in the message."""
@@ -373,7 +373,7 @@ class _Round:
     def _differs_from_accepted(self, release: Release) -> bool:
         """Return whether the accepted release with the same number has other files.
 
-        The seal is an earlier one if there was no room for that of the accepted release.
+        If the disk had no room for the seal of the accepted release, an earlier seal is here.
         """
         seal = read_seal(self._folder)
         with suppress(SrosError):
@@ -414,10 +414,10 @@ class _Round:
                 self._problems.append(f"{name} could not start: {enclave.problem}.")
 
     def _restart(self, names: Iterable[str], opened: Mapping[str, _Opened]) -> Sequence[str]:
-        """Restart the units of enclaves that are due.
+        """Restart the units of enclaves whose restart is due.
 
-        Return the enclaves of those that did and whose processes can be seen: others are of users
-        that this one cannot look at, or no nodes.
+        Return the enclaves whose units restarted and whose processes can be seen: other units run
+        no nodes, or run as users whose processes this user cannot look at.
         """
         settings, machine = self._settings, self._machine
         if not settings.restart or not self._state.due:
@@ -520,7 +520,8 @@ class _Round:
         return self._replaced_list() if self._is_in_step else self._revocation_list(names)
 
     def _replaced_list(self) -> str | None:
-        """Return the list that a release replaced by one that revokes less; None if none did."""
+        """Return the revocation list that a release replaced by a list that revokes less, or
+        None."""
         with suppress(SrosError, OSError):
             path = agent_folder(self._folder) / _REPLACED_LIST
             since = time_of_file(path.stat().st_mtime)
@@ -529,17 +530,18 @@ class _Round:
         return None
 
     def _keep_replaced_list(self, text: str | None) -> None:
-        """Keep the present revocation list, before a release may replace it by one that lacks some.
+        """Keep the present revocation list, which a release may replace by a list with fewer
+        entries.
 
-        A release leaves out what has expired; but a keystore that was restored from a backup may
-        have lost it.
+        A release leaves out entries that have expired; but a keystore that was restored from a
+        backup may have lost entries.
         """
         if text and not self._replaced_list():
             path = agent_folder(self._folder) / _REPLACED_LIST
             self._attempt(lambda: replace_file(path, text.encode()))
 
     def _drop_replaced_list(self, names: Iterable[str]) -> None:
-        """Remove the list that was kept, if the present one revokes the same certificates."""
+        """Remove the kept revocation list if the present list revokes the same certificates."""
         kept, present = self._replaced_list(), self._revocation_list(names)
         if kept and present and _revoked(kept) <= _revoked(present):
             with suppress(OSError):
@@ -726,7 +728,7 @@ _NEW_KEYS = "new-keys"
 def _is_due(file: Path, now: datetime) -> bool:
     """Return whether at most a third of the life of the certificate in ``file`` is left.
 
-    A file that does not change is never written again, so that its time tells how long the
+    A file is written only when it changes, so its modification time tells since when the
     certificate has been here.
 
     Raises:
@@ -752,8 +754,9 @@ def _enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
 class Renewals(NamedTuple):
     """The signing requests (PEM) for a message, and who has to sign it.
 
-    Only the enclave itself can vouch for its new key, with its present one.  So of the enclaves
-    that ask with a new key, a message has the request of one, ``signer``; every hour it is another.
+    Only the enclave itself can vouch for its new key, with its present one.  So a message has the
+    request of only one enclave that asks with a new key, ``signer``; every hour, it is another
+    enclave's turn.
     """
 
     requests: tuple[str, ...]
@@ -767,7 +770,7 @@ def _renewals(
 ) -> Renewals:
     """Return requests for the enclaves ``names`` whose certificates expire.
 
-    With ``new_key``, they are for new keys, which wait next to the present ones until their
+    With ``new_key``, the requests are for new keys, which wait next to the present keys until their
     certificates are installed; a key on a token stays.  ``secrets`` is asked for the PIN of a
     token.
     """

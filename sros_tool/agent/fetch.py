@@ -137,7 +137,7 @@ def fetch_release(
     """Return the release that is published for ``robot``; None if it is the installed one.
 
     Another release with the number of the installed one is returned, too.  The release is not
-    verified against the CAs of the robot: its seal has to be, by
+    verified against the CAs of the robot: callers have to verify its seal, with
     `sros_tool.keystore.delivery.release.seal_problem`.  A release that was fetched before is not
     transferred again.  Not for two processes at once in the same ``state``.
 
@@ -207,7 +207,8 @@ def _transport(
 
 
 def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datetime) -> Updater:
-    """Return the client of TUF, which begins with the pinned root and what it trusted since."""
+    """Return the client of TUF, which starts from the pinned root and the metadata trusted
+    since."""
     from tuf.ngclient import Updater, UpdaterConfig
 
     path = state / _PINNED_ROOT

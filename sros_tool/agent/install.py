@@ -181,7 +181,7 @@ def _check_release(
     installed: int,
     pinned: frozenset[str],
 ) -> None:
-    """Raise `KeystoreError` unless a trusted CA made the release for this robot, not before now."""
+    """Raise `KeystoreError` unless the release is sealed for this robot, usable and not older."""
     if release.robot != robot:
         raise KeystoreError(
             f"the release is of robot {release.robot}, not of {robot}",
@@ -208,7 +208,7 @@ def _check_release(
         usable = [name for name in present if _had_certificate(opened, name)]
     if usable and not {*usable} & release.enclaves().keys():
         raise KeystoreError(
-            f"the release of robot {robot} has no enclave that is here",
+            f"the release of robot {robot} has none of the enclaves that this robot has",
             f"'{folder}' has {enumerated(usable)}, the release has "
             f"{enumerated(sorted(release.enclaves()))}. Installing it would remove the keys of "
             "these enclaves. Nothing was changed.",
@@ -216,7 +216,8 @@ def _check_release(
         )
     if release.number < installed:
         raise KeystoreError(
-            f"release {release.number} is older than release {installed}, which this robot had",
+            f"release {release.number} is older than release {installed}, which this robot has "
+            "installed before",
             "The keystore may come from a backup. Nothing was changed.",
             "Where the keystore is, run `sros fleet publish KEYSTORE PUB --restored`.",
         )
@@ -246,8 +247,8 @@ def _pinned(release: Release, pinned: frozenset[str]) -> Iterator[x509.Certifica
 def _check_lists(folder: Folder, enclaves: Mapping[str, Mapping[str, bytes]]) -> None:
     """Raise `KeystoreError` if a revocation list in the release is older than the one here.
 
-    The owner of the folder can write anything into it, so only a list counts that a CA signed which
-    the release trusts.
+    The owner of the folder can write anything into it, so only lists count that are signed by a CA
+    which the release trusts.
     """
     for name, files in enclaves.items():
         authorities = files.get(IDENTITY_CA_FILE, b"")
@@ -389,8 +390,8 @@ def _weak(state: OpenedEnclave) -> list[str]:
 def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> PublicKey:
     """Return the public key of an enclave, from its key file, its request or its certificate.
 
-    A key on a token has no file.  Its request was signed by it; without one, the enclave's present
-    certificate tells the key.
+    A key on a token has no file: the enclave's signing request shows the public key, or, without a
+    request, the enclave's present certificate.
 
     Raises:
         SrosError: the key is not on this robot, or cannot be read.

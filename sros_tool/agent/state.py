@@ -59,9 +59,10 @@ class AgentState:
     problems: tuple[str, ...] = ()
 
     def next_sequence(self, now: datetime) -> int:
-        """Return the sequence of the next message: higher than all before, also by the clock.
+        """Return the sequence number of the next message: higher than all earlier ones.
 
-        By the clock, so that a robot whose disk is restored goes on where the keystore expects it.
+        It follows the clock, so that the keystore accepts the messages of a robot whose disk was
+        restored.
         """
         return max(self.sequence, int(now.timestamp())) + 1
 
@@ -197,8 +198,8 @@ class AgentStatus(NamedTuple):
     restart: Sequence[str]
     """Enclaves whose processes were not yet seen with the installed files."""
     unseen: Sequence[str]
-    """Enclaves of ``restart`` of which no process was seen, although not all processes here can be
-    seen. `sros agent run FOLDER --once --restarted` says that these restarts are done.
+    """Enclaves of ``restart`` without a process that was seen; some processes here cannot be seen.
+    `sros agent run FOLDER --once --restarted` says that these restarts are done.
     """
     problems: Sequence[str]
     """What the last round could not do, and what is wrong, as sentences."""

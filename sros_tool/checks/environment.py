@@ -153,7 +153,7 @@ NO_ENCLAVE = FindingKind(
     WARNING,
     "ROS_SECURITY_ENCLAVE_OVERRIDE is not set",
     "A process without `--ros-args --enclave ENCLAVE` uses the enclave /, which the keystore does "
-    "not have, and does not start.",
+    "not have, so the process does not start.",
     _RCL,
     _NAME_IT,
 )
@@ -351,7 +351,7 @@ FILE_NOT_FOUND = FindingKind(
     "runtime.zenoh-file-not-found",
     ERROR,
     "a variable of rmw_zenoh names no file that Zenoh can read",
-    "No node, or with ZENOH_ROUTER_CONFIG_URI no router, starts.",
+    "No node starts; with ZENOH_ROUTER_CONFIG_URI, no router starts.",
     _SOURCE,
     f"Correct the path. {OWN_CONFIGURATION}",
 )

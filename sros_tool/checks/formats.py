@@ -48,10 +48,10 @@ def by_robot(
 ) -> Iterator[tuple[tuple[Finding, ...], str]]:
     """Merge single findings that differ only in one robot; yield the first of each kind.
 
-    The text that comes with it names the other robots; it is "" if there are none.  A finding that
-    names several robots is merged with those that differ in the robot in which most others do; many
-    that also differ in their further robots are merged, too.  Findings that share a cause stay as
-    they are, and without ``fleet``, all do.
+    The text that comes with it names the other robots; it is "" if there are none.  If a finding
+    names several robots, it is merged by the robot that merges it with the most findings; if many
+    of the merged findings differ only in the other robots that they name, these become one, too.
+    Findings that share a cause stay as they are, and without ``fleet``, all findings do.
     """
     read = [(group, _kinds(group, fleet) if fleet else {}) for group in groups]
     robots: dict[Hashable, set[str]] = defaultdict(set)
@@ -89,7 +89,10 @@ _MOST_SIMILAR = 5  # findings that differ in further robots; more become one
 
 
 def _kinds(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:
-    """Map each robot that a finding names to what is the same for others, all and without names."""
+    """Map each robot that a finding names to two keys, which equal findings of other robots share.
+
+    The first key keeps the names of all other robots in the finding, the second one has none.
+    """
     first, *more = group
     named = () if more else named_robots(fleet, first.subject, first.text)
     kinds: dict[str, tuple[Hashable, Hashable]] = {}

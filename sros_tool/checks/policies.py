@@ -261,7 +261,7 @@ _ASKING_SIDE = {offering: asking for asking, offering in OFFERING_SIDE.items()}
 def _check_names(checked: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about single names."""
     for statement in checked.statements:
-        if reason := _never(statement.name):
+        if reason := _impossible_because(statement.name):
             yield statement.found(NEVER_MATCHES, f"{statement.name} matches nothing: {reason}")
         if _DDS_PREFIX.match(statement.written):
             yield statement.found(
@@ -426,7 +426,7 @@ def _check_protection(checked: _CheckedPolicy) -> Iterator[Finding]:
         yield CONTRADICTING_PROTECTION.found(other.enclave, text, place.file, place.line)
 
 
-def _never(name: str) -> str:
+def _impossible_because(name: str) -> str:
     if len(name) > _LONGEST and not is_expression(name):
         return f"it has {len(name)} characters, and a ROS name has at most {_LONGEST}"
     return "a part of it begins with a digit" if _DIGIT_FIRST.search(name) else ""
@@ -861,9 +861,9 @@ NO_EFFECT = FindingKind(
     "policy.deny-without-effect",
     NOTE,
     "a DENY of something that no rule allows",
-    "Everything that no rule allows is denied anyway. The DENY has an effect only in a policy "
-    "that others merge with theirs, such as that of a package: a DENY wins over what they allow "
-    "the enclave.",
+    "Everything that no rule allows is denied anyway. The DENY has an effect only in a policy that "
+    "users merge into their own, such as the policy of a package: there, it wins over every ALLOW "
+    "for the enclave.",
     "DDS-Security 1.1, 9.4.1.3 (the default is DENY); sros: merge_policy never weakens a DENY.",
     "Keep the DENY if this right must never be added to the enclave.",
 )

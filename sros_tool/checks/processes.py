@@ -98,7 +98,7 @@ PROCESS_EXPIRED = FindingKind(
     "runtime.process-expired",
     ERROR,
     "a process whose certificate, permissions or CA has expired",
-    "Processes that start, or discover this process, from now on refuse it.",
+    "From now on, processes that start, and processes that discover this process, refuse it.",
     "DDS-Security 1.1, 8.3.2.8 and 9.4.1.3.2.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2 (they read "
     "the files when they start).",
     "Renew the enclave (`sros renew KEYSTORE ENCLAVE`), bring it here, and restart the process.",
@@ -106,9 +106,9 @@ PROCESS_EXPIRED = FindingKind(
 PROCESS_LOCAL_TIME = FindingKind(
     "runtime.process-local-time",
     ERROR,
-    "a process whose permissions Fast DDS refuses in its time zone",
-    'Fast DDS reads their dates in the local time of the process, and says "Not found the '
-    'identity subject name in permissions file".',
+    "a process in whose time zone Fast DDS refuses its permissions",
+    'Fast DDS reads the dates of permissions in the local time of the process, and says "Not '
+    'found the identity subject name in permissions file".',
     "Fast DDS 2.6 to 3.6 (mktime); tested.",
     "Run `sros renew KEYSTORE ENCLAVE`, or start the process with TZ=UTC.",
     vendors=FAST_DDS,

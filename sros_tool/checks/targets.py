@@ -60,8 +60,8 @@ class Circumstances:
 def path_findings(paths: Iterable[Path], at: Circumstances) -> list[Finding]:
     """Return the findings at paths: policies, folders of policies, keystores, or enclaves.
 
-    All policies count as those of one robot or fleet: a name may have its counterpart in another
-    one.  A file ``*.json5``, ``*.json`` or ``*.yaml`` is a Zenoh configuration.  Raises
+    All policies count as the policies of one robot or fleet: a name may have its counterpart in
+    another policy.  A file ``*.json5``, ``*.json`` or ``*.yaml`` is a Zenoh configuration.  Raises
     `DocumentError` for any other path.
     """
     findings, policies = [], []

@@ -180,7 +180,8 @@ _LONGEST_PATH = 200
 def vulnerability_metrics(
     running: RunningProcesses, advisories: Sequence[Advisory] | None = None
 ) -> tuple[Metric, Metric]:
-    """Return the number of known vulnerabilities by DDS release, and of libraries that hide it."""
+    """Return the numbers of known vulnerabilities by DDS release, and of libraries of unknown
+    version."""
     numbers: dict[tuple[str, str], int] = {}
     unknown: Counter[str] = Counter()
     for library in _users(running):

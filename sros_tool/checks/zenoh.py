@@ -149,8 +149,8 @@ PLAIN_ENDPOINT = FindingKind(
     "zenoh.plain-endpoint",
     ERROR,
     "an endpoint without TLS",
-    "Messages there are neither encrypted nor authenticated: everybody on the network reads it, "
-    "and gets a connection without a certificate.",
+    "Messages there are neither encrypted nor authenticated: everybody on the network can read "
+    "them, and gets a connection without a certificate.",
     _TESTED,
     "Write tls/HOST:PORT.",
 )

@@ -38,7 +38,7 @@ def main(arguments: list[str] | None = None, *, name: str = "sros") -> None:
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # warnings of libraries are not for users
     try:
-        from sros_tool.cli.common import secrets_taken
+        from sros_tool.cli.common import without_secrets
         from sros_tool.cli.program import program, report_error
         from sros_tool.errors import NOT_DONE
     except KeyboardInterrupt:
@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None, *, name: str = "sros") -> None:
         sys.exit(130)
 
     try:
-        with secrets_taken():
+        with without_secrets():
             colour = False if os.environ.get("NO_COLOR") else None
             status = program.main(arguments, prog_name=name, standalone_mode=False, color=colour)
         if sys.stdout:  # None where it was closed

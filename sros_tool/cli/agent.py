@@ -90,13 +90,15 @@ def agent() -> None:
 @click.option(
     "--restart", is_flag=True,
     help=(
-        "Restart units of changed enclaves: the units of --unit, and active units by `sros units`. "
-        "[default: only report which restarts are due]"),
+        "Restart units of changed enclaves: the units of --unit, and active units that `sros "
+        "units` wrote. [default: only report which restarts are due]"),
 )  # fmt: skip
 @click.option(
     "--unit", "units", metavar="UNIT=ENCLAVE,...", multiple=True,
-    help="A systemd unit, and the enclaves in which it runs; in the order of the restarts. Can "
-    "be repeated.",
+    help=(
+        "A systemd unit, and the enclaves in which it runs. Units restart in the order of these "
+        "options. Can be repeated."
+    ),
 )  # fmt: skip
 @click.option(
     "--restart-if", metavar="COMMAND",

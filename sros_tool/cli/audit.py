@@ -71,7 +71,7 @@ if TYPE_CHECKING:
 @click.option(
     "--partial",
     is_flag=True,
-    help="Exit with 0 although some nodes were not seen or not judged, if nothing is denied.",
+    help="Exit with 0 if nothing is denied, even if some nodes were not seen or not judged.",
 )
 @fleet_option("The robots that the placeholders of POLICY stand for.")
 @force_option

@@ -40,7 +40,7 @@ def print_changed(
     form: tuple[object, ...] | None = None,
     lines: Iterable[str] = (),
     *,
-    told: Iterable[str] = (),
+    first: Iterable[str] = (),
     after: Iterable[str] = (),
     rights: bool = True,
     exported: bool = True,
@@ -52,7 +52,7 @@ def print_changed(
         result: the change.
         form: what ``--json`` prints of it; None without ``--json``.
         lines: what was done; in place of it, a dry run prints the files that it would change.
-        told: messages that come first on standard error.
+        first: messages that come first on standard error.
         after: messages that follow the rights that change.
         rights: say what enclaves lose and gain.
         exported: also say that exports are out of date.
@@ -65,7 +65,7 @@ def print_changed(
     else:
         for line in lines:
             echo(line)
-    _tell(told)
+    _tell(first)
     print_follow_up(result, after, rights=rights, exported=exported, restart=restart)
 
 
@@ -109,9 +109,10 @@ def _tell(lines: Iterable[str]) -> None:
 
 
 def print_plan(root: Path, changes: Sequence[Change]) -> None:
-    """Print the files that a dry run would change; robots of a fleet in one, many files in short.
+    """Print the files that a dry run would change.
 
-    If steps are logged, all files are printed.
+    Files that differ only in the robot of a fleet share a line, and of many files only the first
+    ones are named.  If steps are logged, all files are printed.
     """
     import logging
 
@@ -168,7 +169,8 @@ def _print_closed(root: Path, changes: Sequence[Change]) -> None:
 
 
 def rights_lines(root: Path, replaced: Sequence[ReplacedRights], *, dry_run: bool) -> Iterator[str]:
-    """Yield a line for every right that an enclave loses or gains; robots of a fleet in one."""
+    """Yield a line for every right that an enclave loses or gains; robots of a fleet share a
+    line."""
     from sros_tool.fleet.robots import folded
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.reader import Keystore

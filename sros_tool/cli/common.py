@@ -423,10 +423,12 @@ def keystore_argument(
 ) -> Callable[[Decorated], Decorated]:
     """Add a keystore as argument to a verb; the default is the keystore of the environment."""
 
-    def given(context: click.Context, _argument: click.Parameter, path: Path | None) -> Path | None:
+    def or_environment(
+        context: click.Context, _argument: click.Parameter, path: Path | None
+    ) -> Path | None:
         return path if path or context.resilient_parsing else keystore_from_environment()
 
-    return click.argument(name, metavar=metavar, type=PATH, required=False, callback=given)
+    return click.argument(name, metavar=metavar, type=PATH, required=False, callback=or_environment)
 
 
 def complete_keystore_and_enclave(
@@ -695,7 +697,7 @@ _KEY_PLACES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS
 
 
 @contextmanager
-def secrets_taken() -> Iterator[None]:
+def without_secrets() -> Iterator[None]:
     """Remove secrets from this process's environment, so that child processes do not get them.
 
     Commands that replace this process, as with ``sros run``, do not get them either.

@@ -51,7 +51,7 @@ def _complete_scenario(
     default="auto",
     show_default=True,
     help="Middleware of the nodes; auto uses rclpy if its RMW enforces security, else Cyclone DDS; "
-    "for a talker or listener without security Cyclone DDS if it is there.",
+    "for a talker or listener without security, auto uses Cyclone DDS if it is installed.",
 )
 @click.option(
     "--scenario",

@@ -580,8 +580,8 @@ def import_verb(
         shown = shown_import(done, pinned=bool(pinned))
     there = f"enclave {done.name} in '{folder}' is already up to date"
     if as_json or dry_run or not done.changes:
-        told = () if as_json or dry_run else (there,)
-        print_changed(done, shown, told=told, restart=False)
+        first = () if as_json or dry_run else (there,)
+        print_changed(done, shown, first=first, restart=False)
         return
     print_changed(done, None, _imported_lines(done, pinned=bool(pinned)), exported=False)
 

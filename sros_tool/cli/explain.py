@@ -528,9 +528,9 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
 
 
 def _to_do_lines(answer: Answer) -> Iterator[str]:
-    """Yield the change of the policy, or the remedy, and the commands.
+    """Yield the change of the policy, or the remedy, and the commands that apply it.
 
-    In their place, the requirements of a closed robot that forbid the change.
+    If requirements of a closed robot forbid the change, yield these requirements instead.
     """
     if forbidding := _forbidding(answer):
         from sros_tool.proof.requirements import demand
@@ -837,8 +837,8 @@ def _who_lines(
     """Yield the allowed enclaves, the enclaves whose participant does not start now, and counts.
 
     The enclaves of a fleet are grouped by robot.  ``domain`` is that of --domain, ``domains`` are
-    those of the keystore, None for an export or a policy: where some of them alone allow it, they
-    are named.
+    those of the keystore, None for an export or a policy: if only some of them allow the operation,
+    the line names these.
     """
     from sros_tool.fleet.robots import folded
 

@@ -165,7 +165,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     Example:
       $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
             sros fleet confirm keystore --robot r7 -
-      kept what r7 has: 18 files of 2 enclaves
+      stored the report of r7: 18 files of 2 enclaves
     """
     from sros_tool.keystore.confirmation import (
         MAX_BYTES,
@@ -206,9 +206,9 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
             )
         )
     else:
-        done = "would keep" if dry_run else "kept"
+        done = "would store" if dry_run else "stored"
         echo(
-            f"{done} what {robot} has: {counted(len(confirmation.files), 'file')} of "
+            f"{done} the report of {robot}: {counted(len(confirmation.files), 'file')} of "
             f"{counted(len(enclaves), 'enclave')}"
         )
     print_notes(notes)
@@ -421,7 +421,7 @@ def _publish(
     Example:
       $ sros fleet publish keystore pub
       published new releases of 2 robots in 'pub', unchanged: 48 robots
-      robots accept it until 2027-05-22T09:00:00Z: publish again before that
+      robots accept these files until 2027-05-22T09:00:00Z: publish again before then
       $ mv keystore/private/fleet_root.pem /media/safe/
       $ sros fleet publish keystore pub --rotate-key timestamp
             --root-key /media/safe/fleet_root.pem
@@ -461,7 +461,7 @@ def _publish(
 
 
 def _published_lines(published: PublishedFleet) -> Iterator[str]:
-    """Yield what was published, which robots were not, and what to do next."""
+    """Yield what was published, which robots got no release, and what to do next."""
     from sros_tool.validity import iso
 
     new, kept = (len(published.names(outcome)) for outcome in ("published", "kept"))
@@ -471,7 +471,7 @@ def _published_lines(published: PublishedFleet) -> Iterator[str]:
     yield f"{what} in '{published.folder}'{rest}"
     if removed := published.names("removed"):
         took = "would remove" if published.dry_run else "removed"
-        yield f"{took} the releases of {first_few(removed, _MOST_GROUPS)}, without enclaves now"
+        yield f"{took} the releases of robots without enclaves: {first_few(removed, _MOST_GROUPS)}"
     for robot in published.robots:
         if robot.outcome == "refused":
             keeps = "keeps its earlier release" if robot.number else "has no release"
@@ -484,7 +484,7 @@ def _published_lines(published: PublishedFleet) -> Iterator[str]:
         yield f"robots pin {published.root}, SHA-256 {published.root_sha256}"
     if published.expires:
         end = iso(published.expires["timestamp"])
-        yield f"robots accept it until {end}: publish again before that"
+        yield f"robots accept these files until {end}: publish again before then"
 
 
 @shows(spread=("status",))
@@ -910,10 +910,10 @@ def _dds_counts(compared: ComparedFleet) -> Iterator[str]:
     status, outdated = compared.status, compared.outdated_dds
     if outdated:
         robots = _robot_names(outdated, status.names, status.groups)
-        only = "the exit status is 1 only for a DDS" if status.complete else "a DDS"
+        only = "the exit status is 1 only because " if status.complete else ""
         yield (
-            f"{only} to upgrade, for known vulnerabilities: {robots}; "
-            f"which: `sros fleet status {quote(str(status.keystore))} --robot {outdated[0]}`"
+            f"{only}a later release fixes known vulnerabilities in the DDS of {robots}; "
+            f"`sros fleet status {quote(str(status.keystore))} --robot {outdated[0]}` lists them"
         )
     elif list(_dds_findings(compared)):
         severities = Counter(finding.severity.word for finding in compared.findings)

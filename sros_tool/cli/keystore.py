@@ -308,7 +308,7 @@ def _show(
         result,
         shown,
         _created_lines(result),
-        told=_hints(result, as_json),
+        first=_hints(result, as_json),
         after=filter(None, (lasting_text(result.root, result.rights),)),
     )
     if findings and not as_json:
@@ -612,9 +612,9 @@ def _open_rights(root: Path, template: Template) -> list[Note]:
         notes.append(Note("keystore.open-permissions", text))
     if not template.separate_authorities:
         text = (
-            "with one CA for both, an enclave can sign its own permissions, and Cyclone DDS 0.10.2 "
-            "and Fast DDS 2.9.1 accept them; create the keystore with `--ca-layout separate`, or "
-            f"change it with {change}."
+            "with one CA for identities and permissions, an enclave can sign its own permissions, "
+            "and Cyclone DDS 0.10.2 and Fast DDS 2.9.1 accept them; create the keystore with "
+            f"`--ca-layout separate`, or change it with {change}."
         )
         notes.append(Note("keystore.single-ca", text))
     return notes
@@ -734,7 +734,9 @@ def update_keystore(
         from sros_tool.keystore.lifecycle.update import trust_records as trust
 
         if next_stage or any(value not in (None, (), False) for value in chosen):
-            raise UsageError("--trust-records changes nothing else", "", "Give it alone.")
+            raise UsageError(
+                "--trust-records and other changes exclude each other", "", "Give it alone."
+            )
         update = trust(root, now=now(), keyring=keyring(), dry_run=dry_run)
         _show_update(update, (), "", as_json)
         return 0
@@ -869,7 +871,7 @@ def _show_update(update: KeystoreUpdate, undone: Sequence[str], again: str, as_j
     print_changed(
         update,
         lines=_issued_lines(update),
-        told=_replaced_lines(update),
+        first=_replaced_lines(update),
         rights=False,
         exported=False,
         restart=not update.dry_run,

@@ -127,7 +127,7 @@ def renew(
         result,
         json_form(result, "RenewedEnclaves") if as_json else None,
         enclave_lines(tuple(result.outcomes), "renewed enclave {}"),
-        told=_replaced_lines(result),
+        first=_replaced_lines(result),
     )
 
 

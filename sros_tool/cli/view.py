@@ -105,7 +105,7 @@ def _complete_focus(
     multiple=True,
     metavar="NAME...",
     help="Draw only the enclaves and names that can influence this topic, service, action "
-    "or enclave, or be influenced.",
+    "or enclave, or be influenced by it.",
     shell_complete=_complete_focus,
 )
 @click.option(

@@ -385,7 +385,7 @@ def _rmw_here(environment: Mapping[str, str]) -> str:
 
 
 def _deaf_to(node: HandNode, environment: Mapping[str, str]) -> str:
-    """Return which nodes a secured node does not hear, as the ROS of this shell lets expect."""
+    """Return which nodes a secured node will not hear, judging by the ROS of this shell."""
     rmw = _rmw_here(environment)
     is_deaf = node.backend == CYCLONE and vendor_of(rmw) not in (None, Vendor.CYCLONE)
     if not is_deaf or environment.get(ENABLE) != "true":

@@ -97,8 +97,8 @@ class UserKeystore(NamedTuple):
     ``topic`` is the attacked ROS topic, ``service`` the attacked ROS service ("": none). ``grants``
     has the grant of each enclave of the cast, ``why`` the reasons for the choice of some parts.
     ``rows`` are for the enclaves with the widest permissions, and for those with faulty or revoked
-    files.  ``enclaves`` is the number of all enclaves; the key of ``elsewhere`` of them is not in
-    the keystore.  ``not_tried`` lists tests that a proof needs and that cannot run.
+    files.  ``enclaves`` is the number of all enclaves, ``elsewhere`` the number of those whose key
+    is not in the keystore.  ``not_tried`` lists tests that a proof needs and that cannot run.
     """
 
     root: Path

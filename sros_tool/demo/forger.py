@@ -1,8 +1,8 @@
 """Forgeries: change a keystore as an attacker would, or remove a defence.
 
-Rows of scenarios refer to these functions.  A function alone changes a copy of the keystore, with
-all defences in place.  In `Undefended`, it changes a new keystore without one of the defences, to
-show that the attack works there.
+Rows of scenarios refer to these functions. A row that names only a function applies it to a copy of
+the keystore, with all defences in place. A row that names an `Undefended` applies its function to a
+new keystore without one of the defences, to show that the attack works there.
 """
 
 from __future__ import annotations
@@ -467,7 +467,7 @@ def _revoke(copy: KeystoreCopy, part: str) -> None:
 def _outdated_lists(copy: KeystoreCopy) -> dict[Path, bytes]:
     """Return the CRLs (empty: none) of enclaves that lack the keystore's current CRL.
 
-    Who did not get the last list will not get the next one, either.
+    An enclave that did not get the last list will not get the next one, either.
     """
     newest = copy.root / CRL
     revoked = any(entry.what == "revocation" for entry in Keystore(copy.root).ledger.entries)

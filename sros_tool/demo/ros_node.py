@@ -85,7 +85,7 @@ def _run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> 
 
 
 def _by_hand(name: str) -> Any:
-    """Return a node without what would need the rights of a node of this name."""
+    """Return a node without the parts that would need the rights of a node of this name."""
     import rclpy
     from rclpy.parameter import Parameter
 
@@ -110,9 +110,9 @@ def _spin(nodes: Sequence[Any], ended: Callable[[], bool]) -> None:
 def _until_signalled() -> Callable[[], bool]:
     """Handle SIGINT and SIGTERM; return a function that tells whether a signal has arrived.
 
-    Not rclpy's handlers: they shut its context down in the middle of a callback, or just before a
-    wait without end, and a KeyboardInterrupt inside its C++ becomes another error there ("Unable to
-    convert call argument").
+    rclpy's handlers are not used: they shut its context down in the middle of a callback, or just
+    before a wait without end, and a KeyboardInterrupt inside its C++ becomes another error there
+    ("Unable to convert call argument").
     """
     received: list[int] = []
     for each in (signal.SIGINT, signal.SIGTERM):

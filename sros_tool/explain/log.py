@@ -404,8 +404,8 @@ _DROPPED: Mapping[tuple[str, bool], str] = {
     ("Reply", False): "call",
     ("Declare Queryable", False): "call",
 }
-"""Maps a message kind, and whether the message came in, to the denied right of the remote
-process.
+"""Maps a kind of message, and whether it was an incoming message, to the right that the remote
+process lacks.
 """
 _GRAPH: Mapping[tuple[str, bool], str] = {
     ("Liveliness Token", True): "announce this node, topic or service in the graph",
@@ -529,7 +529,8 @@ class _Examiner:
         )
 
     def _other_folder(self, path: str, remedy: str) -> str:
-        """Return the remedy if an enclave's folder, which a log misses, is not in this keystore."""
+        """Return the remedy if an enclave's folder, which a log reports missing, is not in this
+        keystore."""
         place, inside, name = path.rpartition("/enclaves/")
         if not inside or self._keystore is None:
             return ""

@@ -242,8 +242,8 @@ def _exported(answer: Answer) -> Iterator[Note]:
     """Yield a note if an export denies what its keystore may allow by now."""
     if answer.change and answer.is_of_export:
         text = (
-            "these files were exported. If the policy of the keystore already allows this, they "
-            "are older: the last command alone mends it."
+            "these files are from an export. If the policy of the keystore already allows this, "
+            "the export is older than that policy: then the last command alone is enough."
         )
         yield Note("explain.exported", text)
 

@@ -209,9 +209,9 @@ def read_policy_for(path: Path, fleet: Fleet | None, read: PolicyFiles | None = 
 
 
 def fleet_with_enclaves(fleet: Fleet, files: Iterable[Path]) -> Fleet:
-    """Return the fleet with the paths of enclaves that policies have; unreadable ones are left out.
+    """Return the fleet with the paths of enclaves that policies have, unreadable ones left out.
 
-    It says which robot an enclave belongs to, where only that is shown.
+    Use the result only to show which robot an enclave belongs to.
     """
     patterns: list[str] = []
     for file in files:

@@ -461,9 +461,10 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
     """Yield lines about enclaves; lines that differ only in the robot become one line.
 
     That line has placeholders for the robot's name and namespace, and lists the robots at its end.
-    The robot of a line is that of the enclave; if the enclave has none, the only one that the text
-    names.  If more lines differ only in the one *other* robot that they name, that is ``{other}``;
-    many lines that differ in both robots become one with the number of pairs.
+    The robot of a line is the robot of the enclave, or, for an enclave of no robot, the only robot
+    that the text names.  Lines that differ only in the one *other* robot that they name share a
+    line with ``{other}``; many lines that differ in both robots become one line with the number of
+    pairs.
 
     Args:
         fleet: the robots; None leaves every line as it is.
@@ -504,7 +505,8 @@ class _Folding(NamedTuple):
 
 
 def _foldings(fleet: Fleet, enclave: str, text: str) -> list[tuple[_Folding, str]]:
-    """Return a line folded by its robot, by the one other robot, by both; with the robot's name."""
+    """Return a line folded by its robot, by the one other robot, and by both; also the robot's
+    name."""
     own = robot_of(fleet, enclave)
     named = [robot for robot in named_robots(fleet, "", text) if robot != own]
     other = named[0] if len(named) == 1 else None

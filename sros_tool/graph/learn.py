@@ -979,7 +979,7 @@ def with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> by
 
 
 def _beyond(given: frozenset[NodeRight], profile: Profile) -> tuple[Group, ...]:
-    """Return the groups of a profile without names all of whose rights are in ``given``."""
+    """Return the groups of a profile, without the names whose rights are all in ``given``."""
     groups = []
     for group in profile.groups:
         names = tuple(

@@ -468,7 +468,8 @@ def refusals(root: Path) -> dict[str, RefusedMessage]:
     """Return why the last messages of robots were refused, by robot.
 
     Raises:
-        DocumentError: the file cannot be read, or is damaged: it cannot be told who is current.
+        DocumentError: the file cannot be read, or is damaged: then it is unknown which robots are
+        current.
     """
     path = root / REFUSED
     if not os.path.lexists(path):

@@ -188,10 +188,10 @@ class ConfirmedFile:
 class RobotStatus:
     """The deployment status of a robot, by its last confirmation.
 
-    ``others`` are enclaves of the robot that the fleet does not record.  ``is_published`` says of a
-    robot with other files than the keystore that the release which it says it has was published
-    with the present files of the keystore.  ``has_list`` says whether it has the present revocation
-    list, in force or not, and ``renew_from`` from when a file of it expires soon.
+    ``others`` are enclaves of the robot that the fleet does not record.  ``is_published`` is for a
+    robot whose files differ from the keystore's: whether the release that the robot reports was
+    published with the present files of the keystore.  ``has_list`` says whether it has the present
+    revocation list, in force or not, and ``renew_from`` from when a file of it expires soon.
     """
 
     robot: str
@@ -401,11 +401,12 @@ class FleetStatus:
         return all(robot.settled for robot in self.robots)
 
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
-        """Return a copy with what is to be done, in which robots not heard of for long are offline.
+        """Return a copy with the pending actions, in which robots that were silent for long are
+        offline.
 
         These are the robots whose last confirmation is older than ``max_age``; without it, the
-        robots that fetch and were not heard of for more than a day.  Messages of robots that fetch
-        are also as old as they say themselves: whoever has the inbox could hold them back.
+        robots that fetch and sent nothing for more than a day.  Messages of robots that fetch are
+        also as old as they say themselves: whoever has the inbox could hold them back.
         """
         late = frozenset(
             robot.robot
@@ -498,14 +499,15 @@ class _ComparedRobot(NamedTuple):
         return self.received.confirmation if self.received else None
 
     def running(self) -> Mapping[str, RunningFiles] | None:
-        """Return what the processes of the robot's enclaves have loaded; None if it is not said."""
+        """Return what processes of the robot's enclaves have loaded; None if it was not
+        reported."""
         if self.confirmed is None or self.confirmed.running is None:
             return None
         running = self.confirmed.running
         return {name: running[name] for name in self.enclaves if name in running}
 
     def restart(self) -> tuple[str, ...] | None:
-        """Return the enclaves whose processes have earlier files; None if it is not said."""
+        """Return the enclaves whose processes have earlier files; None if it was not reported."""
         running = self.running()
         due = self.confirmed.restart if self.confirmed else None
         if due is None and running is None:

@@ -15,10 +15,10 @@ the end of the ledger; other lines that were changed are noticed by whoever read
 
 A change that makes the file longer than 16 MiB seals it: it is never written again, as part
 ``ledger.0001.jsonl``, and ``ledger.jsonl`` becomes a link to the next part.  Each part begins with
-an entry ``sealed``, which has the number and the SHA-256 of the part before.  Only who reads all
-lines opens sealed parts, and accepts no part but the one that was sealed; the index has the lines
-for everybody else.  Versions of sros that know no parts refuse to follow the link when they change
-a keystore.
+an entry ``sealed``, which has the number and the SHA-256 of the part before.  Only a reader of all
+lines opens sealed parts, and accepts a part only as it was sealed; all other readers get these
+lines from the index.  Versions of sros that know no parts refuse to follow the link when they
+change a keystore.
 """
 
 from __future__ import annotations
@@ -357,7 +357,8 @@ class LedgerFile:
     def recorded_enclaves(self) -> Sequence[str] | None:
         """Return the sorted enclaves whose last certificate was not revoked; None without an index.
 
-        They may be missing in the keystore, and enclaves that were put there by hand lack.
+        Some may be missing in the keystore, and enclaves that were put there by hand are not among
+        them.
         """
         if self._recorded is None:
             names = self.recorded_with()
@@ -387,15 +388,17 @@ class LedgerFile:
             self._files = self._read()
         return self._files
 
-    def end(self) -> _Reading:
-        """Return the values that are needed to add lines; their ``ledger`` may lack entries."""
+    def reading_for_append(self) -> _Reading:
+        """Return what is needed to add lines; its ``ledger`` may lack
+        entries."""
         return self._readings.get(_EVERY) or self._reading(_NONE, ())
 
     def index_with(self, new: int, reading: _Reading) -> IndexUpdate | None:
-        """Return an index update for ``new`` more lines of the ledger; None if it gets no index.
+        """Return an index update for ``new`` more lines of the ledger; None if the ledger gets no
+        index.
 
-        ``reading`` is the present `end`.  A ledger with a fault gets no index: only who reads all
-        of it knows what is certain.
+        ``reading`` is from `reading_for_append`.  A ledger with a fault gets no index: only a
+        reader of all lines knows what is certain.
         """
         if reading.ledger.lines + new < _INDEXED_FROM or not reading.sound:
             return None
@@ -1024,7 +1027,7 @@ def append(
     read under the lock.  Faults that are not recorded yet are added first, so that the new head
     does not hide them.
     """
-    present = file.end()
+    present = file.reading_for_append()
     gaps = [Entry(iso(now), GAP, reason=e.text, number=e.line) for e in present.unrecorded]
     index = None
     if not transaction.dry_run:

@@ -11,8 +11,8 @@ that a line has a term, where the line is, and what its digest is.  Postings are
 the first bits of their terms, each with the names of the enclaves whose postings are in it and
 whose last certificate was not revoked; the root is the digest of the digests of all buckets.
 
-The index also has the lines of the sealed parts of the ledger, so that nobody needs those files who
-does not read all lines; a line is compared with the digest in its posting.
+The index also has the lines of the sealed parts of the ledger, so that only a reader of all lines
+needs the files of those parts; a line is compared with the digest in its posting.
 """
 
 from __future__ import annotations

@@ -638,8 +638,8 @@ def _header(content: bytes, key: bytes) -> str:
     return found
 
 
-def _entries(data: bytes, length: int) -> dict[str, TreeEntry]:
-    """Return the entries of a git tree, by name; ids have ``length`` bytes.
+def _entries(data: bytes, id_length: int) -> dict[str, TreeEntry]:
+    """Return the entries of a git tree, by name; ids have ``id_length`` bytes.
 
     Raises:
         DocumentError: the tree is malformed, has a name twice, or a name that no file can have.
@@ -648,13 +648,13 @@ def _entries(data: bytes, length: int) -> dict[str, TreeEntry]:
     while data:
         head, _, rest = data.partition(b"\0")
         mode, _, raw = head.partition(b" ")
-        name, data = os.fsdecode(raw), rest[length:]
+        name, data = os.fsdecode(raw), rest[id_length:]
         if name in entries or name in ("", ".", "..") or "/" in name or name.lower() == ".git":
             raise DocumentError(
                 f"a folder of the commit has '{name}' twice, or no file can have this name",
                 "Programs interpret such a folder in different ways.",
             )
-        entries[name] = TreeEntry(_checked_out(mode), rest[:length].hex())
+        entries[name] = TreeEntry(_checked_out(mode), rest[:id_length].hex())
     return entries
 
 

@@ -886,10 +886,10 @@ def _parts(requirement: Requirement) -> Iterator[Requirement]:
     match requirement:
         case Widest(rights=rights, enclaves=enclaves):
             for right in rights:
-                for some in _one_by_one(enclaves):
+                for some in _single_enclaves(enclaves):
                     yield replace(requirement, rights=(right,), enclaves=some)
         case NothingBut(enclaves=enclaves):
-            for some in _one_by_one(enclaves):
+            for some in _single_enclaves(enclaves):
                 yield replace(requirement, enclaves=some)
         case NotBoth(first=first, second=second):
             for right in _single_rights(first):
@@ -908,14 +908,14 @@ def _parts(requirement: Requirement) -> Iterator[Requirement]:
             for pair in pairs:
                 yield replace(requirement, names=(pair,))
         case Apart(sources=sources, targets=targets):
-            for source in _one_by_one(sources):
-                for target in _one_by_one(targets):
+            for source in _single_enclaves(sources):
+                for target in _single_enclaves(targets):
                     yield replace(requirement, sources=source, targets=target)
         case _:
             raise AssertionError(requirement)
 
 
-def _one_by_one(enclaves: Sequence[str]) -> Iterator[tuple[str, ...]]:
+def _single_enclaves(enclaves: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Yield lists with one enclave or pattern of a list, each with all its exceptions."""
     excepted = tuple(enclave for enclave in enclaves if enclave.startswith(EXCEPT))
     yield from ((enclave, *excepted) for enclave in enclaves if not enclave.startswith(EXCEPT))

@@ -541,7 +541,7 @@ class _Review:
         reviewed: Sequence[Path],
         fleet: Fleet | None,
     ) -> Iterator[str]:
-        """Yield changed policies of which reviewed policies or keystores include only a part."""
+        """Yield changed policies that reviewed policies or keystores include only in part."""
         named = {str(path.relative_to(self.head.folder)) for path in reviewed}
         known = {
             path: self.head.written(path)
@@ -567,7 +567,7 @@ class _Review:
     def _parts_used_in_part(
         self, parts: Mapping[str, bytes], named: Iterable[str]
     ) -> Iterator[str]:
-        """Yield changed files for includes of which reviewed policies use only a part."""
+        """Yield changed files that the reviewed policies include only in part."""
         files = self.head.files
         whole = used_whole(named, lambda path: self.head.written(path) if path in files else None)
         for path, data in parts.items():

@@ -552,7 +552,7 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
 def is_enforced(
     enforcers: Iterable[Enforcement], enclave: str, domain: int, topic: str, *, writes: bool
 ) -> bool:
-    """Return whether an enforcer lets an enclave write or read a topic, as `decide` of it says."""
+    """Return whether an enforcer lets an enclave write or read a topic, by its method `decide`."""
     messages = zenoh_message(topic, domain, writes=writes)
     remote = Remote(enclave)
     return bool(messages) and any(

@@ -115,8 +115,8 @@ class DrawnUnit(NamedTuple):
     """A robot, a namespace or an enclave that can be equal to others of its ``family``.
 
     ``values`` are the words by which names name it: its name, and its namespace if that differs.
-    ``group`` are the groups and the domain of a robot: only robots of the same are expected to be
-    alike.
+    ``group`` are the groups and the domain of a robot: only robots with the same groups and domain
+    are expected to be alike.
     """
 
     name: str

@@ -414,8 +414,8 @@ class EqualUnits(NamedTuple):
 class UnreadUnits(NamedTuple):
     """Units of a large keystore of which only the text of their permissions was compared.
 
-    It is that of the unit ``like``, but for their names.  ``enclaves`` is the number of enclaves
-    of the ``members``.
+    That text equals the text of the unit ``like``, except for the names.  ``enclaves`` is the
+    number of enclaves of the ``members``.
     """
 
     what: str

@@ -170,7 +170,8 @@ class Participant:
         return tuple(sorted(self._discovered(_BUILTIN_SUBSCRIPTIONS, _publication_of)))
 
     def process_ids(self) -> dict[str, int]:
-        """Map the discovered participants of this machine that tell it to their process ids.
+        """Map the discovered participants of this machine to their process ids, where they state
+        these.
 
         A participant is the first 12 bytes of its identifier, in hexadecimal.
         """

@@ -684,7 +684,7 @@ def _expression_parts(expression: str) -> tuple[str, str, str]:
 
 
 def _differences(expressions: Iterable[str]) -> tuple[Difference, ...]:
-    """Return the keys of expressions that are not graph tokens."""
+    """Return key expressions, except graph tokens, as differences that deny nothing."""
     names: dict[tuple[str, str], set[Chunks]] = {}
     for expression in expressions:
         if not expression.startswith("@"):

@@ -170,7 +170,7 @@ def test_the_release_of_a_robot_with_other_enclaves_takes_no_key(home: Home, rob
         (other / f"enclaves/r1/{name}").rename(other / f"enclaves/r1/{name}{name}")
     sros("create_request", "/r1/new", other).ok()
     before = content(other)
-    with pytest.raises(KeystoreError, match="has no enclave that is here") as refused:
+    with pytest.raises(KeystoreError, match="has none of the enclaves that this") as refused:
         install(other, home.renewed)
     assert content(other) == before
     assert "/r1/aa, /r1/bb and /r1/cc, the release" in str(refused.value), "not /r1/new"

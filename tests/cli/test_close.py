@@ -306,7 +306,7 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     assert robot.restarts == ["daemon-reload", "restart listener.service talker.service"]
     assert closed.out.splitlines()[-4:] == [
         "yes: every process runs in its enclave: 2 enclaves, and no open process",
-        "yes: the requirements hold: as the file says: robot/requirements.toml",
+        "yes: the requirements hold: all of them: robot/requirements.toml",
         "yes: everything that talked still talks: 2 nodes with 36 endpoints as before",
         "yes: an open listener finds nothing: the observer that saw 2 nodes before sees none",
     ]

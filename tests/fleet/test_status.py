@@ -774,7 +774,8 @@ def test_the_dds_of_a_robot(
     libraries = [library] if library else []
     field.confirm("r1", dds={"libraries": libraries, "unseen": unseen})
     ended = field.run("fleet", "status", "ks", status=1 if outdated else 0)
-    only = "the exit status is 1 only for a DDS to upgrade, for known vulnerabilities: r1; "
+    only = "the exit status is 1 only because a later release fixes known vulnerabilities in the "
+    only += "DDS of r1; "
     more = only if outdated else "on the DDS of robots: 1 "
     assert (
         "3 robots: 3 current" in ended.out

@@ -144,8 +144,8 @@ LOCAL_TIME = FindingKind(
     "enclave.permissions-local-time",
     ERROR,
     "permissions that Fast DDS refuses in the time zone of this host",
-    'Fast DDS reads their dates in local time, and says "Not found the identity subject name in '
-    'permissions file".',
+    'Fast DDS reads the dates of permissions in local time, and says "Not found the identity '
+    'subject name in permissions file".',
     "Fast DDS 2.6 to 3.6 (mktime); tested.",
     "Run `sros renew KEYSTORE ENCLAVE`, or let the host run in UTC.",
     vendors=FAST_DDS,

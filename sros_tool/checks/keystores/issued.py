@@ -322,7 +322,7 @@ def _exported_governance(
     for copy in copies[1:]:
         if copy.governance != copies[0].governance:
             file = f"{keystore.root}/{enclave_folder(copy.name)}/governance.p7s"
-            text = f"its governance differs from the one of {copies[0].name}"
+            text = f"its governance differs from the governance of {copies[0].name}"
             yield GOVERNANCE_DIFFERS.found(copy.name, text, file)
 
 
@@ -340,7 +340,9 @@ def _lists(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> It
             folder = str(enclave_path(keystore.root, summary.name))
             of = f"the list of {newest.name} has number {newest.list_number}"
             if crl.revokes(summary.serial):
-                yield REVOKED_BY_NEWER_LIST.found(summary.name, f"{of}, and revokes it", folder)
+                yield REVOKED_BY_NEWER_LIST.found(
+                    summary.name, f"{of}, and revokes this enclave", folder
+                )
             elif (
                 summary.list_number >= 0 or not keystore.crl
             ):  # another check reports a missing list

@@ -350,7 +350,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list
             "permissions again.",
         )
     unknown = {finding.subject for finding in findings if finding.kind is UNEXPLAINED}
-    names = sorted(name for name in unknown if _is_plain(findings, name))
+    names = sorted(name for name in unknown if _is_unrecorded(findings, name))
     keys = {f"{enclave_path(root, name)}/{KEY_FILE}" for name in names}
     chosen = [
         finding
@@ -394,7 +394,7 @@ def _with_cause_of_expiry(findings: Sequence[Finding], root: Path) -> list[Findi
     )
 
 
-def _is_plain(findings: Sequence[Finding], name: str) -> bool:
+def _is_unrecorded(findings: Sequence[Finding], name: str) -> bool:
     """Return whether neither certificate nor permissions of an enclave are in the ledger."""
     return sum(finding.kind is UNEXPLAINED and finding.subject == name for finding in findings) > 1
 

@@ -234,7 +234,7 @@ _SERVICES = _scenario(
     _unasked(
         "client without permission",
         Role.CLIENT,
-        "the request is dropped before the server",
+        "the request is dropped before it reaches the server",
         "client without permission",
         "server",
         "client",
@@ -258,7 +258,7 @@ _SERVICES = _scenario(
     _unasked(
         "action client without permission",
         Role.ACTION_CLIENT,
-        "the goal is dropped before the server",
+        "the goal is dropped before it reaches the server",
         "action client without permission",
         "action server",
         "action client",
@@ -353,7 +353,7 @@ def _outsider(name: str, keystore: KeystoreChoice, mechanism: str, evidence: str
 
 
 def _let_in(name: str, keystore: KeystoreChoice, removed: str) -> Row:
-    """Return a row in which messages of that process arrive, because a defence is missing."""
+    """Return a row in which messages of such a process arrive, because a defence is missing."""
     wide, _, listener = _topic_pair(keystore)
     party = _attacker("attacker", Role.TALKER, keystore, "talker")
     return _attempt(
@@ -557,7 +557,7 @@ def _past_the_router(party: Party, attack: str, denied: RowStatus, done: RowStat
             f"{attack}, rules at the router only",
             party,
             done,
-            "sessions of a host connect to each other: the router sees nothing of it",
+            "sessions of a host connect to each other: the router does not see their messages",
             zenoh_forger.rules_at_the_router_only,
             "rules at the router",
             "the rules in the sessions",
@@ -954,7 +954,7 @@ def _earlier(name: str, keystore: KeystoreChoice, expected: RowStatus, removed: 
         expected,
         "only this file decides what its own process may do"
         if removed
-        else "a session file limits only the others, which decide what this enclave may do",
+        else "a session file limits only other enclaves; their files decide what this one may do",
         hears("listener", guest.name),
         (*_topic_pair(keystore), guest),
         _CHATTER,

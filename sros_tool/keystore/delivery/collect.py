@@ -3,7 +3,7 @@
 An inbox is a folder with ``<robot>/confirmation.p7s`` of each robot that fetches: its confirmation,
 signed with the key of one of its enclaves.  Whoever runs the web server or carries the folder can
 write anything into it, so that nothing is believed before the signature, the certificate, the robot
-and the sequence number of a message were verified.  A message that is refused stops no other one.
+and the sequence number of a message were verified.  A refused message does not stop the others.
 """
 
 from __future__ import annotations
@@ -164,7 +164,8 @@ class CollectedInbox(NamedTuple):
 
     @property
     def complete(self) -> bool:
-        """Whether no message, request or release was refused, and all that may be signed is."""
+        """Whether no message, request or release was refused, and everything that may be signed is
+        signed."""
         if self.published and self.published.refused:
             return False
         requests = (request for robot in self.robots for request in robot.requests)
@@ -210,7 +211,7 @@ def collect(
         verifier = _Verifier(keystore, fleet, now, frozenset(restored))
         renewals = _Renewals(keystore, fleet, now)
         forgotten = Forgotten(keystore, now)
-        telling: list[str] = []
+        robots_with_lists: list[str] = []
         changes: list[FileChange] = []
         taken: list[_ReceivedMessage] = []
         for message in _read_inbox(inbox, fleet, verifier):
@@ -218,7 +219,7 @@ def collect(
                 message.requests = renewals.judge(message.robot, message.verified)
                 message.crl = message.verified.confirmation.crl
             if message.crl and forgotten.add(message.crl.encode()):
-                telling.append(message.robot.name)
+                robots_with_lists.append(message.robot.name)
             if message.stranger:
                 forgotten.add_certificate(message.stranger, REPORTED)
             if message.received:
@@ -232,7 +233,7 @@ def collect(
         if not dry_run:
             keep_refusals(root, refused_before, _refusals(refused_before, taken), now=now)
         not_signed, notes, signed = _revoke_again(
-            root, forgotten, telling, taken, now=now, keyring=keyring, dry_run=dry_run
+            root, forgotten, robots_with_lists, taken, now=now, keyring=keyring, dry_run=dry_run
         )
         if not not_signed:
             not_signed, more_notes, more_signed = _sign(
@@ -469,7 +470,8 @@ class _Verifier:
         )
 
     def _arrival(self, file: _File, last: Received | None) -> datetime:
-        """Return when a message arrived: when its file was written, but after the last message.
+        """Return when a message arrived: when its file was written, but not before the last
+        message.
 
         Messages may lie in the inbox for long before somebody takes them in.
         """
@@ -632,7 +634,8 @@ class _Renewals:
     def _decide_request(
         self, robot: Robot, message: _Verified, request: SigningRequest
     ) -> tuple[str, str]:
-        """Return the outcome of a request, and why; it has to be signed if this is "renewed".
+        """Return the outcome of a request, and why; if the outcome is "renewed", it has to be
+        signed.
 
         Raises:
             SrosError: it must not be signed.
@@ -683,7 +686,7 @@ class _Renewals:
     def _issued(self, name: str) -> Iterator[tuple[Window, datetime | None]]:
         """Yield the validity of certificate and permissions of an enclave, and when they were made.
 
-        None if the ledger does not tell it, such as of files that it has taken over.
+        None if the ledger does not have them, such as for files that it has taken over.
         """
         credentials = read_credentials(self._keystore, name)
         lifetime = credentials.lifetime()
@@ -715,7 +718,7 @@ class _Renewals:
 def _revoke_again(
     root: Path,
     forgotten: Forgotten,
-    telling: Sequence[str],
+    robots_with_lists: Sequence[str],
     taken: Sequence[_ReceivedMessage],
     *,
     now: datetime,
@@ -724,9 +727,9 @@ def _revoke_again(
 ) -> tuple[str, list[Note], list[FileChange]]:
     """Revoke enclaves that only lists of robots revoke, and refuse the requests that they signed.
 
-    ``telling`` are robots with such lists.  Certificates that the ledger lacks are recorded.  If
-    the lists cannot be signed, nothing is signed; a note says it of the list of a CA service, which
-    alone can sign another, and knows its certificates.  Return as `_sign`.
+    Certificates that the ledger lacks are recorded.  If the lists cannot be signed, nothing is
+    signed; but if they are lists of a CA service, which alone can sign another one and knows its
+    certificates, there is only a note.  Return the same as `_sign`.
     """
     if not (forgotten.lists or forgotten.unknown(Keystore(root))):
         return "", [], []
@@ -735,18 +738,20 @@ def _revoke_again(
     for request in requests:
         if again & {*request.vouching}:
             request.done("refused", "its certificate was revoked")
-    have = f"{first_few(telling, _SHOWN)} {'has' if len(telling) == 1 else 'have'}"
+    have = (
+        f"{first_few(robots_with_lists, _SHOWN)} {'has' if len(robots_with_lists) == 1 else 'have'}"
+    )
     if keyring.ca_service(root, IDENTITY, Keystore(root).template):
         # Its list is for all sites, and everybody can have it: nobody else has to wait.
         text = (
             f"{have} a revocation list of the CA service that the keystore lacks: import it "
             f"with `sros crl {quote(str(root))} --refresh --crl FILE`"
         )
-        return "", [Note("fleet.later-list", text)] if telling else [], []
+        return "", [Note("fleet.later-list", text)] if robots_with_lists else [], []
     try:
         restored = restore_revocations(root, forgotten, now=now, keyring=keyring, dry_run=dry_run)
     except SrosError as error:
-        if not telling:
+        if not robots_with_lists:
             text = f"a certificate that the ledger lacks cannot be recorded: {error.what}"
             return "", [Note("fleet.certificates-restored", text)], []
         why = (
@@ -757,7 +762,7 @@ def _revoke_again(
             if request.request:
                 request.done("not_signed", why)
         return why, [], []
-    notes = [restored_note(restored, have)] if telling else []
+    notes = [restored_note(restored, have)] if robots_with_lists else []
     return "", [*notes, *restored.notes], [*changes_below(root, restored.changes)]
 
 

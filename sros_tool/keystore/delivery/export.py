@@ -264,7 +264,7 @@ def released_files(root: Path, name: str) -> dict[str, bytes]:
 
 
 def _evaluated_until(files: Mapping[str, bytes], state: OpenedEnclave, now: datetime) -> datetime:
-    """Return the first moment at which files without problems may have one, whatever the list.
+    """Return the first moment at which sound files may get a problem, whatever the list has.
 
     It is ``now`` for files whose evaluation looks at revocation lists in other ways: there are
     lists in the file of a CA, or Zenoh configurations.

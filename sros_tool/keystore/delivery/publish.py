@@ -236,7 +236,8 @@ def publish(
 def later_in_folder(keystore: Keystore) -> str:
     """Return how the folder in which a keystore publishes is later than the keystore, as a clause.
 
-    "" if it is not, or this cannot be told here.  Only what keys of the keystore signed counts.
+    "" if it is not later, or if this is unknown here.  Only metadata that keys of the keystore
+    signed counts.
     """
     with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
         if may_be_later(keystore):
@@ -284,7 +285,7 @@ class _Keys:
         self._new_elsewhere = b""
 
     def recover(self, dry_run: bool) -> None:
-        """Complete or undo the rotation of a root key elsewhere that was killed.
+        """Complete or undo a killed rotation of a root key that is outside of the keystore.
 
         The root metadata of the keystore tells whether the new key counts already.
         """
@@ -404,7 +405,7 @@ class _Keys:
                 put_in_place()
 
     def finish(self) -> None:
-        """Put a new root key that is elsewhere in its place, and remove the keys of before."""
+        """Put a new root key outside of the keystore in its place, and remove the replaced keys."""
         if self._new_elsewhere and self._elsewhere:
             with Folder(self._elsewhere.parent) as folder:
                 spare = self._next_to(self._elsewhere).name
@@ -622,9 +623,9 @@ class _Run:
         return True
 
     def _check_removed(self) -> None:
-        """Refuse to publish a robot again that was removed later than the keystore knows.
+        """Refuse to publish for a robot that was removed after the state that the keystore has.
 
-        The releases of others need not tell whether it was revoked, or left the fleet.
+        The releases of other robots may not show whether it was revoked, or left the fleet.
         """
         from sros_tool.keystore.delivery.repository import RENEWED_ALONE
 
@@ -913,10 +914,11 @@ class _Run:
         self._changes = changes_below(self.keystore.root, change.transaction.changes)
 
     def write(self, keys: _Keys) -> None:
-        """Write the metadata, the timestamp last; then remove what nothing has named for long.
+        """Write the metadata, the timestamp last; then remove files long without a reference.
 
-        A new root comes first if what is there follows it already, else after the metadata, which
-        the keys of both roots have signed: so robots find whole metadata at every moment.
+        A new root is written first if the present metadata already fits it; otherwise after the
+        new metadata, which the keys of both roots have signed.  So robots find complete metadata
+        at every moment.
         """
         assert self._composed
         with Folder(self._folder) as folder:

@@ -2,8 +2,8 @@
 
 Top-level targets delegates to bins, each with the releases of about 32 robots, so that a robot
 transfers little.  All files but the timestamp have their version in the name and are never changed;
-robots read the timestamp first, so it is written last: whoever stops the writing leaves what was
-there.
+robots read the timestamp first, so it is written last: if the writing is interrupted, robots still
+find the earlier metadata.
 """
 
 from __future__ import annotations
@@ -323,8 +323,8 @@ class Composed(NamedTuple):
 class Composer:
     """Makes the metadata for releases, and keeps existing metadata that still fits.
 
-    ``signers`` has the signers of each role: the present one, and during its rotation also the one
-    before, whose signature robots ask for that do not know the new root yet.
+    ``signers`` has the signers of each role: the present one, and during a rotation of its key also
+    the previous one: robots that do not know the new root yet ask for its signature.
     """
 
     def __init__(

@@ -123,7 +123,7 @@ class Forgotten:
         return {serial: entry for serial, entry in self.certificates.items() if serial not in known}
 
     def add(self, document: bytes) -> bool:
-        """Add the lists in a PEM file that tell more than what is known; return whether any does.
+        """Add the lists in a PEM file that have more than is known; return whether any has.
 
         These revoke other certificates, or are not earlier than the keystore's, so that robots
         would refuse its next list.

@@ -139,7 +139,7 @@ def restore_revocations(
     """Revoke again all certificates on revocation lists that the keystore signed and lost.
 
     The next list has a higher number than these.  Enclaves that they revoke are moved to
-    ``revoked``, as they were before, also if they were renewed since; those of which only an
+    ``revoked``, as they were before, also if they were renewed since; enclaves of which only an
     earlier certificate was replaced stay.  Certificates that the ledger lacks are recorded, so that
     they can be revoked, and are revoked at once if their enclaves were.  The ledger records that
     the keystore was restored, with a number that it did not give before: the seconds since 1970.

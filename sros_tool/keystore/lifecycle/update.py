@@ -553,7 +553,7 @@ class _Updater:
         change = self._change
         earlier = checked_rights(state, change.authorities, change.recorded)
         replaces_default = self._has_default_rights(state, earlier)
-        certificate = self._certificates or self._expires_otherwise(name)
+        certificate = self._certificates or self._changes_longest_validity(name)
         if not (self._permissions or replaces_default or certificate):
             return None
         rights: SignedRights | StatedRights
@@ -571,8 +571,8 @@ class _Updater:
             old = Superseded.by(name, state.certificate, issued.certificate, change.now)
         return _Reissued(name, replaced_rights(name, present, grant, change.now), old)
 
-    def _expires_otherwise(self, name: str) -> bool:
-        """Return whether the update makes an enclave short-lived, or ends that."""
+    def _changes_longest_validity(self, name: str) -> bool:
+        """Return whether the update changes the longest validity of an enclave's files."""
         before, after = self._present.settings, self._goal.settings
         return before.longest_validity(name) != after.longest_validity(name)
 

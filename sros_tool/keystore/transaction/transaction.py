@@ -358,7 +358,7 @@ class Transaction:
     def remove(self, path: str) -> None:
         """Stage the removal of a file or link, and of folders that become empty."""
         there = self._prepare_folder(path.rpartition("/")[0], wanted=False)
-        before = self._at(path) if there else None
+        before = self._present_content(path) if there else None
         if before is None:
             raise KeystoreError(f"'{self.root}/{path}' does not exist")
         self._begin_change(path, "remove")
@@ -382,7 +382,7 @@ class Transaction:
         ``after`` is as in `Move`.  Return None in a dry run.
         """
         exists = self._prepare_folder(path.rpartition("/")[0])
-        before = self._at(path) if exists else None
+        before = self._present_content(path) if exists else None
         self._begin_change(path, "create" if before is None else "replace")
         if exists:
             self._moves.append(Move(path, before, after))
@@ -410,8 +410,8 @@ class Transaction:
         folder, _, name = path.rpartition("/")
         return name == CRL_FILE and (folder.removeprefix(ENCLAVES) or "/") in self._linked
 
-    def _at(self, path: str) -> str | None:
-        """Return the present content of a path, as in `Move.before`."""
+    def _present_content(self, path: str) -> str | None:
+        """Return the present content of a path, in the form of `Move.before`."""
         state = self._in.state(path)
         if state is None:
             return None
