@@ -308,7 +308,7 @@ class _Draft:
         return is_plain(tie) and (tie.node, tie.right) in self._lettered
 
     def _only_node(self, bundle: Bundle) -> str:
-        """Return the only node, apart from those with a letter, with a right to these names, or ""."""
+        """Return the only node without a letter that has a right to these names, or ""."""
         looking = {tie.node for tie in bundle.ties if self._looks(tie)}
         drawn = {tie.node for tie in bundle.ties if not self._looks(tie)}
         if not all(map(is_plain, bundle.ties)):
