@@ -503,8 +503,8 @@ def explain_access(
     Zenoh decides by the files that `sros zenoh` has written into the keystore.
 
     Args:
-        keystore: The keystore, or its path; or a policy, or its file, by which sros decides as it
-            would be signed.
+        keystore: The keystore, or its path; or a policy, or its file, by which sros decides as if
+            it were signed.
         enclave: The name of the enclave, such as "/talker".
         action: "publish", "subscribe", "call", "serve", "execute" or "join"; "request" and "reply",
             the words of policies, mean "call" and "serve" for a service.
@@ -591,7 +591,7 @@ def _enclave_to_ask(
     policy: AnyPath | Policy | None,
     asking: AskingContext,
 ) -> AskedEnclave:
-    """Return an enclave of a keystore, or of a policy as it would be signed."""
+    """Return an enclave of a keystore, or of a policy as if it were signed."""
     from sros_tool.explain.asking import (
         AskedEnclave,
         not_in_policy,

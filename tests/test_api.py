@@ -179,7 +179,7 @@ def test_an_action_is_found_out_as_on_the_command_line(tmp_path: Path) -> None:
     assert sros_tool.explain_access(made, "/arm", "serve", "/pick", policy=file)
     assert not sros_tool.explain_access(made, "/arm", "call", "/pick")
     assert not sros_tool.explain_access(made, "/planner", "call", "/pick", kind="service")
-    for policy in (file, sros_tool.read_policy(file)):  # as it would be signed
+    for policy in (file, sros_tool.read_policy(file)):  # as if it were signed
         answer = sros_tool.explain_access(policy, "/planner", "call", "/pick")
         assert answer and answer.policy_lines == (f"{file}:1",)
         assert not sros_tool.explain_access(policy, "/arm", "call", "/pick")

@@ -82,7 +82,7 @@ def distribute_key(
     Example:
       $ sros distribute_key keystore /talker talker.tar.gz
       exported enclave /talker to 'talker.tar.gz'
-      $ tar --no-overwrite-dir -xzf talker.tar.gz -C /etc/robot    # on it
+      $ tar --no-overwrite-dir -xzf talker.tar.gz -C /etc/robot    # on the robot
       $ sros distribute_key keystore --match '/arm/*' - | \
             ssh robot tar -xz -C robot
       exported enclave /arm/gripper to standard output

@@ -252,7 +252,7 @@ def explain(
     call and serve are about services, execute is about actions. If the rights name an action NAME
     but no service NAME, call and serve are about the action; use --type to choose. KEYSTORE is a
     keystore, here or on a robot; ENCLAVE can also be an enclave's folder. With a policy and no
-    keystore, sros decides by the policy alone, as it would be signed.
+    keystore, sros decides by the permissions that the policy would give.
 
     The exit status is 0 if the operation is allowed (with --who: to at least one enclave), and 1 if
     it is denied; with --log, 1 if the log reports a fault.

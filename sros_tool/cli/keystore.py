@@ -64,7 +64,8 @@ def create_enclave(words: tuple[str, ...], key: str, dry_run: bool, as_json: boo
     """Create ENCLAVE... in KEYSTORE.
 
     An existing enclave keeps its key and its permissions; missing files are added. With --key, the
-    key is on a PKCS#11 token and cannot be copied; without object= in URI, its label is ENCLAVE.
+    key is on a PKCS#11 token and cannot be copied; without object= in URI, the label of the key is
+    ENCLAVE.
 
     Example:
       $ sros create_enclave keystore /talker /listener

@@ -176,7 +176,8 @@ def _complete_reason(
     default="unspecified",
     shell_complete=_complete_reason,
     show_default=True,
-    help="Reason as in RFC 5280, such as key_compromise or cessation_of_operation; not superseded.",
+    help="Reason as in RFC 5280, such as key_compromise or cessation_of_operation; any but "
+    "superseded.",
 )
 @click.option(
     "--until-retired",
@@ -448,8 +449,8 @@ def rotate_ca(
 
     With Fast DDS (2.9.1), all processes can talk to each other at every moment of a rotation.
     Cyclone DDS (0.10.2) trusts one CA at a time: after stage 2, restart all its processes
-    together. To only extend the validity of the identity CA, use --same-key: it has no stages and
-    needs no common restart.
+    together. To only extend the validity of the identity CA, use --same-key: it has no stages, and
+    you need not restart all processes together.
 
     In a keystore with a fleet, a stage is refused until all robots have confirmed the stage before
     (`sros fleet confirm`).

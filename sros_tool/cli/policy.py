@@ -74,10 +74,10 @@ def merge_policy(
     """Print POLICY with the rights of every OTHER policy added.
 
     Comments, includes, metadata and layout of POLICY do not change. A right is added only if the
-    enclave does not have it yet; rights from includes and wildcards count. A new profile includes
-    the common parts in POLICY's folder where OTHER has includes. Publish and subscribe
-    are separate rights. A DENY always stays and always wins over an ALLOW; contradictions between
-    the policies are reported.
+    enclave does not have it yet; rights from includes and wildcards count. Where a profile of OTHER
+    includes common parts, a new profile of POLICY includes those in POLICY's folder. Publish and
+    subscribe are separate rights. A DENY always stays and always wins over an ALLOW; contradictions
+    between the policies are reported.
 
     Example:
       $ sros merge_policy robot.xml learned.xml --in-place
@@ -211,19 +211,19 @@ def diff_policy(
     A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, or
     Zenoh configurations such as router.json5. Permissions and Zenoh rules are shown in ROS
     terms; the signature of permissions is verified if the permissions CA is next to them. "!" is a
-    right of B whose counterpart only A has. If A or B covers only some enclaves, only these are
-    compared. Lines that differ only in the robot of a fleet are shown as one. For two policies, the
-    protection that they demand is compared, too.
+    right of B that needs a counterpart, such as a subscriber, which only A has. If A or B covers
+    only some enclaves, only these are compared. Lines that differ only in the robot of a fleet are
+    shown as one. For two policies, the protection that they demand is compared, too.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
 
     With --no-new-access, A and B can also be folders of policies, and policies at a git revision,
     as git:REVISION:PATH. The exit status is 0 only if B gives no enclave any access that A does
     not give, with no vendor, in no domain and for no name, and protects nothing less; it is 2 if
-    that cannot be decided. sros assumes that a policy is signed with access control of everything.
-    If A is a policy, a keystore B that protects less than the template production counts as giving
-    more access; a policy B never lowers the protection. The last line says what is assumed and
-    what is left out, such as dates.
+    that cannot be decided. sros assumes that a policy is signed with a governance that controls all
+    access. If A is a policy, a keystore B that protects less than the template production counts as
+    giving more access; a policy B never lowers the protection. The last line says what is assumed
+    and what is left out, such as dates.
 
     Example:
       $ sros diff_policy robot.xml keystore

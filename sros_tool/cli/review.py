@@ -181,9 +181,9 @@ def review(
 ) -> int:
     r"""Review a change of policies, requirements and keystores, as in a pull request.
 
-    Checks the policies and keystores of the commit HEAD, decides the requirements of HEAD and the
-    requirements that HEAD drops, and compares all access with the commit BASE. PATHs are relative
-    to the top of the repository.
+    Checks the policies and keystores of the commit HEAD, decides whether the requirements of HEAD
+    hold, and those that HEAD drops, and compares all access with the commit BASE. PATHs are
+    relative to the top of the repository.
 
     Both commits are read from git itself: nothing is checked out, files of the work tree are read
     only to report that they differ, no link in a commit is followed, and nothing that the

@@ -89,8 +89,8 @@ _FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer ne
 @click.option(
     "--off",
     is_flag=True,
-    help="Remove the Zenoh files, and the network from the keystore's settings, so that no verb "
-    "writes such files any more.",
+    help="Remove the Zenoh files, and the Zenoh network from the keystore's settings, so that no "
+    "verb writes such files any more.",
 )
 @click.option(
     "--check",

@@ -398,7 +398,7 @@ def _outcome(name: str, answer: Answer) -> VendorOutcome:
 
 
 class VendorOfPolicy(NamedTuple):
-    """The decisions of a vendor on the enclaves of a policy, as it would be signed.
+    """The decisions of a vendor on the enclaves of a policy, by the permissions that it would give.
 
     Only enclaves that match one of the ``patterns`` are asked about; without patterns, all are.
     """

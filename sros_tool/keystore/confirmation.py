@@ -150,7 +150,7 @@ class RobotClock(StrEnum):
     BEHIND = "behind"
     """The clock is earlier than documents that the robot has already verified."""
     UNKNOWN = "unknown"
-    """The kernel does not say it."""
+    """The kernel does not tell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,9 +159,9 @@ class Confirmation:
 
     ``files`` maps paths to the SHA-256 of the files.  ``certificates`` maps the paths of
     certificate and CA files to the SHA-256 of each certificate (DER) in the file, in order; without
-    an entry, an earlier certificate in that file cannot be recognised.  ``dds`` is None if the
-    confirmation does not say it, and so is ``restart``: the enclaves whose processes still have
-    earlier files.
+    an entry, an earlier certificate in that file cannot be recognised.  ``dds`` is the DDS of the
+    robot; ``restart`` are the enclaves whose processes still have earlier files. Both are None if
+    the confirmation does not tell.
 
     The other parts come from `sros agent`, and are None in a confirmation of another program.
     ``sequence`` is higher in each message of a robot.  ``release`` is the number of the release

@@ -231,10 +231,10 @@ class RobotStatus:
     """Files that differ from the keystore; empty if the robot sent no confirmation."""
     restart: tuple[str, ...] | None
     """The robot's enclaves whose processes may still run with earlier files, by its last
-    confirmation; null if it does not say it."""
+    confirmation; null if the confirmation does not tell."""
     running: Mapping[str, RunningFiles] | None
     """The files that the processes of each enclave of the robot have loaded, by its last
-    confirmation; null if it does not say it."""
+    confirmation; null if the confirmation does not tell."""
     crl_in_force: bool | None
     """Whether the robot has the present revocation list, says that no process may run with earlier
     files (``restart`` is empty), and is not ``offline``; false if this is not known, or the
@@ -244,13 +244,14 @@ class RobotStatus:
     expiry: Mapping[Annotated[str, Words(_EXPIRING)], datetime]
     """The first expiry of the files that the robot confirmed, by kind, in UTC, from the ledger."""
     dds: RobotDds | None
-    """The DDS of the robot by its last confirmation; null if it does not say it."""
+    """The DDS of the robot by its last confirmation; null if the confirmation does not tell."""
     problems: tuple[str, ...] | None
-    """What the robot's agent could not do, in its own words; null if it does not say it."""
+    """What the robot's agent could not do, in its own words; null if the confirmation does not
+    tell."""
     notes: tuple[str, ...]
     """Remarks, as clauses, such as on the robot's clock."""
     to_do: str = ""
-    """What is to be done with the robot, in few words; empty if nothing is."""
+    """What you have to do for the robot, in a few words; empty if nothing."""
     is_published: bool = False
     has_list: bool = False
     renew_from: datetime | None = None
@@ -366,7 +367,7 @@ class FleetStatus:
     --robot."""
     overdue: frozenset[str] = frozenset()
     """The robots whose last confirmation is older than --max-age, sorted by name; without that
-    option, the robots that fetch and were not heard of for more than a day."""
+    option, the robots that fetch and have sent nothing for more than a day."""
     older: str = ""
     """Why the keystore is older than its robots, as a clause: it was restored from a backup, or is
     a copy, and has not published with ``--restored`` since. Null if nothing shows that it is older.
@@ -994,7 +995,7 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_agent_problems",
-            "Number of things that the agent of a robot could not do, for robots that say it.",
+            "Number of things that the agent of a robot could not do, for robots that report it.",
             per_robot(lambda robot: None if robot.problems is None else len(robot.problems)),
         ),
         Metric(

@@ -60,8 +60,8 @@ class Group:
 
     ``rights`` are pairs of a right and its qualifier, in the order of `RIGHTS`; ``names`` are as
     written: relative, private or absolute, perhaps with wildcards.  ``protect`` is how messages of
-    these names have to be protected at least, or None if the policy does not say it.  ``lines`` are
-    the lines of the names in the file of ``source``, if read from one.
+    these names have to be protected at least, or None if the policy does not say how.  ``lines``
+    are the lines of the names in the file of ``source``, if read from one.
     """
 
     kind: str

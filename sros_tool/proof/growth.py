@@ -239,10 +239,10 @@ class NewAccess(NamedTuple):
 def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     """Return the access that ``head`` adds to ``base`` and removes from it.
 
-    A policy counts as signed, with access control of everything.  As BASE it stands for encryption
-    wherever it demands no other protection, so a keystore that protects less has lost protection.
-    As HEAD it lowers no protection of a keystore.  A policy is for the domains of the other side;
-    enclaves of a fleet's robots are for the domain of their robot.
+    A policy counts as signed, with a governance that controls all access.  As BASE it stands for
+    encryption wherever it demands no other protection, so a keystore that protects less has lost
+    protection. As HEAD it lowers no protection of a keystore.  A policy is for the domains of the
+    other side; enclaves of a fleet's robots are for the domain of their robot.
 
     Raises:
         DocumentError: the comparison cannot be decided: there are too many wildcards, or
@@ -1103,7 +1103,7 @@ def _certified_domains(side: AccessSource) -> DomainSet:
 
 
 def _controlling(governance: Governance | None, more: DomainSet) -> Governance | None:
-    """Return a governance with access control of everything, also for the domains ``more``."""
+    """Return a governance that controls all access, also in the domains ``more``."""
     if governance is None:
         return None
     strict = governance_for(strict_protection(), more).domain_access_rules[0]
@@ -1136,12 +1136,13 @@ def _assumptions(base: AccessSource, head: AccessSource) -> Iterator[str]:
             yield "both are signed with the same governance, which controls all access"
         elif base.governance is None:
             yield (
-                "BASE is signed with access control of everything, and with encryption unless it "
-                "demands another protection"
+                "BASE is signed with a governance that controls all access, and with encryption "
+                "unless it demands another protection"
             )
         elif head.governance is None:
             yield (
-                "HEAD is signed with access control of everything, and protects no less than BASE"
+                "HEAD is signed with a governance that controls all access, and protects no less "
+                "than BASE"
             )
     for name, side, other in (("BASE", base, "HEAD"), ("HEAD", head, "BASE")):
         against = head if side is base else base

@@ -164,7 +164,7 @@ def policy_system(
     only: Collection[str] = (),
     template: Template | None = None,
 ) -> System:
-    """Return the worlds of a policy as it would be signed at ``at``.
+    """Return the worlds of a policy as if it were signed at ``at``.
 
     The governance is the template's, with the protection that the policy states added.  Without a
     template, a name has exactly the protection that the policy states for it, and all other names

@@ -347,11 +347,11 @@ def test_a_policy_alone_means_a_strict_governance(made: Path, kind: str) -> None
     back = sros(*words, keystore.name, "robot.xml", cwd=made)
     assert back.status == 0, back
     assert "- more protection: protection." in back.out
-    assert "; assumed: HEAD is signed with access control of everything" in back.err
+    assert "; assumed: HEAD is signed with a governance that controls all access" in back.err
     strict = sros(*words, "robot.xml", "ks", cwd=made)
     assert strict.status == 0
     assert "nothing is protected less" in strict.err
-    assert "; assumed: BASE is signed with access control of everything" in strict.err
+    assert "; assumed: BASE is signed with a governance that controls all access" in strict.err
 
 
 def test_what_a_policy_demands_of_a_name_is_asked_of_a_keystore(made: Path) -> None:
