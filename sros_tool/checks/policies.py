@@ -6,6 +6,7 @@ import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property
@@ -562,13 +563,19 @@ def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
         if profile.node and profile.ns.startswith("/") and not profile.node.startswith("_")
         for gap in _basics(checked, enclave, profile)
     ]
-    by_file: dict[str, list[_Lacking]] = defaultdict(list)
+    groups: dict[tuple[str, str], list[_Lacking]] = defaultdict(list)
+    differs = cache(_is_not_shipped)
     for gap in lacking:
         if gap.has_include:
-            by_file[gap.finding.file].append(gap)
-    causes = {file: _no_common_part(gaps) for file, gaps in by_file.items() if len(gaps) > 1}
-    for gap in lacking:
-        yield gap.finding._replace(cause=causes.get(gap.finding.file) if gap.has_include else None)
+            included = gap.included if gap.included and differs(gap.included) else ""
+            groups[gap.finding.file, included].append(gap)
+    for (_, included), gaps in groups.items():
+        cause = _other_common_part(included, gaps) if included else _no_common_part(gaps)
+        for gap in gaps:
+            remedy = cause.remedy if included else ""
+            shared = cause if len(gaps) > 1 else None
+            gap.finding = gap.finding._replace(cause=shared, own_remedy=remedy)
+    yield from (gap.finding for gap in lacking)
     for statement in checked.statements:
         if (
             statement.written in _GLOBAL
@@ -581,13 +588,17 @@ def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
             yield statement.found(RELATIVE_GLOBAL, text, f"Write /{statement.written}.")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Lacking:
-    """A finding about a node without a right that every node needs."""
+    """A finding about a node without a right that every node needs.
+
+    ``included`` is the folder of the common parts that its profile includes, or "".
+    """
 
     finding: Finding
     node: str
     listener: bool
+    included: str
 
     @property
     def has_include(self) -> bool:
@@ -595,18 +606,63 @@ class _Lacking:
         return not self.listener and self.finding.severity is ERROR
 
 
-def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
-    """Return the common cause of findings in one file: ``common/node.xml`` is not included."""
-    file = Path(lacking[0].finding.file)
+def _common_folder(profile: Profile) -> str:
+    """Return the folder of the ``common/node.xml`` that a profile includes, or ""."""
+    next_to_it = Path(profile.source.file).parent / COMMON
+    for group in profile.groups:
+        for folder in Path(group.source.file).parents:
+            if folder.name == COMMON and group.source.file.startswith(f"{folder}/node"):
+                return str(next_to_it if next_to_it.absolute() == folder else folder)
+    return ""
+
+
+def _is_not_shipped(folder: str) -> bool:
+    """Return whether the ``node.xml`` in a folder, or its parts, differ from those of sros."""
+    shipped = policies_dir() / COMMON
+    parts = (shipped / "node.xml", *(shipped / "node").iterdir())
+    with suppress(OSError):
+        own = [Path(folder, part.relative_to(shipped)) for part in parts]
+        return own[0].is_file() and any(
+            not copy.is_file() or copy.read_bytes() != part.read_bytes()
+            for copy, part in zip(own, parts, strict=True)
+        )
+    return False
+
+
+def _denied_at_start(lacking: Sequence[_Lacking]) -> str:
+    """Return a sentence that says what nodes do at their start and may not."""
     nodes = list(dict.fromkeys(gap.node for gap in lacking))
-    lines = list(dict.fromkeys(gap.finding.line or 0 for gap in lacking))
     kinds = Counter(gap.finding.kind for gap in lacking)
-    plural = len(nodes) > 1
     what = [
         verb if kinds[kind] == len(nodes) else f"{verb} ({counted(kinds[kind], 'node')})"
         for kind, verb in _STARTING.items()
         if kinds[kind]
     ]
+    return (
+        f"{some_names(nodes)} may not {'; '.join(what)}. A node exits at its start if this is "
+        "denied."
+    )
+
+
+def _other_common_part(folder: str, lacking: Sequence[_Lacking]) -> Cause:
+    """Return the common cause of findings: the included common part is not the one of sros."""
+    here, old = quote(folder), quote(f"{folder}.old")
+    return Cause(
+        f"the included '{folder}/node.xml' lacks rights that the one of this sros has",
+        _denied_at_start(lacking),
+        f"'{folder}/node.xml' is included and differs from the one of this sros. Replace it: "
+        f"`mv {here} {old} && sros policies --copy {here}`. Files and changes of your own are then "
+        f"in {old} only: copy them back.",
+        len(lacking),
+    )
+
+
+def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
+    """Return the common cause of findings in one file: ``common/node.xml`` is not included."""
+    file = Path(lacking[0].finding.file)
+    nodes = list(dict.fromkeys(gap.node for gap in lacking))
+    lines = list(dict.fromkeys(gap.finding.line or 0 for gap in lacking))
+    plural = len(nodes) > 1
     copied = (file.parent / COMMON / "node.xml").exists()
     target = quote(str(file.parent / COMMON))
     first = "Put" if copied else f"Run `sros policies --copy {target}`, and put"
@@ -616,8 +672,7 @@ def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
         f"{counted(len(nodes), 'node')} lack the common part"
         if plural
         else "a node lacks the common part",
-        f"{some_names(nodes)} may not {'; '.join(what)}. A node exits at its start if this is "
-        "denied.",
+        _denied_at_start(lacking),
         f"{first} this line into {place} ({at}): {_INCLUDE}",
         len(lacking),
     )
@@ -640,8 +695,8 @@ def _basics(checked: _CheckedPolicy, enclave: Enclave, profile: Profile) -> Iter
             kind = NO_PARAMETERS
         lacks_others = True
         text = f"node {node} may not {right} {', '.join(missing)}"
-        source = profile.source
-        yield _Lacking(kind.found(enclave.path, text, source.file, source.line), node, listener)
+        found = kind.found(enclave.path, text, profile.source.file, profile.source.line)
+        yield _Lacking(found, node, listener, _common_folder(profile))
 
 
 DOCUMENT_SIZE = FindingKind(

@@ -99,6 +99,21 @@ def test_nodes_without_the_common_part_are_one_paragraph_with_one_mend(tmp_path:
     assert sros("check", "--strict", "robot.xml", cwd=tmp_path).ok().out == ""
 
 
+def test_an_older_common_part_that_is_included_is_replaced(tmp_path: Path) -> None:
+    policy = write_policy(tmp_path / "robot.xml", ("arm", "base"))
+    fixed(policy, sros("check", "robot.xml", cwd=tmp_path).out)
+    whole = (tmp_path / "common/node.xml").read_text()
+    for gone, title in ((("types",), "may not offer ~"), (("types", "logging"), "lacks rights")):
+        lines = [each for each in whole.splitlines() if not any(f"/{x}.xml" in each for x in gone)]
+        (tmp_path / "common/node.xml").write_text("\n".join(lines))
+        said = " ".join(sros("check", "robot.xml", cwd=tmp_path).out.split())
+        assert title in said and "Put this line" not in said and "put this line" not in said
+    (command,) = set(re.findall("`mv common (.+?) && (sros .+?)`", said))
+    (tmp_path / "common").rename(tmp_path / command[0])
+    sros(*shlex.split(command[1])[1:], cwd=tmp_path).ok()
+    sros("check", "robot.xml", cwd=tmp_path).ok()
+
+
 def test_a_cause_of_which_a_finding_is_left_out_is_not_one_paragraph(tmp_path: Path) -> None:
     write_policy(tmp_path / "robot.xml", ("arm",))
     whole = sros("check", "robot.xml", cwd=tmp_path)
