@@ -656,22 +656,24 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
 
     threshold = parse_threshold(text)
     keystore = Keystore(root)
-    due, unreadable, count = due_enclaves(keystore, threshold, moment, keystore.template)
+    found = due_enclaves(keystore, threshold, moment, keystore.template)
     if form == "json":
-        print_json(expiring_enclaves(due, unreadable))
+        print_json(expiring_enclaves(found))
     else:
-        lines = [describe_lifetime(enclave, moment) for enclave in due]
-        lines += [f"{other.name}  unknown: {other.error}" for other in unreadable]
-        none = "the 1 enclave does not need" if count == 1 else ""
-        none = f"{none or f'none of {count} enclaves needs'} to be renewed ({text})"
+        lines = [describe_lifetime(enclave, moment) for enclave in found.due]
+        lines += [f"{other.name}  unknown: {other.error}" for other in found.unreadable]
+        none = "the 1 enclave does not need" if found.lasting == 1 else ""
+        none = f"{none or f'none of {found.lasting} enclaves needs'} to be renewed ({text})"
+        left_out = found.short_lived_text()
+        left_out = f"not counted: {left_out}" if left_out else ""
         if form == "markdown":
-            echo_lines(renewal_markdown(lines, none, text))
-            return NOT_DONE if unreadable else 1 if due else 0
-        for line in lines:
-            echo(line)
-        if not lines:
-            echo(none, err=True)
-    return NOT_DONE if unreadable else 1 if due else 0
+            echo_lines(renewal_markdown(lines, "; ".join(filter(None, (none, left_out))), text))
+        else:
+            for line in lines:
+                echo(line)
+            for said in filter(None, ("" if lines else none, left_out)):
+                echo(said, err=True)
+    return NOT_DONE if found.unreadable else 1 if found.due else 0
 
 
 def renewal_markdown(lines: Sequence[str], none: str, text: str) -> str:

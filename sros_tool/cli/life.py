@@ -59,8 +59,9 @@ _crl_option = click.option(
 @click.option(
     "--all-expiring",
     metavar="DURATION|PERCENT",
-    help="Also renew the enclaves that expire within DURATION (30d), or have used PERCENT "
-    "of their validity (66%). Short-lived enclaves are renewed only if named.",
+    help="Renew the enclaves that expire within DURATION (30d), or have used PERCENT of their "
+    "validity (66%), in addition to those that are named. Short-lived enclaves are renewed only if "
+    "named.",
 )
 @click.option("--new-key", is_flag=True, help="Also create new private keys.")
 @key_option

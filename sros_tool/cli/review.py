@@ -350,10 +350,10 @@ def _sentence(result: Review, step: ReviewStep) -> str:
     """Return the result of a step as a clause."""
     from sros_tool.checks.registry import ChosenFindings
     from sros_tool.cli.policy import access_summary
+    from sros_tool.keystore.expiry import ExpiryCheck
     from sros_tool.proof.review import (
         AccessChange,
         DroppedRequirements,
-        ExpiryCheck,
         Facts,
         RightsChange,
     )
@@ -379,9 +379,11 @@ def _sentence(result: Review, step: ReviewStep) -> str:
         case DroppedRequirements(count=count, chosen=chosen):
             dropped = counted(count, "requirement")
             return f"{dropped} dropped or changed, decided as they were before: {chosen.summary()}"
-        case ExpiryCheck(due=due, unreadable=unreadable, count=count):
+        case ExpiryCheck(due=due, unreadable=unreadable, lasting=count) as expiry:
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""
-            return f"{len(due)} of {count} enclaves need to be renewed{unread}"
+            left_out = expiry.short_lived_text()
+            left_out = f"; not counted: {left_out}" if left_out else ""
+            return f"{len(due)} of {count} enclaves need to be renewed{unread}{left_out}"
         case Facts(lines=lines):
             more = f", and {len(lines) - 1} more" if len(lines) > 1 else ""
             return f"'{lines[0][1]}' {lines[0][0]}{more}"
@@ -518,12 +520,11 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     from sros_tool.checks.registry import ChosenFindings
     from sros_tool.cli.check import renewal_markdown
     from sros_tool.cli.policy import access_markdown, rights_markdown
-    from sros_tool.keystore.expiry import describe_lifetime
+    from sros_tool.keystore.expiry import ExpiryCheck, describe_lifetime
     from sros_tool.markdown import bounded, code
     from sros_tool.proof.review import (
         AccessChange,
         DroppedRequirements,
-        ExpiryCheck,
         Facts,
         RightsChange,
     )

@@ -21,6 +21,7 @@ from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.validity import Window, iso, parse_duration, time_of_file
+from sros_tool.wording import counted, first_few
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,20 +116,23 @@ class ExpiringEnclaves(NamedTuple):
     """Enclaves that are due, with their expiry."""
     unreadable: Sequence[EnclaveProblem]
     """Enclaves whose expiry cannot be read."""
+    short_lived: Sequence[DueEnclave]
+    """Short-lived enclaves, which are renewed only if named, with their expiry."""
 
 
-def expiring_enclaves(
-    due: Sequence[Lifetime], unreadable: Sequence[UnreadableEnclave]
-) -> ExpiringEnclaves:
+def expiring_enclaves(renewals: ExpiryCheck) -> ExpiringEnclaves:
     """Return the value that ``--json`` prints for enclaves that are due for renewal."""
+
+    def shown(lifetimes: Sequence[Lifetime]) -> list[DueEnclave]:
+        return [
+            DueEnclave(each.name, each.certificate.not_after, each.permissions.not_after)
+            for each in lifetimes
+        ]
+
     return ExpiringEnclaves(
-        [
-            DueEnclave(
-                lifetime.name, lifetime.certificate.not_after, lifetime.permissions.not_after
-            )
-            for lifetime in due
-        ],
-        [EnclaveProblem(enclave.name, str(enclave.error)) for enclave in unreadable],
+        shown(renewals.due),
+        [EnclaveProblem(enclave.name, str(enclave.error)) for enclave in renewals.unreadable],
+        shown(renewals.short_lived),
     )
 
 
@@ -175,20 +179,37 @@ def survey(keystore: Keystore) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEn
     )
 
 
+class ExpiryCheck(NamedTuple):
+    """The enclaves of a keystore, by whether they are due for renewal."""
+
+    due: tuple[Lifetime, ...]
+    unreadable: tuple[UnreadableEnclave, ...]
+    lasting: int
+    """Number of the readable enclaves that are not short-lived."""
+    short_lived: tuple[Lifetime, ...]
+    """Enclaves that the settings let expire earlier than others, and that are renewed by name."""
+    moment: datetime
+
+    def short_lived_text(self) -> str:
+        """Return a clause that names the short-lived enclaves and their expiry; "" without any."""
+        shown = [describe_lifetime(lifetime, self.moment) for lifetime in self.short_lived]
+        enclaves = counted(len(shown), "short-lived enclave")
+        return f"{enclaves}, renewed only if named: {first_few(shown, 3)}" if shown else ""
+
+
 def due_enclaves(
     keystore: Keystore, threshold: Threshold, moment: datetime, settings: Template
-) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...], int]:
-    """Return the enclaves that are due for renewal, the unreadable enclaves, and a count.
-
-    The count is the number of readable enclaves.  Short-lived enclaves, which the settings let
-    expire earlier than others, are never due: they are renewed in another way.
-    """
+) -> ExpiryCheck:
+    """Return the enclaves of a keystore, by whether they are due for renewal."""
     lifetimes, unreadable = survey(keystore)
-    lasting = (
-        lifetime for lifetime in lifetimes if settings.longest_validity(lifetime.name) is None
-    )
+    is_short = {
+        lifetime.name: settings.longest_validity(lifetime.name) is not None
+        for lifetime in lifetimes
+    }
+    short_lived = tuple(lifetime for lifetime in lifetimes if is_short[lifetime.name])
+    lasting = [lifetime for lifetime in lifetimes if not is_short[lifetime.name]]
     due = tuple(lifetime for lifetime in lasting if lifetime.due(threshold, moment))
-    return due, unreadable, len(lifetimes)
+    return ExpiryCheck(due, unreadable, len(lasting), short_lived, moment)
 
 
 def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> None:

@@ -28,7 +28,7 @@ from sros_tool.fleet.expansion import FleetPolicy, fleet_with_enclaves, read_pol
 from sros_tool.fleet.fleet_file import read_connections, read_fleet
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.folders import Folder
-from sros_tool.keystore.expiry import Lifetime, Threshold, UnreadableEnclave, due_enclaves
+from sros_tool.keystore.expiry import ExpiryCheck, Threshold, due_enclaves
 from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import FLEET, KEY_FILE, SETTINGS, is_keystore
 from sros_tool.keystore.reader import Keystore
@@ -136,15 +136,6 @@ class DroppedRequirements:
 
     count: int
     chosen: ChosenFindings
-
-
-@dataclass(frozen=True, slots=True)
-class ExpiryCheck:
-    """Enclaves of a keystore that must be renewed, and enclaves that could not be read."""
-
-    due: tuple[Lifetime, ...]
-    unreadable: tuple[UnreadableEnclave, ...]
-    count: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -838,11 +829,8 @@ class _Review:
 
     def _expiry(self, settings_of: Path, folder: Path) -> tuple[int, Content]:
         settings = Keystore(settings_of).template
-        due, unreadable, count = due_enclaves(
-            Keystore(folder), self.request.renew_within, self.request.at, settings
-        )
-        status = _UNDECIDED if unreadable else _FOUND if due else _OK
-        return status, ExpiryCheck(due, unreadable, count)
+        found = due_enclaves(Keystore(folder), self.request.renew_within, self.request.at, settings)
+        return _UNDECIDED if found.unreadable else _FOUND if found.due else _OK, found
 
 
 def _decisive_first(where: str) -> tuple[bool, str]:

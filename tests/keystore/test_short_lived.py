@@ -114,9 +114,16 @@ def test_a_short_lived_enclave_is_renewed_by_its_name_alone(tmp_path: Path) -> N
     root = tmp_path / "ks"
     sros("create_keystore", root).ok()
     create(root)
-    assert sros("check", "keystore", root, "--needs-renewal", "30d").ok()
+    said = sros("check", "keystore", root, "--needs-renewal", "30d").ok().err
+    none, left_out = said.splitlines()
+    assert none == "the 1 enclave does not need to be renewed (30d)"
+    assert left_out.startswith(
+        f"not counted: 1 short-lived enclave, renewed only if named: {SHORT}"
+    )
     due = sros("check", "keystore", root, "--needs-renewal", "99y")
     assert (due.status, SHORT in due.out, LONG in due.out) == (1, False, True)
-    assert sros("renew", root, "--all-expiring", "99y").ok().out == f"renewed enclave {LONG}\n"
+    renewed = sros("renew", root, "--all-expiring", "99y").ok()
+    assert renewed.out == f"renewed enclave {LONG}\n"
+    assert f"[renew.short-lived]: short-lived, and renewed only if named: {SHORT}" in renewed.err
     renewed = sros("renew", root, SHORT, "--all-expiring", "30d").ok()
     assert renewed.out == f"renewed enclave {SHORT}\n"

@@ -41,6 +41,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.keys import PrivateKey, generate_key
 from sros_tool.validity import duration_text, iso
+from sros_tool.wording import first_few
 
 
 def renew(
@@ -88,8 +89,14 @@ def renew(
         thresholds: dict[str, Threshold | None] = dict.fromkeys(names)
         if expiring is not None:
             # A short-lived enclave, such as a person's, ends unless somebody renews it by its name.
-            lasting = (e for e in change.names if change.template.longest_validity(e) is None)
-            thresholds |= {name: expiring for name in lasting if name not in thresholds}
+            others = [name for name in change.names if name not in thresholds]
+            short_lived = [
+                name for name in others if change.template.longest_validity(name) is not None
+            ]
+            thresholds |= {name: expiring for name in others if name not in short_lived}
+            if short_lived:
+                text = f"short-lived, and renewed only if named: {first_few(short_lived, 3)}"
+                change.notes.append(Note("renew.short-lived", text))
         renewer = _Renewer(
             change,
             writer,
