@@ -26,8 +26,8 @@ from sros_tool.wording import counted
 _MODULES = (
     *("policies", "requirements", "keystores.files", "keystores.authorities"),
     *("keystores.enclaves", "keystores.vendors", "keystores.documents", "keystores.topic_names"),
-    *("keystores.issued", "keystores.zenoh_files", "zenoh", "upgrade", "environment", "runtime"),
-    *("processes", "vulnerabilities"),
+    *("keystores.issued", "keystores.trust", "keystores.zenoh_files", "zenoh", "upgrade"),
+    *("environment", "runtime", "processes", "vulnerabilities"),
 )
 """The modules of checks, in the order in which their kinds are listed."""
 

@@ -61,10 +61,12 @@ def path_findings(paths: Iterable[Path], at: Circumstances) -> list[Finding]:
     """Return the findings at paths: policies, folders of policies, keystores, or enclaves.
 
     All policies count as the policies of one robot or fleet: a name may have its counterpart in
-    another policy.  A file ``*.json5``, ``*.json`` or ``*.yaml`` is a Zenoh configuration.  Raises
+    another policy.  Keystores and enclaves in several folders have to trust each other.  A file
+    ``*.json5``, ``*.json`` or ``*.yaml`` is a Zenoh configuration.  Raises
     `DocumentError` for any other path.
     """
-    findings, policies = [], []
+    findings: list[Finding] = []
+    policies, paths = [], tuple(paths)
     for path in paths:
         found = _no_policy_findings(path, at)
         if found is None:
@@ -73,7 +75,25 @@ def path_findings(paths: Iterable[Path], at: Circumstances) -> list[Finding]:
             findings += found
     if policies:
         findings += policy_findings(policies, at)
+    findings += stranger_findings(paths, at)
     return list(dict.fromkeys(findings))
+
+
+def stranger_findings(paths: Iterable[Path], at: Circumstances) -> list[Finding]:
+    """Return findings about folders among the paths whose enclaves do not trust each other."""
+    targets: dict[str, tuple[Keystore, Sequence[str]]] = {}
+    for path in filter(Path.is_dir, paths):
+        if is_keystore(path):
+            keystore = at.keystore(path)
+            targets[str(path)] = keystore, keystore.names
+        elif is_enclave(path):
+            root, name = locate_enclave(path)
+            targets[str(path)] = at.keystore(root), (name,)
+    if len(targets) < 2:
+        return []
+    from sros_tool.checks.keystores.trust import strangers
+
+    return list(strangers(targets, on_zenoh=at.vendors == (ZENOH,)))
 
 
 def _no_policy_findings(path: Path, at: Circumstances) -> list[Finding] | None:

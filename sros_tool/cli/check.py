@@ -461,14 +461,19 @@ def _suggested(system: System) -> str:
 def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:
     """Return the family of checks that the first word names, or "", and the paths.
 
-    A single word is a path if that path exists: many keystores are named `keystore`.
+    A single word is a path if that path exists: many keystores are named `keystore`.  Next to other
+    paths, too, a keystore of this name is checked unless it is named again.
     """
+    from sros_tool.keystore.layout import is_keystore
+
     word = str(targets[0]) if targets else ""
     if word in _FAMILIES and not (len(targets) == 1 and targets[0].exists()):
         if word == "runtime" and len(targets) > 1:
             raise UsageError(
                 "`check runtime` takes no path", "It checks this machine.", "Leave the path out."
             )
+        if word == "keystore" and is_keystore(targets[0]) and targets[0] not in targets[1:]:
+            return "", targets
         return word, targets[1:]
     return "", targets
 
@@ -554,7 +559,7 @@ def _refuse_besides_upgrade() -> None:
 
 def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[Finding]:
     from sros_tool.checks.keystores.keystore import keystore_findings
-    from sros_tool.checks.targets import path_findings, policy_findings
+    from sros_tool.checks.targets import path_findings, policy_findings, stranger_findings
     from sros_tool.keystore.layout import is_keystore
 
     if family == "runtime":
@@ -571,7 +576,7 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
                 "Go to the folder of the keystore, or name its path.",
             )
         roots = paths or (keystore_from_environment(),)
-        return [
+        findings = [
             finding
             for root in roots
             for finding in keystore_findings(
@@ -585,6 +590,7 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
                 vendors=at.vendors,
             )
         ]
+        return [*findings, *stranger_findings(roots, at)]
     if paths:
         return path_findings(paths, at)
     findings = _runtime(at)

@@ -20,6 +20,7 @@ from tests.checks import (
     policy_cases,
     runtime_cases,
     test_policy_findings,
+    test_trust,
     zenoh_cases,
 )
 from tests.checks.bench import Bench
@@ -37,6 +38,7 @@ def test_every_finding_has_a_test_that_brings_it_about() -> None:
     tested = {
         *(case.id for case in policy_cases.CASES),
         *test_policy_findings.FOUND_OTHERWISE,
+        *test_trust.FOUND,
         *keystore_cases.CASES,
         *runtime_cases.CASES,
         *zenoh_cases.CASES,

@@ -1,0 +1,126 @@
+"""Whether the enclaves of several keystores and exports trust each other."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import lru_cache
+from itertools import combinations, product
+
+from cryptography import x509
+
+from sros_tool.checks.kind import WARNING, Finding, FindingKind, some_names
+from sros_tool.errors import SrosError
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    IDENTITY_CA_FILE,
+    PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
+    ROLES,
+)
+from sros_tool.keystore.reader import Keystore
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import issued_by, load_certificate, load_certificates
+
+STRANGERS = FindingKind(
+    "keystore.strangers",
+    WARNING,
+    "keystores or exports whose nodes do not trust each other",
+    "A node accepts only a peer whose certificate and permissions come from CAs that it trusts, "
+    "and neither Fast DDS nor Cyclone DDS reports why a peer is refused.",
+    "DDS-Security 1.1, 9.3 and 9.4; Fast DDS 2.9.1, Cyclone DDS 0.10.2; tested.",
+    "If their nodes have to communicate, export all of their enclaves again from one keystore; if "
+    "not, check each of them alone.",
+)
+
+_Certificates = tuple[x509.Certificate, ...]
+
+
+class _Party:
+    """What an enclave trusts, and what it presents, of the identity and the permissions CA."""
+
+    def __init__(self, certificate: x509.Certificate, trusted: tuple[bytes, bytes]) -> None:
+        self.certificate = certificate
+        self.trusted = tuple(map(_certificates, trusted))
+        self.signer: x509.Certificate | None = None
+
+    def accepts(self, other: _Party, role: int) -> bool:
+        """Return whether a node of this enclave accepts the CA of the other one in this role."""
+        shown = (other.certificate, other.signer)[role]
+        return shown is not None and any(
+            shown == authority or issued_by(shown, authority) for authority in self.trusted[role]
+        )
+
+
+@lru_cache(maxsize=64)
+def _certificates(data: bytes) -> _Certificates:
+    return load_certificates(data, "the certificate of a CA")
+
+
+def strangers(
+    targets: Mapping[str, tuple[Keystore, Sequence[str]]], *, on_zenoh: bool = False
+) -> Iterator[Finding]:
+    """Yield findings about keystores and exports of which no two enclaves accept each other.
+
+    In a rotation of CAs, enclaves trust the old and the new one.  What cannot be read is a finding
+    of another check.
+
+    Args:
+        targets: maps what the user named to a keystore or export, and the enclaves in it.
+        on_zenoh: whether all nodes use Zenoh, which reads no permissions.
+    """
+    parties = {shown: list(_parties(*target)) for shown, target in targets.items()}
+    roles = range(1 if on_zenoh else len(ROLES))
+    # What each target is apart from, and in which roles; targets with the same are one group.
+    apart: dict[str, dict[str, tuple[int, ...]]] = {shown: {} for shown in targets}
+    for one, other in combinations(targets, 2):
+        if refused := _refused(parties[one], parties[other], roles):
+            apart[one][other] = apart[other][one] = refused
+    groups: dict[tuple[tuple[str, tuple[int, ...]], ...], list[str]] = defaultdict(list)
+    for shown, strange in apart.items():
+        groups[tuple(strange.items())].append(shown)
+    for some, others in combinations(groups.values(), 2):
+        if refused := apart[some[0]].get(others[0], ()):
+            authorities = " and ".join(f"{ROLES[role]} CA" for role in refused)
+            text = (
+                f"nodes of {some_names(some)} do not communicate with nodes of "
+                f"{some_names(others)}: they do not trust each other's {authorities}"
+            )
+            yield STRANGERS.found(others[0], text, others[0])
+
+
+def _refused(some: Sequence[_Party], others: Sequence[_Party], roles: range) -> tuple[int, ...]:
+    """Return the roles in which all pairs of enclaves refuse each other; () if one pair does not.
+
+    It is () without a readable enclave, too.
+    """
+    pairs = (
+        tuple(role for role in roles if not (one.accepts(other, role) and other.accepts(one, role)))
+        for one, other in product(some, others)
+    )
+    return min(pairs, key=len, default=())
+
+
+def _parties(keystore: Keystore, enclaves: Sequence[str]) -> Iterator[_Party]:
+    """Yield one of all enclaves that trust and present the same CAs."""
+    seen = set()
+    for name in enclaves:
+        folder = keystore.folder(name)
+        with suppress(SrosError, ValueError):
+            certificate = load_certificate(
+                keystore.read(folder / CERTIFICATE_FILE, "certificate"), name
+            )
+            trusted = (
+                keystore.read(folder / IDENTITY_CA_FILE, "CA certificate"),
+                keystore.read(folder / PERMISSIONS_CA_FILE, "CA certificate"),
+            )
+            party = _Party(certificate, trusted)
+            issuers = tuple(issued_by(certificate, each) for each in party.trusted[0])
+            message = keystore.read(folder / PERMISSIONS_FILE, "permissions document")
+            # Which of several CAs signed them differs only in a rotation.
+            if (kind := (trusted, issuers)) in seen and len(party.trusted[1]) == 1:
+                continue
+            seen.add(kind)
+            party.signer = smime.parse(message).signer()
+            yield party
