@@ -138,7 +138,7 @@ def loadable_environment(
     if problems:
         raise KeystoreError(
             f"a process cannot run in enclave {name}",
-            "; ".join(map(str, problems)) + ".",
+            "; ".join(str(problem).rstrip(".") for problem in problems) + ".",
             f"See `sros inspect {folder}`.",
         )
     if state.token:

@@ -568,7 +568,9 @@ def process_findings(
             yield from _unsecured(process)
         elif security[process.pid] is Security.OPEN:
             if _network_and_domain(process) in closed:
-                text = f"{_domain_text(process)}, with {ENABLE} not 'true'"
+                value = process.environment.get(ENABLE)
+                stated = f"{ENABLE} '{plain(value)}', not 'true'" if value else f"no {ENABLE}"
+                text = f"{_domain_text(process)}, with {stated}"
                 yield PROCESS_UNSECURED.found(process.label, text)
             else:
                 open_nodes.append(process)

@@ -20,7 +20,8 @@ VACUOUS = FindingKind(
     "Such a requirement protects nothing: perhaps a name is misspelled or was changed, or the "
     "exceptions cover every enclave.",
     "The requirements file.",
-    "Correct the name, here or in the policy (was a topic renamed?), or remove the requirement.",
+    "Correct the name or its kind (service or action), here or in the policy (was a topic "
+    "renamed?), or remove the requirement.",
 )
 DROPPED = FindingKind(
     "requirement.dropped",

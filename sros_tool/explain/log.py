@@ -192,6 +192,10 @@ def explain_log_of(
     named: LoadedEnclave | None = None
     if name:
         named = signed_enclave(keystore, name, asking.at)
+        if named is None and not name.startswith("/"):
+            raise UsageError(
+                f"'{name}' does not exist", "", "Name a keystore, or an enclave's folder."
+            )
         if named is None:
             raise UsageError(
                 f"the keystore of enclave {name} is missing in the command",
@@ -779,8 +783,9 @@ def _renamed(right: str, wrong: str) -> str:
     ns, _, name = right.rpartition("/")
     return (
         f"Start it under that name (`--ros-args -r __node:={quote(name)} "
-        f"-r __ns:={quote(ns or '/')}`); or, "
-        f"if {wrong} is right, give it a profile in the policy of ENCLAVE, with common/node.xml."
+        f"-r __ns:={quote(ns or '/')}`); or, if {wrong} is right, give it a profile with "
+        "common/node.xml: in the policy of ENCLAVE, or in an enclave of its own if it is another "
+        "program."
     )
 
 

@@ -575,6 +575,10 @@ def _uses(hop: TopicHop) -> Iterator[Use]:
 # ── requirements that cannot fail ──────────────────────────────────────────────────────────
 
 
+_OF_OTHER_KIND = {"call": "request", "request": "call", "execute": "reply", "reply": "execute"}
+"""For a right to an action, the same right to a service, and the other way round."""
+
+
 def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterator[str]:
     """Yield clauses on enclaves in a requirement that do not exist, and on names without users."""
     patterns: tuple[str, ...] = ()
@@ -598,7 +602,11 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
             for right, names in sides:
                 for name in names:
                     if not _anybody(world, _sufficient_parts(right), name, limit):
-                        yield f"no enclave may {right} {_named_right(right, name)}"
+                        text = f"no enclave may {right} {_named_right(right, name)}"
+                        other = _OF_OTHER_KIND.get(right, "")
+                        if other and _anybody(world, _sufficient_parts(other), name, limit):
+                            text += f", but some may {other} {_named_right(other, name)}"
+                        yield text
         case Nobody():
             for right, names in requirement.rights:
                 other = OTHER_SIDE[right]

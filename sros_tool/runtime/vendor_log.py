@@ -205,7 +205,8 @@ LOG_TEXTS: tuple[LogText, ...] = (
     ),
     _text(
         "not-started", _ROS, r"Unable to (?:run the command|print the environment): (?P<why>.+)",
-        "sros did not start the process: {why}", "Do what the line says, and start it again.",
+        "sros did not start the process: {why}",
+        "Repair what the line names, and start the process again.",
     ),
     # ── Cyclone DDS, meeting peers ─────────────────────────────────────────────────────────
     _text(

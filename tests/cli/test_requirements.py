@@ -108,6 +108,16 @@ def test_what_holds_and_what_cannot_fail(folder: Path, tmp_path: Path) -> None:
     sros(*ONLY, "--requirements", held, "--exclude", "requirement.vacuous", cwd=folder).ok()
 
 
+def test_an_action_that_is_a_service(tmp_path: Path) -> None:
+    calls = '<services request="ALLOW"><service>/set</service></services>'
+    (tmp_path / "p.xml").write_text(policy_text({"/a": calls}))
+    held = tmp_path / "held.toml"
+    held.write_text('[[only]]\ncall = ["/set"]\nenclaves = ["/a"]\n')
+    ended = sros("check", "p.xml", "--requirements", held, cwd=tmp_path)
+    said = "no enclave may call action /set, but some may request service /set"
+    assert said in ended.out
+
+
 def test_what_is_no_longer_demanded(folder: Path, tmp_path: Path) -> None:
     new, more = tmp_path / "new.toml", tmp_path / "more.toml"
     new.write_text(REQUIRED.split("[[apart]]")[0].replace('"/mux"', '"/mux", "/web"'))

@@ -310,7 +310,7 @@ def _evaluated(root: Path, name: str, now: datetime) -> EvaluatedEnclave:
 def _not_running(root: Path, name: str, problems: Sequence[str]) -> KeystoreError:
     return KeystoreError(
         f"enclave {name} would not run on a robot",
-        "; ".join(problems) + ".",
+        "; ".join(problem.rstrip(".") for problem in problems) + ".",
         f"See `sros inspect {quote(str(enclave_path(root, name)))}`.",
     )
 
