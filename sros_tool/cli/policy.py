@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -146,6 +148,11 @@ def merge_policy(
         echo(saved, err=True)
 
 
+_MOST_ADDED = 20
+_MOST_OF_ENCLAVE = 2
+"""Numbers of rights that a merge lists: up to the first all of them, else so many per enclave."""
+
+
 def _print_added(merged: Merged) -> None:
     count = len(merged.added)
     if not count:
@@ -153,10 +160,18 @@ def _print_added(merged: Merged) -> None:
         return
     from sros_tool.checks.policies import only_basic
 
-    echo(f"added {counted(count, 'right')}", err=True)
     own = [right for right in merged.added if not only_basic([right])]
-    for right in own:
-        echo(f"  {right}", err=True)
+    folded = len(own) > _MOST_ADDED and not logging.getLogger("sros_tool").isEnabledFor(
+        logging.INFO
+    )
+    echo(f"added {counted(count, 'right')}{' (-v lists all)' * folded}", err=True)
+    if folded:
+        for enclave, rights in groupby(own, lambda right: right.enclave):
+            texts = [str(right).removeprefix(f"{enclave} ") for right in rights]
+            echo(f"  {enclave} {first_few(texts, _MOST_OF_ENCLAVE)}", err=True)
+    else:
+        for right in own:
+            echo(f"  {right}", err=True)
     if others := count - len(own):
         echo(f"  and {counted(others, 'right')} that every node needs", err=True)
 

@@ -348,18 +348,21 @@ class Merged:
     """A policy file after a merge: its new content, the added rights, and the contradictions.
 
     Without additions ``document`` is the unchanged content of the file.  ``instances`` are texts on
-    the enclaves that have a node in several namespaces only since the merge.
+    the enclaves that have a node in several namespaces only since the merge, and ``shared`` on
+    those whose nodes have other names than the nodes that the merge adds.
     """
 
     document: bytes
     added: tuple[Right, ...]
     contradictions: tuple[Contradiction, ...]
     instances: tuple[str, ...] = ()
+    shared: tuple[str, ...] = ()
 
     def notes(self) -> tuple[Note, ...]:
-        """Return notes on denials that win, and on enclaves that several instances share."""
-        shared = (Note("merge.several-instances", text) for text in self.instances)
-        return (*merge_notes(self.contradictions), *shared)
+        """Return notes on denials that win, and on enclaves that several nodes share now."""
+        several = (Note("merge.several-instances", text) for text in self.instances)
+        shared = (Note("merge.shared-enclave", text) for text in self.shared)
+        return (*merge_notes(self.contradictions), *several, *shared)
 
 
 @shows(optional=("document",))
@@ -394,7 +397,7 @@ def merge_into(path: Path, additions: Policy) -> Merged:
 
 def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
     """Merge several policies, one after the other, into the file at ``path``; write nothing."""
-    document = read_bytes(path, "policy file")
+    document, policies = read_bytes(path, "policy file"), tuple(policies)
     first = before = read_policy(path, document)
     added: list[Right] = []
     contradictions: list[Contradiction] = []
@@ -407,14 +410,43 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
             added += plan.added
         _check_protection(path, before, additions)
     already = instances(first.enclaves)
-    shared = (
+    several = (
         f"{enclave} has the node {node} in {first_few([profile.ns for profile in profiles], 3)}: "
         "each process in this enclave has the rights of all of them. Put the namespace into path=, "
         "too, to give each instance an enclave of its own."
         for (enclave, node), profiles in instances(before.enclaves).items()
         if already.get((enclave, node), ()) != profiles
     )
-    return Merged(document, tuple(added), tuple(contradictions), tuple(shared))
+    shared = tuple(_shared_enclaves(first, policies, before))
+    return Merged(document, tuple(added), tuple(contradictions), tuple(several), shared)
+
+
+def _shared_enclaves(before: Policy, policies: Iterable[Policy], after: Policy) -> Iterator[str]:
+    """Yield a text on each enclave to which policies add nodes, and of which they know no other.
+
+    Nodes of the same name in other namespaces are `instances`.
+    """
+    asked: dict[str, set[str]] = {}
+    for additions in policies:
+        for enclave, nodes in additions.nodes().items():
+            asked.setdefault(enclave, set()).update(map(_name_of, nodes))
+    now = after.nodes()
+    for enclave, nodes in before.nodes().items():
+        come = [node for node in now[enclave] if node not in nodes]
+        if nodes and come and asked.get(enclave, set()).isdisjoint(map(_name_of, nodes)):
+            yield (
+                f"{enclave} has {_nodes_text(nodes)}, and now also {_nodes_text(come)}: each "
+                "process in this enclave has the rights of all of them. Unless they run in one "
+                "process, rename the enclave in one of the policies."
+            )
+
+
+def _name_of(node: str) -> str:
+    return node.rpartition("/")[2]
+
+
+def _nodes_text(nodes: Sequence[str]) -> str:
+    return f"the node{'s' * (len(nodes) > 1)} {first_few(nodes, _SHOWN)}"
 
 
 def _proven(path: Path, document: bytes, before: Policy, added: Sequence[Right]) -> Policy:

@@ -57,6 +57,26 @@ def test_a_merge_counts_what_every_node_needs_and_notes_a_shared_enclave(folder:
     assert "nothing found (not shown: 1 note" in found
 
 
+def test_a_merge_notes_an_enclave_that_gets_nodes_of_another_policy(folder: Path) -> None:
+    of_package = policy_text({"/a": publish("/p1", "/p2"), "/b": publish("/q")})
+    (folder / "package.xml").write_text(of_package.replace('node="n"', 'node="driver"'))
+    said = sros("merge_policy", "a.xml", "package.xml", "--in-place").ok().err.splitlines()
+    (note,) = [line for line in said if "merge.shared-enclave" in line]
+    assert "/a has the node /n, and now also the node /driver: each process" in note
+    # A later version of the same package is no surprise.
+    (folder / "package.xml").write_text(of_package.replace("/p1", "/p3"))
+    assert "merge.shared-enclave" not in sros("merge_policy", "a.xml", "package.xml").ok().err
+
+
+def test_many_rights_of_a_merge_are_folded_by_enclave(folder: Path) -> None:
+    names = [f"/n{number:02}" for number in range(12)]
+    (folder / "b.xml").write_text(policy_text({"/b": publish(*names), "/c": publish(*names)}))
+    said = sros("merge_policy", "a.xml", "b.xml").ok().err.splitlines()
+    few = "ALLOW publish topic /n00, ALLOW publish topic /n01 and 10 more"
+    assert said == ["added 24 rights (-v lists all)", f"  /b {few}", f"  /c {few}"]
+    assert "  /c ALLOW publish topic /n11" in sros("merge_policy", "-v", "a.xml", "b.xml").ok().err
+
+
 def test_merge_to_stdout(folder: Path) -> None:
     before = snapshot(folder)
     ended = sros("merge_policy", "a.xml", "b.xml").ok()
