@@ -62,8 +62,8 @@ from sros_tool.keystore.template import load_template
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import merge_into
-from sros_tool.policy.model import RIGHTS, Policy
-from sros_tool.policy.rights import policy_rights
+from sros_tool.policy.model import ALLOW, RIGHTS, Policy
+from sros_tool.policy.rights import Rules, policy_rights
 from sros_tool.proof.findings import decide_all
 from sros_tool.proof.requirements import Requirement, read_requirements
 from sros_tool.proof.system import policy_system
@@ -531,7 +531,7 @@ def read_processes(path: Path) -> ObservedProcesses:
 
 
 def access_lines(policy: Policy, folder: Path) -> list[str]:
-    """Return a line for each name in a policy, with who uses it on either side.
+    """Return a line for each name in a policy, with who may use it on either side.
 
     Names that are used only as every node uses them (the common parts) are left out.
     """
@@ -543,28 +543,33 @@ def access_lines(policy: Policy, folder: Path) -> list[str]:
         for profile in enclave.all_profiles()
         for right in common.given(parts, profile.ns, profile.node)
     }
-    sides: dict[tuple[str, str], dict[str, list[str]]] = {}
-    shown: set[tuple[str, str]] = set()
-    for right in sorted(policy_rights(policy)):
-        if right.kind in RIGHTS:
-            name = right.kind, right.name
-            sides.setdefault(name, {}).setdefault(right.right, []).append(right.enclave)
-            if (right.enclave, right.right, right.name) not in ordinary:
-                shown.add(name)
+    rights = policy_rights(policy)
+    rules, enclaves = Rules(rights), sorted({right.enclave for right in rights})
+    shown = {
+        (right.kind, right.name)
+        for right in rights
+        if right.kind in RIGHTS
+        and right.qualifier is ALLOW
+        and (right.enclave, right.right, right.name) not in ordinary
+    }
+    sides = {
+        (kind, name): [
+            [enclave for enclave in enclaves if rules.allow(enclave, right, name)]
+            for right in RIGHTS[kind]
+        ]
+        for kind, name in shown
+    }
     kinds = [*RIGHTS]
+    in_order = sorted(
+        sides, key=lambda named: (not all(sides[named]), kinds.index(named[0]), named[1])
+    )
     lines = [
-        f"{kind.removesuffix('s')} {name}: {' -> '.join(_users(of_name, e) for e in RIGHTS[kind])}"
-        for (kind, name), of_name in sorted(
-            sides.items(), key=lambda side: (-len(side[1]), kinds.index(side[0][0]), side[0][1])
-        )
-        if (kind, name) in shown
+        f"{kind.removesuffix('s')} {name}: "
+        + " -> ".join(first_few(of, _MOST_NAMES) or "nobody" for of in sides[kind, name])
+        for kind, name in in_order
     ]
     more = len(lines) - _MOST_LINES
     return [*lines[:_MOST_LINES], *([f"and {counted(more, 'more name')}"] if more > 0 else [])]
-
-
-def _users(of_name: Mapping[str, Sequence[str]], right: str) -> str:
-    return first_few(of_name.get(right, ()), _MOST_NAMES) or "nobody"
 
 
 def forbidding(robot: Path, addition: str, at: datetime) -> list[Requirement]:

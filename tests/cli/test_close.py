@@ -15,7 +15,7 @@ import yaml
 
 from sros_tool import closing
 from sros_tool.cli import close
-from sros_tool.closing import assign
+from sros_tool.closing import access_lines, assign
 from sros_tool.graph import observe
 from sros_tool.graph.observation import Endpoint, ObservedNode
 from sros_tool.keystore.layout import list_enclaves
@@ -36,7 +36,7 @@ from sros_tool.runtime.processes import (
 )
 from tests.cli.test_json import Seen
 from tests.graph.fake_graph import Beside, graph
-from tests.support.harness import Ended, snapshot, sros
+from tests.support.harness import Ended, policy_text, publish, snapshot, sros, subscribe
 from tests.support.long_form import some, sometimes
 
 pytest_plugins = ["tests.graph.beside"]
@@ -1023,3 +1023,15 @@ def test_a_process_that_was_launched_is_launched_secured(tmp_path: Path, robot: 
     robot.by_hand = set(PID)
     undone = robot.close("--undo", status=1).out
     assert undone.count("restart it open: cd /opt && /usr/bin/python3 /opt/ros/jazzy/bin/ros2") == 1
+
+
+def test_wildcards_and_denials_count_in_what_is_shown(tmp_path: Path) -> None:
+    text = policy_text({
+        "/a": publish("/odom"),
+        "/b": subscribe("/odom"),
+        "/look": subscribe("/*"),
+        "/not": subscribe("/*") + subscribe("/odom").replace("ALLOW", "DENY"),
+    })  # fmt: skip
+    (tmp_path / "p.xml").write_text(text)
+    lines = access_lines(read_policy(tmp_path / "p.xml"), tmp_path)
+    assert lines == ["topic /odom: /a -> /b, /look", "topic /*: nobody -> /look"]
