@@ -448,7 +448,8 @@ class Fault(Enum):
 
 
 def in_original_keystore(remedy: str) -> str:
-    """Return a remedy that needs CA keys as the remedy for an export, which has none."""
+    """Return a remedy for an export, which has no CA keys: to do ``remedy`` in the original
+    keystore."""
     then = "" if remedy.endswith("export the enclave again.") else " Then export the enclave again."
     return f"In the {ORIGINAL_KEYSTORE}: {remedy}{then}"
 

@@ -113,7 +113,7 @@ def test_what_decides_the_status_of_the_action(case: str, origin: Origin, tmp_pa
         assert "no requirements are named" in said
     elif case == "new access is allowed":
         assert "/web ALLOW publish topic /cmd_vel" in said
-        assert "new access does not fail the review, as asked" in said
+        assert "new access does not fail the review, as the options say" in said
 
 
 @sometimes("requirements that a pull request drops")
@@ -218,7 +218,7 @@ def test_no_comparison_is_asked_for_by_name(origin: Origin, tmp_path: Path) -> N
     status, said, _ = run_action(origin, clone, **words)
     assert status == 0
     assert "but 2 things were left out" in said.splitlines()[0]
-    assert "nothing is compared with an earlier commit, as asked" in said
+    assert "nothing is compared with an earlier commit, as the options say" in said
 
 
 @sometimes("what the action compares with")

@@ -57,7 +57,8 @@ class GuardedConnection(http.client.HTTPConnection):
             self.sock = self._context.wrap_socket(plain, server_hostname=self.host)
 
     def end(self) -> None:
-        """Close everything; `close` leaves an answer open that ends with the connection."""
+        """Close everything, also an answer that lasts until the connection ends; `close` leaves it
+        open."""
         self.close()
         self._end_guard()
 

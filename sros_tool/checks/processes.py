@@ -706,7 +706,7 @@ def _first_nodes(nodes: Sequence[Process]) -> str:
 # ── next to each other ─────────────────────────────────────────────────────────────────────
 
 
-def _by_place(processes: Iterable[Process]) -> Mapping[tuple[str, str], list[Process]]:
+def _by_network_and_domain(processes: Iterable[Process]) -> Mapping[tuple[str, str], list[Process]]:
     found: dict[tuple[str, str], list[Process]] = defaultdict(list)
     for process in processes:
         found[_network_and_domain(process)].append(process)
@@ -720,7 +720,7 @@ def _mixed_vendors(
 
     ``environment`` is the environment of this shell if it enables security, otherwise None.
     """
-    places = dict(_by_place(secured))
+    places = dict(_by_network_and_domain(secured))
     here = ("", environment.get(DOMAIN) or "0") if environment is not None else None
     if here:
         places.setdefault(here, [])
@@ -746,7 +746,7 @@ def _other_keystores(
     """
     here = ("", environment.get(DOMAIN) or "0") if environment is not None else None
     own = _authorities_here(environment) if environment is not None else frozenset()
-    for place, processes in _by_place(secured).items():
+    for place, processes in _by_network_and_domain(secured).items():
         groups = _by_authorities(process for process in processes if not process.is_zenoh)
         if own and place == here:
             main = f"this environment has '{plain((environment or {})[KEYSTORE], _LONGEST_PATH)}'"

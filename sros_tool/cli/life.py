@@ -453,8 +453,8 @@ def rotate_ca(
     together. To only extend the validity of the identity CA, use --same-key: it has no stages, and
     you need not restart all processes together.
 
-    In a keystore with a fleet, a stage is refused until all robots have confirmed the stage before
-    (`sros fleet confirm`).
+    In a keystore with a fleet, a stage is refused until all robots have confirmed the previous
+    stage (`sros fleet confirm`).
 
     Example:
       $ sros rotate_ca keystore --next

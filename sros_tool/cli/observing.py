@@ -417,7 +417,7 @@ def generate_policy(
 
         texts = {log: _log_text(log) for log in logs}
         learned, lines, denied = learned_from_logs(
-            texts, file=file, enclave=enclave or "", place=_profile_place(node), present=present
+            texts, file=file, enclave=enclave or "", node=_namespace_and_name(node), present=present
         )
         if not learned.profiles:
             print_notes(learned.notes)
@@ -639,7 +639,7 @@ def _log_text(log: Path) -> str:
     return read_log(str(log))
 
 
-def _profile_place(node: str | None) -> tuple[str, str] | None:
+def _namespace_and_name(node: str | None) -> tuple[str, str] | None:
     from sros_tool.names import check_namespace, expression_problem
 
     if node is None:

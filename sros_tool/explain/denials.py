@@ -238,7 +238,7 @@ def learned_from_logs(
     *,
     file: Path | None,
     enclave: str,
-    place: tuple[str, str] | None,
+    node: tuple[str, str] | None,
     present: Policy | None,
 ) -> tuple[Learned, list[AskingLine], bool]:
     """Return the rights that are missing by logs, explanations, and whether there is a denial.
@@ -247,13 +247,13 @@ def learned_from_logs(
         logs: the texts of the logs by their paths.
         file: the policy to which the rights are to be added, for the paths of common parts.
         enclave: the enclave of processes whose log does not name their enclave, or "".
-        place: namespace and name of the node whose profile gets the rights, or None.
+        node: namespace and name of the node whose profile gets the rights, or None.
         present: the content of ``file``, if it exists.
     """
     denials = {log: read_denials(plain_text(text)) for log, text in logs.items()}
     missing = propose(denial for denied in denials.values() for denial in denied)
     common = common_parts(file.parent if file else policies_dir(), policies_dir())
-    learned = as_learned(missing, enclave, place, present, common)
+    learned = as_learned(missing, enclave, node, present, common)
     asked = {profile.enclave for profile in learned.profiles}
     lines = [
         AskingLine(
@@ -293,18 +293,18 @@ def as_learned(
     profiles, others, wholes = [], dict[str, str](), dict[str, str]()
     for path, rights in sorted(_by_enclave(missing, enclave).items()):
         present = _profiles(policy, path)
-        for place, denied in sorted(_by_place(rights, node, present).items()):
-            if present and node is None and place not in (_ANY_NODE, *present):
+        for profile, denied in sorted(_by_profile(rights, node, present).items()):
+            if present and node is None and profile not in (_ANY_NODE, *present):
                 there = ", ".join(sorted(map(_fqn, present)))
-                others[_fqn(place)] = f"enclave {path} has {there}"
+                others[_fqn(profile)] = f"enclave {path} has {there}"
                 continue
-            has = present.get(place, frozenset())
-            parts = _whole_parts(denied, place, has, common) if common else ()
-            node_rights = common.given(parts, *place) if common else frozenset[NodeRight]()
+            has = present.get(profile, frozenset())
+            parts = _whole_parts(denied, profile, has, common) if common else ()
+            node_rights = common.given(parts, *profile) if common else frozenset[NodeRight]()
             if parts:
-                wholes[_fqn(place)] = ", ".join(parts)
-            groups = groups_of(denied - node_rights, *place)
-            profiles.append(LearnedProfile(path, *place, denied | node_rights, parts, groups))
+                wholes[_fqn(profile)] = ", ".join(parts)
+            groups = groups_of(denied - node_rights, *profile)
+            profiles.append(LearnedProfile(path, *profile, denied | node_rights, parts, groups))
     elsewhere = {
         path: f"{len(rights)} right{'s' * (len(rights) > 1)}"
         for path, rights in sorted(missing.rights.items())
@@ -339,7 +339,7 @@ def _by_enclave(missing: MissingRights, enclave: str) -> dict[str, frozenset[Nod
     return found
 
 
-def _by_place(
+def _by_profile(
     rights: frozenset[NodeRight],
     node: tuple[str, str] | None,
     present: Mapping[tuple[str, str], frozenset[NodeRight]],
@@ -355,7 +355,7 @@ def _by_place(
     for right in rights:
         served = nodes_served([(right.right, right.name)])
         found.setdefault(_profile_of_node(served[0], present) if served else rest, set()).add(right)
-    return {place: frozenset(node_rights) for place, node_rights in found.items()}
+    return {profile: frozenset(node_rights) for profile, node_rights in found.items()}
 
 
 def _profile_of_node(fqn: str, present: Iterable[tuple[str, str]]) -> tuple[str, str]:
@@ -364,22 +364,22 @@ def _profile_of_node(fqn: str, present: Iterable[tuple[str, str]]) -> tuple[str,
     return next((each for each in present if covers(_fqn(each), fqn)), (ns or "/", name))
 
 
-def _fqn(place: tuple[str, str]) -> str:
-    return f"{place[0].rstrip('/')}/{place[1]}"
+def _fqn(profile: tuple[str, str]) -> str:
+    return f"{profile[0].rstrip('/')}/{profile[1]}"
 
 
 def _whole_parts(
     denied: frozenset[NodeRight],
-    place: tuple[str, str],
+    profile: tuple[str, str],
     has: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
     """Return the first common part of which a node has no right and was denied one, or ()."""
-    if is_expression(place[1]):
+    if is_expression(profile[1]):
         return ()
     for part in _NODE_PARTS:
         if part in common.rights:
-            rights = common.given([part], *place)
+            rights = common.given([part], *profile)
             if rights & denied and not rights & has:
                 return (part,)
     return ()

@@ -248,7 +248,7 @@ class WhoOnZenoh(NamedTuple):
     vendor: Literal["zenoh"]
     """Zenoh."""
     vendor_why: str
-    """Why Zenoh was asked."""
+    """Why Zenoh was chosen."""
     domain: int | None
     """The ROS domain of ``--domain``; null for every domain."""
     enclaves: Sequence[ZenohEnclaveOutcome]
@@ -873,7 +873,7 @@ class ZenohExplanation(NamedTuple):
 
     asked: Asked
     vendor_why: str
-    """Why Zenoh was asked."""
+    """Why Zenoh was chosen."""
     answer: ZenohAnswer
     out_of_date: tuple[str, ...] | None
     """The deciding files that do not match the permissions for the question; null if not known."""

@@ -332,7 +332,7 @@ _SHOWN = {"robots": "hosts", **_VARIABLES}
 
 _OF_ALL = ("all", "ungrouped", "_meta")
 _MOST_DEPTH = 64
-_MOST_STEPS = 200_000  # a host counts in each group, a group in each other one
+_MOST_STEPS = 200_000  # a host counts in each group, a group in every other group
 _WRITE_OUT = (
     "Write it out with `ansible-inventory -i FILE --list > hosts.json`, and name hosts.json."
 )

@@ -84,8 +84,8 @@ class Fleet:
 
     ``enclaves`` are paths of enclaves with a placeholder, such as ``/{robot}/base``: they say
     which robot an enclave belongs to.  ``routers`` is the path of the enclaves of the robots' Zenoh
-    routers; it is one of ``enclaves`` if a robot has one.  ``by_namespace`` has the names of the
-    robots in each namespace.
+    routers; it is one of ``enclaves`` if any robot has a router.  ``by_namespace`` has the names of
+    the robots in each namespace.
     """
 
     robots: Mapping[str, Robot]
@@ -572,7 +572,7 @@ def _named(fleet: Fleet, names: Sequence[str], folding: _Folding) -> str:
     if folding.pairs:
         sources = list(dict.fromkeys(pair.split()[0] for pair in names))
         if {*names} == {f"{one} and {two}" for one, two in permutations(sources, 2)}:
-            return f"{_named(fleet, sources, _Folding(''))}, each with each other one"
+            return f"{_named(fleet, sources, _Folding(''))}, each with every other"
         return f"{len(names)} pairs of robots, such as {names[0]}"
     own = folding.own
     count = f"{len(names)}{' other' if own else ''} robots"

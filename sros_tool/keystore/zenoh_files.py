@@ -560,7 +560,7 @@ def _last_revocation(entries: Iterable[Entry] = (), lists: Iterable[RevocationLi
 
 
 def _peers(name: str, router: RenderedRights, between: RightsBetween) -> list[RenderedRights]:
-    """Return the rights that a session gives to the router and to each other session, in order.
+    """Return the rights that a session gives to the router and to every other session, in order.
 
     Raises:
         PolicyError: the common rights of two enclaves take too many key expressions.

@@ -300,7 +300,7 @@ def _uses_of_rights(
 
 
 def _first_of(uses: Mapping[str, Sequence[Use]]) -> Witness | None:
-    """Return the shortest use as a witness, with a use of each other enclave."""
+    """Return the shortest use as a witness, with a use of every other enclave."""
     if not uses:
         return None
     best = min((use for own in uses.values() for use in own), key=_better)

@@ -654,7 +654,7 @@ def _entries(data: bytes, id_length: int) -> dict[str, TreeEntry]:
                 f"a folder of the commit has '{name}' twice, or no file can have this name",
                 "Programs interpret such a folder in different ways.",
             )
-        entries[name] = TreeEntry(_checked_out(mode), rest[:id_length].hex())
+        entries[name] = TreeEntry(_mode_on_checkout(mode), rest[:id_length].hex())
     return entries
 
 
@@ -662,7 +662,7 @@ _OCTAL = re.compile(rb"[0-7]{1,11}")
 _TYPE_BITS, _EXECUTABLE = 0o170000, 0o100
 
 
-def _checked_out(mode: bytes) -> str:
+def _mode_on_checkout(mode: bytes) -> str:
     """Return the file mode that git uses when it checks out an entry of a tree.
 
     ``mode`` is octal.  An entry that is no file, link or folder counts as a submodule. Source: git

@@ -658,13 +658,13 @@ class _Review:
         if not asked.requirements:
             yield "no requirements are named"
         if not self.base:
-            yield "nothing is compared with an earlier commit, as asked"
+            yield "nothing is compared with an earlier commit, as the options say"
         if asked.allow_new_access:
-            yield "new access does not fail the review, as asked"
+            yield "new access does not fail the review, as the options say"
         if asked.allow_dropped_requirements:
-            yield "dropped requirements do not fail the review, as asked"
+            yield "dropped requirements do not fail the review, as the options say"
         for path in asked.left_out:
-            yield f"policies in '{path}' are not reviewed, as asked"
+            yield f"policies in '{path}' are not reviewed, as the options say"
         if asked.keystores:
             yield "private keys of keystores are not reviewed"
         for side in (self.head, self.base):

@@ -450,7 +450,7 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, placed: bool = True) -> Sc
         cards=tuple(cards.values()),
         links=tuple(links),
         frames=(),
-        lettered=(),
+        onlookers=(),
         heads=tuple(draft.heads(cards)),
         shown=len(names),
     )

@@ -18,9 +18,9 @@ from sros_tool.policy.model import ALLOW
 from sros_tool.report.folding import Folding
 from sros_tool.report.layout import (
     KIND_NAMES,
-    LETTERED_VERBS,
     LEVEL_NAMES,
     LINE,
+    ONLOOKERS,
     OTHERS,
     OWN,
     PAD,
@@ -278,13 +278,13 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
     yield from _card_legend(picture, scene)
     if any(note.startswith(OWN) for card in scene.cards for note in card.notes):
         yield _row([("", f"{OWN} names that no other enclave may use")])
-    if scene.lettered:
+    if scene.onlookers:
         yield _row(
             (
-                f'<text class="tag" x="4" y="0">{lettered.tag}</text>',
-                f"{LETTERED_VERBS[lettered.right]} {lettered.enclave.removeprefix(':')}",
+                f'<text class="tag" x="4" y="0">{onlooker.tag}</text>',
+                f"{ONLOOKERS[onlooker.right]} {onlooker.enclave.removeprefix(':')}",
             )
-            for lettered in scene.lettered
+            for onlooker in scene.onlookers
         )
 
 
@@ -467,10 +467,10 @@ def _texts(scene: Scene, card: Card) -> Iterable[str]:
         yield KIND_NAMES[card.kind] + _level_text(card)
     yield from card.members if len(card.members) <= len(card.lines) else card.lines
     yield from card.notes
-    for lettered in scene.lettered:
-        if lettered.tag in card.tags:
-            enclave = lettered.enclave.removeprefix(":")
-            yield f"{lettered.tag}: {LETTERED_VERBS[lettered.right]} {enclave}"
+    for onlooker in scene.onlookers:
+        if onlooker.tag in card.tags:
+            enclave = onlooker.enclave.removeprefix(":")
+            yield f"{onlooker.tag}: {ONLOOKERS[onlooker.right]} {enclave}"
 
 
 def _level_text(card: Card) -> str:

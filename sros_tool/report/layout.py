@@ -37,8 +37,8 @@ LINE, PAD, SMALL = 16, 7, 14
 """Height of a text line, padding of a card, and height of a note line, in pixels."""
 _GAP, _LEAD, _TOP, MARGIN = 9.0, 24.0, 34.0, 14
 SIDE_LETTERS, _NAMES_LETTERS = 20, 35  # letters per line on a card
-_LETTERED_LINES, _LETTERED_SHARE = 8, 0.3  # with more bundles than both limits: a letter
-_MOST_LETTERED = 26  # the number of letters
+_ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # onlookers have more bundles than both limits
+_MOST_ONLOOKERS = 26  # the number of letters
 _FEW_BUNDLES, _MOST_BUNDLES = 24, 80  # with more: private names are counted; bundles joined
 _MOST_ENCLAVES = 40  # with more, groups are drawn
 _MOST_NAMES, _SHOWN_NAMES = 8, 4  # a card has up to 8 names; of more, the first 4
@@ -51,7 +51,7 @@ LEVEL_NAMES = {
     WireLevel.NONE: "not protected",
     WireLevel.UNKNOWN: "protection unknown",
 }
-LETTERED_VERBS = {
+ONLOOKERS = {
     "publish": "also written by",
     "subscribe": "also read by",
     "request": "also called by",
@@ -104,7 +104,7 @@ class Scene:
     cards: tuple[Card, ...]
     links: tuple[Link, ...]
     frames: tuple[Frame, ...]
-    lettered: tuple[LetteredEnclave, ...]
+    onlookers: tuple[Onlooker, ...]
     heads: tuple[Head, ...]
     hidden: int = 0
     shown: int = 0
@@ -118,7 +118,7 @@ class Card:
     on both sides.  A card in the focus of the picture is ``chosen``.  ``lines``
     is the text, ``notes`` smaller text below it.  ``members`` are all enclaves or names of the
     card.  Only cards of names have ``kind``, ``level``, ``lacks`` and ``tags`` (letters of
-    enclaves); only cards of enclaves have ``group``.
+    onlookers); only cards of enclaves have ``group``.
     """
 
     id: str
@@ -160,7 +160,7 @@ class Link:
     differs: bool = False
 
 
-class LetteredEnclave(NamedTuple):
+class Onlooker(NamedTuple):
     """An enclave with lines to very many names: their cards show its letter (``tag``) instead."""
 
     tag: str
@@ -281,8 +281,8 @@ class _Draft:
         self._groups = {enclave.path: enclave.group for enclave in picture.enclaves}
         self._notes = enclave_notes(picture)
         bundles = fold(picture.names, edges, owner)
-        self._lettered = _lettered_enclaves(bundles)
-        self._tags = {side: chr(ord("A") + n) for n, side in enumerate(self._lettered)}
+        self._looking = _onlookers(bundles)
+        self._tags = {side: chr(ord("A") + n) for n, side in enumerate(self._looking)}
         self._own: dict[str, list[Bundle]] = defaultdict(list)
         self._bundles: list[Bundle] = []
         for bundle in bundles:
@@ -305,10 +305,10 @@ class _Draft:
 
     def _looks(self, tie: Tie) -> bool:
         """Return whether a right is drawn as a letter on the card of the name, not as a line."""
-        return is_plain(tie) and (tie.node, tie.right) in self._lettered
+        return is_plain(tie) and (tie.node, tie.right) in self._looking
 
     def _only_node(self, bundle: Bundle) -> str:
-        """Return the only node without a letter that has a right to these names, or ""."""
+        """Return the only node, apart from onlookers, with a right to these names, or ""."""
         looking = {tie.node for tie in bundle.ties if self._looks(tie)}
         drawn = {tie.node for tie in bundle.ties if not self._looks(tie)}
         if not all(map(is_plain, bundle.ties)):
@@ -329,8 +329,8 @@ class _Draft:
             cards=tuple(cards.values()),
             links=self._links(cards),
             frames=(),
-            lettered=tuple(
-                LetteredEnclave(tag, node, right) for (node, right), tag in self._tags.items()
+            onlookers=tuple(
+                Onlooker(tag, node, right) for (node, right), tag in self._tags.items()
             ),
             heads=(
                 Head(MARGIN, "start", SENDERS),
@@ -357,7 +357,7 @@ class _Draft:
 
     def _cards(self) -> Iterable[Card]:
         sides = {end for key in self._ties for end in key[:2] if end[0] in "sl"}
-        sides |= {f"{'s' if SENDS[right] else 'l'}{node}" for node, right in self._lettered}
+        sides |= {f"{'s' if SENDS[right] else 'l'}{node}" for node, right in self._looking}
         # The scene of a group has all enclaves of the group, but only neighbours with links.
         inner = {node for node in self._members if not node.startswith(":")}
         idle = (inner or set(self._members)) - {side[1:] for side in sides}
@@ -386,7 +386,7 @@ class _Draft:
             notes += _own_text(own)
         notes += self._notes.get(node, ())
         notes += [
-            f"{reach} {counted(self._lettered[node, right], 'name')}: see {tag}"
+            f"{reach} {counted(self._looking[node, right], 'name')}: see {tag}"
             for (other, right), tag in self._tags.items()
             for reach in (_REACHES[right],)
             if other == node and SENDS[right] is sends
@@ -440,11 +440,11 @@ class _Draft:
         )
 
 
-def _lettered_enclaves(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
-    """Map pairs of node and right that are drawn as a letter to the number of their names.
+def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
+    """Map onlookers (node and right) to the number of their names.
 
-    For example ("/recorder", "subscribe"): its wildcards match so many names that its lines would
-    hide all other lines.
+    An onlooker, such as ("/recorder", "subscribe"), has wildcards that match so many names that its
+    lines would hide all other lines.
     """
     reached: dict[tuple[str, str], list[Bundle]] = defaultdict(list)
     wild: dict[tuple[str, str], int] = defaultdict(int)
@@ -453,13 +453,13 @@ def _lettered_enclaves(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
         for key, by in ties.items():
             reached[key].append(bundle)
             wild[key] += bool(by)
-    most = max(_LETTERED_LINES, _LETTERED_SHARE * len(bundles))
-    lettered = [
+    most = max(_ONLOOKER_LINES, _ONLOOKER_SHARE * len(bundles))
+    looking = [
         (key, sum(len(bundle.names) for bundle in bundles))
         for key, bundles in sorted(reached.items())
         if len(bundles) > most and 2 * wild[key] > len(bundles)
     ]
-    return dict(lettered[:_MOST_LETTERED])
+    return dict(looking[:_MOST_ONLOOKERS])
 
 
 # ── text on cards ───────────────────────────────────────────────────────────────────────

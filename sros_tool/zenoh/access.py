@@ -313,7 +313,7 @@ class RightsBetween:
         }
 
     def of_all(self, own: str) -> Iterator[RemoteRights]:
-        """Yield the rights that a process of the enclave ``own`` gives to each other enclave.
+        """Yield the rights that a process of the enclave ``own`` gives to every other enclave.
 
         Raises:
             TooManyExpressions: the shared rights need too many key expressions.

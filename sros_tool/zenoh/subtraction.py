@@ -121,7 +121,8 @@ _MOST_COMPARED = 64
 _MOST_WILD = 32
 """Maximum number of denied chunks with wildcards at one position of an expression."""
 _MOST_KINDS = 1024
-"""Maximum number of kinds of chunks that these denied chunks distinguish."""
+"""Maximum number of sets into which these denied chunks divide all chunks, by which of them
+match."""
 
 
 def _check_number(number: int, most: int = _MOST_STEPS) -> None:

@@ -91,7 +91,7 @@ def test_many_lines_that_differ_in_two_robots_are_one() -> None:
         return list(folded(fleet, lines))
 
     text = "/{robot}/base publish /{other}/go  "
-    assert told(every) == [f"{text}(all 8 robots, each with each other one)"]
+    assert told(every) == [f"{text}(all 8 robots, each with every other)"]
     assert told(every[1:]) == [f"{text}(55 pairs of robots, such as r0 and r2)"]
     to_two = [pair for pair in every if pair[1] in ("r6", "r7")]
     assert len(told(to_two)) == 2
@@ -114,7 +114,7 @@ def test_pairs_are_said_to_be_all_only_if_they_are_all() -> None:
 
     each_other = told([*permutations(sources, 2)])
     (line,) = each_other
-    assert line.endswith("a6, each with each other one)")
+    assert line.endswith("a6, each with every other)")
     # As many pairs as of seven robots with each other, but with other robots.
     (line,) = told([*product(sources, targets[1:])])
     assert line == "/{robot}/x to /{other}/y  (42 pairs of robots, such as a0 and b1)"
@@ -211,7 +211,7 @@ def test_a_review_is_folded(tmp_path: Path) -> None:
     change.commit({"p.xml": wide.replace("{namespace}/go", "{namespaces}/go", 1)})
     words = ("--policy", "p.xml", "--fleet", "fleet.toml", "--requirements", "r.toml")
     ended = change.review(*words, "--summary", str(tmp_path.parent / "review.md"))
-    each = "(all 6 robots, each with each other one)"
+    each = "(all 6 robots, each with every other)"
     for text in (ended.out, (tmp_path.parent / "review.md").read_text()):
         assert each in text and "/{robot}/nav publish topic /{other}/go" in text
         assert text.count("influences /r") == 2, text

@@ -106,7 +106,7 @@ def test_a_revocation_takes_effect_in_every_stage(
     heard = {name: both_trusted or name == "reissued" for name in thieves}
     restarted = {"restarted": (root, TALKER)}
     friends = dict(restarted)
-    if both_trusted:  # one who runs since the stage before
+    if both_trusted:  # one who runs since the previous stage
         friends["running"] = (copy(thieves["distributed"][0], "running"), TALKER)
     hears(ask, root, thieves | friends, heard | dict.fromkeys(friends, True))
     assert not revoke(root, [LOST], now=now()).remarks

@@ -103,7 +103,7 @@ def test_rights_that_move_to_a_second_policy_are_seen(change: Change) -> None:
     change.commit({"second.xml": None, "tests/second.xml": policy_text(WIDER)})
     left = change.review("--policy", "robot.xml", "--leave-out", "tests")
     assert left.status == 0
-    assert "policies in 'tests' are not reviewed, as asked" in left.out
+    assert "policies in 'tests' are not reviewed, as the options say" in left.out
     assert change.review("--policy", "robot.xml", "--leave-out", "tests/second.xml").status == 0
 
 

@@ -66,7 +66,7 @@ def test_every_name_is_drawn_counted_or_left_out_once() -> None:
 
 def test_the_one_who_reads_everything_is_told_by_a_letter_and_its_denial_by_a_line() -> None:
     scene = scenes_of(mobile_robot())[0]
-    assert [(o.enclave, o.right) for o in scene.lettered] == [
+    assert [(o.enclave, o.right) for o in scene.onlookers] == [
         ("/mobile_robot/recorder", "subscribe")
     ]
     recorder = "l/mobile_robot/recorder"
@@ -85,7 +85,7 @@ def test_an_enclave_with_few_wildcards_keeps_its_lines(tmp_path: Path) -> None:
         },
     )
     scene = scenes_of(picture)[0]
-    assert not scene.lettered
+    assert not scene.onlookers
     assert len(scene.links) == 2  # five topics with the same rights are one card
 
 

@@ -56,7 +56,7 @@ _UNCONTROLLED = (
 )
 
 
-def _open_to(success: RowStatus, expected: RowStatus) -> tuple[Variant, ...]:
+def _variants_without_defence(success: RowStatus, expected: RowStatus) -> tuple[Variant, ...]:
     """Return variants of a row that expect ``success`` if the template does not stop the attack."""
     if expected is RowStatus.REFUSED:
         return (Variant((Condition.UNCONTROLLED,), success, *_UNCONTROLLED),)
@@ -96,7 +96,7 @@ def _injection(
         (hears("listener", _ATTACKER).expecting(expected),),
         () if removed else (hears("listener", "talker"),),
         brief=True,
-        variants=(*variants, *_open_to(RowStatus.HEARD, expected)),
+        variants=(*variants, *_variants_without_defence(RowStatus.HEARD, expected)),
         removed=removed,
     )
 
@@ -149,7 +149,7 @@ def _listening(
         (hears(_ATTACKER, "talker").expecting(expected),),
         (hears("listener", "talker"),),
         brief=True,
-        variants=_open_to(RowStatus.HEARD, expected),
+        variants=_variants_without_defence(RowStatus.HEARD, expected),
         removed=removed,
     )
 
@@ -212,7 +212,7 @@ def _calling(
         (answered(_ATTACKER, "server").expecting(expected),),
         (answered("client", "server"),),
         brief=True,
-        variants=() if removed else _open_to(RowStatus.ANSWERED, expected),
+        variants=() if removed else _variants_without_defence(RowStatus.ANSWERED, expected),
         removed=removed,
     )
 
@@ -235,7 +235,7 @@ def _posing_as_server(
         (answered("client", _ATTACKER).expecting(expected),),
         () if removed else (answered("client", "server"),),
         brief=True,
-        variants=() if removed else _open_to(RowStatus.ANSWERED, expected),
+        variants=() if removed else _variants_without_defence(RowStatus.ANSWERED, expected),
         removed=removed,
     )
 
@@ -336,7 +336,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                         "authenticates"
                     ),
                 ),
-                *_open_to(RowStatus.HEARD_AGAIN, RowStatus.NOT_HEARD_AGAIN),
+                *_variants_without_defence(RowStatus.HEARD_AGAIN, RowStatus.NOT_HEARD_AGAIN),
             ),
         ),
         replace(
@@ -964,7 +964,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 "keep join_access_control on",
                 mechanism="its DDS joins, and then finds no rule for the topic in this domain",
             ),
-            *_open_to(RowStatus.HEARD, RowStatus.NOT_HEARD),
+            *_variants_without_defence(RowStatus.HEARD, RowStatus.NOT_HEARD),
             Variant(
                 (Condition.UNCONTROLLED,),
                 RowStatus.NOT_HEARD,
@@ -1059,7 +1059,7 @@ def _misconfigured(
         (hears("unsecured listener", "misconfigured talker").expecting(expected),),
         (hears("unsecured listener", "unsecured talker"),),
         brief=True,
-        variants=_open_to(RowStatus.HEARD, expected),
+        variants=_variants_without_defence(RowStatus.HEARD, expected),
         removed=removed,
     )
 

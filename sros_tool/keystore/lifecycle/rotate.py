@@ -107,7 +107,7 @@ class RotationStep(Changed):
     ``stage`` is the stage of the keystore afterwards.  ``files`` are the stems of the CA files that
     are replaced ("identity_ca", "permissions_ca" or "ca").  ``kept_elsewhere`` are the places of
     old keys outside of the keystore, which sros does not delete.  ``cut_off`` are robots that have
-    not confirmed the stage before, and can no longer communicate with the others.
+    not confirmed the previous stage, and can no longer communicate with the others.
     """
 
     stage: RotationStage
@@ -138,7 +138,7 @@ def rotate_ca(
     "permissions"; default: both) and the ``validity`` of the new CAs are only used when a rotation
     begins.  ``keyring`` opens the present keys; ``new_keys`` names the places of new keys outside
     of the keystore.  In a keystore with a fleet, a stage that cuts off robots, because they have
-    not confirmed the stage before, needs ``allow_unconfirmed``.  The nodes of the vendors in
+    not confirmed the previous stage, needs ``allow_unconfirmed``.  The nodes of the vendors in
     ``allow_refusal`` may stop working.
 
     Raises:
@@ -187,7 +187,7 @@ def robots_cut_off(
 ) -> tuple[str, ...]:
     """Return the sorted names of the robots that the stage ``to`` would cut off from the others.
 
-    These are the robots with enclaves that have not confirmed the stage before: first that they
+    These are the robots with enclaves that have not confirmed the previous stage: first that they
     trust the new CA, then that they have the files it issued; those where processes still run with
     earlier files; those that fetch and are offline, or say that they have what was never
     published; and those whose last message was refused.  Without a fleet, or by the first stage, no

@@ -230,7 +230,7 @@ class KeystoreZenoh(NamedTuple):
     network: NetworkSettings | None
     """The network, as the keystore's settings have it afterwards; null after ``--off``."""
     files: Sequence[ZenohFileState]
-    """The file of the router, and a file for each other enclave with rights."""
+    """The file of the router, and a file for every other enclave with rights."""
     left_out: Sequence[EnclaveWithoutZenoh]
     """The enclaves that have no file; with ``--check`` they make the exit status 1."""
     created: Sequence[str]
@@ -515,7 +515,7 @@ class RotationChange(NamedTuple):
     old_keys_elsewhere: Sequence[str]
     """Places of old CA keys outside of the keystore, which sros does not delete."""
     cut_off: Sequence[str]
-    """The robots of the fleet that have not confirmed the stage before, and so cannot communicate
+    """The robots of the fleet that have not confirmed the previous stage, and so cannot communicate
     with the others until they get its files (``--allow-unconfirmed``)."""
     remarks: Sequence[str]
     """Next steps, as sentences; empty in a dry run."""
