@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from datetime import datetime, timedelta
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
@@ -25,6 +27,7 @@ from sros_tool.cli.common import (
     local_zone,
     moment_of,
     named_zone,
+    now,
     only_enclaves,
     print_json,
     print_notes,
@@ -191,7 +194,8 @@ def _refuse_ignored(mode: str) -> None:
     "--at",
     "moment",
     metavar="MOMENT",
-    help="Decide as of a date (2027-06-01) or a time from now (90d). [default: now]",
+    help="Decide with the present files as of a date (2027-06-01) or a time from now (90d). "
+    "[default: now]",
 )
 @click.option(
     "--domain",
@@ -298,6 +302,7 @@ def explain(
         only_in = domain_of(domain)
         return _show_reach(reach, root, rest, stated, infrastructure, only_in, as_json, zenoh=zenoh)
     asking = _circumstances(moment, domain, time_zone, fleet_file)
+    print_notes([*_notes_on_past(asking.at, root)])
     if logs:
         return _show_log(logs[0], root, rest, asking, as_json)
     if vendor == ZENOH and distro:
@@ -376,6 +381,23 @@ def _circumstances(
         domain=ros_domain() if domain is None else domain_of(domain),
         fleet_file=fleet_file,
     )
+
+
+def _notes_on_past(moment: datetime, root: Path | None) -> Iterator[Note]:
+    """Yield a note if the moment is in the past, where other files may have been in force."""
+    if moment > now() - timedelta(minutes=1):
+        return
+    changes = 0
+    if root:
+        from sros_tool.keystore.reader import Keystore
+
+        with suppress(SrosError):
+            entries = Keystore(root).ledger.entries
+            changes = sum(entry.time > iso(moment) for entry in entries)
+    text = "today's files decide, as if it were that time: they do not tell what was allowed then"
+    if changes:
+        text += f"; {counted(changes, 'entry', 'entries')} of ledger.jsonl are later"
+    yield Note("explain.past", text)
 
 
 def _why_zenoh(vendor: str | None, root: Path | None) -> str:

@@ -346,6 +346,9 @@ def _hints(result: Creation, as_json: bool) -> Iterator[str]:
             "running processes keep the earlier files: restart them, after a new export if they "
             "use one"
         )
+    if result.revoked:
+        verb = "would revoke" if result.dry_run else "revoked"
+        yield f"{verb} {counted(result.revoked, 'earlier certificate')}"
     if result.kept:
         yield f"unchanged: {counted(len(result.kept), 'enclave')}: {shown_names(result.kept)}"
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections import ChainMap
+from collections import ChainMap, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from shlex import quote
 from types import MappingProxyType
@@ -27,6 +28,7 @@ from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageE
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
+from sros_tool.keystore.delivery.published import may_be_later
 from sros_tool.keystore.fleet import (
     EnclaveDomains,
     left_enclaves,
@@ -48,6 +50,7 @@ from sros_tool.keystore.issuing.enclave import (
 )
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import EnclaveTokens, place_in, token_notes, token_places
+from sros_tool.keystore.known_keys import restored_at
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     ENCLAVES,
@@ -68,7 +71,7 @@ from sros_tool.keystore.layout import (
     refuse_earlier,
     similar_keystores,
 )
-from sros_tool.keystore.ledger import certificate_entry, document_entry
+from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import (
     ReplacedRights,
@@ -90,6 +93,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     common_name_of,
     enclave_subject,
+    has_unique_part,
     issued_by,
     other_issuer,
     parse_subject,
@@ -261,8 +265,9 @@ def generate_artifacts(
     """Create the named enclaves and the enclaves of policies, with permissions, all or nothing.
 
     If a policy names an existing enclave, the enclave's permissions are replaced, and with
-    ``revoke_old`` its certificate, as by `create_permission`.  Without ``revoke_old``, permissions
-    that state the same rights and do not expire soon are kept (`EnclaveWriter.would_only_date`).
+    ``revoke_old`` its certificate, as by `create_permission`.  Permissions that state the same
+    rights and do not expire soon are kept (`EnclaveWriter.would_only_date`), with ``revoke_old``
+    only if no other permissions fit the certificate.
     The keystore protects each name at least as the policies demand.  If the keystore does not exist
     and ``create`` is given, it is created from that template.
 
@@ -809,8 +814,9 @@ class _EnclaveMaker:
         if policy or PERMISSIONS_FILE not in present:
             enclave = policy or _default_rights(change.template, name)
             rights = StatedRights(enclave, self._domains.of(name))
-        if rights and certificate and PERMISSIONS_FILE in present and not self._revoke_old:
-            rights = None if self._is_kept(certificate, rights) else rights
+        if rights and certificate and PERMISSIONS_FILE in present:
+            is_revoked = self._revoke_old and not self._is_alone(name, certificate)
+            rights = None if not is_revoked and self._is_kept(certificate, rights) else rights
         if rights and PERMISSIONS_FILE in present:
             earlier = earlier_permissions(
                 change.keystore, name, change.permissions.certificate, certificate
@@ -837,6 +843,27 @@ class _EnclaveMaker:
             notes += tuple(self._lost_rights(rights.enclave, present))
         completed = len(change.transaction.changes) > before
         return _EnclaveOutcome("completed" if completed else "kept", notes)
+
+    def _is_alone(self, name: str, certificate: x509.Certificate) -> bool:
+        """Return whether only the present permissions fit an enclave's certificate, by the ledger.
+
+        If its subject is not unique, permissions of earlier certificates may fit, too.
+        """
+        issued = [entry.what for entry in self._ledger.get(name, ())]
+        if not has_unique_part(certificate.subject) or "certificate" not in issued:
+            return False
+        last = len(issued) - issued[::-1].index("certificate")
+        return issued[last:].count("permissions") == 1
+
+    @cached_property
+    def _ledger(self) -> Mapping[str, Sequence[Entry]]:
+        """The ledger entries of each enclave, in order; none if the ledger may lack some."""
+        keystore = self._change.keystore
+        ledger, entries = keystore.ledger, defaultdict[str, list[Entry]](list)
+        if not (ledger.gaps or ledger.unchained or restored_at(keystore) or may_be_later(keystore)):
+            for entry in ledger.entries:
+                entries[entry.enclave].append(entry)
+        return entries
 
     def _lost_rights(self, default: Enclave, present: set[str]) -> Iterator[Note]:
         """Yield a note if an enclave had other rights than the default ones that it gets.
