@@ -300,7 +300,12 @@ def _check_accepted(options: DemoOptions) -> None:
             "Only attacks that your own keystore allows can be accepted.",
             "Leave it out, or name the keystore.",
         )
-    rows = {row.name for scenario in options.scenarios for row in scenario.rows if not row.removed}
+    rows = {
+        row.name
+        for scenario in options.scenarios
+        for row in scenario.rows
+        if not row.defence_removed
+    }
     for name in options.accept_open:
         if name not in rows:
             raise UsageError(

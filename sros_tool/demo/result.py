@@ -115,7 +115,8 @@ class RowResult:
     """Length of the observation in seconds."""
     attack: str = ""
     """Name of the attack, or an empty string for ordinary communication."""
-    removed: str = ""
+    defence_removed: str = ""
+    """Defence that the row removes, or an empty string."""
     open_because: str = ""
     """Why the attack is known to succeed, or an empty string."""
     remedy: str = ""
@@ -128,11 +129,6 @@ class RowResult:
     scenario: str = ""
     """Name of the scenario."""
     libraries: frozenset[MappedLibrary] = frozenset()
-
-    @property
-    def defence_removed(self) -> str:
-        """Defence that the row removes, or an empty string."""
-        return self.removed
 
     @property
     def as_expected(self) -> bool:
@@ -159,7 +155,7 @@ class RowResult:
         False for rows that prove nothing about a keystore (without the defence, or of an attack
         that is known to succeed or was accepted), and for rows that do not apply to it.
         """
-        if self.observed is not RowStatus.SKIPPED or not self.applies or self.removed:
+        if self.observed is not RowStatus.SKIPPED or not self.applies or self.defence_removed:
             return False
         return not self.accepted and (self.unaccepted or not self.open_because)
 
@@ -188,7 +184,7 @@ def judge_row(record: RowRecord) -> RowResult:
         domain=record.domain,
         seconds=round(record.seconds, 1),
         attack=row.attack,
-        removed=row.removed,
+        defence_removed=row.defence_removed,
         open_because=row.open_because,
         remedy=row.remedy,
         accepted=row.accepted,
@@ -830,7 +826,7 @@ def _left_out(result: DemoResult) -> Iterator[str]:
 
 def summary_page(result: DemoResult, now: datetime) -> str:
     """Return a summary for reviewers in Markdown; ``now`` is the time of the demo."""
-    attacks = [row for row in result.rows if row.attack and not row.removed]
+    attacks = [row for row in result.rows if row.attack and not row.defence_removed]
     others = [row for row in result.rows if not row.attack]
     wrong = [row for row in result.rows if not row.as_expected]
     lines = [
@@ -854,7 +850,7 @@ def summary_page(result: DemoResult, now: datetime) -> str:
         ]
         lines.append("")
     if attacks:
-        lines += _attacks(attacks, [row for row in result.rows if row.removed])
+        lines += _attacks(attacks, [row for row in result.rows if row.defence_removed])
     if others:
         lines += ["## Other rows", "", *_rows_table(others)]
     return "\n".join(lines).rstrip() + "\n"
@@ -912,9 +908,10 @@ def _attacks(attacks: Sequence[RowResult], removed: Sequence[RowResult]) -> list
 
 def _twin(row: RowResult) -> str:
     """Return the result without the defence, such as ``heard with the right key``."""
-    if row.removed.startswith("the wrong "):  # the defence is a fault of the attacker's own files
-        return f"{row.observed} with the right {row.removed.removeprefix('the wrong ')}"
-    return f"{row.observed} without {row.removed}"
+    if row.defence_removed.startswith("the wrong "):
+        # The defence is a fault of the attacker's own files.
+        return f"{row.observed} with the right {row.defence_removed.removeprefix('the wrong ')}"
+    return f"{row.observed} without {row.defence_removed}"
 
 
 def _unique(texts: Iterable[str]) -> list[str]:

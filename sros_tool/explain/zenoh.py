@@ -120,7 +120,7 @@ class Reached(NamedTuple):
 
 
 class DecidingWildcard(NamedTuple):
-    """A key expression with a wildcard that decides."""
+    """A key expression with a wildcard on which the decision depends."""
 
     expression: str
     """The key expression."""
@@ -166,7 +166,7 @@ class ZenohAnswer:
     reached: tuple[Reached, ...] = ()
     """The enclaves with the matching right, such as to subscribe to what this one publishes."""
     wildcards: tuple[DecidingWildcard, ...] = ()
-    """Key expressions with wildcards that decide."""
+    """Key expressions with wildcards on which the decision depends."""
     until: datetime | None = None
     """When the certificate expires, or null."""
     unsigned: tuple[str, ...] = ()

@@ -153,7 +153,7 @@ def _cms(content: bytes, certificate: x509.Certificate, key: PrivateKey) -> byte
 
 
 def _now() -> bytes:
-    """Return the current time as a UTCTime; nothing reads when a document was signed."""
+    """Return the current time as a UTCTime; no reader uses the time of signing."""
     return time.strftime("%y%m%d%H%M%SZ", time.gmtime()).encode()
 
 

@@ -548,16 +548,16 @@ def _filled_tables(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
             "Write a table for each group.",
         )
     if not singular:
-        yield table.with_names(partial(_filled_names, several=members))
+        yield table.with_names(partial(_filled_names, members=members))
         return
     for robot in members[groups[0] if groups else ""]:
-        own = table.with_names(partial(_filled_names, several=members, robot=robot))
+        own = table.with_names(partial(_filled_names, members=members, robot=robot))
         words = {
             key: _filled_words(own.values[key], singular, robot)
             for key in _WORDS
             if key in own.values
         }
-        of_robots = tuple(_of_robots(table, members, robot))
+        of_robots = tuple(_plural_names(table, members, robot))
         yield replace(own, values={**own.values, **words}, robot=robot.name, of_robots=of_robots)
 
 
@@ -623,26 +623,29 @@ def _names_in(value: object) -> Iterator[str]:
 
 
 def _filled_names(
-    name: str, several: Mapping[str, Sequence[Robot]], robot: Robot | None = None
+    name: str, members: Mapping[str, Sequence[Robot]], robot: Robot | None = None
 ) -> list[str]:
-    """Return the names that a name, perhaps with `EXCEPT` before it, stands for."""
+    """Return the names that a name, perhaps with `EXCEPT` before it, stands for.
+
+    ``members`` maps each group to its robots.
+    """
     begin = EXCEPT if name.startswith(EXCEPT) else ""
     parts = parts_of(name.removeprefix(begin))
     if robot:
         parts = fill(parts, robot.name, robot.namespace)
     plural = placeholders_of(parts)
     filled = (
-        [fill(parts, each.name, each.namespace, plural=True) for each in several[plural[0].group]]
+        [fill(parts, each.name, each.namespace, plural=True) for each in members[plural[0].group]]
         if plural
         else [parts]
     )
     return [begin + "".join(map(str, each)) for each in filled]
 
 
-def _of_robots(
-    table: _Table, several: Mapping[str, Sequence[Robot]], robot: Robot
+def _plural_names(
+    table: _Table, members: Mapping[str, Sequence[Robot]], robot: Robot
 ) -> Iterator[RobotNames]:
-    """Yield what the names of a table stand for that have a plural placeholder."""
+    """Yield what each name with a plural placeholder in a table stands for."""
     values = [value for key, value in table.values.items() if key not in _WORDS]
     for name in filter(has_placeholder, _names_in(values)):
         if name.startswith(EXCEPT):
@@ -650,7 +653,7 @@ def _of_robots(
         parts = fill(parts_of(name), robot.name, robot.namespace)
         if plural := placeholders_of(parts):
             yield RobotNames(
-                tuple(_filled_names(name, several, robot)),
+                tuple(_filled_names(name, members, robot)),
                 "".join(map(str, fill(parts, robot.name, robot.namespace, plural=True))),
                 "".join(map(str, fill(parts, "{other}", "/{other}", plural=True))),
                 plural[0].group,

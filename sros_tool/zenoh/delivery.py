@@ -50,7 +50,7 @@ class Check:
 
     @property
     def rules(self) -> tuple[str, ...]:
-        """The ids of the rules that decide."""
+        """The ids of the rules that decide whether the message passes."""
         return self.decision.rules
 
     @property

@@ -49,18 +49,18 @@ BY_NAME = for_every(ROWS, lambda row: row.name)
 @BY_NAME
 def test_a_closed_door_has_a_control_that_is_open(row: Row) -> None:
     if row.expected in CLOSED:
-        assert not row.removed
+        assert not row.defence_removed
         assert row.controls
         assert all(claim.holds for claim in row.controls)
 
 
 def test_every_closed_door_opens_without_its_defence() -> None:
     closed = {row.attack for row in ROWS if row.expected in CLOSED}
-    opened = {row.attack for row in ROWS if row.removed}
+    opened = {row.attack for row in ROWS if row.defence_removed}
     # The closed row of this one is the control of those with variables that are spelt wrong.
     assert closed - opened == {"misspelt security variables"}
     for row in ROWS:
-        if row.removed:
+        if row.defence_removed:
             assert row.expected not in CLOSED, row.name
 
 
@@ -73,13 +73,15 @@ def test_the_page_lists_the_attacks_that_work(title: str, scenario: Scenario, co
     page = (CHECKOUT / "docs/attacks.md").read_text()
     _, _, text = page.partition(f"Attacks that are known to work{title}:\n")
     listed = re.findall(r"^\| (.+?) \|", text.strip().partition("\n\n")[0], re.MULTILINE)[2:]
-    assert listed == [row.name for row in scenario.rows if row.open_because and not row.removed]
+    assert listed == [
+        row.name for row in scenario.rows if row.open_because and not row.defence_removed
+    ]
     assert len(listed) == count, "docs/security.md has the number"
 
 
 @BY_NAME
 def test_what_is_open_says_why_and_what_to_do(row: Row) -> None:
-    if row.expected not in CLOSED and not row.removed:
+    if row.expected not in CLOSED and not row.defence_removed:
         assert row.open_because
         assert row.remedy
     for variant in row.variants:

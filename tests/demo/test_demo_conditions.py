@@ -114,8 +114,11 @@ def test_what_differs_between_templates_and_vendors() -> None:
 
 def test_a_defence_that_a_vendor_has_in_another_form_is_removed_in_that_form() -> None:
     holding = conditions(FAST, load_template("production"), "rt/chatter")
-    twins = {row.name: row.expected_under(holding) for row in ATTACKS.rows if row.removed}
-    assert twins["permissions borrowed, subjects not unique"].removed == "a unique subject name"
+    twins = {row.name: row.expected_under(holding) for row in ATTACKS.rows if row.defence_removed}
+    assert (
+        twins["permissions borrowed, subjects not unique"].defence_removed
+        == "a unique subject name"
+    )
     for name, row in twins.items():
         assert row.expected in OPEN, name
 

@@ -33,7 +33,7 @@ TWIN = RowResult(
     "seen",
     1,
     attack="forged",
-    removed="the signature",
+    defence_removed="the signature",
 )
 OPEN = RowResult(
     "put back",

@@ -57,13 +57,13 @@ def test_every_attack_is_also_tried_without_its_defence_or_told_as_open() -> Non
     for row in ATTACKS.rows:
         rows[row.attack].append(row)
     for attack, of in rows.items():
-        tried = [each for each in of if not each.removed]
+        tried = [each for each in of if not each.defence_removed]
         assert tried, attack
         for each in tried:
             if each.open_because:
                 assert each.remedy
             else:
-                assert any(other.removed for other in of), attack
+                assert any(other.defence_removed for other in of), attack
 
 
 def test_every_row_has_a_router_for_each_host_and_one_starts_before_all_others() -> None:

@@ -92,7 +92,7 @@ def test_every_attack_ends_as_expected(
         assert observed["packets of an unsecured talker sent again"] in ("heard again", "skipped")
         assert observed["packets of a secured talker sent again"] in ("not heard again", "skipped")
     assert observed[SIGNED_BY_ITSELF] == "not let in"
-    twins = [row.name for row in rows if row.attack == SIGNED_BY_ITSELF and row.removed]
+    twins = [row.name for row in rows if row.attack == SIGNED_BY_ITSELF and row.defence_removed]
     assert [observed[name] for name in twins] == ["heard"]
     open_doors = {row["name"] for row in result["rows"] if row["open_because"]}
     assert (PUT_BACK in open_doors) is (PUT_BACK in some_attacks())
@@ -120,7 +120,7 @@ def test_a_weakness_makes_its_rows_fail_and_no_others(
     """
     weakness = WEAKNESSES[name]
     broken = weakness.broken_on(backend)
-    rows_with_defences = [row.name for row in ATTACKS.rows if not row.removed]
+    rows_with_defences = [row.name for row in ATTACKS.rows if not row.defence_removed]
     others = [row for row in rows_with_defences if row not in broken]
     other = others[list(WEAKNESSES).index(name) % len(others)]
     tried = [row for row in rows_with_defences if LONG or row in broken or row == other]
@@ -146,7 +146,7 @@ def test_a_weakness_makes_its_rows_fail_and_no_others(
 @ONLY_LONG
 @needs_isolation
 def test_interrupted_attacks_leave_nothing(backend: Backend, tmp_path: Path) -> None:
-    rows = [row for row in ATTACKS.rows if not row.removed]
+    rows = [row for row in ATTACKS.rows if not row.defence_removed]
     words = [word for row in rows if LONG or row in rows[:6] for word in ("--only", row.name)]
     process = demo(backend, *words, folder=tmp_path)
     deadline = time.monotonic() + PATIENCE

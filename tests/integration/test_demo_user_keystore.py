@@ -144,7 +144,10 @@ def test_a_weak_robot_fails_in_the_rows_of_its_weakness(
         sros("create_enclave", foreign, victim).ok()
         weak.weaken(Place(robot, foreign, victim, other))
         broken = weak.broken_on(enforcing)
-    names = [row.name for row in ATTACKS.rows if not row.removed] + [OTHERS, "the widest enclave"]
+    names = [row.name for row in ATTACKS.rows if not row.defence_removed] + [
+        OTHERS,
+        "the widest enclave",
+    ]
     words = [word for each in names for word in ("--only", each)]
     ended = sros(
         *("demo", "--backend", backend, "--scenario", "attacks", "--keystore", robot, "--json"),

@@ -89,7 +89,9 @@ def without_defences(name: str) -> Scenario:
     """The scenario of an attack as if it were closed, in a keystore where it is not."""
     attacks = {row.name: row for row in ATTACKS.rows}
     closed = attacks[name]
-    opened = next(row for row in ATTACKS.rows if row.attack == closed.attack and row.removed)
+    opened = next(
+        row for row in ATTACKS.rows if row.attack == closed.attack and row.defence_removed
+    )
     row = replace(opened, name=name, expected=closed.expected, claims=closed.claims, world="")
     return replace(ATTACKS, rows=(row,))
 

@@ -2,8 +2,8 @@
 
 The attacker is the intruder of a row.  A row that expects the attack to fail has a control: the
 same listener must hear the permitted talker at the same time.  For each attack there is also a row
-with ``removed``, which shows that the attack succeeds without that defence: an attack that never
-works would prove nothing.
+with ``defence_removed``, which shows that the attack succeeds without that defence: an attack that
+never works would prove nothing.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ def _variants_without_defence(success: RowStatus, expected: RowStatus) -> tuple[
     return (Variant((Condition.UNAUTHENTICATED,), success, *_LET_IN),)
 
 
-def _victims(attacker: Identity, removed: str) -> KeystoreChoice:
-    return attacker.keystore if removed and attacker.keystore is not None else OWN
+def _victims(attacker: Identity, defence_removed: str) -> KeystoreChoice:
+    return attacker.keystore if defence_removed and attacker.keystore is not None else OWN
 
 
 def _injection(
@@ -75,15 +75,15 @@ def _injection(
     expected: RowStatus,
     mechanism: str,
     *variants: Variant,
-    removed: str = "",
+    defence_removed: str = "",
     victims: KeystoreChoice | None = None,
 ) -> Row:
     """Return a row that shows whether the attacker is heard on the topic.
 
-    A permitted talker on the same topic shows that the listener can hear, unless ``removed`` names
-    a defence that is switched off.
+    A permitted talker on the same topic shows that the listener can hear, unless a defence is
+    switched off (``defence_removed``).
     """
-    talker, listener = talker_and_listener(victims or _victims(attacker, removed))
+    talker, listener = talker_and_listener(victims or _victims(attacker, defence_removed))
     return Row(
         name,
         expected,
@@ -91,13 +91,13 @@ def _injection(
         (
             Party(_ATTACKER, Role.TALKER, attacker, intruder=True),
             listener,
-            *(() if removed else (talker,)),
+            *(() if defence_removed else (talker,)),
         ),
         (hears("listener", _ATTACKER).expecting(expected),),
-        () if removed else (hears("listener", "talker"),),
+        () if defence_removed else (hears("listener", "talker"),),
         brief=True,
         variants=(*variants, *_variants_without_defence(RowStatus.HEARD, expected)),
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
@@ -118,14 +118,16 @@ def _tampered(name: str, expected: RowStatus, mechanism: str, victims: KeystoreC
 
 
 def _succeeds(
-    name: str, attacker: Identity, removed: str, victims: KeystoreChoice | None = None
+    name: str, attacker: Identity, defence_removed: str, victims: KeystoreChoice | None = None
 ) -> Row:
     """Return a row in which the listener hears the attacker, because a defence is removed.
 
     The files of the attacker are valid.
     """
     mechanism = "an attacker with valid files is heard"
-    return _injection(name, attacker, RowStatus.HEARD, mechanism, removed=removed, victims=victims)
+    return _injection(
+        name, attacker, RowStatus.HEARD, mechanism, defence_removed=defence_removed, victims=victims
+    )
 
 
 def _listening(
@@ -134,7 +136,7 @@ def _listening(
     expected: RowStatus,
     mechanism: str,
     *,
-    removed: str = "",
+    defence_removed: str = "",
     victims: KeystoreChoice | None = None,
 ) -> Row:
     """Return a row that shows whether the attacker hears the topic."""
@@ -144,13 +146,13 @@ def _listening(
         mechanism,
         (
             Party(_ATTACKER, Role.LISTENER, attacker, intruder=True),
-            *talker_and_listener(victims or _victims(attacker, removed)),
+            *talker_and_listener(victims or _victims(attacker, defence_removed)),
         ),
         (hears(_ATTACKER, "talker").expecting(expected),),
         (hears("listener", "talker"),),
         brief=True,
         variants=_variants_without_defence(RowStatus.HEARD, expected),
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
@@ -160,7 +162,7 @@ def _discovering(
     expected: RowStatus,
     mechanism: str,
     *variants: Variant,
-    removed: str = "",
+    defence_removed: str = "",
     victims: KeystoreChoice = OWN,
 ) -> Row:
     """Return a row that shows whether the attacker discovers a publisher of the topic.
@@ -186,7 +188,7 @@ def _discovering(
         controls,
         brief=True,
         variants=variants,
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
@@ -196,10 +198,10 @@ def _on_service(role: Role, identity: Identity, name: str = "") -> Party:
 
 
 def _calling(
-    name: str, attacker: Identity, expected: RowStatus, mechanism: str, *, removed: str = ""
+    name: str, attacker: Identity, expected: RowStatus, mechanism: str, *, defence_removed: str = ""
 ) -> Row:
     """Return a row that shows whether a service answers the attacker."""
-    victims = _victims(attacker, removed)
+    victims = _victims(attacker, defence_removed)
     return Row(
         name,
         expected,
@@ -212,16 +214,16 @@ def _calling(
         (answered(_ATTACKER, "server").expecting(expected),),
         (answered("client", "server"),),
         brief=True,
-        variants=() if removed else _variants_without_defence(RowStatus.ANSWERED, expected),
-        removed=removed,
+        variants=() if defence_removed else _variants_without_defence(RowStatus.ANSWERED, expected),
+        defence_removed=defence_removed,
     )
 
 
 def _posing_as_server(
-    name: str, attacker: Identity, expected: RowStatus, mechanism: str, *, removed: str = ""
+    name: str, attacker: Identity, expected: RowStatus, mechanism: str, *, defence_removed: str = ""
 ) -> Row:
     """Return a row that shows whether a client accepts answers from an attacker."""
-    victims = _victims(attacker, removed)
+    victims = _victims(attacker, defence_removed)
     rightful = _on_service(Role.SERVER, Identity(victims, "server"))
     return Row(
         name,
@@ -230,13 +232,13 @@ def _posing_as_server(
         (
             _on_service(Role.SERVER, attacker, _ATTACKER),
             _on_service(Role.CLIENT, Identity(victims, "client")),
-            *(() if removed else (rightful,)),
+            *(() if defence_removed else (rightful,)),
         ),
         (answered("client", _ATTACKER).expecting(expected),),
-        () if removed else (answered("client", "server"),),
+        () if defence_removed else (answered("client", "server"),),
         brief=True,
-        variants=() if removed else _variants_without_defence(RowStatus.ANSWERED, expected),
-        removed=removed,
+        variants=() if defence_removed else _variants_without_defence(RowStatus.ANSWERED, expected),
+        defence_removed=defence_removed,
     )
 
 
@@ -314,7 +316,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                 "with the protection kind NONE, access is controlled but nothing is encrypted",
                 _IN_CLEAR,
             ),
-            removed="encryption",
+            defence_removed="encryption",
         ),
     ),
     *tries(
@@ -348,7 +350,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                 OWN,
             ),
             parties=(Party("talker", Role.TALKER), Party("listener", Role.LISTENER)),
-            removed="security",
+            defence_removed="security",
         ),
     ),
     *tries(
@@ -379,7 +381,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                 "with the protection kind NONE, nothing in a packet proves who sent it",
                 _IN_CLEAR,
             ),
-            removed="signatures and encryption",
+            defence_removed="signatures and encryption",
         ),
     ),
     *tries(
@@ -413,7 +415,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
             UNSECURED,
             RowStatus.HEARD,
             "the governance admits everybody and protects nothing",
-            removed=_STRANGERS_REFUSED,
+            defence_removed=_STRANGERS_REFUSED,
             victims=_OPEN_GOVERNANCE,
         ),
     ),
@@ -436,7 +438,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
             UNSECURED,
             RowStatus.VISIBLE,
             "discovery is not protected, and everybody may join",
-            removed=_STRANGERS_REFUSED,
+            defence_removed=_STRANGERS_REFUSED,
             victims=_OPEN_GOVERNANCE,
         ),
     ),
@@ -453,7 +455,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
             UNSECURED,
             RowStatus.HEARD,
             "the governance admits everybody and protects nothing",
-            removed=_STRANGERS_REFUSED,
+            defence_removed=_STRANGERS_REFUSED,
             victims=_OPEN_GOVERNANCE,
         ),
     ),
@@ -505,7 +507,7 @@ def _trespass(
             Identity(Undefended(forge), part),
             done,
             opened,
-            removed="least privilege",
+            defence_removed="least privilege",
         ),
     )
 
@@ -578,7 +580,7 @@ _RIGHTS_ROWS: tuple[Row, ...] = (
             Identity(Undefended(template=forger.open_default), "newcomer"),
             RowStatus.HEARD,
             "an enclave without a policy may do everything",
-            removed="the template's rule to deny by default",
+            defence_removed="the template's rule to deny by default",
         ),
     ),
 )
@@ -702,7 +704,7 @@ _IDENTITY_ROWS: tuple[Row, ...] = (
             Identity(Undefended(forger.talker_revocation_not_delivered), forger.STOLEN),
             RowStatus.HEARD,
             _NO_LIST,
-            removed="the listener's crl.pem",
+            defence_removed="the listener's crl.pem",
         ),
     ),
     *tries(
@@ -735,7 +737,7 @@ _IDENTITY_ROWS: tuple[Row, ...] = (
             Identity(Undefended(forger.files_readable_for_all), "talker"),
             RowStatus.HEARD,
             "no DDS checks file modes: any user that can read the key can pose as the enclave",
-            removed="the modes of files and folders",
+            defence_removed="the modes of files and folders",
         ),
     ),
 )
@@ -758,14 +760,14 @@ _TRUSTED_AS_SIGNER = _injection(
     Identity(Undefended(forger.enclave_among_the_signers), "guest"),
     RowStatus.HEARD,
     "every certificate in the file of the permissions CA may sign",
-    removed="a permissions CA file with only the CA in it",
+    defence_removed="a permissions CA file with only the CA in it",
 )
 _SAME_SUBJECT = _injection(
     "permissions borrowed, the same subject",
     Identity(Undefended(forger.borrowed_permissions_and_subject), "guest"),
     RowStatus.HEARD,
     "the same permissions are valid for two certificates with one subject name",
-    removed="a unique subject name",
+    defence_removed="a unique subject name",
 )
 
 _PERMISSIONS_ROWS: tuple[Row, ...] = (
@@ -805,7 +807,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Identity(Undefended(forger.another_permissions_ca_trusted), "guest"),
             RowStatus.HEARD,
             "the listener accepts what the permissions CA that it trusts has signed",
-            removed="the listener's permissions CA",
+            defence_removed="the listener's permissions CA",
         ),
     ),
     *tries(
@@ -851,7 +853,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 mechanism="Cyclone DDS 11 accepts only the permissions CA itself as signer",
             ),
             Variant((Condition.EXACT_SIGNER,), RowStatus.HEARD, instead=_TRUSTED_AS_SIGNER),
-            removed="a separate permissions CA",
+            defence_removed="a separate permissions CA",
         ),
     ),
     *tries(
@@ -881,7 +883,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             "Cyclone DDS compares parts of subject names: /guest may use the permissions of "
             "/guest/admin",
             Variant((Condition.FAST,), RowStatus.HEARD, instead=_SAME_SUBJECT),
-            removed=_UNIQUE_SUBJECTS,
+            defence_removed=_UNIQUE_SUBJECTS,
         ),
     ),
     *tries(
@@ -919,7 +921,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             ),
             RowStatus.HEARD,
             "the old and new permissions are for the same subject name",
-            removed=_UNIQUE_SUBJECTS,
+            defence_removed=_UNIQUE_SUBJECTS,
         ),
     ),
     *tries(
@@ -936,7 +938,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Identity(Undefended(forger.guest_revocation_not_delivered), forger.STOLEN),
             RowStatus.HEARD,
             _NO_LIST,
-            removed="the listener's crl.pem",
+            defence_removed="the listener's crl.pem",
         ),
     ),
     *tries(
@@ -1031,7 +1033,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             UNSECURED,
             RowStatus.HEARD,
             "the governance admits everybody and protects nothing",
-            removed="the wrong signature",
+            defence_removed="the wrong signature",
             victims=_OPEN_GOVERNANCE,
         ),
     ),
@@ -1044,7 +1046,7 @@ _ENABLE, _STRATEGY = "ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY"
 
 
 def _misconfigured(
-    name: str, identity: Identity, expected: RowStatus, mechanism: str, *, removed: str = ""
+    name: str, identity: Identity, expected: RowStatus, mechanism: str, *, defence_removed: str = ""
 ) -> Row:
     """Return a row that shows whether a misconfigured talker is heard by an unsecured listener."""
     return Row(
@@ -1060,7 +1062,7 @@ def _misconfigured(
         (hears("unsecured listener", "unsecured talker"),),
         brief=True,
         variants=_variants_without_defence(RowStatus.HEARD, expected),
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
@@ -1091,7 +1093,7 @@ _VARIABLE_ROWS: tuple[Row, ...] = (
             ),
             RowStatus.HEARD,
             "with Permissive, the talker runs unsecured, and everybody hears it",
-            removed="ROS_SECURITY_STRATEGY=Enforce",
+            defence_removed="ROS_SECURITY_STRATEGY=Enforce",
         ),
     ),
     *tries(

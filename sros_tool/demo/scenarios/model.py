@@ -290,8 +290,8 @@ class Row:
     all processes run; with ``short_lived``, the talker of the first claim gets a certificate that
     expires while the row runs.  Rows of the same ``world`` share their processes: a party of two
     rows is the same process.  The first of ``variants`` whose conditions hold replaces the expected
-    status.  ``attack`` names the attack to which the row belongs; with ``removed`` it shows that
-    attack without the defence that ``removed`` names.  ``open_because`` and ``remedy`` are as in
+    status.  ``attack`` names the attack to which the row belongs; with ``defence_removed``, the row
+    shows that attack without the defence of that name.  ``open_because`` and ``remedy`` are as in
     `Variant`.  ``accepted`` says that the user accepts that the attack succeeds, ``unaccepted``
     that it succeeds because of the user's keystore, and the user did not accept that.
     """
@@ -311,7 +311,7 @@ class Row:
     world: str = ""
     variants: tuple[Variant, ...] = ()
     attack: str = ""
-    removed: str = ""
+    defence_removed: str = ""
     open_because: str = ""
     remedy: str = ""
     accepted: bool = False

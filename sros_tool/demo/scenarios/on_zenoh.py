@@ -99,7 +99,7 @@ def _attempt(
     controls: tuple[Claim, ...] = (),
     *,
     world: str = "",
-    removed: str = "",
+    defence_removed: str = "",
     evidence: str = "",
 ) -> Row:
     """Return a brief row with one claim, expected as ``expected``."""
@@ -112,7 +112,7 @@ def _attempt(
         controls,
         brief=True,
         world=world,
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
@@ -289,7 +289,7 @@ def _tapped(attack: str, wire: Wire, *, readable: bool) -> tuple[Row, ...]:
         wire=True,
         brief=True,
         world="tapped, open" if readable else "tapped",
-        removed="TLS" if readable else "",
+        defence_removed="TLS" if readable else "",
     )
     return tries(attack, row)
 
@@ -319,7 +319,7 @@ def _shared_memory_row(name: str, keystore: KeystoreChoice, *, readable: bool) -
         (Claim(Relation.READABLE, "talker", holds=readable, wire=Wire.MEMORY),),
         _CHATTER,
         brief=True,
-        removed="`shared_memory` off" if readable else "",
+        defence_removed="`shared_memory` off" if readable else "",
     )
 
 
@@ -352,7 +352,7 @@ def _outsider(name: str, keystore: KeystoreChoice, mechanism: str, evidence: str
     )
 
 
-def _let_in(name: str, keystore: KeystoreChoice, removed: str) -> Row:
+def _let_in(name: str, keystore: KeystoreChoice, defence_removed: str) -> Row:
     """Return a row in which messages of such a process arrive, because a defence is missing."""
     wide, _, listener = _topic_pair(keystore)
     party = _attacker("attacker", Role.TALKER, keystore, "talker")
@@ -362,14 +362,14 @@ def _let_in(name: str, keystore: KeystoreChoice, removed: str) -> Row:
         "it gets a connection, and rules without a name let it through",
         hears("listener", party.name),
         (wide, listener, party),
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
 _IN_DATE = _attacker("talker in date", Role.TALKER, zenoh_forger.in_date, "talker")
 
 
-def _in_date(name: str, removed: str) -> Row:
+def _in_date(name: str, defence_removed: str) -> Row:
     return _attempt(
         name,
         RowStatus.HEARD,
@@ -377,7 +377,7 @@ def _in_date(name: str, removed: str) -> Row:
         hears("listener", _IN_DATE.name),
         (*_topic_pair(), _IN_DATE),
         world=_PEERS,
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
@@ -466,7 +466,7 @@ def _expiring(name: str, keystore: KeystoreChoice, *, cut: bool) -> Row:
         (hears("listener", steady.name),),
         brief=True,
         short_lived=True,
-        removed="" if cut else "close_link_on_expiration",
+        defence_removed="" if cut else "close_link_on_expiration",
     )
 
 
@@ -491,7 +491,7 @@ def _trespass(
     mechanism: str,
     keystore: KeystoreChoice,
     world: str,
-    removed: str = "",
+    defence_removed: str = "",
 ) -> Row:
     """Return a row in which a party uses the topic or the service in a keystore, or tries to."""
     claim = {
@@ -511,7 +511,7 @@ def _trespass(
         (*others, replace(party, identity=identity)),
         _CALLS if on_service else _CHATTER,
         world=world,
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
@@ -622,7 +622,7 @@ def _rogue(
     world: str,
     *,
     reads: bool,
-    removed: str = "",
+    defence_removed: str = "",
     part: str = "guest",
 ) -> Row:
     """Return a row in which a talker and a listener are connected to a router that attacks.
@@ -630,7 +630,7 @@ def _rogue(
     The attack succeeds without the defence, and for an attacker with the router's enclave.
     """
     rogue = Party("attacking router", Role.RELAY, Identity(keystore, part), intruder=True)
-    succeeds = bool(removed) or part == "router"
+    succeeds = bool(defence_removed) or part == "router"
     return _attempt(
         name,
         RowStatus.HEARD if succeeds else RowStatus.NOT_HEARD,
@@ -641,13 +641,13 @@ def _rogue(
         (rogue, *_topic_pair(keystore)[1:]),
         () if part == "router" else _CHATTER,
         world=world,
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
 _ROUTER_ROWS = tuple(
     row
-    for suffix, keystore, world, removed in (
+    for suffix, keystore, world, defence_removed in (
         ("", zenoh_forger.another_router, "rogue router", ""),
         (
             ", a subject for everybody",
@@ -661,7 +661,8 @@ _ROUTER_ROWS = tuple(
         (True, "another enclave plays the router and reads"),
     )
     for row in tries(
-        attack, _rogue(f"{attack}{suffix}", keystore, world, reads=reads, removed=removed)
+        attack,
+        _rogue(f"{attack}{suffix}", keystore, world, reads=reads, defence_removed=defence_removed),
     )
 )
 
@@ -716,21 +717,21 @@ _ROUTERS = _scenario(
 )
 
 
-def _rogue_far_router(name: str, keystore: KeystoreChoice, removed: str = "") -> Row:
+def _rogue_far_router(name: str, keystore: KeystoreChoice, defence_removed: str = "") -> Row:
     """Return a row in which the guest connects to the talker's router as another router."""
     rogue = Party("attacking far router", Role.RELAY, Identity(keystore, "guest"), intruder=True)
     wide, talker, _ = _topic_pair(keystore)
     observer = _rightful("observer", Role.OBSERVER, keystore, "client")
     return _attempt(
         name,
-        RowStatus.HEARD if removed else RowStatus.NOT_HEARD,
+        RowStatus.HEARD if defence_removed else RowStatus.NOT_HEARD,
         "the router trusts this router"
-        if removed
+        if defence_removed
         else "a router trusts another router only by the name in its certificate",
         hears(rogue.name, "talker"),
         (rogue, replace(wide, turn=1), replace(talker, turn=2), replace(observer, turn=2)),
         (Claim(Relation.SEES, "observer", "talker"),),
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
@@ -851,7 +852,11 @@ _TOKENS = (
 
 
 def _announcing(
-    token: _FalseToken, keystore: KeystoreChoice, world: str, how: str = "", removed: str = ""
+    token: _FalseToken,
+    keystore: KeystoreChoice,
+    world: str,
+    how: str = "",
+    defence_removed: str = "",
 ) -> Row:
     """Return a row in which an enclave announces a publisher to an observer of the graph."""
     impostor = replace(
@@ -862,13 +867,15 @@ def _announcing(
     wide, talker, _ = _topic_pair(keystore)
     return _attempt(
         f"{token.attack}{how}",
-        RowStatus.VISIBLE if removed else RowStatus.NOT_VISIBLE,
-        "nobody compares the names in a token with a policy" if removed else token.mechanism,
+        RowStatus.VISIBLE if defence_removed else RowStatus.NOT_VISIBLE,
+        "nobody compares the names in a token with a policy"
+        if defence_removed
+        else token.mechanism,
         Claim(Relation.SEES, "observer", impostor.name),
         (wide, talker, observer, impostor),
         (Claim(Relation.SEES, "observer", "talker"),),
         world=world,
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
@@ -896,22 +903,22 @@ _SERVICE_TOKEN = _TOKENS[-1]
 _ERASING = "another enclave erases a node"
 
 
-def _erasing(how: str, keystore: KeystoreChoice, world: str, removed: str = "") -> Row:
+def _erasing(how: str, keystore: KeystoreChoice, world: str, defence_removed: str = "") -> Row:
     """Return a row in which the guest takes the talker out of the graph of an observer."""
     wide, talker, _ = _topic_pair(keystore)
     eraser = _attacker("eraser", Role.ERASER, keystore)
     observer = _rightful("observer", Role.OBSERVER, keystore, "client")
     return _attempt(
         f"{_ERASING}{how}",
-        RowStatus.ERASED if removed else RowStatus.NOT_ERASED,
+        RowStatus.ERASED if defence_removed else RowStatus.NOT_ERASED,
         "when a token ends, the graph compares its session and name, but not the enclave"
-        if removed
+        if defence_removed
         else "a token passes only for nodes that the policy of its sender names",
         Claim(Relation.LOSES, "observer", "eraser"),
         (wide, talker, observer, eraser),
-        () if removed else (Claim(Relation.SEES, "observer", "talker"),),
+        () if defence_removed else (Claim(Relation.SEES, "observer", "talker"),),
         world=world,
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
@@ -947,23 +954,29 @@ _TOKEN_ROWS = (
 # ── what was valid earlier ─────────────────────────────────────────────────────────────────
 
 
-def _earlier(name: str, keystore: KeystoreChoice, expected: RowStatus, removed: str = "") -> Row:
+def _earlier(
+    name: str, keystore: KeystoreChoice, expected: RowStatus, defence_removed: str = ""
+) -> Row:
     guest = _attacker("guest with an earlier file", Role.TALKER, keystore, lawless=False)
     return _attempt(
         name,
         expected,
         "only this file decides what its own process may do"
-        if removed
+        if defence_removed
         else "a session file limits only other enclaves; their files decide what this one may do",
         hears("listener", guest.name),
         (*_topic_pair(keystore), guest),
         _CHATTER,
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
 def _thief(
-    name: str, keystore: KeystoreChoice, expected: RowStatus, mechanism: str, removed: str = ""
+    name: str,
+    keystore: KeystoreChoice,
+    expected: RowStatus,
+    mechanism: str,
+    defence_removed: str = "",
 ) -> Row:
     wide, _, listener = _topic_pair(keystore)
     talker = _rightful("talker", Role.TALKER, keystore, "admin")
@@ -975,7 +988,7 @@ def _thief(
         hears("listener", "thief"),
         (wide, talker, listener, thief),
         _CHATTER,
-        removed=removed,
+        defence_removed=defence_removed,
     )
 
 
@@ -1077,21 +1090,21 @@ _OPEN_ROWS = (
 )
 
 
-def _flooded(name: str, keystore: KeystoreChoice, world: str, removed: str = "") -> Row:
+def _flooded(name: str, keystore: KeystoreChoice, world: str, defence_removed: str = "") -> Row:
     """Return a row in which a talker connects while somebody makes useless connections."""
     late = replace(_LATE, identity=replace(_LATE.identity, keystore=keystore))
     return _attempt(
         name,
-        RowStatus.NOT_LET_IN if removed else RowStatus.HEARD,
+        RowStatus.NOT_LET_IN if defence_removed else RowStatus.HEARD,
         "after each failed handshake the router accepts nobody for a moment"
-        if removed
+        if defence_removed
         else "the router has room for thousands of handshakes that do not end",
         hears("listener", late.name),
         (*_topic_pair(keystore), _attacker("flooder", Role.FLOODER, keystore), late),
         _CHATTER,
         world=world,
-        evidence="InvalidContentType" if removed else "",
-        removed=removed,
+        evidence="InvalidContentType" if defence_removed else "",
+        defence_removed=defence_removed,
     )
 
 

@@ -151,7 +151,8 @@ class IssuedEarlier:
                 self._expiry[kind] = max(self._expiry.get(kind, ""), entry.not_after)
 
     def until(self, name: str, known: datetime, *kinds: str) -> datetime:
-        """Return until when an enclave's files of all ``kinds`` work, at least until ``known``.
+        """Return the time until which files of all ``kinds`` of an enclave work, or ``known`` if
+        later.
 
         ``kinds`` are "certificate" and "permissions"; revoked certificates do not work.
         """
