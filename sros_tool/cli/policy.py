@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -273,7 +273,7 @@ def diff_policy(
     elif form == "markdown":
         echo_lines(rights_markdown(first, second, compared))
     else:
-        lines = difference_lines(difference, first.fleet, second.fleet)
+        lines = _difference_lines(difference, first.fleet, second.fleet)
         lines += domain_lines(compared, first.fleet or second.fleet)
         unanswered = unanswered_lines(compared, second.fleet)
         for line in (*lines, *_protection_lines(protections), *unanswered):
@@ -307,12 +307,12 @@ def rights_markdown(first: RightsSource, second: RightsSource, compared: Sources
     drawn = drawn_difference(
         first, second, compared.rights, letters=_MOST_PICTURE, arrows=_MOST_LINKS
     )
-    lines = difference_lines(compared.rights, first.fleet, second.fleet)
+    lines = folded_differences(first, second, compared.rights)
     lines += domain_lines(compared, first.fleet or second.fleet)
     lines += _protection_lines(compared.protections)
     parts = []
     rest = "which `sros diff_policy` shows"
-    for sign, title in (("+", "added"), ("-", "removed")):
+    for sign, title in (("~", "renamed"), ("+", "added"), ("-", "removed")):
         signed = [line.removeprefix(f"{sign} ") for line in lines if line.startswith(sign)]
         if signed:
             parts.append(f"**{len(signed)} {title}**")
@@ -367,7 +367,7 @@ def _protection_lines(protections: Iterable[tuple[str, StatedProtection]]) -> li
     ]
 
 
-def difference_lines(
+def _difference_lines(
     difference: RightsDifference,
     first: Fleet | None,
     second: Fleet | None,
@@ -391,6 +391,23 @@ def difference_lines(
         text
         for side, fleet in fleets
         for text in folded(fleet, [(name, text) for sign, name, text in lines if sign == side])
+    ]
+
+
+def folded_differences(
+    first: RightsSource,
+    second: RightsSource,
+    difference: RightsDifference,
+    sides: tuple[str, str] = ("A", "B"),
+) -> list[str]:
+    """Return the lines for a difference, with one line for each enclave that was renamed."""
+    from sros_tool.policy.rights import renamed_enclaves
+
+    renamed = renamed_enclaves(first.rights, second.rights)
+    others = difference.without({*renamed, *renamed.values()})
+    return [
+        *_renamed_lines(renamed, second.fleet),
+        *_difference_lines(others, first.fleet, second.fleet, sides),
     ]
 
 
@@ -741,7 +758,7 @@ def _show_new_access(
     elif form == "markdown":
         echo_document(access_markdown(before, after, growth))
     else:
-        for line in (*added_lines(after, growth), *_removed_lines(before, growth)):
+        for line in (*added_lines(before, after, growth), *_removed_lines(before, after, growth)):
             echo(line)
         echo(access_summary(growth), err=True)
     if form != "json":
@@ -749,21 +766,40 @@ def _show_new_access(
     return int(bool(growth))
 
 
-def added_lines(head: AccessSource, growth: Growth) -> list[str]:
-    """Return the added access as lines that begin with "+"."""
+def added_lines(base: AccessSource, head: AccessSource, growth: Growth) -> list[str]:
+    """Return the added access as lines that begin with "+", or "~" for a renamed enclave."""
+    from sros_tool.proof.growth import renamed_between
+
+    renamed = renamed_between(base, head)
+    rest = growth.without_renames(renamed)
     return [
-        *_folded_gains(head, "+", growth.added, growth),
+        *_renamed_lines(renamed, head.fleet),
+        *_folded_gains(head, "+", rest.added, growth),
         *(f"+ less protection: {change}" for change in growth.lost),
-        *_reach_lines(head, growth.reach),
+        *_reach_lines(head, rest.reach),
     ]
 
 
-def _removed_lines(base: AccessSource, growth: Growth) -> list[str]:
+def _renamed_lines(renamed: Mapping[str, str], fleet: Fleet | None) -> Iterator[str]:
+    """Yield a line for each enclave that has another name; lines of robots are merged."""
+    from sros_tool.fleet.robots import folded
+
+    lines = (
+        (new, f"~ enclave {old} is now {new}, with the same rights")
+        for old, new in sorted(renamed.items())
+    )
+    return folded(fleet, lines)
+
+
+def _removed_lines(base: AccessSource, head: AccessSource, growth: Growth) -> list[str]:
+    from sros_tool.proof.growth import renamed_between
+
+    removed = growth.without_renames(renamed_between(base, head)).removed
     more = (
         f"- more protection: {change.key} {change.after} -> {change.before}"
         for change in growth.gained
     )
-    return [*_folded_gains(base, "-", growth.removed, growth), *more]
+    return [*_folded_gains(base, "-", removed, growth), *more]
 
 
 def _folded_gains(
@@ -860,8 +896,13 @@ def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> s
 
     rest = "which `sros diff_policy --no-new-access` shows"
     parts = [f"### New access: {plain('yes' if growth else 'none')}", plain(access_summary(growth))]
-    lists = (("added", added_lines(head, growth)), ("removed", _removed_lines(base, growth)))
-    for title, lines in lists:
+    added, removed = added_lines(base, head, growth), _removed_lines(base, head, growth)
+    renamed = [line for line in added if line.startswith("~")]
+    for title, lines in (
+        ("renamed", renamed),
+        ("added", added[len(renamed) :]),
+        ("removed", removed),
+    ):
         if lines:
             parts.append(f"**{len(lines)} {title}**")
             parts.append(bounded((code(line[2:]) for line in lines), _MOST_CHARACTERS, rest))

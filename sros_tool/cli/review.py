@@ -391,12 +391,23 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             return result.shown(str(error))
 
 
+def _sentences(result: Review, steps: Sequence[ReviewStep]) -> Iterator[tuple[ReviewStep, str]]:
+    """Yield each step with its result as a clause, which repeats no error of an earlier step."""
+    said = ""
+    for step in steps:
+        sentence = _sentence(result, step)
+        if isinstance(step.content, SrosError) and sentence in said:
+            sentence = "could not be decided, for the same reason"
+        said += "\n".join((sentence, *map(result.shown, _reasons(step))))
+        yield step, sentence
+
+
 def _text(result: Review) -> list[str]:
     """Return the review as lines."""
     lines = []
-    for step in result.steps:
+    for step, sentence in _sentences(result, result.steps):
         subject = f" {result.shown(step.subject)}" if step.subject else ""
-        lines.append(f"{step.kind}{subject}: {_sentence(result, step)}")
+        lines.append(f"{step.kind}{subject}: {sentence}")
         said = _reasons(step)
         more = [f"and {len(said) - _MOST_REASONS} more (--summary FILE has all)"]
         shown = said[:_MOST_REASONS] + more * (len(said) > _MOST_REASONS)
@@ -410,17 +421,15 @@ def _reasons(step: ReviewStep) -> list[str]:
     """
     from sros_tool.checks.formats import by_robot
     from sros_tool.checks.registry import ChosenFindings
-    from sros_tool.cli.policy import added_lines, difference_lines, domain_lines, unanswered_lines
+    from sros_tool.cli.policy import added_lines, domain_lines, folded_differences, unanswered_lines
     from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange
 
     match step.content:
-        case AccessChange(after=after, growth=growth):
-            return added_lines(after, growth)
+        case AccessChange(before=before, after=after, growth=growth):
+            return added_lines(before, after, growth)
         case RightsChange(before=before, after=after, compared=compared):
             unanswered = unanswered_lines(compared, after.fleet)
-            differing = difference_lines(
-                compared.rights, before.fleet, after.fleet, ("BASE", "HEAD")
-            )
+            differing = folded_differences(before, after, compared.rights, ("BASE", "HEAD"))
             differing += domain_lines(compared, after.fleet or before.fleet)
             return [*unanswered, *_absolute_lines(step.content), *differing]
         case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen) if (
@@ -484,8 +493,8 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
     lines = (
         f"{_SIGN_ALLOWED if step.allowed else _SIGNS[step.status]} {_TITLES[step.kind]}"
         f"{' ' + code(result.shown(step.subject)) if step.subject else ''}: "
-        f"{code(_sentence(result, step))}"
-        for step in _by_weight(result)
+        f"{code(sentence)}"
+        for step, sentence in _sentences(result, _by_weight(result))
     )
     count = len(result.left_out)
     out = f", but {count} thing{'s were' if count > 1 else ' was'} left out:" if count else ""
@@ -556,8 +565,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
         case Facts(lines=facts):
             said = (f"{code(name)} {code(text)}" for text, name in facts)
             return f"### {_TITLES[step.kind]}\n\n{bounded(said, 6000, rest)}"
-        case error:
-            return f"### {_TITLES[step.kind]}: could not be decided\n\n{code(str(error))}"
+    return ""
 
 
 assert max(_SIGNS) == NOT_DONE

@@ -8,7 +8,7 @@ joins them again.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -262,6 +262,41 @@ class RightsDifference:
         """Return the different rights with "-" (only first side) or "+" (only second side)."""
         found = [("-", right) for right in self.only_first] + [("+", e) for e in self.only_second]
         return sorted(found, key=lambda line: (*order(line[1]), line[0] == "+"))
+
+    def without(self, enclaves: Collection[str]) -> RightsDifference:
+        """Return the difference in the rights of all other enclaves."""
+        one, other = (
+            tuple(right for right in side if right.enclave not in enclaves)
+            for side in (self.only_first, self.only_second)
+        )
+        return RightsDifference(one, other, self.covered)
+
+
+def renamed_enclaves(first: Iterable[Right], second: Iterable[Right]) -> dict[str, str]:
+    """Map enclaves that only ``first`` has to enclaves that only ``second`` has, by equal rights.
+
+    An enclave is left out where several others have the same rights.
+    """
+    before, after = (_rights_by_enclave(side) for side in (first, second))
+    gone: dict[frozenset[Right], list[str]] = defaultdict(list)
+    new: dict[frozenset[Right], list[str]] = defaultdict(list)
+    for enclave in before.keys() - after.keys():
+        gone[frozenset(before[enclave])].append(enclave)
+    for enclave in after.keys() - before.keys():
+        new[frozenset(after[enclave])].append(enclave)
+    return {
+        names[0]: new[rights][0]
+        for rights, names in gone.items()
+        if len(names) == len(new.get(rights, ())) == 1
+    }
+
+
+def _rights_by_enclave(rights: Iterable[Right]) -> dict[str, set[Right]]:
+    """Return the rights of each enclave, without the enclave."""
+    by_enclave: dict[str, set[Right]] = defaultdict(set)
+    for right in rights:
+        by_enclave[right.enclave].add(right._replace(enclave=""))
+    return by_enclave
 
 
 def compare(

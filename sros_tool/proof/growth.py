@@ -33,7 +33,7 @@ from sros_tool.dds.decision.matching import ExpressionIndex, matches
 from sros_tool.dds.decision.vendors import TESTED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance
-from sros_tool.dds.permissions import Grant, Permissions
+from sros_tool.dds.permissions import Grant, Permissions, Rule
 from sros_tool.errors import DocumentError, Note
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.comparison import Effect, SettingChange
@@ -46,7 +46,7 @@ from sros_tool.names import (
 )
 from sros_tool.policy.model import ALLOW, Source
 from sros_tool.policy.patterns import literal_prefix
-from sros_tool.policy.rights import KIND_OF, Right
+from sros_tool.policy.rights import KIND_OF, Right, renamed_enclaves
 from sros_tool.proof.protection import (
     added_crossing,
     contradiction,
@@ -204,6 +204,44 @@ class Growth:
 
     def __bool__(self) -> bool:
         return bool(self.added or self.lost)
+
+    def without_renames(self, renamed: Mapping[str, str]) -> Growth:
+        """Return this growth without the access that a list has for renamed enclaves alone.
+
+        ``renamed`` is what `renamed_between` returns.  If nothing else is added, nobody reaches
+        anybody whom it did not reach before, under the old names.
+        """
+        names = {*renamed, *renamed.values()}
+
+        def is_other(gain: Gain) -> bool:
+            own = gain.right is not None and gain.enclaves == (gain.right.enclave,)
+            return not own or gain.enclaves[0] not in names or gain.denied is not None
+
+        added, removed = (tuple(filter(is_other, gains)) for gains in (self.added, self.removed))
+        reach = self.reach
+        if not added:
+            reach = tuple(new for new in reach if names.isdisjoint((new.source, new.target)))
+        return replace(self, added=added, removed=removed, reach=reach)
+
+
+def renamed_between(base: AccessSource, head: AccessSource) -> dict[str, str]:
+    """Map enclaves of BASE to enclaves of HEAD that have their rights, and only another name.
+
+    Their permissions are the same but for the subject; Zenoh rules are not compared, so that with
+    them no enclave counts as renamed.
+    """
+    if base.zenoh is not None or head.zenoh is not None:
+        return {}
+
+    def rules(side: AccessSource, enclave: str) -> list[tuple[Rule, ...]]:
+        known = side.permissions.get(enclave)
+        return [grant.rules for grant in known.grants] if known else []
+
+    return {
+        old: new
+        for old, new in renamed_enclaves(base.rights, head.rights).items()
+        if rules(base, old) and rules(base, old) == rules(head, new)
+    }
 
 
 class ComparedSide(NamedTuple):

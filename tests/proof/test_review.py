@@ -14,6 +14,8 @@ import pytest
 
 from sros_tool.cli.review import review as review_verb
 from sros_tool.errors import DocumentError, SrosError, UsageError
+from sros_tool.policy.model import ALLOW
+from sros_tool.policy.rights import Right, renamed_enclaves
 from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.repository import Repository
 from tests.support.code_host import PROJECT
@@ -146,6 +148,43 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     (absolute,) = (line for line in said if line.startswith("  ~"))
     assert "/c subscribe topic /x has a / at its beginning now, so that it does" in absolute
     assert absolute.endswith("(second.xml:3)")
+
+
+def test_a_renamed_enclave_is_one_line_and_still_new_access(change: Change) -> None:
+    change.commit({"robot.xml": policy_text({"/a": publish("/x", "/z"), "/c": publish("/y")})})
+    ended = change.review("--policy", "robot.xml")
+    renamed = "  ~ enclave /b is now /c, with the same rights"
+    assert ended.status == 1 and "13 rights are new; 12 rights are gone" in ended.out
+    assert [line.partition("  (")[0] for line in ended.out.splitlines() if line[:2] == "  "] == [
+        *(renamed, "  + /a publish topic /z"),
+        *(renamed, "  + /a ALLOW publish topic /z"),
+    ]
+
+
+def test_an_enclave_is_renamed_only_if_all_of_its_rights_are_the_same() -> None:
+    def rights(enclaves: dict[str, str]) -> set[Right]:
+        return {
+            Right(name, ALLOW, "publish", topic) for name in enclaves for topic in enclaves[name]
+        }
+
+    base = rights({"/a": "x", "/b": "yz"})
+    for enclaves, renamed in (
+        ({"/a": "x", "/c": "yz"}, {"/b": "/c"}),
+        ({"/a": "x", "/c": "yzx"}, {}),
+        ({"/a": "x", "/c": "y"}, {}),
+        ({"/a": "x", "/b": "y", "/c": "yz"}, {}),
+        ({"/a": "x", "/c": "yz", "/d": "yz"}, {}),
+    ):
+        assert renamed_enclaves(base, rights(enclaves)) == renamed, enclaves
+
+
+def test_an_error_is_said_once(change: Change, tmp_path: Path) -> None:
+    change.commit({"robot.xml": "<policy"})
+    summary = tmp_path.with_name("summary.md")
+    ended = change.review("--policy", "robot.xml", "--summary", str(summary))
+    assert ended.status == 2 and ended.out.count("not well-formed") == 1
+    assert ended.out.count(": could not be decided, for the same reason\n") == 2
+    assert summary.read_text().count("not well-formed") == 2  # in short, and as a finding
 
 
 def test_a_common_part_that_ships_with_sros_needs_no_review(change: Change) -> None:
