@@ -57,6 +57,7 @@ from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     GOVERNANCE_P7S,
     GOVERNANCE_XML,
+    IDENTITY,
     KEY_FILE,
     KEY_FILES,
     PERMISSIONS_FILE,
@@ -176,9 +177,18 @@ def create_keystore(
             change.notes += imported_notes(
                 change.transaction, template, change.authorities, domains, now
             )
+            if IDENTITY in imported:
+                change.notes.append(_OWN_LIST)
         change.transaction.commit()
     change.notes += _place_notes(root)
     return change.result(Creation, template=template, domains=domains, new_keystore=True)
+
+
+_OWN_LIST = Note(
+    "keystore.own-list",
+    "this keystore has a revocation list of its own: it lacks what another keystore or program "
+    "with the same identity CA revokes, and their lists lack what this keystore revokes",
+)
 
 
 def create_enclaves(
