@@ -528,10 +528,10 @@ def rotate_ca(
         )
     elif not dry_run:
         _print_step(step, rotation_status(root, now=now()), together=finish, same_key=same_key)
-    verb = "would be" if dry_run else "are"
+    cannot = "could not" if dry_run else "cannot"
     cut_off = (
-        f"cut off: {', '.join(step.cut_off)} {verb} unable to talk to robots with the files of "
-        "this stage until they get these files, too"
+        f"cut off: {', '.join(step.cut_off)} {cannot} talk to robots with the files of this stage "
+        "before getting these files, too"
     )
     print_changed(step, shown, after=[cut_off] if step.cut_off else (), restart=False)
 

@@ -330,7 +330,7 @@ def _judge_expiry(case: _Case) -> _Finding:
 def _with_evidence(finding: _Finding, claim: Claim, record: RowRecord) -> _Finding:
     """Return a refusal with the log line that proves it, if the claim names a log text.
 
-    A process that merely gets no connection may be slow.
+    Without that line, nothing is proved: a process without a connection may only be slow.
     """
     if not claim.evidence or finding.status is not RowStatus.NOT_LET_IN:
         return finding

@@ -199,10 +199,10 @@ def signed_enclave(
     """
     if keystore is None:
         folder = Path(name)
-        return _in_folder(folder, at) if is_enclave(folder) else None
+        return _load_enclave(folder, at) if is_enclave(folder) else None
     root = keystore.root
     if is_enclave(root) and not (root / "enclaves").is_dir():
-        enclave = _in_folder(root, at)
+        enclave = _load_enclave(root, at)
         if enclave.name != name:
             own = enclave.name or "no enclave"
             raise KeystoreError(f"'{root}' is the folder of {own}, not of {name}")
@@ -217,7 +217,7 @@ def signed_enclave(
     raise no_such_enclave(keystore, name, keystore.names)
 
 
-def _in_folder(folder: Path, at: datetime) -> LoadedEnclave:
+def _load_enclave(folder: Path, at: datetime) -> LoadedEnclave:
     """Load the enclave in a folder; its name is the common name of its certificate, or ""."""
     from sros_tool.pki.certificates import common_name_of
 

@@ -422,7 +422,7 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
 
 
 def _shared_enclaves(before: Policy, policies: Iterable[Policy], after: Policy) -> Iterator[str]:
-    """Yield a text on each enclave to which policies add nodes, and of which they know no other.
+    """Yield a text on each enclave to which policies add nodes without naming any that it has.
 
     Nodes of the same name in other namespaces are `instances`.
     """

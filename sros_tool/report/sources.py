@@ -408,7 +408,8 @@ def _pictured(finding: Finding, enclaves: Container[str]) -> PicturedFinding:
 
 
 def _finding_text(finding: Finding, about: str = "") -> str:
-    """Return the text of a finding, after its file name, line and subject ``about``."""
+    """Return the file name, the line, the subject (``about``) and the text of a finding, as one
+    text."""
     place = f"{Path(finding.file).name}:{finding.line}" if finding.line else ""
     return ": ".join(filter(None, (place, about, finding.text)))
 

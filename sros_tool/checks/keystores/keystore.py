@@ -248,7 +248,7 @@ def joined(findings: Sequence[Finding]) -> list[Finding]:
         file = "" if finding.id in _OF_SEVERAL_FILES else finding.file
         place = (finding.accepted,) if one else (file, finding.line, finding.text)
         together.setdefault((finding.id, *place), []).append(finding)
-    return [_one_of(group) for group in together.values()]
+    return [_joined(group) for group in together.values()]
 
 
 def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, bytes]:
@@ -316,7 +316,7 @@ def _with_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
     return finding if remedy == finding.remedy else finding._replace(own_remedy=remedy)
 
 
-def _one_of(group: list[Finding]) -> Finding:
+def _joined(group: list[Finding]) -> Finding:
     subjects = list(dict.fromkeys(finding.subject for finding in group))
     if len(subjects) == 1:
         return group[0]

@@ -614,7 +614,7 @@ class _Run:
                 for robot, there in self._there.items()
                 if robot not in known or there.number > known[robot].release.number
             ]
-            raise self._restored(
+            raise self._restored_error(
                 f"has later releases: {first_few(robots, 3)}, up to the number {latest}",
                 "repeat the later changes, and then add --restored, which revokes again the "
                 "enclaves that these releases revoke",
@@ -635,13 +635,13 @@ class _Run:
             gone = sorted(self.list.robots.keys() - self._there.keys())
             if removed := [robot for robot in gone if self._enclaves(fleet, robot)]:
                 revoke = f"sros revoke {quote(str(self.keystore.root))} --robot {removed[0]}"
-                raise self._restored(
+                raise self._restored_error(
                     f"was published later without {first_few(removed, 3)}",
                     f"repeat the revocations (`{revoke}`), remove robots that left the fleet from "
                     "the fleet file, and publish again",
                 )
 
-    def _restored(self, what: str, remedy: str) -> KeystoreError:
+    def _restored_error(self, what: str, remedy: str) -> KeystoreError:
         return KeystoreError(
             f"'{self._folder}' {what}, which the keystore '{self.keystore.root}' does not know",
             "The keystore was restored from a backup, or is a copy. Publishing would undo later "
