@@ -542,6 +542,8 @@ def check_keystore(root: Path) -> None:
                 "It is a file.",
                 "Name the folder of a keystore.",
             )
+        if root.suffix == ".xml" and not root.exists():
+            raise KeystoreError(f"the policy '{root}' does not exist", "", "Correct its path.")
         why = f"It has no {ENCLAVES} folder, or has neither a CA, a governance nor an enclave."
         if not root.exists():
             parent = next((path for path in root.parents[-2::-1] if not path.exists()), None)
