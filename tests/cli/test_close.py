@@ -489,7 +489,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     )
     robot.more = (robot.process("/talker", is_secured=False),)
     ended = robot.close("--proof", status=1)
-    assert "'true'. Stop it: another process runs in /talker.\n" in ended.err
+    assert "ROS_SECURITY_ENABLE. Stop it: another process runs in /talker.\n" in ended.err
     robot.more = ()
     robot.outdated = {"/talker"}
     named = f"earlier files in the processes of /talker (process {PID['/talker']}); restart them\n"
