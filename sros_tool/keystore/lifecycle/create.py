@@ -859,11 +859,13 @@ class _EnclaveMaker:
 
         If its subject is not unique, permissions of earlier certificates may fit, too.
         """
-        issued = [entry.what for entry in self._ledger.get(name, ())]
-        if not has_unique_part(certificate.subject) or "certificate" not in issued:
-            return False
-        last = len(issued) - issued[::-1].index("certificate")
-        return issued[last:].count("permissions") == 1
+        permissions, serial = 0, ""
+        for entry in self._ledger.get(name, ()):
+            if entry.what == "certificate":
+                permissions, serial = 0, entry.serial
+            permissions += entry.what == "permissions"
+        is_last = serial != "" and int(serial, 16) == certificate.serial_number
+        return is_last and has_unique_part(certificate.subject) and permissions == 1
 
     @cached_property
     def _ledger(self) -> Mapping[str, Sequence[Entry]]:
