@@ -151,14 +151,20 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
 
 
 def test_a_renamed_enclave_is_one_line_and_still_new_access(change: Change) -> None:
-    change.commit({"robot.xml": policy_text({"/a": publish("/x", "/z"), "/c": publish("/y")})})
-    ended = change.review("--policy", "robot.xml")
+    reads = publish("/x").replace("publish", "subscribe")
+    change.base = change.commit({"robot.xml": policy_text({"/a": publish("/x"), "/b": reads})})
     renamed = "  ~ enclave /b is now /c, with the same rights"
-    assert ended.status == 1 and "13 rights are new; 12 rights are gone" in ended.out
-    assert [line.partition("  (")[0] for line in ended.out.splitlines() if line[:2] == "  "] == [
-        *(renamed, "  + /a publish topic /z"),
-        *(renamed, "  + /a ALLOW publish topic /z"),
-    ]
+    for rights, also in ((publish("/x"), ()), (publish("/x", "/z"), ("/a publish topic /z",))):
+        change.commit({"robot.xml": policy_text({"/a": rights, "/c": reads})})
+        said = change.review("--policy", "robot.xml")
+        assert said.status == 1 and f"{12 + len(also)} rights are new; 1 enclave can" in said.out
+        lines = [line.partition("  (")[0] for line in said.out.splitlines() if line[:2] == "  "]
+        # Whom the enclave is influenced by is only new if other access is.
+        reach = ["  + /a can influence /c: /a -publish /x-> /c"] * len(also)
+        assert lines == [
+            *(renamed, *(f"  + {right}" for right in also), *reach),
+            *(renamed, *(f"  + {right}".replace(" publish", " ALLOW publish") for right in also)),
+        ]
 
 
 def test_an_enclave_is_renamed_only_if_all_of_its_rights_are_the_same() -> None:
