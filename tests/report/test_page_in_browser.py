@@ -124,6 +124,9 @@ def test_search_finds_enclaves_and_names_and_shows_who_may_do_what(
         assert "May publish (1)" in text and "/mobile_robot/velocity_mux" in text
         assert "May listen (3)" in text and "/mobile_robot/base" in text
         assert "encrypted" in text
+        shown = "#map .card.enclave:not(.faded)"
+        assert len(texts(page, shown)) == 4, texts(page, shown)
+        assert page.locator(f"{shown}:has-text('recorder')").count() == 1, "it reads by a wildcard"
         page.fill("#search", "no such thing")
         assert "No name matches." in page.inner_text("#results")
 

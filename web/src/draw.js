@@ -137,11 +137,13 @@ export function drawScene(node, scene, { overlay, problems, choose }) {
       const any = belongs && scene.cards.some(belongs);
       if (any) {
         for (const link of scene.links.filter(lit)) near.add(link.source).add(link.target);
-        const tags = scene.onlookers
-          .filter((each) => scene.cards.some((c) => belongs(c) && onlooks(c, each)))
-          .map((each) => each.tag);
-        for (const card of scene.cards) {
-          if (belongs(card) || tags.some((tag) => card.tags.includes(tag))) near.add(card.id);
+        for (const card of scene.cards.filter(belongs)) near.add(card.id);
+        // An onlooker has no links: its tag stands on the names that it may read.
+        for (const onlooker of scene.onlookers) {
+          const looking = scene.cards.filter((card) => onlooks(card, onlooker));
+          const seen = scene.cards.filter((card) => card.tags.includes(onlooker.tag));
+          if (looking.some(belongs)) for (const card of seen) near.add(card.id);
+          if (seen.some(belongs)) for (const card of looking) near.add(card.id);
         }
       }
       drawn.classed("faded", (card) => any && !near.has(card.id));
