@@ -243,7 +243,7 @@ def _refusals(
         return
     all_refuse = all(causes.values())
     if all_refuse:
-        errors = [finding for finding in known if finding.severity is ERROR]
+        errors = [finding for finding in known if finding.kind.severity is ERROR]  # also accepted
         if all(
             any(_is_named(refusal_cause, errors) for refusal_cause in cause)
             for cause in causes.values()

@@ -312,6 +312,10 @@ def generate_artifacts(
         with change:
             _begin(change, domain, fleet, patterns, wanted, protections)
             again = _revoked_before(change, wanted, enclaves, fleet)
+            ended = dict(_ended(change, wanted.keys() - {*enclaves}))
+            again = [*again, *ended.values()]
+            if ended:
+                wanted = {name: wanted[name] for name in wanted if name not in ended}
             rights = write_enclaves(
                 change,
                 wanted,
@@ -332,6 +336,21 @@ def generate_artifacts(
         write_enclaves(change, wanted, places=places, progress=progress)
     change.notes += _place_notes(root)
     return creation(change, ())
+
+
+def _ended(change: KeystoreChange, names: Iterable[str]) -> Iterator[tuple[str, Note]]:
+    """Yield the short-lived enclaves that have expired, with a note: nobody has to renew them."""
+    for name in sorted(names):
+        path = enclave_path(change.root, name) / CERTIFICATE_FILE
+        if change.template.longest_validity(name) is None or not path.exists():
+            continue
+        end = validity_of(change.keystore.certificate(path)).not_after
+        if end < change.now:
+            text = (
+                f"{name} stays as it is: it is short-lived, and expired at {iso(end)}. `sros renew "
+                f"{quote(str(change.root))} {quote(name)}` issues it again; then run this again."
+            )
+            yield name, Note("enclave.expired-short-lived", text)
 
 
 def creation(change: KeystoreChange, rights: tuple[ReplacedRights, ...]) -> Creation:
