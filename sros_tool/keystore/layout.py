@@ -20,6 +20,8 @@ from sros_tool.errors import DocumentError, KeystoreError
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 CLOSED_PROCESSES, CLOSED_POLICY = "processes.json", "policy.xml"
 """Files that `sros close` writes next to its keystore."""
+CLOSED_OBSERVER = "/sros_observer"
+"""The enclave with which `sros close` looks at a closed robot; no policy of the robot has it."""
 SETTINGS = "sros.toml"
 """The settings of the keystore; keystores of ros2/sros2 do not have this file."""
 FLEET = "fleet.toml"

@@ -11,7 +11,7 @@ import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from shlex import quote
@@ -26,11 +26,13 @@ from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
 from sros_tool.fleet.robots import Fleet, robot_of
 from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import (
+    CLOSED_OBSERVER,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
     ROUTER_FILE,
     SESSION_FILE,
     SETTINGS,
+    closed_robot,
     enclave_names,
     enclave_path,
     is_keystore,
@@ -596,8 +598,10 @@ class SourcesDifference(NamedTuple):
 def compare_sources(first: RightsSource, second: RightsSource) -> SourcesDifference:
     """Return the difference between two sources of rights.
 
-    If a source is only for some enclaves, only these are compared.
+    If a source is only for some enclaves, only these are compared.  The observer of a closed robot
+    is left out, because only its keystore and export have it.
     """
+    first, second = _without_observer(first, second), _without_observer(second, first)
     scope = None
     if first.scope is None or second.scope is None:
         scope = second.scope if first.scope is None else first.scope
@@ -606,6 +610,14 @@ def compare_sources(first: RightsSource, second: RightsSource) -> SourcesDiffere
     protections = _protection_differences(first, second)
     domains = _domain_differences(first, second, scope)
     return SourcesDifference(scope, difference, protections, unanswered, domains)
+
+
+def _without_observer(source: RightsSource, other: RightsSource) -> RightsSource:
+    """Return a source without the observer of a closed robot, unless ``other`` has it, too."""
+    if closed_robot(source.path) and not any(e.enclave == CLOSED_OBSERVER for e in other.rights):
+        own = (right for right in source.rights if right.enclave != CLOSED_OBSERVER)
+        return replace(source, rights=frozenset(own))
+    return source
 
 
 def _domain_differences(
