@@ -243,7 +243,7 @@ def _exported(answer: Answer) -> Iterator[Note]:
     if answer.change and answer.is_of_export:
         text = (
             "these files are from an export. If the policy of the keystore already allows this, "
-            "the export is older than that policy: then the last command alone is enough."
+            f"the export is older than that policy: then `{answer.commands[-1]}` alone is enough."
         )
         yield Note("explain.exported", text)
 

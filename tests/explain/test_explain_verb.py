@@ -422,6 +422,7 @@ def test_by_environment_option_and_folder(whole: Path, tmp_path: Path) -> None:
     found = explain(tmp_path / "robot", *denied)
     assert found.out.rstrip().endswith(f"sros distribute_key KEYSTORE {ENCLAVE} TARGET --force")
     assert "note [explain.exported]" in found.err, "the keystore may allow it by now"
+    assert f"then `sros distribute_key KEYSTORE {ENCLAVE} TARGET --force` alone is" in found.err
     assert "note [explain.exported]" not in explain(whole, *denied).err
 
 
