@@ -122,6 +122,15 @@ PROCESS_REPLACEABLE = FindingKind(
     "POSIX.1-2017, rename() and unlink(): they need only the right to write to the folder.",
     "Remove the write permission of other users: `chmod go-w FOLDER`.",
 )
+PROCESS_KEY_READABLE = FindingKind(
+    "runtime.process-key-readable",
+    ERROR,
+    "a process whose private key others can read",
+    "Anyone who can read the key can act as the enclave. Neither rcl nor DDS checks file modes.",
+    "rcl 9, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 check no modes.",
+    "Run `chmod 600` on the key. If others had access, give the enclave another key: `sros renew "
+    "KEYSTORE ENCLAVE --new-key --revoke-old`.",
+)
 PROCESS_NOT_SEEN = FindingKind(
     "runtime.process-not-seen",
     WARNING,
@@ -174,6 +183,12 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
     yield from _local_time(process, loaded, now, zone)
     if enclave.writable:
         yield PROCESS_REPLACEABLE.found(process.label, _plain_path(enclave.writable))
+    mode = enclave.file(KEY_FILE).mode
+    if mode & 0o077:
+        path = f"{enclave.keystore}/enclaves/{enclave.name.strip('/')}/{KEY_FILE}"
+        yield PROCESS_KEY_READABLE.found(
+            process.label, f"the mode of '{_plain_path(path)}' is {mode:04o}"
+        )
     yield from _unread_files(process, enclave)
 
 

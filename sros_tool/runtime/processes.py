@@ -676,13 +676,14 @@ class LoadedFile:
 
     ``changed`` is when the file, or a link to it, was last written, replaced or given another mode
     or owner; None if the file does not exist.  ``problem`` is a clause on why it could not be
-    examined.
+    examined.  ``mode`` are its permission bits.
     """
 
     name: str
     changed: datetime | None = None
     data: bytes = field(default=b"", repr=False)
     problem: str = ""
+    mode: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -693,7 +694,8 @@ class ProcessEnclave:
     last change added or removed no file (they were moved, or got another mode) to the time of that
     change.  ``writable`` names a folder that others than the owner of the keystore can change.
     ``here`` is the path of the keystore for this process; None if that path is another folder here.
-    ``problem`` is a clause on why the enclave could not be examined.
+    ``folders`` are the device and inode of the keystore and of the enclave, as far as they are
+    there.  ``problem`` is a clause on why the enclave could not be examined.
     """
 
     keystore: str
@@ -703,11 +705,27 @@ class ProcessEnclave:
     moved: Mapping[str, datetime] = field(default_factory=dict)
     writable: str = ""
     here: Path | None = None
+    folders: tuple[tuple[int, int], ...] = ()
     problem: str = ""
 
     def file(self, name: str) -> LoadedFile:
         """Return a file of the enclave by its name."""
         return next((file for file in self.files if file.name == name), LoadedFile(name))
+
+    def is_of(self, keystore: Path) -> bool:
+        """Return whether this is an enclave of a keystore of this machine, by whatever path.
+
+        The folder of the enclave decides, or that of the keystore: links, ``..`` and the mounts of
+        a container give a folder other paths.  Of a folder that is not there, the path decides.
+        """
+        own = keystore / "enclaves" / self.name.strip("/")
+        for path, folder in zip((keystore, own), self.folders, strict=False):
+            with suppress(OSError, ValueError):
+                state = path.stat()
+                if folder == (state.st_dev, state.st_ino):
+                    return True
+        lost = not self.folders and not self.problem
+        return lost and os.path.abspath(self.keystore) == os.path.abspath(keystore)  # noqa: PTH100
 
     @property
     def lacking(self) -> tuple[str, ...]:
@@ -772,7 +790,7 @@ class ProcessRoot:
                 data = self._reader.read(handle, way[-1][1]) if read else b""
         except OSError as error:
             return LoadedFile(name, problem=_reason(error))
-        return LoadedFile(name, _moment(changed), data)
+        return LoadedFile(name, _moment(changed), data, mode=stat.S_IMODE(way[-1][1].st_mode))
 
     def copies(self, path: str) -> list[str]:
         """Return files next to a library that have its size, and a name that begins with its name.
@@ -803,8 +821,8 @@ class ProcessRoot:
         except OSError:
             return []
 
-    def folders(self, path: str) -> dict[str, os.stat_result]:
-        """Map the folders on the way to a folder, and the folder itself, to their states.
+    def folders(self, path: str) -> list[tuple[str, os.stat_result]]:
+        """Return the folders on the way to a folder, and last the folder itself, with their states.
 
         Raises:
             OSError: The folder does not exist, or cannot be examined.
@@ -812,7 +830,7 @@ class ProcessRoot:
         with self._opened(path) as (_, way):
             if not stat.S_ISDIR(way[-1][1].st_mode):
                 raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
-            return {step: state for step, state in way if stat.S_ISDIR(state.st_mode)}
+            return [(step, state) for step, state in way if stat.S_ISDIR(state.st_mode)]
 
     @contextmanager
     def _opened(self, path: str) -> Iterator[tuple[int, list[tuple[str, os.stat_result]]]]:
@@ -897,11 +915,13 @@ def _loaded_enclave(
         above = root.folders(top)
     except OSError as error:
         return ProcessEnclave(keystore, name, problem=_reason(error))
+    folder_of_keystore, here = _identity(above), _same_here(top, above)
     try:
         folders = root.folders(place)
     except OSError as error:
-        return ProcessEnclave(keystore, name, problem=_reason(error), here=_same_here(top, above))
-    own = list(folders.items())[len(above) - 1 :]
+        there = (folder_of_keystore,)
+        return ProcessEnclave(keystore, name, here=here, folders=there, problem=_reason(error))
+    own = [above[-1], *folders[len(above) - 1 :]]
     return ProcessEnclave(
         keystore,
         name,
@@ -916,7 +936,8 @@ def _loaded_enclave(
             if state.st_mtime_ns < state.st_ctime_ns
         },
         writable=_writable(own, user),
-        here=_same_here(top, above),
+        here=here,
+        folders=(folder_of_keystore, _identity(folders)),
     )
 
 
@@ -936,10 +957,16 @@ def _writable(folders: list[tuple[str, os.stat_result]], user: int) -> str:
     return ""
 
 
-def _same_here(path: str, folders: Mapping[str, os.stat_result]) -> Path | None:
+def _identity(folders: Sequence[tuple[str, os.stat_result]]) -> tuple[int, int]:
+    """Return the device and inode of the last folder."""
+    state = folders[-1][1]
+    return state.st_dev, state.st_ino
+
+
+def _same_here(path: str, folders: Sequence[tuple[str, os.stat_result]]) -> Path | None:
     """Return ``path`` if it is the same folder for this process as for the examined process."""
     with suppress(OSError, ValueError):
-        if os.path.samestat(Path(path).stat(), list(folders.values())[-1]):
+        if os.path.samestat(Path(path).stat(), folders[-1][1]):
             return Path(path)
     return None
 

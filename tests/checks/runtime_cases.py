@@ -168,6 +168,11 @@ def _others_can_write(state: RuntimeState, _: Bench) -> RuntimeState:
     return state
 
 
+def _others_can_read_the_key(state: RuntimeState, _: Bench) -> RuntimeState:
+    _of(state, "key.pem").chmod(0o640)
+    return state
+
+
 def _among_strangers(state: RuntimeState, bench: Bench) -> RuntimeState:
     other = bench.root.parent / "of others"
     shutil.copytree(state.environment[KEYSTORE], other)
@@ -250,6 +255,7 @@ CASES: dict[str, Change] = {
     "runtime.process-other-keystore": _among_strangers,
     "runtime.process-local-time": lambda state, bench: _at_the_end(state, bench, TZ="Asia/Tokyo"),
     "runtime.process-files-replaceable": _others_can_write,
+    "runtime.process-key-readable": _others_can_read_the_key,
     "runtime.process-elsewhere": changed(0, network="net:[1]"),
     "runtime.process-not-seen": _unseen,
     "runtime.container-alone": lambda state, _: replace(

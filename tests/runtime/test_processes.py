@@ -15,11 +15,14 @@ from sros_tool.runtime.environment import enclave_argument
 from sros_tool.runtime.processes import (
     FileReader,
     LoadedFile,
+    Process,
     ProcessRoot,
     ProcessTable,
     RunningProcesses,
     _Stat,
+    with_files,
 )
+from sros_tool.runtime.variables import ENABLE, ENCLAVE, KEYSTORE
 
 NOW = datetime(2026, 11, 23, tzinfo=UTC)
 ROS = ("talker", "--ros-args")
@@ -224,6 +227,36 @@ def test_what_is_no_file_is_not_opened(root: ProcessRoot, tmp_path: Path) -> Non
         file.truncate(17 * 1024**2)
     for path in ("/pipe", "/etc", "/endless"):
         assert root.load("x", path).problem
+
+
+def test_an_enclave_is_known_by_whatever_path_a_process_names(
+    root: ProcessRoot, tmp_path: Path
+) -> None:
+    """The same folder has other paths by links, by ``..`` and in a container; a copy has not."""
+    export = tmp_path / "root/opt/export"
+    for place in (export, tmp_path / "root/copy"):
+        (place / "enclaves/a").mkdir(parents=True)
+    (tmp_path / "root/link").symlink_to("opt/export")
+    # As a bind mount of the folder of the enclave alone: the keystore above it is another folder.
+    (tmp_path / "root/etc/enclaves").mkdir()
+    (tmp_path / "root/etc/enclaves/a").symlink_to("/opt/export/enclaves/a")
+    for path, is_own in {
+        "/opt/export": True,
+        "/opt/export/": True,
+        "/opt/../link": True,
+        "etc": True,
+        "/opt/export/enclaves/..": True,
+        "/copy": False,
+        "/gone": False,
+        str(export): True,
+    }.items():
+        environment = {ENABLE: "true", KEYSTORE: path, ENCLAVE: "/a"}
+        process = with_files(Process(1, (), environment, datetime.now(UTC)), root, "/")
+        assert process.enclave and process.enclave.is_of(export) == is_own, path
+    # Another folder of the same path, as a copy in the image of a container.
+    (tmp_path / "root" / export.relative_to("/") / "enclaves/a").mkdir(parents=True)
+    other = with_files(process, root, "/").enclave
+    assert other and other.is_there and not other.is_of(export)
 
 
 def test_a_replaced_link_is_a_change(root: ProcessRoot, tmp_path: Path) -> None:
