@@ -21,7 +21,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, tzinfo
@@ -49,8 +49,10 @@ from sros_tool.graph.observation import (
     make_observation,
 )
 from sros_tool.keystore.layout import (
+    CLOSED_OBSERVER,
     CLOSED_POLICY,
     CLOSED_PROCESSES,
+    KEY_FILES,
     enclave_folder,
     enclave_path,
     list_enclaves,
@@ -86,6 +88,7 @@ from sros_tool.runtime.processes import (
     ProcessTable,
     RunningProcesses,
     launch_verb,
+    plain,
     process_origin,
     program_of,
 )
@@ -99,10 +102,10 @@ from sros_tool.xml import read_bytes
 _FAST_DDS = "010f"
 """The first two bytes of a participant of Fast DDS: its vendor id (RTPS 2.3, 9.4.5.1)."""
 _NODE_PARTS = ("common/node.xml", "common/rclcpp_node.xml", "common/rclpy_node.xml")
-_MOST_LINES, _MOST_NAMES = 20, 3
+_MOST_LINES, _MOST_NAMES, _LONGEST_PATH = 20, 3, 300
 _SYSTEMD = Path("/etc/systemd/system")
 _REQUIREMENTS, _TEMPLATE = "requirements.toml", "production"
-_OBSERVER, _ROUTER = "/sros_observer", "/router"
+_OBSERVER, _ROUTER = CLOSED_OBSERVER, "/router"
 _DROP_IN, COMMANDS, _SERVICES = "sros-close.conf", "commands.txt", "compose.yaml"
 _RESTART_SECONDS, _START_SECONDS = 30.0, 3.0
 """How long processes may take until they run in their enclaves: restarted by sros, or by hand."""
@@ -230,6 +233,8 @@ class ObservedProcesses(NamedTuple):
     """Enclaves with nodes whose process sros did not find on this machine."""
     ended: Sequence[str] = ()
     """Enclaves whose processes ended while sros watched."""
+    not_here: Sequence[str] = ()
+    """Enclaves that belong to other machines: those of `--elsewhere`."""
 
     @property
     def units(self) -> dict[str, str]:
@@ -250,6 +255,15 @@ class ObservedProcesses(NamedTuple):
         ]
         processes = [process.as_it_runs(running) for process in self.processes]
         return self._replace(processes=processes, unknown=unknown)
+
+    def belonging_elsewhere(self, names: Iterable[str]) -> ObservedProcesses:
+        """Return a copy in which the enclaves ``names`` belong to other machines."""
+        not_here = {*self.not_here, *names}
+        return self._replace(
+            processes=[process for process in self.processes if process.enclave not in not_here],
+            elsewhere=[enclave for enclave in self.elsewhere if enclave not in not_here],
+            not_here=sorted(not_here),
+        )
 
     def within(self, policy: Policy) -> ObservedProcesses:
         """Return a copy without enclaves that the policy does not have any more."""
@@ -511,6 +525,8 @@ def read_processes(path: Path) -> ObservedProcesses:
     try:
         value = json.loads(read_bytes(path, "list of processes"))
         processes = [ClosedProcess(**process) for process in value["processes"]]
+        if not all(isinstance(name, str) for name in value.get("not_here", ())):
+            raise ValueError(f"{value['not_here']} are not all text")
         for process in processes:
             words = (process.enclave, process.folder, process.container, process.rmw)
             texts = (*words, *process.command, *process.launch, *process.shares)
@@ -608,6 +624,8 @@ class _Step(NamedTuple):
     into: Path | None = None
     guards: bool = False
     """Whether the later steps are left out if this step finds something."""
+    signs: bool = False
+    """Whether the step changes rights, and says which on standard error."""
 
     @property
     def command(self) -> str:
@@ -624,9 +642,15 @@ class OpenRobot:
     """
 
     def __init__(
-        self, folder: Path, domain: int | None, shell: Shell, without: Iterable[str] = ()
+        self,
+        folder: Path,
+        domain: int | None,
+        shell: Shell,
+        without: Iterable[str] = (),
+        elsewhere: Iterable[str] = (),
     ) -> None:
         self.folder, self._shell, self._without = folder, shell, sorted({*without})
+        self._named_elsewhere = sorted({*elsewhere})
         self.policy, self.observer = folder / CLOSED_POLICY, folder / "observer.xml"
         self.requirements = folder / _REQUIREMENTS
         self.keystore, self.export = folder / "keystore", folder / "export"
@@ -663,8 +687,25 @@ class OpenRobot:
                     "Close the robot into a folder that only you and root can change.",
                 )
 
-    def steps(self, duration: str | None) -> list[_Step]:
-        """Return the steps; with a ``duration``, the robot is watched even if it was before."""
+    @property
+    def _not_here(self) -> set[str]:
+        """The enclaves that belong to other machines."""
+        return {*self._named_elsewhere, *(self.observed.not_here if self.observed else ())}
+
+    def _to_export(self) -> Sequence[str]:
+        """Return the words that select the enclaves of this machine."""
+        if not self._not_here:
+            return ("--all",)
+        names = {_OBSERVER, *(list_enclaves(self.keystore) if self.keystore.exists() else ())}
+        if self.policy.exists():
+            names |= {enclave.path for enclave in read_policy(self.policy).enclaves}
+        return sorted(names - self._not_here)
+
+    def steps(self, duration: str | None) -> Iterator[_Step]:
+        """Yield the steps; with a ``duration``, the robot is watched even if it was before.
+
+        The enclaves to export are known when the steps before are done.
+        """
         policy, keystore, needed = str(self.policy), str(self.keystore), str(self.requirements)
         domain = ("--domain", str(self.domain))
         learn = ["generate_policy", policy, "--enclave-per-node", *domain]
@@ -674,17 +715,19 @@ class OpenRobot:
         both, created = ("-p", policy, str(self.observer)), ("--template", _TEMPLATE)
         on_zenoh = self._shell.environment.get(RMW) == RMW_ZENOH
         watched = self.policy.exists() and not duration
-        return [
-            _Step((*learn, "--json"), self.processes if watched else None, self.seen),
-            _Step(("check", policy, "--suggest"), self.requirements, self.requirements),
-            _Step(("check", policy, "--requirements", needed, *created, *only_errors), guards=True),
-            _Step(("create_keystore", keystore, *created, *domain), self.keystore),
-            _Step(("generate_artifacts", "-k", keystore, *both)),
-            *([_Step(("zenoh", keystore))] if on_zenoh else ()),
-            _Step(("distribute_key", keystore, "--all", str(self.export), "--force")),
-            _Step(("check", policy, keystore, "--policy", policy, *only_errors)),
-            _Step(("view", policy, *created, "-o", str(self.page), "--force")),
-        ]
+        yield _Step((*learn, "--json"), self.processes if watched else None, self.seen)
+        yield _Step(("check", policy, "--suggest"), self.requirements, self.requirements)
+        yield _Step(
+            ("check", policy, "--requirements", needed, *created, *only_errors), guards=True
+        )
+        yield _Step(("create_keystore", keystore, *created, *domain), self.keystore)
+        yield _Step(("generate_artifacts", "-k", keystore, *both), signs=True)
+        if on_zenoh:
+            yield _Step(("zenoh", keystore))
+        exported = *self._to_export(), str(self.export)
+        yield _Step(("distribute_key", keystore, *exported, "--force"))
+        yield _Step(("check", policy, keystore, "--policy", policy, *only_errors))
+        yield _Step(("view", policy, *created, "-o", str(self.page), "--force"))
 
     def prepare(self, duration: str | None, *, partial: bool, dry_run: bool) -> Closing:
         """Do the steps whose results are not there yet, and write how each process is started.
@@ -701,6 +744,11 @@ class OpenRobot:
         own = (self.seen, self.policy, self.keystore, self.export)
         if self.folder.is_dir() and [*self.folder.iterdir()] and not any(map(Path.exists, own)):
             self._shell.say(f"'{self.folder}' has files of yours: sros adds its own to them")
+        if self.observed and self._named_elsewhere:
+            self._check_elsewhere()
+            self.observed = self.observed.belonging_elsewhere(self._named_elsewhere)
+            if not dry_run:
+                self._write_processes(self.observed)
         denied_before: Sequence[str] = ()
         with suppress(SrosError):  # the steps say what is wrong
             denied_before = self._denied() if self.export.exists() and self.seen.exists() else ()
@@ -709,6 +757,9 @@ class OpenRobot:
             state = "kept" if step.made and step.made.exists() else "open"
             if dry_run:
                 self._shell.say(f"{'kept' if state == 'kept' else 'would run'}: {step.command}")
+                if step.signs and self.keystore.exists():
+                    _, output, messages = self._shell.run((*step.words, "--dry-run"), False)
+                    self._say(messages if output else "")
             elif state == "open" and not is_stopped:
                 state, problem = self._do(step)
                 problems += [problem] if problem else []
@@ -717,15 +768,16 @@ class OpenRobot:
             if step.into == self.seen and not dry_run:
                 mixed = [*self._programs(), *(() if partial else self._twins())]
                 problems, is_stopped = [*problems, *mixed], bool(mixed)
+        changes = [] if dry_run or is_stopped else self._remove_enclaves()
         closing = self._closing()._replace(steps=steps, dry_run=dry_run)
         if dry_run or is_stopped:
             return closing._replace(problems=problems)
         if self.observed and len(closing.observed.processes) > len(self.observed.processes):
             self._write_processes(closing.observed)
-        changes = [*self._write_starts(closing), *self._remove_revoked_enclaves()]
+        changes = [*self._write_starts(closing), *changes]
         denied = self._denied()
         newly = [right for right in denied if right not in denied_before]
-        problems += self._problems(closing.observed, partial=partial)
+        problems += self._problems(closing, partial=partial)
         return closing._replace(
             denied=denied, newly_denied=newly, problems=problems, changes=changes
         )
@@ -744,17 +796,28 @@ class OpenRobot:
             observed = observed.within(policy)
             known = {process.enclave for process in observed.processes} | names
             new = {enclave.path for enclave in policy.enclaves} - known - {*observed.elsewhere}
+            new -= self._not_here
         new -= {_OBSERVER} if self.observed else new
         until = self._valid_until()
         known = {process.enclave for process in observed.processes} | new | secured.keys()
-        if unknown := sorted({*self._without} - known):
+        self._check_named(self._without, known | self._not_here, "--without")
+        started = observed, (), secured, sorted(new), self._without, until
+        return Closing(self.folder, *started, (), (), (), (), False, ())
+
+    def _check_elsewhere(self) -> None:
+        """Raise `UsageError` if neither the policy nor the keystore has an enclave elsewhere."""
+        known = {*(list_enclaves(self.keystore) if self.keystore.exists() else ())} - {_OBSERVER}
+        if self.policy.exists():
+            known |= {enclave.path for enclave in read_policy(self.policy).enclaves}
+        self._check_named(self._named_elsewhere, known, "--elsewhere")
+
+    def _check_named(self, names: Iterable[str], known: Collection[str], option: str) -> None:
+        if unknown := sorted({*names}.difference(known)):
             raise UsageError(
                 f"the robot has no enclave {unknown[0]}",
                 f"It has {first_few(sorted(known), _MOST_NAMES)}.",
-                "Correct --without.",
+                f"Correct {option}.",
             )
-        started = observed, (), secured, sorted(new), self._without, until
-        return Closing(self.folder, *started, (), (), (), (), False, ())
 
     def _with_later(
         self, observed: ObservedProcesses, running: RunningProcesses
@@ -764,7 +827,8 @@ class OpenRobot:
         Only processes of users who can read the enclaves count, because sros proposes to run their
         commands.
         """
-        known = {_OBSERVER, *(process.enclave for process in observed.processes)}
+        known = {_OBSERVER, *observed.not_here}
+        known |= {process.enclave for process in observed.processes}
         later = []
         for process, enclave in self._secured(running):
             if enclave.name not in known and process.user in (0, self.export.stat().st_uid):
@@ -808,8 +872,9 @@ class OpenRobot:
                 "Start the robot open, and run this again.",
             )
         if status or (step.guards and output):
-            for line in () if step.into else f"{output}{messages}".splitlines():
-                self._shell.say(line)
+            self._say("" if step.into else f"{output}{messages}")
+        elif step.signs and output:
+            self._say(messages)
         if status:
             mend = "; nothing was signed" if step.guards else ""
             if VIOLATED.id in output:
@@ -819,6 +884,10 @@ class OpenRobot:
         if step.into:
             replace_file(step.into, output.encode())
         return "done", self._keep_processes(output) if watches else ""
+
+    def _say(self, text: str) -> None:
+        for line in text.splitlines():
+            self._shell.say(line)
 
     def _check_shell(self) -> None:
         """Raise `UsageError` if an observer that this shell starts might run secured."""
@@ -868,7 +937,11 @@ class OpenRobot:
         observed = assign(stayed, running, self.domain, process_ids)
         ended = {node.enclaves[0] for node in nodes} - {node.enclaves[0] for node in stayed}
         processes = [_as_its_unit_starts(process) for process in observed.processes]
-        self._write_processes(observed._replace(processes=processes, ended=sorted(ended)))
+        observed = observed._replace(processes=processes, ended=sorted(ended))
+        seen_here = {process.enclave for process in processes}
+        not_here = (self._not_here - seen_here).union(self._named_elsewhere)
+        self._check_elsewhere()
+        self._write_processes(observed.belonging_elsewhere(not_here))
         number = counted(len(processes), "process", "processes")
         self._shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
         lacking = learned["added"] if learned["dry_run"] else ()
@@ -1040,22 +1113,26 @@ class OpenRobot:
         """Return the enclaves of the export that the keystore does not have any more."""
         return sorted({*list_enclaves(self.export)} - {*list_enclaves(self.keystore)})
 
-    def _remove_revoked_enclaves(self) -> list[FileChange]:
-        """Remove from the export the enclaves that the keystore revoked."""
+    def _remove_enclaves(self) -> list[FileChange]:
+        """Remove from the export enclaves that the keystore revoked, or of other machines."""
         keystore = Keystore(self.keystore)
-        revoked = [name for name in self._enclaves_left() if revocation_of(keystore, name)]
+        left = [name for name in self._enclaves_left() if revocation_of(keystore, name)]
+        removed = dict.fromkeys(left, "its enclave was revoked")
+        for name in self._not_here.intersection(list_enclaves(self.export)):
+            if any((enclave_path(self.keystore, name) / file).exists() for file in KEY_FILES):
+                removed[name] = "its enclave belongs to another machine"
         with Folder(self.export) as export:
-            for inside in map(enclave_folder, revoked):
+            for inside in map(enclave_folder, removed):
                 for entry in (f"{inside}/{name}" for name in export.names(inside)):
                     if not stat.S_ISDIR(export.mode(entry)):
                         export.unlink(entry)
-            for inside in sorted(map(enclave_folder, revoked), reverse=True):  # inner ones first
+            for inside in sorted(map(enclave_folder, removed), reverse=True):  # inner ones first
                 if not export.names(inside):
                     export.rmdir(inside)
-        paths = [enclave_path(self.export, name) for name in revoked]
-        for path in paths:
-            self._shell.say(f"removed {path}: its enclave was revoked")
-        return [FileChange("remove", str(path)) for path in paths]
+        paths = {str(enclave_path(self.export, name)): why for name, why in removed.items()}
+        for path, why in paths.items():
+            self._shell.say(f"removed {path}: {why}")
+        return [FileChange("remove", path) for path in paths]
 
     def _drop_in_heading(self) -> str:
         """Return the first line of each drop-in that is made for this folder."""
@@ -1077,13 +1154,21 @@ class OpenRobot:
         enclaves = audited_enclaves([self._rights], vendor, context)
         return audit(self._observation(), enclaves, _OBSERVER).denied
 
-    def _problems(self, observed: ObservedProcesses, *, partial: bool) -> Iterator[str]:
+    def _problems(self, closing: Closing, *, partial: bool) -> Iterator[str]:
         """Yield what keeps the robot from running closed, with what to do."""
-        policy = read_policy(self.policy)
+        policy, observed = read_policy(self.policy), closing.observed
+        folder, not_here = shlex.quote(str(self.folder)), self._not_here
         for name in list_enclaves(self.keystore):
-            if name not in (_OBSERVER, _ROUTER) and not policy.enclave(name):
+            if name not in (_OBSERVER, _ROUTER, *not_here) and not policy.enclave(name):
                 revoke = f"sros revoke {shlex.quote(str(self.keystore))} {name}"
-                yield f"the policy does not have {name}, and the keystore does: {revoke}"
+                yield (
+                    f"the policy does not have {name}, and the keystore does: if nothing needs it "
+                    f"any more, {revoke}; if it belongs to another machine, such as a laptop, sros "
+                    f"close {folder} --elsewhere {name}; if it belongs to this machine, sros "
+                    f"merge_policy {shlex.quote(str(self.policy))} ITS_POLICY --in-place"
+                )
+        for name in sorted(not_here & closing.secured.keys()):
+            yield f"{name} belongs to another machine, and a process runs in it here: stop it"
         for name in self._enclaves_left():
             remove = f"rm -r {shlex.quote(str(enclave_path(self.export, name)))}"
             yield f"the export has {name}, which the keystore neither has nor revoked: {remove}"
@@ -1113,12 +1198,16 @@ class OpenRobot:
             named = first_few(observed.unknown, _MOST_NAMES)
             yield (
                 f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "
-                f"{named}; watch again while they run: sros close "
-                f"{shlex.quote(str(self.folder))} --for 1m; otherwise {silent}"
+                f"{named}; watch again while they run: sros close {folder} --for 1m; otherwise "
+                f"{silent}"
             )
         if observed.elsewhere:
             named = first_few(observed.elsewhere, _MOST_NAMES)
-            yield f"sros knows no process of this machine for nodes of {named}; {silent}"
+            options = " ".join(f"--elsewhere {name}" for name in observed.elsewhere)
+            yield (
+                f"sros knows no process of this machine for nodes of {named}; if they run on "
+                f"another machine: sros close {folder} {options}; otherwise {silent}"
+            )
 
     # ── applying ────────────────────────────────────────────────────────────────────────────
 
@@ -1200,7 +1289,8 @@ class OpenRobot:
     def _not_open(self, observed: ObservedProcesses) -> Iterator[str]:
         """Yield, for each process that runs in an enclave or does not run, how to start it open.
 
-        Processes of enclaves that were taken out of the policy are left out.
+        Processes of enclaves that were taken out of the policy are left out.  What sros cannot
+        tell from a process of this folder is named, so that nothing closed is taken for open.
         """
         running = ProcessTable().look(self._shell.now())
         are_open = {
@@ -1208,7 +1298,8 @@ class OpenRobot:
             for process in filter(self._is_neighbour, running.processes)
             if not process.asks_for_security
         }
-        secured = {enclave.name: process for process, enclave in self._secured(running)}
+        own = [*self._secured(running, everywhere=True)]
+        secured = {enclave.name: process for process, enclave in own}
         if self.policy.exists():
             observed = observed.within(read_policy(self.policy))
         by_hand = [*chain.from_iterable(observed.by_hand(self.folder).values())]
@@ -1221,6 +1312,19 @@ class OpenRobot:
                 self._shell.say(f"{process.enclave} does not run; {how}")
         for name in sorted(secured.keys() - {process.enclave for process in observed.processes}):
             yield f"{name} runs in an enclave, too; restart it open: {_process_text(secured[name])}"
+        pids = {process.pid for process, _ in own}
+        for other in filter(self._is_neighbour, running.processes):
+            if (enclave := other.enclave) and other.pid not in pids and not other.is_daemon:
+                why = f" ({enclave.problem})" if enclave.problem else ""
+                yield (
+                    f"{other.label} runs secured with the files of '{_keystore_of(enclave)}'{why}, "
+                    "which are not known as those of this folder; open processes do not hear it"
+                )
+        for unseen in running.unseen:
+            if unseen.speaks:
+                yield f"{unseen.label} speaks ROS 2, and cannot be looked at: {unseen.why}"
+        if running.hidden or any(not unseen.speaks for unseen in running.unseen):
+            self._shell.say("some processes cannot be looked at: to be sure of them, ask as root")
 
     # ── the proof ───────────────────────────────────────────────────────────────────────────
 
@@ -1272,29 +1376,50 @@ class OpenRobot:
                     return [Proof(_CLAIM, False, why)]
                 break
             time.sleep(0.2)
-        nodes = self._observation().nodes
-        before = make_observation(node for node in nodes if node.enclaves[0] not in missing)
+        nodes, not_here = self._observation().nodes, self._not_here
+        # A laptop may be away; a computer whose nodes were seen has to be seen again.
+        may_be_away = not_here - {node.enclaves[0] for node in nodes}
+        away = sorted({*missing} | may_be_away | not_here.intersection(self._without))
+        before = make_observation(node for node in nodes if node.enclaves[0] not in away)
         proof = self._proof_of_processes(len(expected) - len(missing), running)
-        if missing:
-            state = "not seen" if running.unseen or running.hidden else "not running"
-            proof = proof._replace(reason=f"{proof.reason}; {state}: {', '.join(missing)}")
-        talk = self._proof_of_talk(before, missing)
+        state = "not seen" if running.unseen or running.hidden else "not running"
+        for what, names in ((state, missing), ("not on this machine", sorted(not_here))):
+            if names:
+                proof = proof._replace(reason=f"{proof.reason}; {what}: {', '.join(names)}")
+        talk = self._proof_of_talk(before, away)
+        if talk.fails and (compared := sorted(not_here.difference(away))):
+            options = " ".join(f"--without {name}" for name in compared)
+            talk = talk._replace(reason=f"{talk.reason}; if they may be away, add {options}")
         silence = self._proof_of_silence(before, hears=talk.holds is not None)
-        return [proof, *self._proof_of_requirements(), talk, silence]
+        return [proof, self._proof_of_files(), *self._proof_of_requirements(), talk, silence]
+
+    def _proof_of_files(self) -> Proof:
+        """Ask `check` about the files that the processes use, such as a key that others read."""
+        status = self._check(str(self.export))
+        reasons = {0: "sros check finds none", 1: "sros check finds one", 2: "they are not checked"}
+        holds = {0: True, 1: False}.get(status)
+        return Proof("the files have no error", holds, f"{reasons[status]}: {self.export}")
 
     def _proof_of_requirements(self) -> Iterator[Proof]:
-        """Decide the requirements for the enclaves that the processes use."""
+        """Decide the requirements for the enclaves that the processes use.
+
+        With processes on other machines, for the enclaves of the keystore, or of the policy.
+        """
         if not self.requirements.exists():
             return
         needed = ("--requirements", str(self.requirements), "--include", "requirement.*")
-        step = _Step(("check", str(self.export), *needed, "--fail-on", "error"))
-        self._shell.say(f"$ {step.command}")
-        status, output, messages = self._shell.run(step.words, False)
-        if status:
-            self._shell.say(f"{output}{messages}".rstrip())
+        status = self._check(str(self._rights if self._not_here else self.export), *needed)
         reasons = {0: "all of them", 1: "one is violated", 2: "they could not be decided"}
         holds = {0: True, 1: False}.get(status)
         yield Proof("the requirements hold", holds, f"{reasons[status]}: {self.requirements}")
+
+    def _check(self, *words: str) -> int:
+        """Run `check`, show what it says if it finds an error, and return its status."""
+        step = _Step(("check", *words, "--fail-on", "error"))
+        self._shell.say(f"$ {step.command}")
+        status, output, messages = self._shell.run(step.words, False)
+        self._say(f"{output}{messages}" if status else "")
+        return status
 
     def _why_missing(
         self, missing: Sequence[str], observed: ObservedProcesses, running: RunningProcesses
@@ -1303,17 +1428,21 @@ class OpenRobot:
         earlier = {enclave.name: process.pid for process, enclave in self._secured(running)}
         are_open = {process.enclave: process.pid for process in observed.processes if process.pid}
         absent = [name for name in missing if name not in earlier]
-        named = ", ".join(
-            f"{name} (stop process {are_open[name]}, which is open)" if name in are_open else name
-            for name in absent
-        )
+        others = {
+            enclave.name: f"{process.label} has the files of '{_keystore_of(enclave)}'"
+            for process in filter(self._is_neighbour, running.processes)
+            if (enclave := process.enclave)
+        }
+        others |= {name: f"stop process {pid}, which is open" for name, pid in are_open.items()}
+        named = ", ".join(f"{name} ({others[name]})" if name in others else name for name in absent)
         old = [f"{name} (process {earlier[name]})" for name in missing if name in earlier]
         reasons = [
             f"no secured process of {named}; start it as {self.start / COMMANDS} says; "
             f"if it ended: sros explain {shlex.quote(str(self.export))} --log ITS_LOG"
         ] * bool(absent)
-        if may_end := [name for name in absent if name not in are_open]:
-            reasons.append(f"if it does not always run, add --without {may_end[0]}")
+        if may_end := [name for name in absent if name not in {*are_open, *self._without}]:
+            options = " ".join(f"--without {name}" for name in may_end)
+            reasons.append(f"if it does not always run, add {options}")
         if old:
             reasons.append(f"earlier files in the processes of {', '.join(old)}; restart them")
         return "; ".join(reasons)
@@ -1326,12 +1455,16 @@ class OpenRobot:
             if enclave.is_there and not [*newer_files(process, enclave)]
         }
 
-    def _secured(self, running: RunningProcesses) -> Iterator[tuple[Process, ProcessEnclave]]:
-        """Yield the processes of the robot's domain that run in enclaves of the export."""
-        export = str(self.export.absolute())
-        for process in filter(self._is_neighbour, running.processes):
-            enclave = process.enclave
-            if process.asks_for_security and enclave and enclave.keystore == export:
+    def _secured(
+        self, running: RunningProcesses, *, everywhere: bool = False
+    ) -> Iterator[tuple[Process, ProcessEnclave]]:
+        """Yield the processes of the robot's domain that run in enclaves of the export.
+
+        Those of other domains and networks, too, if they are looked for ``everywhere``.
+        """
+        for process in running.processes:
+            enclave, is_near = process.enclave, everywhere or self._is_neighbour(process)
+            if enclave and is_near and enclave.is_of(self.export):
                 yield process, enclave
 
     def _proof_of_processes(self, number: int, running: RunningProcesses) -> Proof:
@@ -1362,7 +1495,14 @@ class OpenRobot:
         if findings:
             first = (wrong or findings)[0]
             return Proof(_CLAIM, False if wrong else None, f"{first.subject}: {first.text}")
-        return Proof(_CLAIM, True, f"{counted(number, 'enclave')}, and no open process")
+        known_pids = {process.pid for process, _ in self._secured(running)}
+        guests = [
+            f"; {process.label} has the files of '{_keystore_of(process.enclave)}'"
+            for process in near
+            if process.enclave and process.pid not in known_pids and not process.is_daemon
+        ]
+        said = f"{counted(number, 'enclave')}, and no open process{''.join(guests)}"
+        return Proof(_CLAIM, True, said)
 
     def _proof_of_talk(self, before: Observation, missing: Sequence[str]) -> Proof:
         """Compare what an observer in an enclave sees now with what was seen before.
@@ -1449,6 +1589,10 @@ def _as_its_unit_starts(process: ClosedProcess) -> ClosedProcess:
             if f"; argv[]={' '.join(words)} ;".encode() in shown and [*unit_words(words)]:
                 return process._replace(command=words)
     return process._replace(unit="")
+
+
+def _keystore_of(enclave: ProcessEnclave) -> str:
+    return plain(enclave.keystore, _LONGEST_PATH)
 
 
 _CLAIM = "every process runs in its enclave"

@@ -79,6 +79,13 @@ def _run(words: Sequence[str], live: bool) -> tuple[int, str, str]:
     multiple=True,
     help="Accept that no process of ENCLAVE runs; repeat it for others.",
 )
+@click.option(
+    "--elsewhere",
+    metavar="ENCLAVE",
+    multiple=True,
+    help="Remember that ENCLAVE belongs to another machine, such as a laptop, and keep its key out "
+    "of the export; repeat it for others.",
+)
 @dry_run_option
 @json_option
 def close(
@@ -90,6 +97,7 @@ def close(
     undoes: bool,
     partial: bool,
     without: tuple[str, ...],
+    elsewhere: tuple[str, ...],
     dry_run: bool,
     as_json: bool,
 ) -> int:
@@ -102,8 +110,9 @@ def close(
 
     Nothing is closed before --apply, which restarts the processes that are systemd units, and
     shows the commands for all others. --proof checks that every process runs in its enclave, that
-    everything that talked still talks, and that an open listener finds nothing; --apply does it
-    too, if nothing is left to do by hand. --undo goes back.
+    the files of the enclaves have no error, that everything that talked still talks, and that an
+    open listener finds nothing; --apply does it too, if nothing is left to do by hand. --undo goes
+    back.
 
     Example:
       $ sros close robot --for 5m
@@ -123,10 +132,17 @@ def close(
         raise UsageError("--apply, --proof and --undo exclude each other", "", "Choose one.")
     if duration and (applies or proves or undoes):
         raise UsageError("--for is for watching an open robot", "", "Leave it out.")
+    if elsewhere and (proves or undoes):
+        raise UsageError(
+            "--elsewhere changes the export",
+            "",
+            f"Run `sros close {shlex.quote(str(folder))} --elsewhere {elsewhere[0]}` first: it is "
+            "remembered.",
+        )
     shell = closing.Shell(
         _run, lambda line: echo(line, err=True), os.environ, now, local_zone(os.environ)
     )
-    robot = closing.OpenRobot(folder, domain_of(domain_text), shell, without)
+    robot = closing.OpenRobot(folder, domain_of(domain_text), shell, without, elsewhere)
     if (applies or proves or undoes) and not robot.observed:
         if not folder.is_dir():
             raise UsageError(
@@ -180,13 +196,18 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
             how = f"closed {_EARLIER}: {how}"
         pid = f"process {process.pid}"
         pid += f", known by its {process.known_by}" if process.enclave not in closed.secured else ""
-        pid = pid if process.pid else "not running as observed"
+        if not process.pid:
+            runs = process.enclave in closed.secured
+            pid = "started by another command than observed" if runs else "not running as observed"
         nodes = _nodes(policy, process.enclave)
         echo(f"  {process.enclave}: {pid}{nodes}: {how}")
     export = shlex.quote(str(robot.export.absolute()))
     for name in closed.new:
         why = "has ended" if name in closed.observed.ended else "new"
         echo(f"  {name}: {why}, start it with: sros run {export} {name} -- COMMAND")
+    if not_here := closed.observed.not_here:
+        bring = f"sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER"
+        echo(f"not on this machine: {', '.join(not_here)} (to bring one there: {bring})")
     for right in closed.newly_denied:
         echo(f"used when sros watched, and denied now: {right}")
     if closed.newly_denied:
@@ -243,7 +264,8 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
             stop = "" if closed.stopped.issuperset(closed.left) else "stop them, "
             steps = f"{stop}start them by the first commands in {robot.start / COMMANDS}"
         if stopped := sorted(closed.stopped.intersection(closed.left) if closed.secured else ()):
-            ask += f"; what does not always run: --without {stopped[0]}"
+            ask += "; what does not always run: "
+            ask += " ".join(f"--without {name}" for name in stopped)
         if not closed.left:
             following = ask
         elif any(name in observed.units for name in closed.left):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -34,6 +35,7 @@ from sros_tool.runtime.processes import (
     process_origin,
     with_files,
 )
+from sros_tool.values import as_plain
 from tests.cli.test_json import Seen
 from tests.graph.fake_graph import Beside, graph
 from tests.support.harness import Ended, policy_text, publish, snapshot, sros, subscribe
@@ -80,6 +82,8 @@ class Robot:
     launch: tuple[str, ...] = ()
     container: str = ""
     named: bool = False
+    spelled: str = "robot/export"
+    """How the processes name the export."""
     absent: set[str] = field(default_factory=set)
     """The enclaves whose processes do not run."""
     nodes: tuple[Any, ...] = (TALKER, LISTENER)
@@ -99,7 +103,7 @@ class Robot:
         process = Process(PID[enclave], command, {}, now, libraries=libraries, user=os.geteuid())
         if not is_secured:
             return process
-        export = self.folder / "robot" / "export"
+        export = self.folder / self.spelled
         process = replace(
             process,
             environment=secured_environment(export, enclave, 0),
@@ -221,6 +225,8 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     policy.write_text(policy.read_text().replace("chatter", "gossip", 1))
     changed = policy.read_text()
     ended = robot.close()
+    assert "/listener: the rights that it lost still work until 20" in ended.err
+    assert sros("diff_policy", "robot/keystore", "robot/policy.xml", cwd=robot.folder).ok()
     assert policy.read_text() == changed
     assert "/listener subscribe topic /chatter (/listener)" in ended.out
     told_again = robot.close().out
@@ -253,7 +259,10 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     mine = robot.folder / "robot/start/mine.env"
     mine.write_text("A=1\n")
     first = robot.close("--apply", status=1)
-    assert f"the policy does not have /listener, and the keystore does: {revoke}\n" in first.out
+    assert "the policy does not have /listener, and the keystore does: if nothing" in first.out
+    assert (
+        f"{revoke}; if it belongs to another machine, such as a laptop, sros close r" in first.out
+    )
     assert (
         "removed robot/start/listener.env: it was for an enclave without a " in first.err
         and mine.exists()
@@ -300,12 +309,13 @@ def refuse_undo_of_others(robot: Robot) -> None:
 
 
 def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
-    robot.units = UNITS
+    robot.units, robot.spelled = UNITS, "systemd/../robot/export"
     robot.close()
     closed = robot.close("--apply")
     assert robot.restarts == ["daemon-reload", "restart listener.service talker.service"]
-    assert closed.out.splitlines()[-4:] == [
+    assert closed.out.splitlines()[-5:] == [
         "yes: every process runs in its enclave: 2 enclaves, and no open process",
+        "yes: the files have no error: sros check finds none: robot/export",
         "yes: the requirements hold: all of them: robot/requirements.toml",
         "yes: everything that talked still talks: 2 nodes with 36 endpoints as before",
         "yes: an open listener finds nothing: the observer that saw 2 nodes before sees none",
@@ -367,15 +377,19 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     robot.absent = set()
     assert "start it with" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
-    robot.by_hand = {"/talker", "/listener"}
-    said = robot.close().err.splitlines()[-1]
+    robot.by_hand, robot.named = {"/talker", "/listener"}, True
+    ended = robot.close()
+    assert "  /talker: started by another command than observed: closed\n" in ended.out
     assert re.fullmatch(
         "the robot runs closed, its files are valid until 20.*Z; next: sros close robot --proof",
-        said,
+        ended.err.splitlines()[-1],
     )
+    robot.named = False
     for words in ("--apply", "--proof"):
         assert "; next: bring robot/keystore to another machine" in robot.close(words).err
     robot.by_hand, robot.absent = {"/talker"}, {"/listener"}
+    (robot.folder / "link").symlink_to("robot")
+    robot.spelled = "link/export"
     undone = robot.close("--undo", status=1)
     assert undone.out == "restart it open: cd /opt && /opt/run talker\n"
     assert "/listener does not run; start it open: cd /opt && /opt/run listener\n" in undone.err
@@ -388,7 +402,20 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
         "--undo\n"
     )
     robot.by_hand = set()
-    assert robot.close("--undo").err.startswith("the robot is open: ")
+    # Of files that are not those of the folder, nobody knows whether they are a copy of them.
+    (robot.folder / "copy/enclaves").mkdir(parents=True)
+    robot.spelled = "copy"
+    robot.more = (robot.process("/talker", is_secured=True),)
+    undone = robot.close("--undo", status=1)
+    secured = f"process 4711 (run) runs secured with the files of '{robot.folder}/copy', which are"
+    assert secured in undone.out
+    robot.more = ()
+    robot.unseen = (UnseenProcess(9, ("talker", "--ros-args"), "/proc hides it", speaks=True),)
+    assert "process 9 (talker) speaks ROS 2, and ca" in robot.close("--undo", status=1).out
+    robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
+    undone = robot.close("--undo")
+    assert undone.err.startswith("some processes cannot be looked at: to be sure of them, ask as ")
+    assert "the robot is open: " in undone.err
 
 
 @sometimes("processes_that_started_after_the_watch", 1 / 2)
@@ -443,7 +470,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     assert f"\n# /late\ncd /opt && sros run {export} /late -- /opt/late --ros-args\n" in commands
     undone = "restart it open: cd /opt && /opt/late --ros-args\n"
     assert undone in robot.close("--undo", status=1).out
-    robot.by_hand, robot.more = set(), (replace(late, environment={}),)
+    robot.by_hand, robot.more = set(), (replace(late, environment={}, enclave=None),)
     assert "the robot is open" in robot.close("--undo").err
     assert "closed yet; next: stop the robot" in robot.close().err
 
@@ -476,6 +503,7 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert "no secured process of /talker (stop" in killed
     robot.absent = {"/listener", "/talker"}
     assert "no secured process" in robot.close(*without, "--without", "/talker", status=1).out
+    assert "add --without /listener --without /talker\n" in robot.close("--proof", status=1).out
 
 
 def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
@@ -483,12 +511,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     robot.close()
     robot.close("--apply")
     robot.more = (Process(5, ("spy", "--ros-args"), {}, datetime.now(UTC)),)
-    assert (
-        "no: every process runs in its enclave: process 5 (spy)"
-        in robot.close("--proof", status=1).out
-    )
-    robot.more = (robot.process("/talker", is_secured=False),)
+    robot.more += (robot.process("/talker", is_secured=False),)
     ended = robot.close("--proof", status=1)
+    assert "no: every process runs in its enclave: process 5 (spy)" in ended.out
     assert "ROS_SECURITY_ENABLE. Stop it: another process runs in /talker.\n" in ended.err
     robot.more = ()
     robot.outdated = {"/talker"}
@@ -517,7 +542,13 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     needed.write_text("[[only]]\n")
     assert "[[only]] names no right" in robot.close("--proof", status=2).err
     needed.write_text('[[only]]\npublish = ["/chatter"]\nenclaves = ["/listener"]\n')
+    key = robot.folder / "robot/export/enclaves/talker/key.pem"
+    key.chmod(0o644)
     ended = robot.close("--proof", status=1)
+    key.chmod(0o600)
+    named = f"process 4711 (run): the mode of '{key}' is 0644\n"
+    assert f"no: every process runs in its enclave: {named}" in ended.out
+    assert "no: the files have no error: sros check finds one: robot/export\n" in ended.out
     assert "no: the requirements hold: one is violated: robot/requirements.toml\n" in ended.out
     assert "/talker: may publish /chatter" in ended.err
     needed.write_text(kept)
@@ -528,7 +559,6 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     assert "accept with --partial" not in ended.err
     robot.remaining = (TALKER, LISTENER)
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
-    assert "not asked: every process runs in its enclave" in robot.close("--proof", status=1).out
     policy = robot.folder / "robot/policy.xml"
     policy.write_text(policy.read_text().replace("chatter", "gossip", 1))
     ended = robot.close("--proof", "--partial")
@@ -536,6 +566,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
         "policy.xml' differs from the signed permissions of /listener: `sros close robot` checks"
         in ended.err
     )
+    assert "not asked: every process runs in its enclave" in ended.out
     assert "closed, except for what was not asked" in ended.err
 
 
@@ -796,11 +827,16 @@ def test_a_dry_run_changes_nothing(robot: Robot) -> None:
     assert not (robot.folder / "robot").exists()
     robot.units = UNITS
     robot.close()
+    policy = robot.folder / "robot/policy.xml"
+    signed = policy.read_text()
+    policy.write_text(signed.replace("chatter", "gossip", 1))
     before = snapshot(robot.folder)
     ended = robot.close("--apply", "--dry-run")
     assert "kept: sros create_keystore" in ended.err
+    assert "/listener would lose: subscribe topic /chatter\n" in ended.err
     assert "would run: systemctl restart listener.service talker.service" in ended.err
     assert snapshot(robot.folder) == before
+    policy.write_text(signed)
     robot.close("--apply")
     before = snapshot(robot.folder)
     assert "would remove " in robot.close("--undo", "--dry-run").err
@@ -880,6 +916,55 @@ def test_a_process_to_stop_is_named_by_the_id_that_it_has_now() -> None:
     ):
         assert talker.as_it_runs(running).pid == pid
     assert talker._replace(unit="talker.service").as_it_runs(RunningProcesses()).pid == 7
+
+
+def test_what_is_exported_without_the_enclaves_of_other_machines(tmp_path: Path) -> None:
+    """The key of a laptop, or of a computer to which a process moved, is not on this one."""
+    enclaves = "".join(
+        f'<enclave path="/{name}"><profiles><profile ns="/" node="n"/></profiles></enclave>'
+        for name in "ab"
+    )
+    policy = f'<policy version="0.2.0"><enclaves>{enclaves}</enclaves></policy>'
+    (tmp_path / "policy.xml").write_text(policy)
+    start = closing.ClosedProcess("/a", 7, ("talk",), "/opt", 0, "", "program")
+    observed = closing.ObservedProcesses(0, [start, start._replace(enclave="/b")])
+    (tmp_path / "processes.json").write_text(json.dumps(as_plain(observed)))
+    shell = closing.Shell(close._run, print, {}, lambda: datetime.now(UTC), UTC)
+    robot = closing.OpenRobot(tmp_path, 0, shell, elsewhere=["/b"])
+    exported = [step.words[2:-2] for step in robot.steps(None) if step.words[0] == "distribute_key"]
+    assert exported == [("/a", "/sros_observer")]
+    moved = observed.belonging_elsewhere(["/b"])
+    assert [each.enclave for each in moved.processes] == ["/a"] and moved.not_here == ["/b"]
+
+
+@sometimes("an_enclave_that_belongs_to_another_machine", 1 / 4)
+def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
+    """Seen while sros watched, it has to be seen again; another one may be away, as a laptop."""
+    robot.close()
+    assert "has no enclave /x. It has" in robot.close("--elsewhere", "/x", status=2).err
+    assert "is remembered" in robot.close("--proof", "--elsewhere", "/listener", status=2).err
+    robot.absent = {"/listener"}
+    ended = robot.close("--elsewhere", "/listener")
+    left = "robot/export/enclaves/listener"
+    assert f"removed {left}: its enclave belongs to another machine\n" in ended.err
+    assert (
+        "\nnot on this machine: /listener (to bring one there: sros distribute_key r" in ended.out
+    )
+    assert not (robot.folder / left).exists() and "/listener: process" not in ended.out
+    robot.by_hand = {"/talker"}
+    ended = robot.close("--proof")
+    assert "1 enclave, and no open process; not on this machine: /listener\n" in ended.out
+    assert "talks: 2 nodes with 36 endpoints as before\n" in ended.out
+    robot.remaining = (TALKER,)
+    said = robot.close("--proof", status=1).out
+    assert "gone: /listener" in said and "; if they may be away, add --without /listener\n" in said
+    ended = robot.close("--proof", "--without", "/listener")
+    assert "talks: 1 node with 18 endpoints as before, without /listener\n" in ended.out
+    sros("create_enclave", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
+    robot.close("--elsewhere", "/operator/look")
+    assert list_enclaves(robot.folder / "robot/export") == ("/sros_observer", "/talker")
+    robot.remaining = (TALKER, LISTENER)
+    assert "as before, without /operator/look\n" in robot.close("--proof").out
 
 
 def test_the_nodes_of_a_process_that_has_several(tmp_path: Path) -> None:

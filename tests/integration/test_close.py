@@ -112,8 +112,8 @@ def test_a_robot_is_closed(tmp_path: Path) -> None:
     assert first["reason"].startswith("no secured process of /listener (stop process ")
 
     assert said["closed"].status == 1, said["closed"]
-    processes, required, talk, silence = proofs(said["closed"]).values()
-    assert required["holds"] is True, required
+    processes, files, required, talk, silence = proofs(said["closed"]).values()
+    assert files["holds"] is True and required["holds"] is True, (files, required)
     assert processes["holds"] is not False, processes
     # On the wheels of rclpy, which enforce no security, there is no observer with an enclave.
     assert talk["holds"] is None and "without DDS Security" in talk["reason"], talk
@@ -204,8 +204,8 @@ def test_a_robot_on_zenoh_is_closed_and_opened_again(tmp_path: Path) -> None:
     assert "  action /count: /action_client -> /action_server\n" in said["open"].out
     assert said["applied"].status == 1
     assert said["closed"].status == 0, said["closed"]
-    processes, required, talk, silence = proofs(said["closed"]).values()
-    assert required["holds"] is True, required
+    processes, files, required, talk, silence = proofs(said["closed"]).values()
+    assert files["holds"] is True and required["holds"] is True, (files, required)
     assert processes["holds"] is not False, processes
     assert talk["reason"] == "6 nodes with 118 endpoints as before", talk
     assert silence["holds"] is True, silence
