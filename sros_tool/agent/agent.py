@@ -17,12 +17,12 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 from urllib.parse import quote, urlsplit
 
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from sros_tool.agent.connection import GuardedConnection
+from sros_tool.agent.connection import REFUSALS, GuardedConnection, ended_tls
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
 from sros_tool.agent.install import Installation, install_release, made_at, newest_list
 from sros_tool.agent.running import (
@@ -48,12 +48,13 @@ from sros_tool.keystore.confirmation import (
     EnclaveExpiry,
     RobotClock,
     RunningFiles,
+    enclave_of,
+    lacks_key,
     make_confirmation,
     render_confirmation,
 )
 from sros_tool.keystore.delivery.archive import listed_digests
 from sros_tool.keystore.delivery.release import Release, sealed_robot
-from sros_tool.keystore.delivery.robot import OF_ANOTHER_KEY
 from sros_tool.keystore.issuing.tokens import place_in
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -76,6 +77,7 @@ from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.token import Secrets, open_enclave_key
 from sros_tool.runtime.processes import RunningProcesses, boot_id
 from sros_tool.validity import elapsed, iso, time_of_file
+from sros_tool.wording import counted, first_few
 from sros_tool.xml import read_bytes
 
 _TOLERANCE = timedelta(minutes=2)
@@ -85,11 +87,20 @@ _REPLACED_FOR = timedelta(days=30)
 """How long the agent sends a revocation list that a release replaced by a list that revokes
 less.
 """
+_REPAIRED_FOR = timedelta(days=1)
+"""How long the agent reports that it replaced files which were not those of the release."""
 _BRING_KEY = (
-    " A release has no keys: bring the new key as for the first time, with `sros distribute_key "
+    " A release has no keys: bring the key as for the first time, with `sros distribute_key "
     "KEYSTORE --robot {} DIR --force` in the keystore."
 )
 _FULL = (errno.ENOSPC, errno.EDQUOT)
+_Answer = TypeVar("_Answer")
+_MOST_CERTIFICATES = 8
+"""How many enclaves the agent tries with a web server that refuses their certificates."""
+
+
+class RefusedError(UnavailableError):
+    """A message that the web server does not take, perhaps because of the client's certificate."""
 
 
 class Round(NamedTuple):
@@ -170,6 +181,9 @@ class _Round:
         # Documents that were verified prove that this moment has passed, whatever the clock shows.
         certain = max(now, before.latest) if before.latest else now
         installation, fetched = self._fetch_and_install(certain)
+        repaired = self._state.repaired_at
+        if repaired and abs(now - repaired) < _REPAIRED_FOR:
+            self._problems.append(self._state.repaired)
         names = self._enclaves()
         opened = self._open(names, now)
         if clock is not RobotClock.BEHIND:  # what is wrong is seen on a clock that is right
@@ -258,17 +272,21 @@ class _Round:
     def _fetch_and_install(self, certain: datetime) -> tuple[Installation, bool]:
         """Fetch and install a release; return what changed, and whether the source was reached."""
         settings, state = self._settings, self._state
-        intact = self._is_installed()
-        try:
-            release = self._machine.fetch(
+        others = self._other_files()
+
+        def fetch(certificate: ClientCertificate | None) -> Release | None:
+            return self._machine.fetch(
                 agent_folder(self._folder),
                 settings.source,
                 settings.robot,
                 now=certain,
-                installed=state.accepted if intact else 0,
-                client_certificate=self._client_certificate(),
+                installed=0 if others or others is None else state.accepted,
+                client_certificate=certificate,
                 tls_ca=Path(settings.tls_ca) if settings.tls_ca else None,
             )
+
+        try:
+            release = self._as_an_enclave(settings.source, fetch)
         except FetchError as error:
             self._problems.append(_sentence(error))
             if error.problem is FetchProblem.EXPIRED:
@@ -286,23 +304,42 @@ class _Round:
         if release is None:
             self._is_in_step = True
             return Installation(), True
-        return self._install(release, certain), True
+        installation = self._install(release, certain)
+        if release.number == state.accepted:
+            repaired = (path for path in others or () if enclave_of(path) in installation.changed)
+            self._note_repaired(release.number, tuple(repaired))
+        return installation, True
 
-    def _is_installed(self) -> bool:
-        """Return whether the folder has every file of the release that was accepted last."""
-        state = self._state
+    def _other_files(self) -> tuple[str, ...] | None:
+        """Return the paths of files that are missing, or not those of the installed release.
+
+        None if no release is installed with all its enclaves, or its seal cannot be read.
+        """
+        state, others = self._state, []
         if not state.accepted or state.release != state.accepted:
-            return False
+            return None
         try:
             text = smime.parse(read_seal(self._folder)).text
             with Folder(self._folder) as opened:
                 for line in text.splitlines():
                     digest, mark, path = line.decode(errors="replace").partition("  ")
-                    if mark and hashlib.sha256(opened.read_inside(path)).hexdigest() != digest:
-                        return False
+                    if mark and _sha256(opened, path) != digest:
+                        others.append(path)
         except (SrosError, OSError):
-            return False
-        return True
+            return None
+        return tuple(others)
+
+    def _note_repaired(self, release: int, paths: Sequence[str]) -> None:
+        """Remember that files were replaced; messages say it for a day, as each replaces the
+        last."""
+        if paths:
+            now = self._machine.now
+            text = (
+                f"At {iso(now)}, {counted(len(paths), 'file')} that release {release} has "
+                f"{'was' if len(paths) == 1 else 'were'} changed or missing here, and replaced: "
+                f"{first_few(paths, 3)}. Find out who or what changes files on this robot."
+            )
+            self._state = replace(self._state, repaired=text, repaired_at=now)
 
     def _install(self, release: Release, certain: datetime) -> Installation:
         settings, state = self._settings, self._state
@@ -340,7 +377,7 @@ class _Round:
             self._problems.append(self._refused(error))
             return Installation()
         for name, why in installation.kept.items():
-            remedy = _BRING_KEY.format(settings.robot) if OF_ANOTHER_KEY in why else ""
+            remedy = _BRING_KEY.format(settings.robot) if lacks_key(why) else ""
             self._problems.append(f"{name} keeps its files: {why}.{remedy}")
         for name in installation.removed:
             self._problems.append(
@@ -501,16 +538,16 @@ class _Round:
             return False
         settings = self._settings
 
-        def deliver() -> None:
+        def deliver(certificate: ClientCertificate | None) -> None:
             send(
                 settings.inbox,
                 settings.robot,
                 message,
-                client_certificate=self._client_certificate(),
+                client_certificate=certificate,
                 tls_ca=Path(settings.tls_ca) if settings.tls_ca else None,
             )
 
-        arrived = self._attempt(deliver)
+        arrived = self._attempt(lambda: self._as_an_enclave(settings.inbox, deliver))
         if arrived:
             self._state = replace(self._state, sent=now)
         return arrived
@@ -598,17 +635,43 @@ class _Round:
         )
         return b""
 
-    def _client_certificate(self) -> ClientCertificate | None:
-        """Return the files of the enclave whose certificate is valid longest, for TLS."""
-        chosen: tuple[datetime, ClientCertificate] | None = None
+    def _as_an_enclave(
+        self, place: str, ask: Callable[[ClientCertificate | None], _Answer]
+    ) -> _Answer:
+        """Return the answer of a server to the first enclave whose certificate it accepts.
+
+        The certificate of one enclave may be revoked already, where a new one is published.
+
+        Raises:
+            SrosError, OSError: what ``ask`` raised, for the last enclave if all were refused.
+        """
+        certificates: Sequence[ClientCertificate | None] = [None]
+        if place.startswith("https://"):
+            certificates = self._client_certificates() or certificates
+        *others, last = certificates
+        for certificate in others:
+            try:
+                return ask(certificate)
+            except RefusedError:
+                continue
+            except FetchError as error:
+                if error.problem is not FetchProblem.REFUSED:
+                    raise
+        return ask(last)
+
+    def _client_certificates(self) -> list[ClientCertificate]:
+        """Return the files of some enclaves, for TLS; the certificate that is valid longest is
+        first."""
+        found: list[tuple[datetime, ClientCertificate]] = []
         for name in self._enclaves():
             place = enclave_path(self._folder, name)
             with suppress(SrosError, OSError):
                 until = validity_of(read_certificate(place / CERTIFICATE_FILE)).not_after
-                if (place / KEY_FILE).exists() and (chosen is None or until > chosen[0]):
+                if (place / KEY_FILE).exists():
                     files = ClientCertificate(place / CERTIFICATE_FILE, place / KEY_FILE)
-                    chosen = (until, files)
-        return chosen[1] if chosen else None
+                    found.append((until, files))
+        found.sort(key=lambda pair: pair[0], reverse=True)
+        return [files for _, files in found[:_MOST_CERTIFICATES]]
 
 
 class _Opened(NamedTuple):
@@ -621,6 +684,13 @@ class _Opened(NamedTuple):
         with suppress(SrosError):
             return self.state.grant.validity.not_after if self.state.grant else None
         return None
+
+
+def _sha256(folder: Folder, path: str) -> str:
+    """Return the SHA-256 of a file; "" if it is missing or cannot be read."""
+    with suppress(SrosError, OSError):
+        return hashlib.sha256(folder.read_inside(path)).hexdigest()
+    return ""
 
 
 def _revoked(text: str) -> frozenset[int]:
@@ -676,7 +746,8 @@ def send(
         tls_ca: CA certificates (PEM) of the server; None: those of the system.
 
     Raises:
-        UnavailableError: the inbox cannot be reached, or does not take the message.
+        UnavailableError: the inbox cannot be reached, or does not take the message; `RefusedError`
+            if it answers as to a certificate that it refuses.
     """
     if not inbox.startswith(("https://", "http://")):
         _write_message(Path(inbox), robot, message)
@@ -698,13 +769,11 @@ def send(
             if connection.is_cut_off:  # what came may be a part of the answer
                 raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
     except (OSError, http.client.HTTPException, ValueError) as error:
-        raise UnavailableError(
-            what, f"{error}.", ("The agent tries again at its next run.")
-        ) from error
+        kind = RefusedError if ended_tls(error) else UnavailableError
+        raise kind(what, f"{error}.", ("The agent tries again at its next run.")) from error
     if not 200 <= reply.status < 300:
-        raise UnavailableError(
-            what, f"It answers {reply.status} to PUT {where}.", "See the log of the server."
-        )
+        kind = RefusedError if reply.status in REFUSALS else UnavailableError
+        raise kind(what, f"It answers {reply.status} to PUT {where}.", "See the log of the server.")
 
 
 def _write_message(inbox: Path, robot: str, message: bytes) -> None:

@@ -15,6 +15,17 @@ _MOST_SECONDS = 300.0
 """Longest time in seconds that all requests of one visit may take together."""
 _SILENCE = 30.0
 """Longest wait for the next byte of a server, in seconds."""
+REFUSALS = frozenset({400, 401, 495, 496})
+"""Status with which web servers answer to a client whose certificate they refuse (nginx: 400)."""
+
+
+def ended_tls(error: BaseException | None) -> bool:
+    """Return whether a server ended TLS, as for a client's certificate that it refuses.
+
+    With TLS 1.3 this may be an alert, or only the end of the connection.
+    """
+    own = ssl.SSLCertVerificationError  # of the certificate of the server
+    return isinstance(error, ssl.SSLError) and not isinstance(error, own)
 
 
 class GuardedConnection(http.client.HTTPConnection):

@@ -15,6 +15,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from sros_tool.agent.connection import REFUSALS, ended_tls
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.files import remove_file, replace_file
 from sros_tool.fleet.robots import name_problem
@@ -51,6 +52,8 @@ class FetchProblem(StrEnum):
 
     UNREACHABLE = "unreachable"
     """The source does not answer, or lacks a file."""
+    REFUSED = "refused"
+    """The web server refuses the certificate of this robot."""
     EXPIRED = "expired"
     """The metadata expired: none is published, somebody withholds it, or a clock is wrong."""
     ROLLED_BACK = "rolled_back"
@@ -301,12 +304,13 @@ def _explained(error: Exception, source: str, now: datetime) -> FetchError:
 
     why = _sentence(error)
     if isinstance(error, exceptions.ExpiredMetadataError):
+        needs = " KEYSTORE PUB --root-key FILE" if "root.json" in why else ""
         return FetchError(
             FetchProblem.EXPIRED,
             f"the metadata in {source} has expired",
             f"{why} The clock here shows {iso(now)}. Nothing is published any more, or "
             "somebody withholds the new files.",
-            f"Where the keystore is, run `sros fleet publish`; {_CLOCK}.",
+            f"Where the keystore is, run `sros fleet publish{needs}`; {_CLOCK}.",
         )
     if isinstance(error, exceptions.BadVersionNumberError):
         return FetchError(
@@ -319,6 +323,16 @@ def _explained(error: Exception, source: str, now: datetime) -> FetchError:
     if isinstance(error, exceptions.DownloadLengthMismatchError):
         return FetchError(
             FetchProblem.TOO_LARGE, f"{source} sends more than is allowed", why, "Nothing was kept."
+        )
+    status = error.status_code if isinstance(error, exceptions.DownloadHTTPError) else 0
+    if status in REFUSALS or ended_tls(error.__cause__):
+        return FetchError(
+            FetchProblem.REFUSED,
+            f"{source} refuses this robot",
+            f"{why} Perhaps the certificates of its enclaves were revoked or have expired, or the "
+            "server has an old copy of the CA or of its revocation list.",
+            "See the log of the server. If the certificates are the reason, bring new files with "
+            "`sros distribute_key KEYSTORE --robot ROBOT FOLDER --force`.",
         )
     if isinstance(error, exceptions.DownloadError):
         return FetchError(FetchProblem.UNREACHABLE, f"{source} cannot be fetched from", why)

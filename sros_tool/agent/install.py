@@ -26,6 +26,7 @@ from cryptography import x509
 
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder
+from sros_tool.keystore.confirmation import KEY_NOT_HERE
 from sros_tool.keystore.delivery.release import RELEASE_FILES, Release, seal_problem
 from sros_tool.keystore.delivery.robot import evaluate_delivered
 from sros_tool.keystore.layout import (
@@ -406,8 +407,8 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
         own = _content(folder, f"{place}/{CERTIFICATE_FILE}") or files.get(CERTIFICATE_FILE, b"")
         return load_certificates(own, CERTIFICATE_FILE)[0].public_key()  # type: ignore[return-value]
     raise KeystoreError(
-        f"the key of enclave {name} is not on this robot",
-        "A release has no private keys.",
+        f"the key of enclave {name} {KEY_NOT_HERE}",
+        "",
         "Bring the key once, with `sros distribute_key` or a play, or make one here with "
         "`sros create_request`.",
     )

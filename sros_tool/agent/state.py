@@ -44,7 +44,8 @@ class AgentState:
     documents begin to be valid then.  ``due`` are the enclaves whose processes were not yet seen
     with the installed files, since the start ``boot`` of the machine (see `boot_id`); of those in
     ``unseen``, no process was seen.  ``fetched`` and ``sent`` tell when the source and the inbox
-    were last reached.
+    were last reached.  ``repaired`` is a sentence on files that were not those of the release and
+    were replaced, at ``repaired_at``.
     """
 
     release: int = 0
@@ -57,6 +58,8 @@ class AgentState:
     fetched: datetime | None = None
     sent: datetime | None = None
     problems: tuple[str, ...] = ()
+    repaired: str = ""
+    repaired_at: datetime | None = None
 
     def next_sequence(self, now: datetime) -> int:
         """Return the sequence number of the next message: higher than all earlier ones.
@@ -92,10 +95,11 @@ def _state_from(value: Any) -> AgentState:
     for number in ("release", "accepted", "sequence"):
         if type(value[number]) is not int or not 0 <= value[number] <= MOST_NUMBER:
             raise ValueError(number)
-    for moment in ("latest", "fetched", "sent"):
-        if value[moment] is not None:
+    for moment in ("latest", "fetched", "sent", "repaired_at"):
+        if value.get(moment) is not None:
             value[moment] = parse_iso(_text(value[moment]))
     value["boot"] = _text(value["boot"])
+    value["repaired"] = _text(value.get("repaired", ""))
     for names in ("due", "unseen"):
         value[names] = tuple(check_enclave_name(_text(name)) for name in value[names])
     value["problems"] = tuple(map(_text, value["problems"]))

@@ -192,6 +192,18 @@ class Confirmation:
         return tuple(sorted({enclave_of(path) for path in self.files}))
 
 
+KEY_NOT_HERE = "is not on this robot"
+OF_ANOTHER_KEY = "it does not belong to the enclave's key"
+"""What the agent says of an enclave for which a release needs another key than the one that is on
+the robot: there is no key, or the certificate is for another one.
+"""
+
+
+def lacks_key(problem: str) -> bool:
+    """Return whether a problem of an agent is about a key, which no release can bring."""
+    return KEY_NOT_HERE in problem or OF_ANOTHER_KEY in problem
+
+
 def enclave_of(path: str) -> str:
     """Return the name of the enclave that the file at ``path`` of a keystore belongs to."""
     return path.rpartition("/")[0].removeprefix(ENCLAVES) or "/"

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 
-from sros_tool.agent.agent import Machine, Round, run_round
-from sros_tool.agent.fetch import FetchError, FetchProblem
+from sros_tool.agent.agent import Machine, RefusedError, Round, run_round
+from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem
 from sros_tool.agent.running import Systemd
 from sros_tool.agent.settings import (
     AgentSettings,
@@ -81,6 +81,10 @@ class Robot:
     """The units that were restarted."""
     signers: list[x509.Certificate] = field(default_factory=list)
     """Further certificates that may have signed a message."""
+    refused: Sequence[str] = ()
+    """The enclaves whose certificates the source refuses."""
+    tried: list[str] = field(default_factory=list)
+    """The enclaves as which the robot asked the source."""
 
     def __post_init__(self) -> None:
         self.inbox.mkdir()
@@ -107,6 +111,11 @@ class Robot:
     def fetch(self, _state: Path, _source: str, robot: str, **more: object) -> Release | None:
         assert robot == "r1"
         self.asked.append(int(str(more["installed"])))
+        if isinstance(certificate := more["client_certificate"], ClientCertificate):
+            place = certificate.certificate.parent
+            self.tried.append(f"/{place.relative_to(self.folder / 'enclaves')}")
+            if self.tried[-1] in self.refused:
+                raise FetchError(FetchProblem.REFUSED, "the source refuses this robot")
         if isinstance(self.release, FetchError):
             raise self.release
         fresh = self.release and self.release.number != more["installed"]
@@ -202,6 +211,31 @@ def test_rounds_follow_what_home_publishes(home: Home, r1: Robot) -> None:
     assert sum("has expired, at" in problem for problem in late.problems) == len(NAMES)
 
 
+def test_a_server_that_refuses_one_certificate_of_the_robot(
+    home: Home, r1: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as that of an enclave whose next certificate the robot is about to fetch."""
+    sent: list[Path] = []
+
+    def send(*_words: object, client_certificate: ClientCertificate, **_more: object) -> None:
+        sent.append(client_certificate.certificate)
+        if len(sent) == 1:
+            raise RefusedError("the inbox does not take the message")
+
+    monkeypatch.setattr("sros_tool.agent.agent.send", send)
+    r1.settings = replace(r1.settings, source="https://home/pub", inbox="https://home/inbox")
+    r1.round()
+    first, *others = NAMES
+    assert r1.tried == [first] and len(sent) == 2 and sent[0] != sent[1]
+    r1.release, r1.refused = home.renewed, [first]
+    done = r1.round()
+    assert (done.release, done.sent, done.problems) == (2, True, ())
+    assert r1.tried[1:] == [first, others[0]]
+    r1.refused, r1.tried[:] = NAMES, []
+    (problem,) = r1.round().problems
+    assert problem == "The source refuses this robot." and sorted(r1.tried) == sorted(NAMES)
+
+
 def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None:
     r1.round()
     (r1.folder / "enclaves/r1/a/permissions.p7s").unlink()
@@ -209,12 +243,18 @@ def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None
     done = r1.round()
     assert done.changed == ("/r1/a",), "the key of /r1/b is gone, and only here"
     (problem,) = (problem for problem in done.problems if "/r1/b keeps its files" in problem)
-    assert "sros distribute_key" not in problem
+    bring = "`sros distribute_key KEYSTORE --robot r1 DIR --force`"
+    assert "is not on this robot. A release has no keys" in problem and bring in problem
+    changed = "1 file that release 1 has was changed or missing here, and replaced: enclaves/r1/a/p"
+    assert sum(changed in problem for problem in done.problems) == 1
     shutil.copytree(r1.folder / "enclaves/r1/a", r1.folder / "enclaves/r1/b")
     (problem,) = (each for each in r1.round().problems if "/r1/b keeps its files" in each)
-    assert "`sros distribute_key KEYSTORE --robot r1 DIR --force`" in problem, "it has another key"
+    assert bring in problem, "it has another key"
     assert r1.message().release == 1
     assert has(r1.folder, home.first, ("/r1/a", "/r1/c"))
+    assert any(changed in problem for problem in r1.message().problems or ()), "for a day"
+    late = r1.round(moment() + timedelta(days=1, minutes=1)).problems
+    assert not any(changed in problem for problem in late)
     assert sros("agent", "status", r1.folder).status == 1
 
 

@@ -275,12 +275,22 @@ class Quiet(SimpleHTTPRequestHandler):
         return super().translate_path(path.removeprefix("/fleet"))
 
 
+class Refusing(Quiet):
+    """A server that answers as nginx to a certificate that it refuses."""
+
+    def do_GET(self) -> None:
+        self.send_error(400)
+
+
 def test_a_web_server(publisher: Home) -> None:
     with serving(partial(Quiet, directory=str(publisher.pub))) as address:
         assert publisher.robot().gets(address) == publisher.robot().gets()
         shutil.rmtree(publisher.pub / "targets")
         assert "404" in publisher.robot().refuses(FetchProblem.UNREACHABLE, address).why
     assert publisher.robot().refuses(FetchProblem.UNREACHABLE, address)
+    with serving(partial(Refusing, directory=str(publisher.pub))) as address:
+        error = publisher.robot().refuses(FetchProblem.REFUSED, address)
+        assert "answers 400" in error.why and "sros distribute_key" in error.remedy
 
 
 def test_endless_data(publisher: Home) -> None:
@@ -365,7 +375,7 @@ def test_tls_with_the_certificate_of_an_enclave(publisher: Home, tmp_path: Path)
     with serving(partial(Quiet, directory=str(publisher.pub)), context) as address:
         robot = publisher.robot()
         robot.gets(address, client_certificate=own, tls_ca=tmp_path / "s.pem")
-        robot.refuses(FetchProblem.UNREACHABLE, address, tls_ca=tmp_path / "s.pem")
+        robot.refuses(FetchProblem.REFUSED, address, tls_ca=tmp_path / "s.pem")
         error = robot.refuses(FetchProblem.UNREACHABLE, address, client_certificate=own)
         assert "certificate" in error.why
         missing = own._replace(key=tmp_path / "none")

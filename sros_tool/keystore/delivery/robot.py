@@ -16,6 +16,7 @@ from cryptography import x509
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError, UsageError
 from sros_tool.files import write_new_file
+from sros_tool.keystore.confirmation import OF_ANOTHER_KEY
 from sros_tool.keystore.delivery.archive import listed_digests, unpack
 from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.authority import Authority
@@ -371,10 +372,6 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
             "Replace the CA with `sros rotate_ca`, and have the request signed again.",
         )
     return state
-
-
-OF_ANOTHER_KEY = "it does not belong to the enclave's key"
-"""What is wrong with a certificate for another key than the one on the robot, as a clause."""
 
 
 def evaluate_delivered(
