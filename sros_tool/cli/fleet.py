@@ -959,6 +959,11 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     elif robot.fetches and robot.pending:
         other = f"not the files of the published release {robot.release}"
         yield other if robot.is_published else "not published yet"
+    if robot.fetches and robot.lacks_key:
+        names = first_few(robot.lacks_key, _MOST_GROUPS)
+        yield f"lacks the key of {names}, which no release brings"
+    elif robot.is_locked_out and robot.enclaves:
+        yield "all its certificates are revoked: a web server with the present list refuses it"
     if robot.restart:
         yield f"processes of {first_few(robot.restart, _MOST_GROUPS)} may run with earlier files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):

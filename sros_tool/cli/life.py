@@ -128,11 +128,11 @@ def renew(
         result,
         json_form(result, "RenewedEnclaves") if as_json else None,
         enclave_lines(tuple(result.outcomes), "renewed enclave {}"),
-        first=_replaced_lines(result),
+        first=_replaced_lines(result, has_new_keys=new_key),
     )
 
 
-def _replaced_lines(result: Changed) -> Iterator[str]:
+def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
     """Yield until when replaced certificates still work, and where copies of them are."""
     from sros_tool.keystore.fleet import publish_command
     from sros_tool.validity import iso
@@ -156,6 +156,12 @@ def _replaced_lines(result: Changed) -> Iterator[str]:
         yield (
             "exports and running processes still have the earlier certificates and "
             f"permissions: {deliver}, and restart the processes, before these expire"
+        )
+    if has_new_keys and result.outcomes and publish_command(result.root):
+        yield (
+            "a release has no keys, so bring the new ones to robots that fetch by hand, after "
+            "publishing: "
+            f"`sros distribute_key {quote(str(result.root))} --robot NAME FOLDER --force`"
         )
 
 

@@ -38,6 +38,7 @@ from sros_tool.keystore.confirmation import (
     RunningFiles,
     certificate_digests,
     enclave_of,
+    lacks_key,
     last_confirmation,
     refusals,
 )
@@ -54,6 +55,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     REQUIRED_FILES,
     enclave_folder,
+    enclave_path,
     has_enclave,
 )
 from sros_tool.keystore.ledger import RESTORED, Entry
@@ -192,6 +194,9 @@ class RobotStatus:
     robot whose files differ from the keystore's: whether the release that the robot reports was
     published with the present files of the keystore.  ``has_list`` says whether it has the present
     revocation list, in force or not, and ``renew_from`` from when a file of it expires soon.
+    ``lacks_key`` are enclaves whose key the keystore has and the robot does not, which no release
+    brings.  ``reads_copy`` says that it fetched after the publication and got an earlier release,
+    and ``is_locked_out`` that all its certificates are revoked.
     """
 
     robot: str
@@ -246,8 +251,8 @@ class RobotStatus:
     dds: RobotDds | None
     """The DDS of the robot by its last confirmation; null if the confirmation does not tell."""
     problems: tuple[str, ...] | None
-    """What the robot's agent could not do, in its own words; null if the confirmation does not
-    tell."""
+    """What the robot's agent could not do, in its own words, or that it fetches from an old copy of
+    what was published; null if the confirmation does not tell."""
     notes: tuple[str, ...]
     """Remarks, as clauses, such as on the robot's clock."""
     to_do: str = ""
@@ -255,6 +260,9 @@ class RobotStatus:
     is_published: bool = False
     has_list: bool = False
     renew_from: datetime | None = None
+    lacks_key: tuple[str, ...] = ()
+    reads_copy: bool = False
+    is_locked_out: bool = False
 
     @property
     def unrecorded(self) -> tuple[str, ...]:
@@ -320,13 +328,17 @@ class RobotStatus:
             return _TO_DO[self.state]
         if self.state is State.EXPIRED and not self.pending:
             return "renew"
-        if not self.fetches:
+        if not self.fetches or self.lacks_key:
             return "deliver"
         if not is_accepted:
             return "publish"
         if (self.published or 0) == (self.release or 0):
             return "find out why" if self.is_published else "publish"
+        if self.reads_copy:
+            return "look at its `from`"
         is_silent = self.received is None or now - self.received > _SILENCE
+        if self.is_locked_out:
+            return "deliver" if is_silent else "wait, else deliver"
         return "check whether it is on" if is_silent else "wait: it fetches"
 
 
@@ -465,7 +477,8 @@ class _Difference(NamedTuple):
     """A confirmed file that differs from the keystore.
 
     ``confirmed`` is the SHA-256 of the robot's file, "" if the robot has none; ``certificates`` are
-    the SHA-256 of the certificates in the robot's file.  ``exported`` says whether an export has a
+    the SHA-256 of the certificates in the robot's file, ``present`` in the keystore's.
+    ``exported`` says whether an export has a
     file at this path; None: the file in the keystore cannot be read.  ``own`` says whether the path
     belongs to an enclave of the robot.
     """
@@ -475,6 +488,7 @@ class _Difference(NamedTuple):
     certificates: tuple[str, ...]
     exported: bool | None
     own: bool
+    present: tuple[str, ...] = ()
 
 
 class _ComparedRobot(NamedTuple):
@@ -556,8 +570,10 @@ def _compare(
                 certificates = file.certificates
             else:
                 certificates = confirmed.certificates.get(path, ())
-                at_keystore = None if file is None else True
-                different.append(_Difference(path, sha256, certificates, at_keystore, own=True))
+                at_keystore, present = (True, file.certificates) if file else (None, ())
+                different.append(
+                    _Difference(path, sha256, certificates, at_keystore, own=True, present=present)
+                )
             if kind in authorities:
                 authorities[kind].add(certificates)
             elif kind in expiring:
@@ -675,6 +691,13 @@ class _Known:
         different = [file for robot in compared for file in robot.different if file.confirmed]
         wanted = {file.confirmed for file in different}
         wanted.update(certificate for file in different for certificate in file.certificates)
+        wanted.update(
+            certificate
+            for robot in compared
+            for file in robot.different
+            if _kind_of(file.path) == "certificate"
+            for certificate in file.present
+        )
         for robot in compared:
             wanted.update(*robot.expiring.values())
         wanted.discard("")  # of a file that the robot does not have
@@ -715,11 +738,52 @@ class _Known:
 
         return later_in_folder(self._keystore)
 
-    @cached_property
+    def lacks_key(self, compared: _ComparedRobot) -> Iterator[str]:
+        """Yield the enclaves whose certificate is for a key that the robot does not have.
+
+        These are the enclaves of which it has no file, and those with an earlier key.  If the
+        keystore does not have the key, it was made on the robot, and a release is enough.
+        """
+        confirmed = compared.confirmed
+        if confirmed is None:
+            return
+        problems = [text for text in confirmed.problems or () if lacks_key(text)]
+        folders = {path.rpartition("/")[0] for path in confirmed.files}
+        for file in compared.different:
+            name = enclave_of(file.path)
+            if _kind_of(file.path) != "certificate" or not (file.own and file.present):
+                continue
+            if not os.path.lexists(enclave_path(self._root, name) / KEY_FILE):
+                continue
+            before = self._issued.get(file.certificates[0]) if file.certificates else None
+            now = self._issued.get(file.present[0])
+            has_other_key = before and now and before.key and now.key and before.key != now.key
+            has_no_file = enclave_folder(name) not in folders
+            if has_other_key or has_no_file or any(f"{name} " in text for text in problems):
+                yield name
+
+    def reads_copy(self, compared: _ComparedRobot, heard: datetime | None) -> bool:
+        """Return whether a robot fetched long after the publication, and got an earlier release.
+
+        Robots that report a problem say themselves why they got no release.
+        """
+        confirmed = compared.confirmed
+        published = self.published.get(compared.robot.name)
+        if not (confirmed and heard and published) or confirmed.problems:
+            return False
+        since = self._releases.get(published)
+        return (confirmed.release or 0) < published and bool(since and heard - since > _SILENCE)
+
+    @property
     def _last_release(self) -> int:
         """The highest number of a release that the ledger has; 0 without one."""
+        return max(self._releases, default=0)
+
+    @cached_property
+    def _releases(self) -> Mapping[int, datetime]:
+        """The numbers of all releases, with the time of their publication."""
         entries = self._keystore.ledger_with("what", "release").entries
-        return max((entry.number for entry in entries if entry.what == "release"), default=0)
+        return {entry.number: parse_iso(entry.time) for entry in entries if entry.what == "release"}
 
     def is_any_revoked(self) -> bool:
         """Return whether the revocation list revokes a certificate, or cannot be read."""
@@ -842,7 +906,8 @@ def _status(
         and set(counts.get("crl", ())) <= {State.CURRENT}
     )
     validity = known.validity(compared)
-    return RobotStatus(
+    certificates = {*counts.get("certificate", ())}
+    status = RobotStatus(
         compared.robot.name,
         state,
         len(compared.enclaves),
@@ -866,7 +931,16 @@ def _status(
         is_published=bool(different) and known.is_published(compared),
         has_list=has_list,
         renew_from=min((window.expires_soon_from() for window in validity.values()), default=None),
+        lacks_key=tuple(known.lacks_key(compared)) if different else (),
+        is_locked_out=bool(compared.enclaves) and certificates == {State.REVOKED},
     )
+    if not (different and status.fetches and known.reads_copy(compared, status.heard)):
+        return status
+    text = (
+        f"It sent a message long after release {status.published} was published, and has release "
+        f"{status.release or 'none'}: its `from` is an old copy."
+    )
+    return replace(status, reads_copy=True, problems=(*(status.problems or ()), text))
 
 
 # ── the stages of a rotation ───────────────────────────────────────────────────────────────

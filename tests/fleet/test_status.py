@@ -598,18 +598,45 @@ def test_robots_that_differ_in_their_names_share_a_line(field: Field) -> None:
     assert "processes of /r1/base may run" in field.run("fleet", "status", "ks", status=1).out
 
 
-def test_a_robot_that_does_not_fetch_what_is_published_may_be_off(field: Field) -> None:
-    field.deliver(*ROBOTS)
+def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field: Field) -> None:
+    """They may be off; a release has no key, a server may refuse them, and a copy may be old."""
+
+    def said() -> dict[str, tuple[str, str]]:
+        rows = field.run("fleet", "status", "ks", status=1).out.splitlines()[3:]
+        columns = (re.split("  +", row) for row in rows if row.startswith("r"))
+        return {row[0]: (row[3], row[4]) for row in columns if row[0] in ROBOTS}
+
+    field.run("fleet", "publish", "ks", "pub")
     for robot in ROBOTS:
         field.send(robot, release=0)
-    field.run("renew", "ks", "--all")
+    bring = "`sros distribute_key ks --robot NAME FOLDER --force`"
+    assert bring in field.run("renew", "ks", "/r1/base", "--new-key").err
+    field.run("renew", "ks", "/r2/base")
+    err = field.run("renew", "ks", "/r3/base", "--revoke-old").err
+    assert "give the list to a web server of robots" in err and bring not in err
     field.run("fleet", "publish", "ks", "pub")
-    field.age("r3", timedelta(minutes=31))
-    rows = field.run("fleet", "status", "ks", status=1).out
-    assert rows.count("wait: it fetches") == 1 and rows.count("check whether it is on") == 1, rows
+    rows = said()
+    assert rows["r1"][0] == "deliver" and "lacks the key of /r1/base, which no" in rows["r1"][1]
+    refused = "all its certificates are revoked: a web server with the present list refuses it"
+    assert rows["r3"][0] == "wait, else deliver" and refused in rows["r3"][1]
+    assert rows["r2"][0] == "wait: it fetches"
+    for robot in ("r2", "r3"):
+        field.age(robot, timedelta(minutes=31))
     page = field.run("fleet", "status", "ks", "--html", status=1).out
-    assert page.count(">wait: it fetches</td>") == 1
     assert page.count(">check whether it is on</td>") == 1
+    field.age("r2", timedelta(minutes=-62))
+    field.send("r1", files={}, certificates={})
+    kept = field.root / "confirmed/r2.json"
+    value = json.loads(kept.read_text())
+    kept.write_text(
+        json.dumps({**value, "confirmation": {**value["confirmation"], "time": value["received"]}})
+    )
+    rows = said()
+    assert rows["r1"][0] == "deliver" and "lacks the key" in rows["r1"][1], "it has no file"
+    assert rows["r2"][0] == "look at its `from`" and "its `from` is an old copy." in rows["r2"][1]
+    assert rows["r3"][0] == "deliver"
+    metrics = field.run("fleet", "status", "ks", "--prometheus", status=1).out
+    assert re.search(r'agent_problems\{.*robot="r2"\} 1', metrics)
 
 
 def test_a_robot_that_says_it_has_a_release_that_was_never_published(field: Field) -> None:

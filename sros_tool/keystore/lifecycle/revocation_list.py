@@ -20,6 +20,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
+from sros_tool.keystore.fleet import publish_command
 from sros_tool.keystore.issuing.authority import Authority, write_bundle
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.known_keys import restored_at, revoked_serials
@@ -308,11 +309,19 @@ class RevocationListSigner:
     def superseded(self, replaced: Iterable[Superseded]) -> list[Entry]:
         """Return the ledger entries for revoking all earlier certificates of enclaves."""
         by_name = {certificate.name: certificate for certificate in replaced}
-        return self.revocations(
+        entries = self.revocations(
             {name: certificate.old for name, certificate in by_name.items()},
             SUPERSEDED,
             keep={name: certificate.new_key for name, certificate in by_name.items()},
         )
+        if entries and (published := publish_command(self._root)):
+            text = (
+                "give the list to a web server of robots that fetch only when `sros fleet status "
+                f"{quote(str(self._root))}` shows that they have fetched ({published}): before, "
+                "the server would refuse a robot whose certificates are all replaced"
+            )
+            self.remarks.append(Note("crl.web-server", text))
+        return entries
 
     def _still_valid(
         self, names: Iterable[str], present: Mapping[str, Entry], listed: Collection[int]
