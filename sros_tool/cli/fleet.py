@@ -262,12 +262,13 @@ def _collect(
     """
     from sros_tool.keystore.delivery.collect import PublishedAnswers, collect
 
+    moment = now()
     root, inbox = root_and_file(words, "fleet collect takes a keystore and one folder")
     with progress("collecting"):
         collected = collect(
             root,
             inbox,
-            now=now(),
+            now=moment,
             restored=restored,
             allow_refusal=allow_refusal,
             keyring=keyring(),
@@ -280,7 +281,8 @@ def _collect(
 
         try:
             with progress("publishing"):
-                published = publish(root, folder, now=now(), keyring=keyring(), dry_run=dry_run)
+                moment = now()
+                published = publish(root, folder, now=moment, keyring=keyring(), dry_run=dry_run)
             new, refused = published.names("published"), published.names("refused")
             collected = collected._replace(published=PublishedAnswers(folder, new, refused))
         except (SrosError, OSError) as error:
@@ -290,7 +292,7 @@ def _collect(
     else:
         for line in (
             *_collected_lines(collected),
-            *(_published_lines(published) if published else ()),
+            *(_published_lines(published, moment) if published else ()),
         ):
             echo(line)
     print_notes((*collected.notes, *(published.notes if published else ())))
@@ -306,7 +308,8 @@ def _collect(
         raise problem
     if collected.not_signed:
         return NOT_DONE
-    return 0 if collected.complete else 1
+    is_published = published is None or published.is_complete(moment)
+    return 0 if collected.complete and is_published else 1
 
 
 def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
@@ -426,12 +429,14 @@ def _publish(
       $ sros fleet publish keystore pub --rotate-key timestamp
             --root-key /media/safe/fleet_root.pem
 
-    The exit status is 1 if a robot's release was refused, because an enclave cannot run.
+    The exit status is 1 if a robot's release was refused, because an enclave cannot run, and if
+    robots refuse everything, because the root metadata has expired.
     """
     from sros_tool.keystore.delivery.publish import publish
     from sros_tool.keystore.delivery.published import MetadataExpiry
     from sros_tool.validity import parse_duration
 
+    moment = now()
     root, folder = root_and_file(words, "fleet publish takes a keystore and one folder")
     given = {
         name.removesuffix("_validity"): parse_duration(text)
@@ -442,7 +447,7 @@ def _publish(
         published = publish(
             root,
             folder,
-            now=now(),
+            now=moment,
             expiry=MetadataExpiry(**given),
             root_key=root_key,
             rotate=rotated,
@@ -454,13 +459,13 @@ def _publish(
     if as_json:
         print_json(published)
     else:
-        for line in _published_lines(published):
+        for line in _published_lines(published, moment):
             echo(line)
     print_notes(published.notes)
-    return 1 if published.names("refused") else 0
+    return 0 if published.is_complete(moment) else 1
 
 
-def _published_lines(published: PublishedFleet) -> Iterator[str]:
+def _published_lines(published: PublishedFleet, at: datetime) -> Iterator[str]:
     """Yield what was published, which robots got no release, and what to do next."""
     from sros_tool.validity import iso
 
@@ -483,8 +488,16 @@ def _published_lines(published: PublishedFleet) -> Iterator[str]:
     if published.versions.get("timestamp") == 1:
         yield f"robots pin {published.root}, SHA-256 {published.root_sha256}"
     if published.expires:
-        end = iso(published.expires["timestamp"])
-        yield f"robots accept these files until {end}: publish again before then"
+        end, role = min((end, role) for role, end in published.expires.items())
+        again = "publish again"
+        if role == "root":
+            where = f"{quote(str(published.keystore))} {quote(str(published.folder))}"
+            again = f"`sros fleet publish {where} --root-key FILE`"
+        yield (
+            f"robots accept these files until {iso(end)}: {again} before then"
+            if end > at
+            else f"robots refuse these files, because the root metadata has expired: {again}"
+        )
 
 
 @shows(spread=("status",))
@@ -673,6 +686,8 @@ def _facts(compared: ComparedFleet) -> Iterator[str]:
     publication = status.publication
     folder = publication.folder if publication else ""
     publish = f"sros fleet publish {quote(str(status.keystore))} {quote(folder or 'PUB')}"
+    root_end = publication.root_expires if publication else None
+    publish += " --root-key FILE" if root_end and root_end <= compared.at else ""
     restored = f"`{publish} --restored`; docs/howto/keystore_is_lost.md says what else"
     if status.older:
         yield f"the keystore is older than its robots: {status.older}. Publish with {restored}"

@@ -342,7 +342,7 @@ class RobotStatus:
         return "check whether it is on" if is_silent else "wait: it fetches"
 
 
-@shows("folder", "expires", "accepted", null_if_empty=("folder",))
+@shows("folder", "expires", "root_expires", "accepted", null_if_empty=("folder",))
 @dataclass(frozen=True, slots=True)
 class PublishedMetadata:
     """What was published last for the robots that fetch."""
@@ -352,6 +352,9 @@ class PublishedMetadata:
     expires: datetime | None
     """The first expiry of the published metadata, in UTC: from then on, robots refuse it, and get
     no new files. Null if a release of sros published last that did not record it."""
+    root_expires: datetime | None = None
+    """Expiry of the root metadata, in UTC: to renew it needs the root key. Null if a release of
+    sros published last that did not record it."""
     accepted: bool | None = None
     """Whether robots still accept it; null if that is not known, because ``expires`` is null."""
 
@@ -680,7 +683,9 @@ class _Known:
         self.published = {name: robot.release.number for name, robot in published.robots.items()}
         """Robots with the numbers of their releases that were published last."""
         self.publication = (
-            PublishedMetadata(published.folder, published.until) if published.robots else None
+            PublishedMetadata(published.folder, published.until, published.root_until)
+            if published.robots
+            else None
         )
         self.refusals = refusals(keystore.root)
         """Why the last messages of robots were refused, by robot."""
@@ -1000,6 +1005,7 @@ def fleet_metrics(
     place = {"keystore": str(status.keystore.absolute())}
     robots = [({**place, "robot": robot.robot}, robot) for robot in status.robots]
     ends = status.publication.expires if status.publication else None
+    root = status.publication.root_expires if status.publication else None
 
     def per_robot(value: Callable[[RobotStatus], int | None]) -> tuple[Sample, ...]:
         values = ((value(robot), labels) for labels, robot in robots)
@@ -1066,6 +1072,11 @@ def fleet_metrics(
             "sros_fleet_publication_expiry_timestamp_seconds",
             "When robots begin to refuse what was published last, in seconds since 1970.",
             (Sample(int(ends.timestamp()), place),) if ends else (),
+        ),
+        Metric(
+            "sros_fleet_root_expiry_timestamp_seconds",
+            "When the root metadata expires, which only the root key renews, in seconds since 1970.",
+            (Sample(int(root.timestamp()), place),) if root else (),
         ),
         Metric(
             "sros_fleet_agent_problems",

@@ -18,6 +18,7 @@ import pytest
 from cryptography import x509
 
 from sros_tool.agent.fetch import FetchProblem
+from sros_tool.cli.fleet import _published_lines
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery import publish as publishing
@@ -39,6 +40,7 @@ from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer,
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction import transaction
 from sros_tool.pki.crl import load_crl
+from sros_tool.validity import iso
 from tests.agent.published import DAY, ROLES, Home, Thief
 from tests.support.harness import copy_of, policy_text, snapshot, sros
 from tests.support.harness import publish as allow_publish
@@ -489,6 +491,14 @@ def test_what_is_about_to_expire_is_renewed(publisher: Home) -> None:
     quick = MetadataExpiry(timestamp=timedelta(hours=1))
     publisher.publish(expiry=quick)
     robot.refuses(FetchProblem.EXPIRED, now=publisher.now + timedelta(hours=2))
+    end = publisher.publish().expires["root"]
+    for left, said in ((DAY / 2, f"accept these files until {iso(end)}"), (-DAY, "refuse these")):
+        done = publisher.publish(after=end - publisher.now - left)
+        *_, line = _published_lines(done, publisher.now)
+        assert said in line and "/pub --root-key FILE`" in line and done.expires["root"] == end
+        assert done.is_complete(publisher.now) == (left > timedelta(0))
+    assert f"the root metadata expired at {iso(end)}, and robots refuse" in done.notes[0].text
+    assert "--root-key FILE" in robot.refuses(FetchProblem.EXPIRED).remedy
 
 
 # ── folders and keystores that are not what they should be ─────────────────────────────────

@@ -825,7 +825,10 @@ def test_what_was_published_expires(home: Home) -> None:
         assert ended.out.count("`sros fleet publish") == 1
         text = sros(*status, "--prometheus", cwd=home.folder).out
         sample = "sros_fleet_publication_expiry_timestamp_seconds{"
-        assert (sample in text) == bool(until)
+        assert (sample in text) == bool(until) and "sros_fleet_root_expiry_timestamp_" in text
+    file.write_text(json.dumps({**recorded, "until": until, "root_until": "2026-01-01T00:00:00Z"}))
+    ended = sros(*status, cwd=home.folder)
+    assert f"`sros fleet publish ks {home.folder}/pub --root-key FILE`" in ended.out
     home.run("renew", "ks", "/r1/base")
     robots = json.loads(sros(*status, "--json", cwd=home.folder).out)["robots"]
     assert {robot["robot"]: robot["to_do"] for robot in robots}["r1"] == "publish"

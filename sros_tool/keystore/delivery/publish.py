@@ -152,6 +152,10 @@ class PublishedFleet(NamedTuple):
         """Return the robots with this outcome."""
         return [robot.robot for robot in self.robots if robot.outcome == outcome]
 
+    def is_complete(self, now: datetime) -> bool:
+        """Return whether no robot was refused, and robots accept what was published."""
+        return not self.names("refused") and all(end > now for end in self.expires.values())
+
 
 def publish(
     root: Path,
@@ -331,9 +335,13 @@ class _Keys:
         if first or rotate or left < expiry.root / 3:
             self._sign_root(now + expiry.root, new=first or "root" in rotate, must=bool(rotate))
         if left < expiry.root / 3 and not self.has_new_root:
+            end = iso(self.roots.last.expires)
             text = (
-                f"the root metadata expires at {iso(self.roots.last.expires)}, and robots then "
-                "refuse everything: before then, publish with --root-key FILE"
+                f"the root metadata expires at {end}, and robots then refuse everything: before "
+                "then, publish with --root-key FILE"
+                if left > timedelta(0)
+                else f"the root metadata expired at {end}, and robots refuse everything: publish "
+                "with --root-key FILE"
             )
             self.notes.append(Note("fleet.root-expires", text))
 
@@ -872,7 +880,8 @@ class _Run:
         releases = {name: robot.release for name, robot in self.list.robots.items()}
         self._composed = composer.compose(releases)
         self.list.versions = dict(self._composed.versions)
-        self.list.until = min(*self._composed.expires.values(), keys.roots.last.expires)
+        self.list.root_until = keys.roots.last.expires
+        self.list.until = min(*self._composed.expires.values(), self.list.root_until)
         needed = {release.path(robot) for robot, release in releases.items()}
         needed |= {f"{_METADATA}/{version}.{n}.json" for n, version in self.list.versions.items()}
         superseded = (path for path in self._paths() if path not in needed)
@@ -960,7 +969,7 @@ class _Run:
             [outcomes[robot] for robot in sorted(outcomes)],
             keys.rotated,
             dict(sorted(self.list.versions.items())),
-            dict(self._composed.expires) if self._composed else {},
+            {**self._composed.expires, "root": keys.roots.last.expires} if self._composed else {},
             self._folder / path,
             hashlib.sha256(data).hexdigest(),
             self._changes,

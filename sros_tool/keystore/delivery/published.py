@@ -99,8 +99,9 @@ class Published:
 
     ``superseded`` maps paths in the publishing folder that nothing names any more to the time when
     that was first seen.  ``folder`` is the absolute path of the publishing folder, "" if unknown.
-    ``until`` is the first expiry of the metadata: from then on, robots refuse it.  It is None if
-    nothing was published, or by a release of sros that did not record it.
+    ``until`` is the first expiry of the metadata: from then on, robots refuse it; ``root_until`` is
+    the expiry of the root metadata.  They are None if nothing was published, or by a release of
+    sros that did not record them.
     """
 
     robots: dict[str, PublishedRobot] = field(default_factory=dict)
@@ -108,6 +109,7 @@ class Published:
     superseded: dict[str, datetime] = field(default_factory=dict)
     folder: str = ""
     until: datetime | None = None
+    root_until: datetime | None = None
 
     @property
     def number(self) -> int:
@@ -123,6 +125,7 @@ class Published:
             "time": iso(now),
             "folder": self.folder,
             "until": iso(self.until) if self.until else None,
+            "root_until": iso(self.root_until) if self.root_until else None,
             "versions": dict(sorted(self.versions.items())),
         }
         return json.dumps({**value, "superseded": superseded, "robots": robots}).encode()
@@ -144,7 +147,10 @@ def read_published(keystore: Keystore) -> Published:
             {name: check_count(version) for name, version in value["versions"].items()},
             {path: parse_iso(time) for path, time in value["superseded"].items()},
             str(value.get("folder", "")),
-            parse_iso(until) if (until := value.get("until")) else None,
+            *(
+                parse_iso(end) if (end := value.get(name)) else None
+                for name in ("until", "root_until")
+            ),
         )
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise damaged_list(keystore) from error
