@@ -736,14 +736,22 @@ def _expiry_facts(compared: ComparedFleet) -> Iterator[str]:
     left = end - compared.at
     when = f"{end:%Y-%m-%d}" if left > timedelta(days=1) else iso(end)
     what = "first expiry on a robot" if left > timedelta(0) else "expired on a robot since"
-    command = f"`sros renew {quote(str(root))} --all-expiring 30d`, then "
+    short_lived = [name for robot in soon for name in robot.short_lived]
+    named = [*map(quote, short_lived[:_MOST_GROUPS])]
+    named += ["..."] * (len(short_lived) > _MOST_GROUPS)
+    if not all(robot.short_lived for robot in soon):
+        named.append("--all-expiring 30d")
+    command = f"`sros renew {quote(str(root))} {' '.join(named)}`, then "
     if kind == "crl":
         command = f"`sros crl {quote(str(root))} --refresh`, then "
     if not any("current" in robot.files.get(kind, ()) for robot in soon):
         command = ""  # the keystore has renewed them
+    bring = f"{command}{publish_command(root) or 'deliver'}"
+    if not command and all(robot.has_release for robot in soon):
+        bring = "new files are published; the column `to do` says what to do"
     yield (
         f"{what}: {when} ({first}, {_KINDS.get(kind, kind)}), within 30 "
-        f"days on {counted(len(soon), 'robot')}: {command}{publish_command(root) or 'deliver'}"
+        f"days on {counted(len(soon), 'robot')}: {bring}"
     )
 
 

@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, Note, SrosError
-from sros_tool.fleet.robots import Fleet, Robot, enclaves_of, robot_of, router_of, size_problem
+from sros_tool.fleet.robots import (
+    Fleet,
+    Robot,
+    enclaves_of,
+    robot_of,
+    router_of,
+    size_problem,
+    unrecorded_enclaves,
+)
 from sros_tool.keystore.layout import FLEET, FLEET_ROOT, enclave_names, has_enclave
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import Keystore
@@ -321,6 +329,7 @@ def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
 
     No two robots of ``after`` have an enclave in common, as `write_fleet` makes sure.
     """
+    left: dict[str, set[str]] = {}
     for robot in before.robots.values():
         same = after.robots.get(robot.name)
         kept = set(enclaves_of(after, same) if same else ())
@@ -330,16 +339,20 @@ def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
             if has_enclave(root, router):
                 yield _lost_router(root, robot.name, router)
         names = (name for name in enclaves_of(before, robot) if name not in kept)
-        left = [name for name in names if has_enclave(root, name)]
-        if left:
-            is_there = robot.name in after.robots
-            why = "has other enclave paths now" if is_there else "is no longer in the fleet"
-            shown = first_few(left, _SHOWN)
-            yield Note(
-                "fleet.left-enclaves",
-                f"the robot {robot.name} {why}: {shown} stay valid. To take "
-                f"them back, run `sros revoke {quote(str(root))} {arguments_for(root, left)}`.",
-            )
+        if found := {name for name in names if has_enclave(root, name)}:
+            left[robot.name] = found
+    # Also what an earlier change of the fleet left.
+    earlier = unrecorded_enclaves(before, enclave_names(root), left) if left else {}
+    for name, enclaves in left.items():
+        enclaves.update(each for each in earlier[name].below if not robot_of(after, each))
+        why = "has other enclave paths now" if name in after.robots else "is no longer in the fleet"
+        stay = "stays" if len(enclaves) == 1 else "stay"
+        shown = first_few(sorted(enclaves), _SHOWN)
+        yield Note(
+            "fleet.left-enclaves",
+            f"the robot {name} {why}: {shown} {stay} valid. To take them back, run `sros revoke "
+            f"{quote(str(root))} {arguments_for(root, sorted(enclaves))}`.",
+        )
 
 
 def _lost_router(root: Path, robot: str, router: str) -> Note:

@@ -190,9 +190,10 @@ class ConfirmedFile:
 class RobotStatus:
     """The deployment status of a robot, by its last confirmation.
 
-    ``others`` are enclaves of the robot that the fleet does not record.  ``is_published`` is for a
-    robot whose files differ from the keystore's: whether the release that the robot reports was
-    published with the present files of the keystore.  ``has_list`` says whether it has the present
+    ``others`` are enclaves of the robot that the fleet does not record.  ``has_release`` is for a
+    robot whose files differ from the keystore's: whether the release that was published last for it
+    has the present files of the keystore.  ``short_lived`` are enclaves with such a validity, of
+    which a file expires soon or has expired.  ``has_list`` says whether it has the present
     revocation list, in force or not, and ``renew_from`` from when a file of it expires soon.
     ``lacks_key`` are enclaves whose key the keystore has and the robot does not, which no release
     brings.  ``reads_copy`` says that it fetched after the publication and got an earlier release,
@@ -257,12 +258,18 @@ class RobotStatus:
     """Remarks, as clauses, such as on the robot's clock."""
     to_do: str = ""
     """What you have to do for the robot, in a few words; empty if nothing."""
-    is_published: bool = False
+    has_release: bool = False
+    short_lived: tuple[str, ...] = ()
     has_list: bool = False
     renew_from: datetime | None = None
     lacks_key: tuple[str, ...] = ()
     reads_copy: bool = False
     is_locked_out: bool = False
+
+    @property
+    def is_published(self) -> bool:
+        """Whether the robot reports the published release, which has the present files."""
+        return self.has_release and bool(self.release) and self.release == self.published
 
     @property
     def unrecorded(self) -> tuple[str, ...]:
@@ -669,6 +676,13 @@ class _KeystoreFiles:
 # ── what a robot has instead ───────────────────────────────────────────────────────────────
 
 
+class _Expiring(NamedTuple):
+    """The validity of a file on a robot, and its enclave; "" for a file of the keystore."""
+
+    enclave: str
+    window: Window
+
+
 class _Known:
     """Identification, by the ledger, of confirmed files that differ from the keystore."""
 
@@ -724,10 +738,10 @@ class _Known:
         last = self.published.get(robot)
         return release > (self._last_release if last is None else last)
 
-    def is_published(self, compared: _ComparedRobot) -> bool:
-        """Return whether a robot says it has the last release, which has the present files."""
-        release, robot = compared.confirmed and compared.confirmed.release, compared.robot.name
-        if not release or release != self.published.get(robot):
+    def has_release(self, compared: _ComparedRobot) -> bool:
+        """Return whether the last release of a robot that fetches has the present files."""
+        robot = compared.robot.name
+        if robot not in self.published or not (compared.received and compared.received.message):
             return False
         from sros_tool.keystore.delivery.publish import is_all_published  # few robots need it
 
@@ -805,9 +819,15 @@ class _Known:
         names.update(self._unrecorded[robot.name].below)
         return tuple(sorted(name for name in names if not has_enclave(self._root, name)))
 
-    def validity(self, compared: _ComparedRobot) -> dict[str, Window]:
-        """Return the validity of the robot's file that expires first, by kind, by the ledger."""
-        first: dict[str, Window] = {}
+    def short_lived(self, first: Mapping[str, _Expiring]) -> tuple[str, ...]:
+        """Return the short-lived enclaves among those whose files expire first."""
+        names = {file.enclave for file in first.values() if file.enclave}
+        template = self._keystore.template
+        return tuple(sorted(name for name in names if template.longest_validity(name) is not None))
+
+    def validity(self, compared: _ComparedRobot) -> dict[str, _Expiring]:
+        """Return the robot's file that expires first, by kind, by the ledger."""
+        first: dict[str, _Expiring] = {}
         for kind, digests in compared.expiring.items():
             entries = (self._issued.get(digest) for digest in digests)
             files = [
@@ -817,7 +837,8 @@ class _Known:
             ]
             if files:
                 entry = min(files, key=lambda file: file.not_after)
-                first[kind] = Window(parse_iso(entry.not_before), parse_iso(entry.not_after))
+                window = Window(parse_iso(entry.not_before), parse_iso(entry.not_after))
+                first[kind] = _Expiring(entry.enclave, window)
         return first
 
     def file(self, robot: Robot, difference: _Difference) -> ConfirmedFile:
@@ -929,13 +950,16 @@ def _status(
         restart,
         compared.running(),
         has_list and restart == () if known.has_list and compared.enclaves else None,
-        {kind: window.not_after for kind, window in validity.items()},
+        {kind: file.window.not_after for kind, file in validity.items()},
         confirmed.dds if confirmed else None,
         confirmed.problems if confirmed else None,
         compared.notes,
-        is_published=bool(different) and known.is_published(compared),
+        has_release=bool(different) and known.has_release(compared),
+        short_lived=known.short_lived(validity),
         has_list=has_list,
-        renew_from=min((window.expires_soon_from() for window in validity.values()), default=None),
+        renew_from=min(
+            (file.window.expires_soon_from() for file in validity.values()), default=None
+        ),
         lacks_key=tuple(known.lacks_key(compared)) if different else (),
         is_locked_out=bool(compared.enclaves) and certificates == {State.REVOKED},
     )
@@ -1075,7 +1099,7 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_root_expiry_timestamp_seconds",
-            "When the root metadata expires, which only the root key renews, in seconds since 1970.",
+            "When the root metadata expires, in seconds since 1970; only the root key renews it.",
             (Sample(int(root.timestamp()), place),) if root else (),
         ),
         Metric(

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.checks.keystores.keystore import keystore_findings
-from sros_tool.checks.kind import NOTE
+from sros_tool.checks.keystores.issued import OLD_PERMISSIONS
+from sros_tool.checks.keystores.keystore import joined, keystore_findings
+from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.dds.decision.vendors import FAST_DDS, together
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.lifecycle.create import create_keystore
@@ -76,7 +77,10 @@ def test_a_remedy_that_needs_ca_keys_is_for_the_original_keystore(bench: Bench) 
         found = keystore_findings(Keystore(bench.checked), **options)
         return next(each.remedy for each in found if each.id == "enclave.stale-permissions")
 
-    assert f"`sros generate_artifacts -k {bench.root} " in remedy()
+    assert f"`sros generate_artifacts -k {bench.root} -p POLICY_FILE`" in remedy()
+    bench.path("fleet.toml").write_text("[robots.r1]\n")
+    assert "-p POLICY_FILE --fleet FLEET_FILE`" in remedy()
+    bench.path("fleet.toml").unlink()
     bench.export()
     told = remedy()
     assert told.startswith(
@@ -280,3 +284,15 @@ def test_enclaves_in_hidden_folders_are_named_where_enclaves_are_listed(bench: B
     assert "/.h" not in ended.out.splitlines()
     assert "1 enclave in a hidden folder, which DDS loads and sros leaves out: /.h" in ended.err
     assert json.loads(sros("list_enclaves", bench.root, "--json").ok().out)["hidden"] == ["/.h"]
+
+
+def test_a_remedy_for_several_enclaves_names_all_of_them() -> None:
+    remedy = "Run `sros renew ks {}`; `sros explain ks {} join` says more."
+    names = ("/a", "/b", "/c", "/d")
+    found = [
+        Finding(OLD_PERMISSIONS, name, "same", own_remedy=remedy.format(name, name))
+        for name in names
+    ]
+    for number, shown in ((1, "/a"), (2, "/a /b"), (4, "ENCLAVE...")):
+        (named,) = joined(found[:number])
+        assert named.remedy == remedy.format(shown, "/a"), named

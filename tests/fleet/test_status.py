@@ -6,7 +6,7 @@ import importlib.util
 import json
 import re
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,10 @@ from sros_tool.keystore.confirmation import (
     Seen,
     parse_confirmation,
 )
-from sros_tool.keystore.fleet_status import State, fleet_status
+from sros_tool.keystore.fleet_status import FleetStatus, State, fleet_status
 from sros_tool.keystore.layout import ENCLAVES, REFUSED
 from sros_tool.keystore.reader import Keystore, read_certificate
+from sros_tool.keystore.template import Template
 from sros_tool.pki.certificates import digest
 from sros_tool.validity import iso, parse_iso
 from tests.keystore.test_confirmation import DDS, LIBRARY, hostile
@@ -458,7 +459,9 @@ def test_expiry_on_robots_is_that_of_the_files_that_they_have(field: Field) -> N
     assert len(seconds) == 6
 
 
-def test_robots_with_files_that_expire_soon_are_named(field: Field) -> None:
+def test_robots_with_files_that_expire_soon_are_named(
+    field: Field, monkeypatch: pytest.MonkeyPatch
+) -> None:
     status = fleet_status(Keystore(field.root))
     kind, end = min(status.robots[0].expiry.items(), key=lambda item: item[1])
     lines = {
@@ -469,6 +472,18 @@ def test_robots_with_files_that_expire_soon_are_named(field: Field) -> None:
     (line,) = (line for line in lines[24] if "expiry" in line)
     assert f"{end:%Y-%m-%d} (r1, {kind}), within 30 days on 3 robots: `sros renew" in line
     assert line.endswith("--all-expiring 30d`, then deliver")
+
+    def command(status: FleetStatus) -> str:
+        lines = _facts(ComparedFleet(end - timedelta(days=1), status, [], []))
+        return next(line.partition("3 robots: ")[2] for line in lines if "expiry" in line)
+
+    robots = [replace(robot, files={}, has_release=True) for robot in status.robots]
+    assert "new files are published; " in command(replace(status, robots=tuple(robots)))
+    monkeypatch.setattr(
+        Template, "longest_validity", lambda _, name: timedelta(1) if name != "/r2/base" else None
+    )
+    named = "`sros renew ks /r1/base /r3/base --all-expiring 30d`, then deliver"
+    assert command(fleet_status(Keystore(field.root))).replace(str(field.root), "ks") == named
 
 
 def test_a_robot_whose_files_have_expired_is_not_in_order(field: Field) -> None:

@@ -12,8 +12,9 @@ import pytest
 
 from sros_tool.fleet import robots
 from sros_tool.fleet.robots import Fleet, Robot
-from sros_tool.keystore.fleet import left_enclaves
+from sros_tool.keystore.fleet import left_enclaves, recorded_fleet
 from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.reader import Keystore
 from tests.support.harness import Ended, copy_of, policy_text, publish, snapshot, sros
 
 FLEET = "[robots]\na = {}\na_arm = {}\n"
@@ -112,6 +113,13 @@ def of_robot(root: Path, robot: str) -> dict[str, Any]:
     said = sros("fleet", "status", root, "--robot", robot, "--json").out
     (found,) = json.loads(said)["robots"]
     return dict(found)
+
+
+def test_what_an_earlier_change_left_is_named_when_a_robot_leaves(unknown: Path) -> None:
+    before = recorded_fleet(Keystore(unknown / "ks"))
+    after = Fleet.of([Robot("r30", "/r30")], enclaves=before.enclaves)
+    (note,) = left_enclaves(unknown / "ks", before, after)
+    assert "is no longer in the fleet: /r3, /r3/a, /r3/deep/er stay valid" in note.text
 
 
 def test_what_lies_below_a_robot_is_revoked_with_it(unknown: Path, tmp_path: Path) -> None:

@@ -301,6 +301,12 @@ _NEEDS_CA_KEYS = re.compile(
 )
 
 
+_OF_SEVERAL = re.compile(
+    r"(`sros (?:renew|revoke|create_permission|create_enclave|distribute_key) \S+ )([^\s`]+)"
+)
+"""The begin of a command that takes several enclaves, and its first enclave."""
+
+
 def _with_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
     """Return the finding with KEYSTORE and ENCLAVE in its remedy replaced by their names.
 
@@ -311,6 +317,8 @@ def _with_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
         remedy = remedy if ORIGINAL_KEYSTORE in remedy else in_original_keystore(remedy)
     if ORIGINAL_KEYSTORE not in remedy:
         remedy = re.sub(r"\bKEYSTORE\b", lambda _: quote(str(keystore.root)), remedy)
+    if keystore.fleet and "generate_artifacts -k" in remedy and "--fleet" not in remedy:
+        remedy = remedy.replace("-p POLICY_FILE", "-p POLICY_FILE --fleet FLEET_FILE")
     if finding.subject.startswith("/") and "," not in finding.subject:
         remedy = re.sub(r"\bENCLAVE\b", lambda _: quote(finding.subject), remedy)
     return finding if remedy == finding.remedy else finding._replace(own_remedy=remedy)
@@ -320,7 +328,13 @@ def _joined(group: list[Finding]) -> Finding:
     subjects = list(dict.fromkeys(finding.subject for finding in group))
     if len(subjects) == 1:
         return group[0]
-    return group[0]._replace(subject=first_few(subjects, _NAMES_SHOWN))
+    shown = " ".join(map(quote, subjects)) if len(subjects) <= _MOST_NAMED else "ENCLAVE..."
+    remedy = _OF_SEVERAL.sub(
+        lambda found: found[1] + (shown if found[2] == quote(subjects[0]) else found[2]),
+        group[0].remedy,
+    )
+    together = group[0]._replace(subject=first_few(subjects, _NAMES_SHOWN))
+    return together if remedy == group[0].remedy else together._replace(own_remedy=remedy)
 
 
 # ── one cause for what ros2/sros2 made ────────────────────────────────────────────────────
