@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import KeystoreError
+from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.lifecycle.create import (
     Creation,
@@ -209,7 +210,9 @@ def test_missing_files_come_back_without_a_signature(folder: Path) -> None:
     assert results[0].kept == ("/b", "/c")
 
 
-def test_permissions_that_expire_soon_are_signed_again(folder: Path) -> None:
+def test_permissions_that_expire_soon_are_signed_again(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     validity = read_credentials(Keystore(folder / "ks"), "/a").lifetime().permissions
     length = validity.not_after - NOW
     assert state(folder, NOW + length * 0.6).kept == NAMES
@@ -222,8 +225,15 @@ def test_permissions_that_expire_soon_are_signed_again(folder: Path) -> None:
     assert state(folder, end - 20 * DAY).changed == NAMES
     assert read_credentials(Keystore(folder / "ks"), "/a").lifetime().expires() == end
     assert state(folder, end - DAY).kept == NAMES
-    with pytest.raises(KeystoreError, match="is not valid now"):
+    with pytest.raises(KeystoreError, match="3 enclaves are not valid now: /a, /b, /c") as late_for:
         state(folder, end + DAY)
+    assert late_for.value.remedy.endswith("/ks /a /b /c`.")
+    renew(folder / "ks", ["/c"], now=end - DAY)
+    fleet = Fleet.of([Robot("a", "/a")], enclaves=["/{robot}"])
+    monkeypatch.setattr("sros_tool.keystore.lifecycle.create.load_fleet", lambda _: fleet)
+    with pytest.raises(KeystoreError, match="2 enclaves are not valid now: /a, /b") as late_for:
+        state(folder, end + DAY)
+    assert late_for.value.remedy.endswith("/ks /b --robot a`.")
 
 
 def test_a_chosen_validity_takes_effect(folder: Path) -> None:

@@ -31,6 +31,7 @@ from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
 from sros_tool.keystore.delivery.published import may_be_later
 from sros_tool.keystore.fleet import (
     EnclaveDomains,
+    enclaves_of_robot,
     left_enclaves,
     load_fleet,
     publish_command,
@@ -772,7 +773,9 @@ def write_enclaves(
     if routers := set(network.router_names() if network else ()).difference(change.names):
         wanted = ChainMap(dict.fromkeys(sorted(routers)), wanted)  # type: ignore[arg-type]
     writer = change.writer(keys_on_token=bool(places), revoke_old=revoke_old)
-    maker = _EnclaveMaker(change, writer, places, revoke_old=revoke_old, keep_same=keep_same)
+    maker = _EnclaveMaker(
+        change, writer, places, wanted, revoke_old=revoke_old, keep_same=keep_same
+    )
     done = writer.for_each(list(wanted), lambda name: maker.make(name, wanted[name]), progress)
     created = tuple(name for name, made in done.items() if made.outcome == "created")
     change.outcomes = {
@@ -819,6 +822,7 @@ class _EnclaveMaker:
         change: KeystoreChange,
         writer: EnclaveWriter,
         places: Mapping[str, TokenUri],
+        names: Iterable[str],
         *,
         revoke_old: bool,
         keep_same: bool,
@@ -826,6 +830,7 @@ class _EnclaveMaker:
         self._change = change
         self._root = change.root
         self._writer = writer
+        self._names = names
         self._tokens: EnclaveTokens = change.tokens(places)
         self._domains = EnclaveDomains(change.domains, change.fleet)
         self._revoke_old = revoke_old
@@ -1012,14 +1017,46 @@ class _EnclaveMaker:
                 "Restore the right certificate, or remove the enclave's folder and create it "
                 "again.",
             )
-        validity = validity_of(certificate)
-        if not validity.contains(self._change.now):
-            raise KeystoreError(
-                f"the certificate of enclave {name} is not valid now",
-                f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}.",
-                f"Renew it with `sros renew {quote(str(self._root))} {name}`.",
-            )
+        if not validity_of(certificate).contains(self._change.now):
+            raise self._not_valid()
         return certificate
+
+    def _not_valid(self) -> KeystoreError:
+        """Return the error that names all enclaves of the change with a certificate that is not
+        valid now."""
+        found: dict[str, Window] = {}
+        for name in self._names:
+            with suppress(SrosError):
+                path = enclave_path(self._root, name) / CERTIFICATE_FILE
+                validity = validity_of(self._change.keystore.certificate(path))
+                if not validity.contains(self._change.now):
+                    found[name] = validity
+        name, validity = next(iter(found.items()))
+        dates = f"is valid from {iso(validity.not_before)} to {iso(validity.not_after)}."
+        command = f"`sros renew {quote(str(self._root))} {self._robots_or_names(found)}`"
+        if len(found) == 1:
+            return KeystoreError(
+                f"the certificate of enclave {name} is not valid now",
+                f"It {dates}",
+                f"Renew it with {command}.",
+            )
+        return KeystoreError(
+            f"the certificates of {len(found)} enclaves are not valid now: "
+            f"{first_few(list(found), _SHOWN)}",
+            f"That of {name} {dates}",
+            f"Renew them with {command}.",
+        )
+
+    def _robots_or_names(self, names: Collection[str]) -> str:
+        """Return the arguments that select enclaves: robots of which all are chosen, and others."""
+        words, left = [], list(names)
+        fleet = load_fleet(self._change.keystore)
+        for robot in fleet.robots.values() if fleet and len(names) > 1 else ():
+            own = enclaves_of_robot(self._root, fleet, robot) if fleet else ()
+            if own and {*own} <= {*names}:
+                words.append(f"--robot {robot.name}")
+                left = [name for name in left if name not in own]
+        return " ".join([*map(quote, left), *words])
 
 
 def _is_file(path: Path, content: bytes) -> bool:
