@@ -224,6 +224,11 @@ def _check_release(
         )
 
 
+def trusts_any(folder: Path) -> bool:
+    """Return whether an enclave in a security folder has a permissions CA."""
+    return any(_trusted(folder, search_enclaves(folder)[0]))
+
+
 def _trusted(folder: Path, present: Iterable[str]) -> Iterator[x509.Certificate]:
     """Yield the permissions CAs of the enclaves; a file that cannot be read counts as missing."""
     seen = set()

@@ -143,6 +143,7 @@ def _init(
             --from /media/usb/pub --inbox /media/usb/inbox --restart
     """
     from sros_tool.agent.fetch import pin_root
+    from sros_tool.agent.install import trusts_any
     from sros_tool.agent.settings import (
         SETTINGS_FILE,
         AgentSettings,
@@ -164,6 +165,13 @@ def _init(
             "Name the folder that the enclaves of this robot are in, or will be in.",
         )
     check_owner(folder)
+    if not authorities and not trusts_any(folder):
+        raise UsageError(
+            f"'{folder}' has no permissions CA, so this robot could trust no release",
+            "No enclave is there that was delivered.",
+            "Bring the enclaves of this robot first, with `sros distribute_key` or a play; or, if "
+            "their keys were made here by `sros create_request`, name the CA with --ca.",
+        )
     settings = AgentSettings(
         robot,
         _place(source),

@@ -355,7 +355,7 @@ def create_request(
     multiple=True,
     metavar="ENCLAVE",
     help="Accept REQUEST only for this enclave; needed to certify a revoked enclave again."
-    " For several requests, give the option once for each request, in the same order.",
+    " For several requests, give the option once for each request.",
 )
 @allow_refusal_option
 @click.option(

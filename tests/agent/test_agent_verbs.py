@@ -176,6 +176,13 @@ def test_wrong_options_set_up_nothing(words: tuple[str, ...], why: str, world: W
     assert world.agent().status == 2
 
 
+def test_a_robot_that_trusts_no_ca_gets_no_agent(world: World) -> None:
+    (world.folder / "empty").mkdir()
+    words = [word if word != "robot" else "empty" for word in INIT]
+    assert "has no permissions CA" in world.run(*words).err
+    world.run(*words, "--ca", "0" * 64).ok()
+
+
 def test_what_was_reached_before_is_nothing_of_another_source(world: World) -> None:
     world.run(*INIT).ok()
     world.agent().ok()

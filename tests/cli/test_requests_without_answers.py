@@ -52,14 +52,18 @@ def test_requests_of_a_fleet(keystore: Path, tmp_path: Path) -> None:
         assert (ended.status, why in ended.err) == (2, True), ended
     ended = sros(*words, "-o", tmp_path / "x.tgz")
     assert "leave out -o and --force" in ended.err
-    for order in ([B, A], [A], [A, B, B]):  # a robot chooses what its request says
-        ended = sros(*words, *(word for each in order for word in ("--enclave", each)))
-        why = f"number 1 is for enclave {A}, and should be for {B}" if order[1:2] == [A] else "for "
+    for only in ([B, "/other"], [A], [A, B, B]):  # a robot chooses what its request says
+        ended = sros(*words, *(word for each in only for word in ("--enclave", each)))
+        why = (
+            f"number 1 is for enclave {A}, and should be for {B}, /other"
+            if "/other" in only
+            else "for "
+        )
         assert (ended.status, why in ended.err) == (2, True), ended
     sros(*words, "--dry-run").ok()
     assert snapshot(keystore) == before
 
-    named = (*words, "--enclave", A, "--enclave", B)
+    named = (*words, "--enclave", B, "--enclave", A)
     said = json.loads(sros(*named, "--json").ok().out)
     assert [(each["name"], each["outcome"]) for each in said["enclaves"]] == [
         (A, "created"),

@@ -88,6 +88,7 @@ from sros_tool.policy.model import Enclave, Policy, stated_protections
 from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.validity import iso
 from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words, shows
+from sros_tool.wording import first_few
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,9 +228,9 @@ def certify_requests(
 
     As `sign_request`, but no answers are made: an export without keys brings the enclaves to their
     robots.  Unless ``renew`` is set, an enclave whose key is certified already stays as it is.
-    ``only`` has the names of the enclaves that the requests have to be for, in the same order;
-    empty for any.  With ``replace_keys``, the private key of an enclave in the keystore is removed
-    if the request has another key: the enclave's key is on its robot from then on.
+    ``only`` has the names of the enclaves that the requests have to be for; empty for any.  With
+    ``replace_keys``, the private key of an enclave in the keystore is removed if the request has
+    another key: the enclave's key is on its robot from then on.
 
     Raises:
         PkiError: a request is not valid.
@@ -282,17 +283,18 @@ def _split_requests(data: bytes) -> list[bytes]:
 
 
 def _check_requested_enclaves(requests: Sequence[SigningRequest], only: Sequence[str]) -> None:
-    """Raise `KeystoreError` unless the requests are for the enclaves ``only``, in this order."""
+    """Raise `KeystoreError` unless the requests are for the enclaves ``only``, in any order."""
     if len(requests) != len(only):
         raise KeystoreError(
             f"there are {len(requests)} requests for {len(only)} enclaves",
             "",
-            "Name the enclaves with --enclave, one for each request, in the order of the requests.",
+            "Name the enclaves with --enclave, one for each request.",
         )
-    for number, (request, name) in enumerate(zip(requests, only, strict=True), 1):
-        if request.name != name:
+    for number, request in enumerate(requests, 1):
+        if request.name not in only:
             raise KeystoreError(
-                f"request number {number} is for enclave {request.name}, and should be for {name}",
+                f"request number {number} is for enclave {request.name}, and should be for "
+                f"{first_few(only, 3)}",
                 "The request asks for the identity of another enclave. Nothing was signed.",
                 "Examine the robot that the request comes from.",
             )
