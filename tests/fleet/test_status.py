@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from sros_tool.cli import fleet as fleet_verbs
@@ -24,7 +25,7 @@ from sros_tool.keystore.confirmation import (
     Seen,
     parse_confirmation,
 )
-from sros_tool.keystore.fleet_status import FleetStatus, State, fleet_status
+from sros_tool.keystore.fleet_status import FleetStatus, State, fleet_metrics, fleet_status
 from sros_tool.keystore.layout import ENCLAVES, REFUSED
 from sros_tool.keystore.reader import Keystore, read_certificate
 from sros_tool.keystore.template import Template
@@ -860,6 +861,15 @@ def test_newer_advisories_judge_what_robots_reported(field: Field, tmp_path: Pat
     ended = field.run("fleet", "status", "ks", "--advisories", path, status=1)
     assert "r1, r2, r3, 1 known vulnerability" in ended.out and "CVE-2030-12345" in ended.out
     assert "2 versions in" in ended.err and "11.0, v12.0.0-rc1" in ended.err
+
+
+def test_the_alerts_of_the_page_name_metrics_that_are_written(field: Field) -> None:
+    page = (Path(__file__).parents[2] / "docs/fleet.md").read_text()
+    (rules,) = re.findall(r"```yaml\n(groups:.*?)```", page, re.DOTALL)
+    alerts = [rule["expr"] for rule in yaml.safe_load(rules)["groups"][0]["rules"]]
+    named = {name for alert in alerts for name in re.findall(r"sros_\w+", alert)}
+    metrics = fleet_metrics(fleet_status(Keystore(field.root)), now=datetime.now(UTC))
+    assert len(named) == len(alerts) == 7 and named <= {metric.name for metric in metrics}
 
 
 def test_metrics_and_the_page(field: Field) -> None:

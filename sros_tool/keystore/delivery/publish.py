@@ -140,7 +140,7 @@ class PublishedFleet(NamedTuple):
     versions: Mapping[str, int]
     """Versions of the metadata by name; the bins are ``robots-0`` and so on."""
     expires: Mapping[str, datetime]
-    """Expiry of the metadata by name, in UTC."""
+    """Expiry of the metadata by name, also of ``root``, in UTC."""
     root: Path
     """The root metadata that robots are to pin, in the publishing folder."""
     root_sha256: str
