@@ -694,6 +694,7 @@ class _Known:
         self.has_list = keystore.has(CRL)
         """Whether the keystore has a revocation list."""
         published = read_published(keystore)
+        self._published = published.robots
         self.published = {name: robot.release.number for name, robot in published.robots.items()}
         """Robots with the numbers of their releases that were published last."""
         self.publication = (
@@ -740,12 +741,12 @@ class _Known:
 
     def has_release(self, compared: _ComparedRobot) -> bool:
         """Return whether the last release of a robot that fetches has the present files."""
-        robot = compared.robot.name
-        if robot not in self.published or not (compared.received and compared.received.message):
+        published = self._published.get(compared.robot.name)
+        if published is None or not (compared.received and compared.received.message):
             return False
         from sros_tool.keystore.delivery.publish import is_all_published  # few robots need it
 
-        return is_all_published(self._keystore, robot, compared.enclaves)
+        return is_all_published(self._root, published, compared.enclaves)
 
     def older(self) -> str:
         """Return why the keystore is older than its robots, as a clause; "" if nothing shows it."""
@@ -757,29 +758,28 @@ class _Known:
 
         return later_in_folder(self._keystore)
 
-    def lacks_key(self, compared: _ComparedRobot) -> Iterator[str]:
-        """Yield the enclaves whose certificate is for a key that the robot does not have.
+    def lacks_key(self, compared: _ComparedRobot) -> tuple[str, ...]:
+        """Return the enclaves whose certificate is for a key that the robot does not have.
 
-        These are the enclaves of which it has no file, and those with an earlier key.  If the
-        keystore does not have the key, it was made on the robot, and a release is enough.
+        These are the enclaves of which it has no file, those with an earlier key, and those of
+        which its agent says so.  If the keystore does not have the key, it was made on the robot,
+        and a release is enough.
         """
         confirmed = compared.confirmed
         if confirmed is None:
-            return
+            return ()
         problems = [text for text in confirmed.problems or () if lacks_key(text)]
+        found = {name for name in compared.enclaves if any(f"{name} " in text for text in problems)}
         folders = {path.rpartition("/")[0] for path in confirmed.files}
         for file in compared.different:
-            name = enclave_of(file.path)
-            if _kind_of(file.path) != "certificate" or not (file.own and file.present):
-                continue
-            if not os.path.lexists(enclave_path(self._root, name) / KEY_FILE):
-                continue
-            before = self._issued.get(file.certificates[0]) if file.certificates else None
-            now = self._issued.get(file.present[0])
-            has_other_key = before and now and before.key and now.key and before.key != now.key
-            has_no_file = enclave_folder(name) not in folders
-            if has_other_key or has_no_file or any(f"{name} " in text for text in problems):
-                yield name
+            if _kind_of(file.path) == "certificate" and file.own and file.present:
+                before = self._issued.get(file.certificates[0]) if file.certificates else None
+                now = self._issued.get(file.present[0])
+                has_other_key = before and now and before.key and now.key and before.key != now.key
+                if has_other_key or file.path.rpartition("/")[0] not in folders:
+                    found.add(enclave_of(file.path))
+        keys = {name: enclave_path(self._root, name) / KEY_FILE for name in found}
+        return tuple(sorted(name for name, key in keys.items() if os.path.lexists(key)))
 
     def reads_copy(self, compared: _ComparedRobot, heard: datetime | None) -> bool:
         """Return whether a robot fetched long after the publication, and got an earlier release.
@@ -960,7 +960,7 @@ def _status(
         renew_from=min(
             (file.window.expires_soon_from() for file in validity.values()), default=None
         ),
-        lacks_key=tuple(known.lacks_key(compared)) if different else (),
+        lacks_key=known.lacks_key(compared) if different else (),
         is_locked_out=bool(compared.enclaves) and certificates == {State.REVOKED},
     )
     if not (different and status.fetches and known.reads_copy(compared, status.heard)):

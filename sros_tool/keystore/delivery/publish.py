@@ -255,10 +255,9 @@ def later_in_folder(keystore: Keystore) -> str:
     return ""
 
 
-def is_all_published(keystore: Keystore, robot: str, enclaves: Sequence[str]) -> bool:
+def is_all_published(root: Path, published: PublishedRobot, enclaves: Sequence[str]) -> bool:
     """Return whether the files of a robot are as they were when they were published last."""
-    published = read_published(keystore).robots.get(robot)
-    return published is not None and published.files == _state(keystore.root, enclaves)
+    return published.files == _state(root, enclaves)
 
 
 def _check_apart(root: Path, folder: Path) -> None:
