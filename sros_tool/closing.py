@@ -1351,7 +1351,7 @@ class OpenRobot:
         words = ("check", str(self.export), "--policy", str(self.policy), *only)
         _, output, _ = self._shell.run(words, False)
         stale = [finding["subject"] for finding in json.loads(output)["findings"]]
-        policy = {enclave.path for enclave in read_policy(self.policy).enclaves}
+        policy = {enclave.path for enclave in read_policy(self.policy).enclaves} - self._not_here
         return sorted({*stale, *policy.difference(list_enclaves(self.export))})
 
     def _proofs(self, closing: Closing, patience: float) -> list[Proof]:
@@ -1428,12 +1428,12 @@ class OpenRobot:
         earlier = {enclave.name: process.pid for process, enclave in self._secured(running)}
         are_open = {process.enclave: process.pid for process in observed.processes if process.pid}
         absent = [name for name in missing if name not in earlier]
-        others = {
+        others = {name: f"stop process {pid}, which is open" for name, pid in are_open.items()}
+        others |= {
             enclave.name: f"{process.label} has the files of '{_keystore_of(enclave)}'"
             for process in filter(self._is_neighbour, running.processes)
             if (enclave := process.enclave)
         }
-        others |= {name: f"stop process {pid}, which is open" for name, pid in are_open.items()}
         named = ", ".join(f"{name} ({others[name]})" if name in others else name for name in absent)
         old = [f"{name} (process {earlier[name]})" for name in missing if name in earlier]
         reasons = [
