@@ -302,7 +302,7 @@ _NEEDS_CA_KEYS = re.compile(
 
 
 _OF_SEVERAL = re.compile(
-    r"(`sros (?:renew|revoke|create_permission|create_enclave|distribute_key) \S+ )([^\s`]+)"
+    r"(\bsros (?:renew|revoke|create_permission|create_enclave|distribute_key) \S+ )([^\s`]+)"
 )
 """The begin of a command that takes several enclaves, and its first enclave."""
 
