@@ -61,11 +61,12 @@ from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.reader import FilesReadOnce, Keystore, open_enclave
 from sros_tool.keystore.selection import revocation_of
 from sros_tool.keystore.template import load_template
+from sros_tool.names import is_expression
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import merge_into
-from sros_tool.policy.model import ALLOW, RIGHTS, Policy
-from sros_tool.policy.rights import Rules, policy_rights
+from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy
+from sros_tool.policy.rights import Right, Rules, policy_rights
 from sros_tool.proof.findings import decide_all
 from sros_tool.proof.requirements import Requirement, read_requirements
 from sros_tool.proof.system import policy_system
@@ -568,10 +569,18 @@ def access_lines(policy: Policy, folder: Path) -> list[str]:
         and right.qualifier is ALLOW
         and (right.enclave, right.right, right.name) not in ordinary
     }
+    stated = {right for right in rights if right.qualifier is ALLOW and is_expression(right.name)}
+
+    def may(enclave: str, right: str, name: str) -> bool:
+        if rules.allow(enclave, right, name):
+            return True
+        # A denial of some of the names leaves the others.
+        is_stated = Right(enclave, ALLOW, right, name) in stated
+        return is_stated and not rules.cover(Right(enclave, DENY, right, name))
+
     sides = {
         (kind, name): [
-            [enclave for enclave in enclaves if rules.allow(enclave, right, name)]
-            for right in RIGHTS[kind]
+            [enclave for enclave in enclaves if may(enclave, right, name)] for right in RIGHTS[kind]
         ]
         for kind, name in shown
     }

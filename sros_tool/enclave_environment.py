@@ -692,6 +692,7 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
             several.
         PolicyError: the policy cannot be read.
     """
+    from sros_tool.names import is_expression
     from sros_tool.policy.document import read_policy
     from sros_tool.runtime.environment import node_argument
 
@@ -718,7 +719,10 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
     else:
         where = "in no enclave"
         every = {known for nodes in policy.nodes().values() for known in nodes}
-        if alike := sorted(known for known in every if known.endswith(f"/{name}")):
+        alike = sorted(
+            known for known in every if known.endswith(f"/{name}") and not is_expression(known)
+        )
+        if alike:
             why = f"It has the node {first_few(alike, 3)}."
             other = quote(alike[0].rpartition("/")[0] or "/")
             remedy = (

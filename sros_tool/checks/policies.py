@@ -341,8 +341,12 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _is_namespace_apart(one: _Statement, other: _Statement) -> bool:
-    """Return whether one of two names is the other one with a namespace before it."""
-    return one.name.endswith(other.name) or other.name.endswith(one.name)
+    """Return whether the namespace of a profile alone makes one of two names longer.
+
+    A name that is written with a namespace, or with ``~``, is longer on purpose.
+    """
+    shorter, longer = sorted((one, other), key=lambda statement: len(statement.name))
+    return longer.name.endswith(shorter.name) and not {*"/~"} & {*longer.written}
 
 
 def _meant(candidates: Sequence[_Statement]) -> str:

@@ -230,9 +230,9 @@ def check(
     r"""Find errors and weaknesses in policies, keystores and the runtime.
 
     PATH is a policy, a folder of policies, a keystore or an enclave. The type of PATH is detected,
-    unless the first word is `policy` or `keystore`. Without PATH, the keystore of
-    $ROS_SECURITY_KEYSTORE and the runtime are checked. The runtime is the environment and the
-    processes of this machine.
+    unless the first word is `policy` or `keystore`; a keystore here whose name is that word is
+    checked, too. Without PATH, the keystore of $ROS_SECURITY_KEYSTORE and the runtime are checked.
+    The runtime is the environment and the processes of this machine.
 
     Example:
       $ sros check robot.xml keystore

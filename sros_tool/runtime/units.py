@@ -302,7 +302,7 @@ def job_units(
         Job.COLLECT: (
             f"Collect the messages of the fleet of {root}, and publish its releases",
             ("fleet", "collect", root, inbox, "--publish", publishing),
-            [f"ReadWritePaths={root} -{publishing}", "UMask=0022"],
+            [f"ReadWritePaths={root} {publishing}", "UMask=0022"],
         ),
     }[job]
     if job is Job.COLLECT:

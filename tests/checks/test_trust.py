@@ -24,15 +24,15 @@ def test_keystores_and_their_exports_are_strangers(keystore: Path, tmp_path: Pat
     sros("distribute_key", keystore, "/a", export).ok()
     (text,) = strangers(keystore, other, export)
     assert text == (
-        f"nodes of {keystore}, {export} do not communicate with nodes of {other}: they do not "
-        "trust each other's identity CA and permissions CA"
+        f"nodes of {keystore}, {export} do not communicate with nodes of {other}: not both of "
+        "them trust the other's identity CA and permissions CA"
     )
     assert strangers(keystore, export) == strangers(keystore, keystore / "enclaves/a") == []
     assert strangers(other) == strangers(keystore / "enclaves/a/cert.pem", other) == []
     (text,) = strangers(
         export / "enclaves/a", other / "enclaves/a", at=Circumstances(AT.now, vendors=("zenoh",))
     )
-    assert text.endswith("each other's identity CA")
+    assert text.endswith("the other's identity CA")
     assert "keystore.strangers" in sros("check", "keystore", export, other).out
     export.rename(tmp_path / "keystore")  # the word names the folder, and no family of checks
     assert "keystore.strangers" in sros("check", "keystore", "other", cwd=tmp_path).out

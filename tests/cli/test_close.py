@@ -1120,4 +1120,4 @@ def test_wildcards_and_denials_count_in_what_is_shown(tmp_path: Path) -> None:
     })  # fmt: skip
     (tmp_path / "p.xml").write_text(text)
     lines = access_lines(read_policy(tmp_path / "p.xml"), tmp_path)
-    assert lines == ["topic /odom: /a -> /b, /look", "topic /*: nobody -> /look"]
+    assert lines == ["topic /odom: /a -> /b, /look", "topic /*: nobody -> /look, /not"]

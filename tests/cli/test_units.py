@@ -99,7 +99,7 @@ def test_messages_are_collected_and_releases_published(made: Path, tmp_path: Pat
     lines = (tmp_path / "units/sros-collect.service").read_text().splitlines()
     command = f"/usr/bin/sros fleet collect {made} {tmp_path}/in --publish {tmp_path}/pub"
     assert f"ExecStart={command}" in lines
-    assert f"ReadWritePaths={made} -{tmp_path}/pub" in lines
+    assert f"ReadWritePaths={made} {tmp_path}/pub" in lines
     assert "LoadCredential=ca-passphrase:/etc/sros/pass" in lines
     assert (tmp_path / "units/sros-collect.timer").exists()
 

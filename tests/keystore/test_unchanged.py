@@ -273,6 +273,29 @@ def test_old_certificates_are_revoked_where_other_permissions_fit_them(folder: P
     assert state(folder, datetime.now(UTC)).kept == NAMES
 
 
+@pytest.mark.parametrize(
+    ("first", "between"),
+    [
+        (True, ("renew", "ks", "/a")),
+        (False, ("rotate_ca", "ks", "--identity", "--finish")),
+        (True, ("rotate_ca", "ks", "--finish")),
+    ],
+    ids=["renewed", "new identity CA", "new CAs"],
+)
+def test_what_works_besides_is_revoked(first: bool, between: tuple[str, ...], folder: Path) -> None:
+    """A right was taken away before or after that: its permissions fit what still works."""
+    words = ("generate_artifacts", "-k", "ks", "-p", "policy.xml")
+    wide = (folder / "policy.xml").read_text().replace("</topics>", "<topic>/w</topic></topics>", 1)
+    (folder / "wide.xml").write_text(wide)
+    sros("create_permission", "ks", "/a", "wide.xml", cwd=folder).ok()
+    if first:
+        sros(*words, cwd=folder).ok()
+    sros(*between, cwd=folder).ok()
+    if not first:
+        sros(*words, cwd=folder).ok()
+    assert "/a" in sros(*words, "--revoke-old", cwd=folder).ok().out
+
+
 def test_a_revoked_enclave_that_was_put_back_is_refused(folder: Path) -> None:
     root, backup = folder / "ks", folder / "backup"
     copy_of(root / "enclaves/a", backup)

@@ -10,7 +10,7 @@ from itertools import combinations, product
 
 from cryptography import x509
 
-from sros_tool.checks.kind import WARNING, Finding, FindingKind, some_names
+from sros_tool.checks.kind import NOTE, Finding, FindingKind, some_names
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -25,13 +25,14 @@ from sros_tool.pki.certificates import issued_by, load_certificate, load_certifi
 
 STRANGERS = FindingKind(
     "keystore.strangers",
-    WARNING,
+    NOTE,
     "keystores or exports whose nodes do not trust each other",
     "A node accepts only a peer whose certificate and permissions come from CAs that it trusts, "
     "and neither Fast DDS nor Cyclone DDS reports why a peer is refused.",
     "DDS-Security 1.1, 9.3 and 9.4; Fast DDS 2.9.1, Cyclone DDS 0.10.2; tested.",
     "If their nodes have to communicate, export all of their enclaves again from one keystore; if "
-    "not, check each of them alone.",
+    "not, ignore this.",
+    prominent=True,
 )
 
 _Certificates = tuple[x509.Certificate, ...]
@@ -85,7 +86,7 @@ def strangers(
             authorities = " and ".join(f"{ROLES[role]} CA" for role in refused)
             text = (
                 f"nodes of {some_names(some)} do not communicate with nodes of "
-                f"{some_names(others)}: they do not trust each other's {authorities}"
+                f"{some_names(others)}: not both of them trust the other's {authorities}"
             )
             yield STRANGERS.found(others[0], text, others[0])
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections import ChainMap, defaultdict
+from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -51,7 +51,7 @@ from sros_tool.keystore.issuing.enclave import (
 )
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.tokens import EnclaveTokens, place_in, token_notes, token_places
-from sros_tool.keystore.known_keys import restored_at
+from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     ENCLAVES,
@@ -73,7 +73,7 @@ from sros_tool.keystore.layout import (
     refuse_earlier,
     similar_keystores,
 )
-from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
+from sros_tool.keystore.ledger import RESTORED, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import (
     ReplacedRights,
@@ -99,6 +99,7 @@ from sros_tool.pki.certificates import (
     issued_by,
     other_issuer,
     parse_subject,
+    subject_text,
     validity_of,
 )
 from sros_tool.pki.keys import generate_key, load_key
@@ -848,9 +849,14 @@ class _EnclaveMaker:
         if policy or PERMISSIONS_FILE not in present:
             enclave = policy or _default_rights(change.template, name)
             rights = StatedRights(enclave, self._domains.of(name))
-        if rights and certificate and PERMISSIONS_FILE in present:
-            is_revoked = self._revoke_old and not self._is_alone(name, certificate)
-            rights = None if not is_revoked and self._is_kept(certificate, rights) else rights
+        if (
+            rights
+            and certificate
+            and PERMISSIONS_FILE in present
+            and self._is_kept(certificate, rights)
+            and not (self._revoke_old and self._may_have_others(name, certificate))
+        ):
+            rights = None
         if rights and PERMISSIONS_FILE in present:
             earlier = earlier_permissions(
                 change.keystore, name, change.permissions.certificate, certificate
@@ -878,28 +884,44 @@ class _EnclaveMaker:
         completed = len(change.transaction.changes) > before
         return _EnclaveOutcome("completed" if completed else "kept", notes)
 
-    def _is_alone(self, name: str, certificate: x509.Certificate) -> bool:
-        """Return whether only the present permissions fit an enclave's certificate, by the ledger.
+    def _may_have_others(self, name: str, certificate: x509.Certificate) -> bool:
+        """Return whether something else that was issued for an enclave may work, by the ledger.
 
-        If its subject is not unique, permissions of earlier certificates may fit, too.
+        That is an earlier certificate, or other permissions for the subject of this one.
         """
-        permissions, serial = 0, ""
-        for entry in self._ledger.get(name, ()):
-            if entry.what == "certificate":
-                permissions, serial = 0, entry.serial
-            permissions += entry.what == "permissions"
-        is_last = serial != "" and int(serial, 16) == certificate.serial_number
-        return is_last and has_unique_part(certificate.subject) and permissions == 1
+        certificates, permissions = self._working.get(name, (set(), []))
+        subject = subject_text(certificate.subject)
+        return not (
+            has_unique_part(certificate.subject)
+            and certificates == {certificate.serial_number}
+            and permissions.count(subject) == 1
+        )
 
     @cached_property
-    def _ledger(self) -> Mapping[str, Sequence[Entry]]:
-        """The ledger entries of each enclave, in order; none if the ledger may lack some."""
-        keystore = self._change.keystore
-        ledger, entries = keystore.ledger, defaultdict[str, list[Entry]](list)
-        if not (ledger.gaps or ledger.unchained or restored_at(keystore) or may_be_later(keystore)):
-            for entry in ledger.entries:
-                entries[entry.enclave].append(entry)
-        return entries
+    def _working(self) -> Mapping[str, tuple[set[int], list[str]]]:
+        """The serials of each enclave's certificates, and the subjects of its permissions.
+
+        Expired and revoked certificates are left out.  It is empty if the ledger may lack some.
+        """
+        keystore, now = self._change.keystore, iso(self._change.now)
+        working: dict[str, tuple[set[int], list[str]]] = {}
+        try:
+            ledger = keystore.ledger_file.with_values("enclave", {*self._names})
+            was_restored = any(
+                entry.what == RESTORED for entry in keystore.ledger_with("what", RESTORED).entries
+            )
+        except SrosError:  # a sealed part of the ledger is elsewhere
+            return working
+        if ledger.gaps or ledger.unchained or was_restored or may_be_later(keystore):
+            return working
+        revoked = revoked_serials(keystore)
+        for entry in ledger.entries:
+            certificates, permissions = working.setdefault(entry.enclave, (set(), []))
+            if entry.what == "certificate" and entry.not_after > now:
+                certificates |= {int(entry.serial, 16)} - revoked
+            elif entry.what == "permissions":
+                permissions.append(entry.subject)
+        return working
 
     def _lost_rights(self, default: Enclave, present: set[str]) -> Iterator[Note]:
         """Yield a note if an enclave had other rights than the default ones that it gets.
