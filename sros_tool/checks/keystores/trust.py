@@ -36,6 +36,9 @@ STRANGERS = FindingKind(
 )
 
 _Certificates = tuple[x509.Certificate, ...]
+_Kind = tuple[tuple[_Certificates, ...], tuple[bool, ...], x509.Certificate | None]
+"""The CAs that an enclave trusts, which of them issued its certificate, and who signed its
+permissions."""
 
 
 class _Party:
@@ -71,16 +74,21 @@ def strangers(
         targets: maps what the user named to a keystore or export, and the enclaves in it.
         on_zenoh: whether all nodes use Zenoh, which reads no permissions.
     """
-    parties = {shown: list(_parties(*target)) for shown, target in targets.items()}
+    read = {shown: dict(_parties(*target)) for shown, target in targets.items()}
+    # Most exports trust and present the same as others: only one of each kind is compared.
+    alike: dict[frozenset[_Kind], list[str]] = defaultdict(list)
+    for shown, of_target in read.items():
+        alike[frozenset(of_target)].append(shown)
+    parties = {same[0]: list(read[same[0]].values()) for same in alike.values()}
     roles = range(1 if on_zenoh else len(ROLES))
     # What each target is apart from, and in which roles; targets with the same are one group.
-    apart: dict[str, dict[str, tuple[int, ...]]] = {shown: {} for shown in targets}
-    for one, other in combinations(targets, 2):
+    apart: dict[str, dict[str, tuple[int, ...]]] = {shown: {} for shown in parties}
+    for one, other in combinations(parties, 2):
         if refused := _refused(parties[one], parties[other], roles):
             apart[one][other] = apart[other][one] = refused
     groups: dict[tuple[tuple[str, tuple[int, ...]], ...], list[str]] = defaultdict(list)
-    for shown, strange in apart.items():
-        groups[tuple(strange.items())].append(shown)
+    for same in alike.values():
+        groups[tuple(apart[same[0]].items())] += same
     for some, others in combinations(groups.values(), 2):
         if refused := apart[some[0]].get(others[0], ()):
             authorities = " and ".join(f"{ROLES[role]} CA" for role in refused)
@@ -103,8 +111,8 @@ def _refused(some: Sequence[_Party], others: Sequence[_Party], roles: range) -> 
     return min(pairs, key=len, default=())
 
 
-def _parties(keystore: Keystore, enclaves: Sequence[str]) -> Iterator[_Party]:
-    """Yield one of all enclaves that trust and present the same CAs."""
+def _parties(keystore: Keystore, enclaves: Sequence[str]) -> Iterator[tuple[_Kind, _Party]]:
+    """Yield one of all enclaves that trust and present the same CAs, by what these are."""
     seen = set()
     for name in enclaves:
         folder = keystore.folder(name)
@@ -120,8 +128,8 @@ def _parties(keystore: Keystore, enclaves: Sequence[str]) -> Iterator[_Party]:
             issuers = tuple(issued_by(certificate, each) for each in party.trusted[0])
             message = keystore.read(folder / PERMISSIONS_FILE, "permissions document")
             # Which of several CAs signed them differs only in a rotation.
-            if (kind := (trusted, issuers)) in seen and len(party.trusted[1]) == 1:
+            if (shown := (party.trusted, issuers)) in seen and len(party.trusted[1]) == 1:
                 continue
-            seen.add(kind)
+            seen.add(shown)
             party.signer = smime.parse(message).signer()
-            yield party
+            yield (*shown, party.signer), party
