@@ -670,6 +670,8 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
         lines += [f"{other.name}  unknown: {other.error}" for other in found.unreadable]
         none = "the 1 enclave does not need" if found.lasting == 1 else ""
         none = f"{none or f'none of {found.lasting} enclaves needs'} to be renewed ({text})"
+        if found.short_lived and not found.lasting:
+            none = ""
         left_out = found.short_lived_text()
         left_out = f"not counted: {left_out}" if left_out else ""
         if form == "markdown":
