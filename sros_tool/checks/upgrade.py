@@ -59,8 +59,8 @@ NO_NODE = FindingKind(
     "A node creates these endpoints when it starts, and exits if one of them is denied. Nodes of "
     "Iron and later also offer ~/get_type_description.",
     "ROS 2 Jazzy, rcl 9, rclcpp 28, rclpy 7 and rmw_dds_common; REP-2016.",
-    "Include common/node.xml in the profiles of its nodes (`sros check POLICY_FILE` says how), and "
-    "sign the policy with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`.",
+    "Include common/node.xml in the profiles of the enclave's nodes (`sros check POLICY_FILE` says "
+    "how), and sign the policy with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`.",
 )
 BUFFERS = FindingKind(
     "upgrade.zenoh-buffers",

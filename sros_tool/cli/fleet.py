@@ -88,8 +88,8 @@ def fleet() -> None:
 def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
     """Print the robots of KEYSTORE as an Ansible inventory.
 
-    The robots are the hosts, and the groups of the fleet are the groups. The variables of a host
-    are ansible_host, ansible_user, sros_robot, sros_namespace, sros_domain, sros_router,
+    Each robot is a host, and each group of the fleet is a group of the inventory. The variables of
+    a host are ansible_host, ansible_user, sros_robot, sros_namespace, sros_domain, sros_router,
     sros_crossing, sros_distribution, sros_renewal and sros_renewal_grace.
 
     Example:
@@ -243,11 +243,12 @@ def _collect(
 ) -> int:
     """Collect the messages of robots, keep their confirmations, and sign requests for renewal.
 
-    INBOX is a folder with ROBOT/confirmation.p7s of each robot that runs `sros agent`. Reads only
-    the messages of robots in the fleet of KEYSTORE. Accepts a message if an enclave of the same
-    robot signed it, with a certificate that this keystore issued and did not revoke, and if it is
-    later than the robot's last message. Signs requests for renewal if the fleet file has renewal =
-    "allowed" for the robot; rights do not change. A refused message does not stop the others.
+    INBOX is a folder with ROBOT/confirmation.p7s of each robot that runs `sros agent`. sros reads
+    only the messages of robots in the fleet of KEYSTORE. It accepts the message of a robot if an
+    enclave of that robot signed it, with a certificate that this keystore issued and did not
+    revoke, and if the message is later than the robot's last one. It signs requests for renewal if
+    the fleet file has renewal = "allowed" for the robot; rights do not change. A refused message
+    does not stop the others.
 
     Example:
       $ sros fleet collect keystore inbox
@@ -413,7 +414,7 @@ def _publish(
     PUB has plain files for any web server, bucket or USB stick, and no private key. For each
     robot, PUB has an archive with the files of the robot's enclaves, sealed by the permissions CA.
     PUB also has metadata of The Update Framework, with which `sros agent` on the robot refuses
-    old, mixed or forged files. Run this verb after each change, and before the timestamp expires,
+    old, mixed or forged files. Run this verb after each change, and before the time that it prints,
     for example each hour. Archives of unchanged robots stay; archives of robots that were revoked
     or left the fleet are removed.
 
@@ -429,8 +430,8 @@ def _publish(
       $ sros fleet publish keystore pub --rotate-key timestamp
             --root-key /media/safe/fleet_root.pem
 
-    The exit status is 1 if a robot's release was refused, because an enclave cannot run, and if
-    robots refuse everything, because the root metadata has expired.
+    The exit status is 1 in two cases: an enclave of a robot cannot run, so that its release was
+    refused; or the root metadata has expired, so that robots refuse everything.
     """
     from sros_tool.keystore.delivery.publish import publish
     from sros_tool.keystore.delivery.published import MetadataExpiry
@@ -553,8 +554,8 @@ def _status(
     revoked; missing; or unknown (never issued by this keystore). Processes use new files only
     after a restart. Confirmations by the Ansible collection and `sros agent` say which restarts
     are due, confirmations by `sros fleet report` do not. A robot without a recent confirmation is
-    offline. Robots with the same state share a line. A robot that claims a release that was never
-    published is always named. The last line counts the known vulnerabilities of the robots' DDS,
+    offline. Robots with the same state share a line; a robot that reports a release which was never
+    published has its own. The last line counts the known vulnerabilities of the robots' DDS,
     by the advisories of sros; --robot and --advisories list them.
 
     The revocation list is in force on a robot that has the list and reports that no restart is

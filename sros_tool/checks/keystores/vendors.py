@@ -393,8 +393,8 @@ NO_NODE = FindingKind(
     "needs ros_discovery_info.",
     "ROS 2 Jazzy, rcl 9, rclcpp 28, rclpy 7 and rmw_dds_common; ~/get_type_description since Iron "
     "(REP-2016).",
-    "Include common/node.xml in the profiles of its nodes (`sros check POLICY_FILE` says how), and "
-    "sign the policy with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`.",
+    "Include common/node.xml in the profiles of the enclave's nodes (`sros check POLICY_FILE` says "
+    "how), and sign the policy with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`.",
 )
 _PARAMETER_EVENTS, _ROSOUT = "rt/parameter_events", "rt/rosout"
 _OF_TOOLS = (

@@ -34,7 +34,7 @@ class Subjects(Enum):
     SUBSET = auto()
     """The grant has every part of the certificate's subject, split at ``, / |`` (Cyclone DDS)."""
     TRIMMED_SUBSET = auto()
-    """The grant has every part of the certificate's subject, without spaces around parts (11)."""
+    """The grant has every part of the certificate's subject, with any spaces around it (11)."""
 
 
 class Moments(Enum):
