@@ -204,7 +204,8 @@ NO_COUNTERPART = FindingKind(
     "a name for which no enclave has the counterpart right",
     "No enclave, in any ROS domain, may publish this subscribed topic, or serve this called "
     "service or action. The name may have a typing error, or its counterpart is in a policy that "
-    "was not checked in the same command.",
+    "was not checked in the same command. Names that many nodes share are left out, such as /tf, "
+    "/clock and /diagnostics.",
     "sros: compares the rights of all enclaves in the policies that are checked together.",
     "Compare the names that senders and receivers have after remapping, and name all policies of "
     "the robot in one command.",

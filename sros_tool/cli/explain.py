@@ -997,7 +997,7 @@ def _silence(log: str) -> str:
     found = SECURITY_DIRECTORY.search(log)
     if found is None:
         return (
-            "no line says 'Found security directory', so its nodes ran open, or it is not the "
+            "no line says 'Found security directory': on DDS, its nodes ran open, or it is not the "
             "whole log. `sros check runtime` on that machine says how its processes run"
         )
     return (

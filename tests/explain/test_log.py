@@ -561,7 +561,7 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
         (tmp_path / "robot.log").write_text(text)
         ended = sros("explain", "--log", tmp_path / "robot.log").ok()
         assert ended.err.strip().partition(": ")[0] == said
-    assert "no line says 'Found security directory', so its nodes ran open" in ended.err
+    assert "no line says 'Found security directory': on DDS, its nodes ran open" in ended.err
     line = "[INFO] [1.0] [rcl]: Found security directory: /k/enclaves/talker\n"
     (tmp_path / "robot.log").write_text(line)
     ended = sros("explain", "--log", tmp_path / "robot.log").ok()

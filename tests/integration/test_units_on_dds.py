@@ -109,22 +109,26 @@ def test_the_restrictions_are_in_force(robot: Path, units: Path) -> None:
 
 @sometimes("jobs under their restrictions")
 def test_the_jobs_do_their_work_under_their_restrictions(robot: Path, tmp_path: Path) -> None:
-    keystore, metrics = tmp_path / "ks", tmp_path / "metrics"
+    keystore, metrics, pub = tmp_path / "ks", tmp_path / "metrics", tmp_path / "pub"
     metrics.mkdir()
     before = (keystore / "enclaves/arm/cert.pem").read_bytes()
     (tmp_path / "fleet.toml").write_text("[robots.r1]\n")
     (tmp_path / "robot.xml").write_text(policy_text({"/{robot}/a": publish("/a")}))
     stated = ("-p", tmp_path / "robot.xml", "--fleet", tmp_path / "fleet.toml")
     sros("generate_artifacts", "-k", keystore, *stated).ok()
+    sros("fleet", "publish", keystore, pub).ok()
+    (tmp_path / "inbox").mkdir()
+    make = partial(job_units, inbox=str(tmp_path / "inbox"), publishing=str(pub))
     ended = {Job.CHECK: 1, Job.FLEET: 1}  # no node starts with these rights; r1 confirmed nothing
     # The guard never ends, and the agent has a test of its own.
     for job in (each for each in Job if each not in (Job.GUARD, Job.AGENT)):
-        files = job_units(job, str(keystore), user="root", sros="/bin/sros")
+        files = make(job, str(keystore), user="root", sros="/bin/sros")
         (tmp_path / "job").write_text(files[f"sros-{job}.service"])
         (line,) = re.findall("^ExecStart=/bin/sros (.*)$", (tmp_path / "job").read_text(), re.M)
         words = line.replace("/var/lib/sros-metrics", str(metrics)).replace("30d", "9999d")
         program = [sys.executable, "-m", "sros_tool", *words.split()]
-        confined = [sys.executable, CONFINED, tmp_path / "job", keystore, metrics, "--", *program]
+        folders = (keystore, metrics, *([pub] if job is Job.COLLECT else []))
+        confined = [sys.executable, CONFINED, tmp_path / "job", *folders, "--", *program]
         run(confined, status=ended.get(job, 0))
     assert (keystore / "enclaves/arm/cert.pem").read_bytes() != before
     assert "sros_enclaves{" in (metrics / "sros.prom").read_text()

@@ -32,6 +32,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
     REQUEST,
+    ROUTER_FILE,
     ZENOH_FILES,
     ca_certificate,
     waits_for_answer,
@@ -362,7 +363,9 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
             # No template accepts it: whoever checks a keystore asks whether its robot is closed.
             accepted = keystore.accepts(EVERYTHING, lambda _: False)
             yield EVERYTHING.found(enclave.name, text, file, accepted=accepted)
-    elif any(_ANY_NODES_SERVICE in _published(rule) for rule in grant.rules if rule.allow):
+    elif not (enclave.folder / ROUTER_FILE).exists() and any(
+        _ANY_NODES_SERVICE in _published(rule) for rule in grant.rules if rule.allow
+    ):
         text = f"the permissions allow publishing {_ANY_NODES_SERVICE}"
         yield ANY_NODE.found(enclave.name, text, file)
     unique = "," in grant.subject or "+" in grant.subject
