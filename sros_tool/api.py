@@ -321,8 +321,8 @@ def renew(
     Args:
         keystore: The keystore, or its path.
         enclaves: The names of enclaves.
-        expiring: Also renew the enclaves that expire within this time, except those with a validity
-        of their own.
+        expiring: Also renew the enclaves that expire within this time, except those with a
+            validity of their own.
         new_key: Give the enclaves new keys.
         revoke_old: Revoke the earlier certificates, which otherwise work until they expire.
         secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
@@ -425,7 +425,7 @@ def fleet_status(
         keystore: A keystore with a fleet, or its path.
         robots: The names of some robots; all by default.
         max_age: Robots whose last confirmation is older are ``overdue`` and ``offline``; without
-        it, robots that fetch are, after more than a day without a message.
+            it, robots that fetch are, after more than a day without a message.
         now: The time from which ages count; the current time by default.
 
     Returns:
@@ -531,24 +531,24 @@ def explain_access(
         >>> answer.allowed, answer.reason
         (True, 'rule 1 allows publish rt/chatter by rt/chatter')
     """
-    from sros_tool.dds.decision.vendors import Vendor
+    from sros_tool.dds.decision.vendors import ZENOH, Vendor
     from sros_tool.explain.answer import Evaluator, ask
     from sros_tool.explain.asking import AskingContext, question_meant
     from sros_tool.explain.explanation import explain
 
     question = ask(action, name, kind)
     domain = _domain(domain)
-    vendors = [*(known.value for known in Vendor), "zenoh"]
+    vendors = [*(known.value for known in Vendor), ZENOH]
     if vendor not in vendors:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
-    if vendor == "zenoh" and distribution:
+    if vendor == ZENOH and distribution:
         text = "Zenoh decides alike in every distribution."
         raise UsageError("vendor 'zenoh' takes no distribution", text, "Leave it out.")
     (vendor,) = _vendors(vendor, distribution)
     asking = AskingContext(_time_or_now(now), zone, domain)
     asked = _enclave_to_ask(keystore, enclave, policy, asking)
     context = asking.context(asked.enclave.joined_domains)
-    if vendor == "zenoh":
+    if vendor == ZENOH:
         return _access_on_zenoh(asked, question, context, kind)
     evaluator = Evaluator(Vendor(vendor), asked.enclave, context)
     question, _ = question_meant(evaluator, asked, question, kind)
@@ -569,6 +569,7 @@ def explain_access(
 def _access_on_zenoh(
     asked: AskedEnclave, question: Question, context: JoinContext, kind: str | None
 ) -> AccessAnswer:
+    from sros_tool.dds.decision.vendors import ZENOH
     from sros_tool.explain.zenoh import explain_on_zenoh
 
     explanation = explain_on_zenoh(asked, question, "as asked", context, kind=kind)
@@ -577,7 +578,7 @@ def _access_on_zenoh(
         answer.allowed,
         answer.outcome.value,
         answer.text,
-        "zenoh",
+        ZENOH,
         answer.wildcard,
         tuple(str(line.source) for line in explanation.stated.lines),
         answer.until,
@@ -825,10 +826,11 @@ def _vendors(vendor: str, distribution: str) -> tuple[str, ...]:
     Raises:
         UsageError: there is no such distribution, or it does not ship the vendor.
     """
+    from sros_tool.dds.decision.vendors import ZENOH
     from sros_tool.distributions import find_distribution, selected_vendors
 
     named = (find_distribution(distribution),) if distribution else ()
-    return selected_vendors(vendor, named if vendor != "zenoh" else ())
+    return selected_vendors(vendor, named if vendor != ZENOH else ())
 
 
 def _policy(given: AnyPath | Policy) -> Policy:

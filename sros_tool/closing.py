@@ -966,8 +966,7 @@ class OpenRobot:
         )
 
     def _programs(self) -> Iterator[str]:
-        """Yield which programs start processes of several enclaves, which would all run in one
-        enclave."""
+        """Yield which programs start processes of several enclaves, and so would put all in one."""
         observed = (self.observed or ObservedProcesses(self.domain)).within(
             read_policy(self.policy)
         )
@@ -988,8 +987,7 @@ class OpenRobot:
                 )
 
     def _twins(self) -> Iterator[str]:
-        """Yield which processes have nodes of the same names: one enclave would have the rights of
-        all."""
+        """Yield which processes share names of nodes, and so would share one enclave."""
         by_enclave: dict[str, list[ClosedProcess]] = {}
         for process in self.observed.processes if self.observed else ():
             by_enclave.setdefault(process.enclave, []).append(process)
@@ -1575,8 +1573,7 @@ class OpenRobot:
 
 
 def _needs_enclave_argument(process: ClosedProcess) -> bool:
-    """Return whether the command must name the enclave: on Zenoh, others look only at its
-    argument."""
+    """Return whether the command must name the enclave, which others look for on Zenoh."""
     is_node = bool(process.rmw) and process.enclave != _ROUTER
     return is_node and named_enclave(process.command) != process.enclave
 

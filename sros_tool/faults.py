@@ -448,8 +448,7 @@ class Fault(Enum):
 
 
 def in_original_keystore(remedy: str) -> str:
-    """Return a remedy for an export, which has no CA keys: to do ``remedy`` in the original
-    keystore."""
+    """Return the remedy for an export: to do ``remedy`` in the keystore with the CA keys."""
     then = "" if remedy.endswith("export the enclave again.") else " Then export the enclave again."
     return f"In the {ORIGINAL_KEYSTORE}: {remedy}{then}"
 

@@ -331,7 +331,9 @@ USES = {
 def test_random_policies_give_the_same_rights_as_on_dds_or_an_error() -> None:
     """DDS is asked by its own engine, from the permissions of the same enclave."""
     draw, translated = random.Random(SEED), 0
-    for _ in range(3000 if LONG else 5):
+    for _ in range(3000):
+        if translated == 4 and not LONG:
+            break
         enclave = drawn_enclave(draw)
         try:
             stated = dict.fromkeys((0, 7), stated_rights(enclave))
@@ -355,7 +357,7 @@ def test_random_policies_give_the_same_rights_as_on_dds_or_an_error() -> None:
             for domain, here in ((0, on_dds), (7, on_dds), (1, False)):
                 told = control.allows("/e", *use, f"{domain}{name}/{TYPE}")
                 assert told == here, (enclave, right, name)
-    assert translated > (2500 if LONG else 0)
+    assert translated > (2500 if LONG else 3)
 
 
 def rule_allows(permissions: Permissions, topic: str, *, publish: bool) -> bool:

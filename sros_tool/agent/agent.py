@@ -330,8 +330,7 @@ class _Round:
         return tuple(others)
 
     def _note_repaired(self, release: int, paths: Sequence[str]) -> None:
-        """Remember that files were replaced; messages say it for a day, as each replaces the
-        last."""
+        """Remember that files were replaced: every message of the next day says so."""
         if paths:
             now = self._machine.now
             text = (
@@ -557,8 +556,7 @@ class _Round:
         return self._replaced_list() if self._is_in_step else self._revocation_list(names)
 
     def _replaced_list(self) -> str | None:
-        """Return the revocation list that a release replaced by a list that revokes less, or
-        None."""
+        """Return the list that a release replaced by one that revokes less, or None."""
         with suppress(SrosError, OSError):
             path = agent_folder(self._folder) / _REPLACED_LIST
             since = time_of_file(path.stat().st_mtime)
@@ -567,8 +565,7 @@ class _Round:
         return None
 
     def _keep_replaced_list(self, text: str | None) -> None:
-        """Keep the present revocation list, which a release may replace by a list with fewer
-        entries.
+        """Keep the present revocation list: a release may replace it by a shorter one.
 
         A release leaves out entries that have expired; but a keystore that was restored from a
         backup may have lost entries.
@@ -660,8 +657,7 @@ class _Round:
         return ask(last)
 
     def _client_certificates(self) -> list[ClientCertificate]:
-        """Return the files of some enclaves, for TLS; the certificate that is valid longest is
-        first."""
+        """Return the files of some enclaves for TLS, in the order of expiry, the last first."""
         found: list[tuple[datetime, ClientCertificate]] = []
         for name in self._enclaves():
             place = enclave_path(self._folder, name)

@@ -68,8 +68,7 @@ class GuardedConnection(http.client.HTTPConnection):
             self.sock = self._context.wrap_socket(plain, server_hostname=self.host)
 
     def end(self) -> None:
-        """Close everything, also an answer that lasts until the connection ends; `close` leaves it
-        open."""
+        """Close everything, also an answer without an end, which `close` leaves open."""
         self.close()
         self._end_guard()
 

@@ -210,8 +210,7 @@ def _transport(
 
 
 def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datetime) -> Updater:
-    """Return the client of TUF, which starts from the pinned root and the metadata trusted
-    since."""
+    """Return the client of TUF: it trusts the pinned root, and what that led it to since."""
     from tuf.ngclient import Updater, UpdaterConfig
 
     path = state / _PINNED_ROOT

@@ -185,10 +185,8 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
         yield PROCESS_REPLACEABLE.found(process.label, _plain_path(enclave.writable))
     mode = enclave.file(KEY_FILE).mode
     if mode & 0o077:
-        path = f"{enclave.keystore}/enclaves/{enclave.name.strip('/')}/{KEY_FILE}"
-        yield PROCESS_KEY_READABLE.found(
-            process.label, f"the mode of '{_plain_path(path)}' is {mode:04o}"
-        )
+        path = _plain_path(str(enclave_path(Path(enclave.keystore), enclave.name) / KEY_FILE))
+        yield PROCESS_KEY_READABLE.found(process.label, f"the mode of '{path}' is {mode:04o}")
     yield from _unread_files(process, enclave)
 
 

@@ -180,8 +180,7 @@ _LONGEST_PATH = 200
 def vulnerability_metrics(
     running: RunningProcesses, advisories: Sequence[Advisory] | None = None
 ) -> tuple[Metric, Metric]:
-    """Return the numbers of known vulnerabilities by DDS release, and of libraries of unknown
-    version."""
+    """Return how many vulnerabilities DDS releases have, and how many releases are unknown."""
     numbers: dict[tuple[str, str], int] = {}
     unknown: Counter[str] = Counter()
     for library in _users(running):

@@ -169,8 +169,7 @@ def _print_closed(root: Path, changes: Sequence[Change]) -> None:
 
 
 def rights_lines(root: Path, replaced: Sequence[ReplacedRights], *, dry_run: bool) -> Iterator[str]:
-    """Yield a line for every right that an enclave loses or gains; robots of a fleet share a
-    line."""
+    """Yield a line for each lost or gained right; the robots of a fleet share a line."""
     from sros_tool.fleet.robots import folded
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.reader import Keystore

@@ -533,8 +533,7 @@ class _Examiner:
         )
 
     def _other_folder(self, path: str, remedy: str) -> str:
-        """Return the remedy if an enclave's folder, which a log reports missing, is not in this
-        keystore."""
+        """Return the remedy if this keystore lacks a folder that a log reports missing."""
         place, inside, name = path.rpartition("/enclaves/")
         if not inside or self._keystore is None:
             return ""

@@ -505,8 +505,7 @@ class _Folding(NamedTuple):
 
 
 def _foldings(fleet: Fleet, enclave: str, text: str) -> list[tuple[_Folding, str]]:
-    """Return a line folded by its robot, by the one other robot, and by both; also the robot's
-    name."""
+    """Return a line folded by its robot, the one other robot, and both, with the robot's name."""
     own = robot_of(fleet, enclave)
     named = [robot for robot in named_robots(fleet, "", text) if robot != own]
     other = named[0] if len(named) == 1 else None

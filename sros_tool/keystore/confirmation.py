@@ -481,7 +481,7 @@ def refusals(root: Path) -> dict[str, RefusedMessage]:
 
     Raises:
         DocumentError: the file cannot be read, or is damaged: then it is unknown which robots are
-        current.
+            current.
     """
     path = root / REFUSED
     if not os.path.lexists(path):

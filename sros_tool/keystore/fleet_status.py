@@ -424,8 +424,7 @@ class FleetStatus:
         return all(robot.settled for robot in self.robots)
 
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
-        """Return a copy with the pending actions, in which robots that were silent for long are
-        offline.
+        """Return a copy with what is to be done, in which robots silent for long are offline.
 
         These are the robots whose last confirmation is older than ``max_age``; without it, the
         robots that fetch and sent nothing for more than a day.  Messages of robots that fetch are
@@ -524,8 +523,7 @@ class _ComparedRobot(NamedTuple):
         return self.received.confirmation if self.received else None
 
     def running(self) -> Mapping[str, RunningFiles] | None:
-        """Return what processes of the robot's enclaves have loaded; None if it was not
-        reported."""
+        """Return what the processes of its enclaves have loaded; None if not reported."""
         if self.confirmed is None or self.confirmed.running is None:
             return None
         running = self.confirmed.running

@@ -389,13 +389,11 @@ class LedgerFile:
         return self._files
 
     def reading_for_append(self) -> _Reading:
-        """Return what is needed to add lines; its ``ledger`` may lack
-        entries."""
+        """Return what is needed to add lines; its ``ledger`` may lack entries."""
         return self._readings.get(_EVERY) or self._reading(_NONE, ())
 
     def index_with(self, new: int, reading: _Reading) -> IndexUpdate | None:
-        """Return an index update for ``new`` more lines of the ledger; None if the ledger gets no
-        index.
+        """Return the update of the index for ``new`` more lines; None without an index.
 
         ``reading`` is from `reading_for_append`.  A ledger with a fault gets no index: only a
         reader of all lines knows what is certain.

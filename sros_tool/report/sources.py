@@ -408,8 +408,7 @@ def _pictured(finding: Finding, enclaves: Container[str]) -> PicturedFinding:
 
 
 def _finding_text(finding: Finding, about: str = "") -> str:
-    """Return the file name, the line, the subject (``about``) and the text of a finding, as one
-    text."""
+    """Return a finding as one text: file name, line, subject (``about``) and text."""
     place = f"{Path(finding.file).name}:{finding.line}" if finding.line else ""
     return ": ".join(filter(None, (place, about, finding.text)))
 

@@ -170,8 +170,7 @@ class Participant:
         return tuple(sorted(self._discovered(_BUILTIN_SUBSCRIPTIONS, _publication_of)))
 
     def process_ids(self) -> dict[str, int]:
-        """Map the discovered participants of this machine to their process ids, where they state
-        these.
+        """Map the discovered participants of this machine to the process ids that they state.
 
         A participant is the first 12 bytes of its identifier, in hexadecimal.
         """

@@ -164,8 +164,7 @@ class CollectedInbox(NamedTuple):
 
     @property
     def complete(self) -> bool:
-        """Whether no message, request or release was refused, and everything that may be signed is
-        signed."""
+        """Whether nothing was refused, and everything that may be signed is signed."""
         if self.published and self.published.refused:
             return False
         requests = (request for robot in self.robots for request in robot.requests)
@@ -470,8 +469,7 @@ class _Verifier:
         )
 
     def _arrival(self, file: _File, last: Received | None) -> datetime:
-        """Return when a message arrived: when its file was written, but not before the last
-        message.
+        """Return when the file of a message was written, but not before the last message.
 
         Messages may lie in the inbox for long before somebody takes them in.
         """
@@ -634,8 +632,7 @@ class _Renewals:
     def _decide_request(
         self, robot: Robot, message: _Verified, request: SigningRequest
     ) -> tuple[str, str]:
-        """Return the outcome of a request, and why; if the outcome is "renewed", it has to be
-        signed.
+        """Return the outcome of a request, and why; a "renewed" one still has to be signed.
 
         Raises:
             SrosError: it must not be signed.

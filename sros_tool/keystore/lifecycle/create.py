@@ -1044,8 +1044,7 @@ class _EnclaveMaker:
         return certificate
 
     def _not_valid(self) -> KeystoreError:
-        """Return the error that names all enclaves of the change with a certificate that is not
-        valid now."""
+        """Return the error that names all enclaves whose certificates are not valid now."""
         found: dict[str, Window] = {}
         for name in self._names:
             with suppress(SrosError):

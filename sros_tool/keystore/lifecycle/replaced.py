@@ -151,8 +151,7 @@ class IssuedEarlier:
                 self._expiry[kind] = max(self._expiry.get(kind, ""), entry.not_after)
 
     def until(self, name: str, known: datetime, *kinds: str) -> datetime:
-        """Return the time until which files of all ``kinds`` of an enclave work, or ``known`` if
-        later.
+        """Return until when files of all ``kinds`` of an enclave work, at least ``known``.
 
         ``kinds`` are "certificate" and "permissions"; revoked certificates do not work.
         """
