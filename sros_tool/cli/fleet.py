@@ -554,9 +554,9 @@ def _status(
     revoked; missing; or unknown (never issued by this keystore). Processes use new files only
     after a restart. Confirmations by the Ansible collection and `sros agent` say which restarts
     are due, confirmations by `sros fleet report` do not. A robot without a recent confirmation is
-    offline. Robots with the same state share a line; a robot that reports a release which was never
-    published has its own. The last line counts the known vulnerabilities of the robots' DDS,
-    by the advisories of sros; --robot and --advisories list them.
+    offline. Robots with the same state share a line. A robot that reports a release which was never
+    published is named even if its files are current. The last line counts the known vulnerabilities
+    of the robots' DDS, by the advisories of sros; --robot and --advisories list them.
 
     The revocation list is in force on a robot that has the list and reports that no restart is
     due. A robot does not report which earlier files a process has loaded. So after any change of
