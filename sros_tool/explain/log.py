@@ -27,7 +27,7 @@ from sros_tool.explain.explanation import likely_names, remedy
 from sros_tool.faults import Fault
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.known_keys import enclaves_by_identity
-from sros_tool.keystore.layout import is_keystore
+from sros_tool.keystore.layout import ROUTER_FILE, is_keystore
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.reader import Keystore
@@ -148,6 +148,19 @@ class SearchedKeystore:
         return self._by_node.get(node, ())
 
     @cached_property
+    def zenoh_routers(self) -> frozenset[str]:
+        """The enclaves of Zenoh routers: by the settings, by name without them, and by files."""
+        from sros_tool.zenoh.configuration import ZenohNetwork  # most logs are not of Zenoh
+
+        settings = self._keystore.settings
+        network = settings.zenoh if settings else None
+        names = set((network or ZenohNetwork()).router_names())
+        for name in self._keystore.names:
+            if (self._keystore.folder(name) / ROUTER_FILE).exists():
+                names.add(name)
+        return frozenset(names)
+
+    @cached_property
     def rotates(self) -> bool:
         """Whether a CA rotation is in the stage in which the new CAs have issued all files."""
         try:
@@ -258,7 +271,8 @@ def explain_log(
     hits = _strongest(_hits(_joined_lines(lines)), reported)
     findings = [examiner.message(group) for group in _grouped(hits) if examiner.matters(group[0])]
     findings += [examiner.denial(denial, named) for denial, named in denials]
-    findings += _dropped(lines, root)
+    own = find("")
+    findings += _dropped(lines, root, own.name if own else "", keystore)
     return tuple(sorted(findings, key=lambda finding: finding.line))
 
 
@@ -419,18 +433,33 @@ _GRAPH: Mapping[tuple[str, bool], str] = {
 }
 
 
-def _dropped(lines: Iterable[str], root: str) -> Iterator[LogFinding]:
-    """Yield a finding for each right whose lack made Zenoh drop messages."""
+def _dropped(
+    lines: Iterable[str], root: str, own: str, keystore: SearchedKeystore | None
+) -> Iterator[LogFinding]:
+    """Yield a finding for each right whose lack made Zenoh drop messages.
+
+    ``own`` is the enclave of the process that wrote the log, "" if unknown.  Its rules for its
+    router are its own rights: where these drop a message, the process itself lacks a right.
+    """
     numbered = ((n, *labelled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
-    groups: dict[tuple[str, str, str], list[DroppedMessage]] = {}
+    groups: dict[tuple[str, str, bool, str], list[DroppedMessage]] = {}
+    routers = keystore.zenoh_routers if keystore else frozenset[str]()
     for message in dropped_messages(numbered):
+        lacks_own = message.name in routers and own not in routers
+        kind = message.message, message.ingress is not lacks_own
         _, name = name_of_key(message.key)
-        right = _DROPPED.get((message.message, message.ingress), "") if name else ""
-        what = f"{right} {name}" if right else _GRAPH.get((message.message, message.ingress), "")
+        right = _DROPPED.get(kind, "") if name else ""
+        what = f"{right} {name}" if right else _GRAPH.get(kind, "")
         what = what or f"pass {message.message} of {message.key}"
-        groups.setdefault((message.process, message.name or message.zid, what), []).append(message)
-    for (process, who, what), messages in groups.items():
+        group = message.process, message.name or message.zid, lacks_own, what
+        groups.setdefault(group, []).append(message)
+    for (process, who, lacks_own, what), messages in groups.items():
         first = messages[0]
+        if lacks_own:
+            enclave, lacking = own, own or "the process that wrote this log"
+        else:
+            enclave = first.name
+            lacking = enclave or f"the process with the zid {who}"
         yield LogFinding(
             "zenoh-dropped",
             None,
@@ -438,15 +467,16 @@ def _dropped(lines: Iterable[str], root: str) -> Iterator[LogFinding]:
             len(messages),
             f"{first.message} ({'ingress' if first.ingress else 'egress'}) on {first.key}",
             process,
-            first.name,
-            f"{'' if first.name else 'the process with the zid '}{who} may not {what}: the process "
-            "that logged this drops the message by its rules, and reports it nowhere else",
-            _dropped_finding(first, what, root),
+            enclave,
+            f"{lacking} may not {what}: the process that logged this drops the message by its "
+            "rules, and reports it nowhere else",
+            _dropped_finding(first, enclave, what, root),
             zenoh=True,
         )
 
 
-def _dropped_finding(dropped: DroppedMessage, what: str, root: str) -> str:
+def _dropped_finding(dropped: DroppedMessage, enclave: str, what: str, root: str) -> str:
+    """Return the remedy where ``enclave``, "" if unknown, may not do ``what``."""
     if not dropped.name:
         return (
             "The log line with `on Interface(...)+CertCommonName(...)` and this zid has the name "
@@ -459,8 +489,10 @@ def _dropped_finding(dropped: DroppedMessage, what: str, root: str) -> str:
             "files are up to date."
         ).replace("KEYSTORE", quote(root) if root else "KEYSTORE")
     verb, _, name = asked.partition(" ")
-    command = f"sros explain {quote(root) if root else 'KEYSTORE'} {quote(dropped.name)}"
-    return f"`{command} {verb} {quote(name)} --vendor zenoh` shows what is missing in the policy."
+    who = quote(enclave) if enclave else "ENCLAVE"
+    command = f"sros explain {quote(root) if root else 'KEYSTORE'} {who}"
+    shown = f"`{command} {verb} {quote(name)} --vendor zenoh` shows what is missing in the policy"
+    return f"{shown}." if enclave else f"{shown}; ENCLAVE is the enclave of that process."
 
 
 # ── examining ──────────────────────────────────────────────────────────────────────────────

@@ -180,3 +180,22 @@ def test_hostile_lines_end_soon() -> None:
         ]
     )
     assert len(explained(text)) <= 2
+
+
+@pytest.mark.parametrize(
+    ("message", "right"), [("Put (egress)", "publish"), ("Put (ingress)", "subscribe")]
+)
+def test_a_node_that_drops_what_it_has_for_its_router_lacks_the_right_itself(
+    keystore: Path, tmp_path: Path, message: str, right: str
+) -> None:
+    log = tmp_path / "talker.log"
+    named = NAMED.replace("/talker)", "/router)")
+    log.write_text(f"{named}unauthorized to {message} on 0/x/t/h\n{CACHED}{message} on {SECRET}\n")
+    for enclave, who in (("/a", "/a"), ("", "ENCLAVE")):
+        place = [keystore, enclave] if enclave else [keystore]
+        found = json.loads(sros("explain", *place, "--log", log, "--json").out)["findings"]
+        assert all(each["enclave"] == (enclave or None) for each in found)
+        assert f"may not {right} /secret" in found[-1]["cause"]
+        assert not found[-1]["cause"].startswith("/router")
+        command = f"sros explain {keystore} {who} {right} /secret --vendor zenoh"
+        assert command in found[-1]["remedy"]
