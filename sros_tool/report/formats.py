@@ -236,7 +236,7 @@ def _card(card: Card) -> Iterable[str]:
         right = card.width - (32 if card.level in _LOCKS else 12) - 18 * number
         yield f'<text class="tag" x="{right}" y="{PAD + 12}" text-anchor="end">{tag}</text>'
     for note in card.notes:
-        lack = " lack" if note == lacks else ""
+        lack = " lack" if note == lacks or (names and note.startswith("everybody may ")) else ""
         yield f'<text class="small{lack}" x="{x}" y="{y - 1}">{escape(note)}</text>'
         y += SMALL
     yield "</g>"
@@ -399,15 +399,19 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
             who += f" by {', '.join(map(code, edge.by))}" if edge.by else ""
             who += f" ({', '.join(edge.parts)})" if edge.parts else ""
             ends[0 if edge.sends else 1].append(who)
-    lacks = {(name.kind, name.name): name.lacks for name in picture.names}
+    known = {(name.kind, name.name): name for name in picture.names}
     lines = [f"### {plain(picture.title)}: who may do what", ""]
     lines += [f"- {plain(headline)}" for headline in picture.headlines]
     lines += ["", "| name | may send or call | may receive or serve |", "| --- | --- | --- |"]
     for (kind, name), ends in rows.items():
         cells = [f"{KIND_NAMES[kind]} {code(name)}"]
-        for end, lack in zip(ends, (Lack.SENDER, Lack.RECEIVER), strict=True):
-            nobody = ["nobody"] if lacks.get((kind, name)) is lack else []
-            cells.append(", ".join(dict.fromkeys((*nobody, *end))))
+        stated = known[kind, name]
+        controls = stated.protection.write_control, stated.protection.read_control
+        sides = Lack.SENDER, Lack.RECEIVER
+        for end, lack, controlled in zip(ends, sides, controls, strict=True):
+            first = ["everybody with an identity"] if not controlled else []
+            first += ["nobody"] if stated.lacks is lack else []
+            cells.append(", ".join(dict.fromkeys((*first, *end))))
         lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
     return "\n".join((*lines, ""))
 

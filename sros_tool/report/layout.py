@@ -311,7 +311,7 @@ class _Draft:
         """Return the only node, apart from onlookers, with a right to these names, or ""."""
         looking = {tie.node for tie in bundle.ties if self._looks(tie)}
         drawn = {tie.node for tie in bundle.ties if not self._looks(tie)}
-        if not all(map(is_plain, bundle.ties)):
+        if not all(map(is_plain, bundle.ties)) or bundle.protection.open_text:
             return ""
         nodes = {node for name in bundle.names for node in self._everybody[bundle.kind, name]}
         nodes -= looking - drawn
@@ -507,6 +507,8 @@ def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = (
     titles, notes = _names_title(bundle)
     lines = tuple(line for title in titles for line in wrapped(title, _NAMES_LETTERS))
     notes += more
+    if bundle.protection.open_text:
+        notes += (bundle.protection.open_text,)
     if bundle.lacks:
         notes += (lack_text(bundle.kind, bundle.lacks),)
     return Card(

@@ -67,6 +67,12 @@ class Protection:
     write_control: bool = True
     """Whether permissions control who may write."""
 
+    @property
+    def open_text(self) -> str:
+        """What everybody with an identity may do: "everybody may send and receive", or ""."""
+        sides = ["send"] * (not self.write_control) + ["receive"] * (not self.read_control)
+        return f"everybody may {' and '.join(sides)}" if sides else ""
+
 
 UNKNOWN = Protection(WireLevel.UNKNOWN)
 """The protection without a known governance, such as for a policy alone."""

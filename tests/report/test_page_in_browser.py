@@ -430,6 +430,7 @@ def test_axe_finds_nothing(browser: Browser, robot_page: Path, built: Path, size
                 page.select_option("#theme", theme)
                 check(f"{where}, {theme}", runOnly=["color-contrast"])
 
+        page.click("#tab-map")  # a phone shows the table first
         check("map")
         check_contrast("map")
         page.fill("#search", "cmd_vel")
@@ -460,6 +461,7 @@ def test_no_text_leaves_its_card_and_nothing_is_wider_than_the_window(
         });
     }).map(card => card.textContent)"""
     with opened(browser, robot_page, size) as page:
+        page.click("#tab-map")
         for scene in ("0", "1"):
             page.evaluate("document.querySelectorAll('.fold').forEach(f => f.open = true)")
             page.select_option("#scene", scene)
@@ -553,6 +555,7 @@ def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -
 def test_fit_shows_the_whole_map(browser: Browser, robot_page: Path, size: str) -> None:
     _, height = SIZES[size]
     with opened(browser, robot_page, size) as page:
+        page.click("#tab-map")
         page.click("#zoom-fit")
         box = page.locator("#map").bounding_box()
         room = page.locator("#canvas").bounding_box()
@@ -586,11 +589,38 @@ def test_the_table_has_every_name_and_those_that_only_one_side_may_use(
         page.click("#tab-names")
         assert "1 name may be used by one side only." in page.inner_text("#names")
         rows = page.locator("#names tbody tr")
-        assert ["/lost" in each for each in rows.all_inner_texts()] == [True, False]
+        assert ["/lost" in each for each in rows.all_inner_texts()] == [False, True]
+        page.fill("#search-names", "USED")
+        assert rows.count() == 1
+        page.fill("#search-names", "")
         page.check("#only-lacking")
         assert "nobody may subscribe" in "".join(rows.all_inner_texts()) and rows.count() == 1
         page.click("#names .link-button")
         assert "nobody may subscribe" in details(page)
+
+
+def test_a_phone_shows_first_who_may_drive_and_what_everybody_may_do(
+    browser: Browser, open_keystores: dict[str, Path], tmp_path: Path
+) -> None:
+    path = tmp_path / "open.html"
+    sros("view", open_keystores["some names"], "-o", path).ok()
+    shown = sros("view", open_keystores["some names"], "--format", "markdown").out
+    assert (
+        "| topic `/cmd_vel` | everybody with an identity, `/mobile_robot/velocity_mux` |" in shown
+    )
+    with opened(browser, path, "phone") as page:
+        first, *others = page.locator("#names tbody tr").all_inner_texts()
+        assert first.split()[1:9] == [
+            *("/cmd_vel", "everybody", "with", "an", "identity"),
+            *("/mobile_robot/velocity_mux", "/mobile_robot/base", "/mobile_robot/monitor"),
+        ]
+        (scan,) = (row for row in others if "/scan" in row.split())
+        assert scan.split()[1:7] == [
+            *("/scan", "/mobile_robot/lidar", "everybody", "with", "an", "identity"),
+        ]
+        page.click("#names .link-button >> nth=0")
+        assert "everybody may send" in details(page)
+        assert "everybody may send" in " ".join(texts(page, "#map .card.names"))
 
 
 def test_it_prints_every_part(browser: Browser, robot_page: Path) -> None:

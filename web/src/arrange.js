@@ -50,7 +50,7 @@ export function namesCard(id, bundle, notes = []) {
     level: bundle.protection.level,
     members: bundle.names,
     lines: shown.flatMap((name) => wrapped(name, 35)),
-    notes: [...(rest ? [`and ${rest} more ${KINDS[bundle.kind]}s`] : []), ...notes, ...(bundle.lacks ? [bundle.lacks] : [])],
+    notes: [...(rest ? [`and ${rest} more ${KINDS[bundle.kind]}s`] : []), ...notes, ...[bundle.open, bundle.lacks].filter(Boolean)],
     tags: "",
     lacks: bundle.lacks,
   };

@@ -174,10 +174,11 @@ export function nameDetails(model, kind, name, act) {
     );
   }
   if (bundle.lacks) parts.push(el("p", {}, chip("warning", bundle.lacks)));
-  for (const [title, wanted] of [
-    [kind === "topics" || kind === "dds" ? "May publish" : "May call", (tie) => !tie.deny && sends(tie)],
-    [kind === "topics" || kind === "dds" ? "May listen" : kind === "actions" ? "May carry out, or listen" : "May serve", (tie) => !tie.deny && !sends(tie)],
-    ["Denied", (tie) => tie.deny],
+  if (bundle.open) parts.push(el("p", {}, chip("warning", bundle.open)));
+  for (const [title, wanted, controlled] of [
+    [kind === "topics" || kind === "dds" ? "May publish" : "May call", (tie) => !tie.deny && sends(tie), protection.write_control],
+    [kind === "topics" || kind === "dds" ? "May listen" : kind === "actions" ? "May carry out, or listen" : "May serve", (tie) => !tie.deny && !sends(tie), protection.read_control],
+    ["Denied", (tie) => tie.deny, true],
   ]) {
     const ties = bundle.ties.filter(wanted);
     if (!ties.length && title === "Denied") continue;
@@ -192,8 +193,10 @@ export function nameDetails(model, kind, name, act) {
         chips(model, { ...tie, deny: false }),
       ),
     );
-    const nobody = el("p", { class: "soft", text: "Nobody." });
-    parts.push(section(`${title} (${ties.length})`, ties.length ? longList(items) : nobody));
+    const nobody = el("p", { class: "soft", text: controlled ? "Nobody." : "Nobody is named." });
+    const everybody = controlled ? null : el("p", { text: "Everybody with an identity; permissions allow it to:" });
+    const heading = controlled ? `${title} (${ties.length})` : `${title} (everybody)`;
+    parts.push(section(heading, ...[everybody, ties.length ? longList(items) : nobody].filter(Boolean)));
   }
   const others = bundle.names.filter((each) => each !== name);
   if (others.length) {

@@ -186,7 +186,7 @@ function drawCard(group, card, problems) {
     y += 16;
   }
   for (const text of card.notes) {
-    const kind = card.lacks && text.startsWith("nobody may ") ? "small lack" : "small";
+    const kind = names && /^(nobody|everybody) may /.test(text) ? "small lack" : "small";
     group.append("text").attr("class", kind).attr("x", names ? 32 : 12).attr("y", y - 1).text(`${text} `);
     y += 14;
   }

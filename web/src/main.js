@@ -344,10 +344,11 @@ function start() {
     }
   });
   window.addEventListener("resize", () => zoom(0));
-  // On a small screen the map comes first.
-  if (window.innerWidth <= 720) for (const fold of document.querySelectorAll(".fold")) fold.open = false;
+  // A small screen has no room for the columns of the whole map, and the table fits.
+  const small = window.innerWidth <= 720;
+  if (small) for (const fold of document.querySelectorAll(".fold")) fold.open = false;
   fillLists();
-  showTab("map");
+  showTab(small && !model.overlay && model.scenes[0].id !== "focus" ? "names" : "map");
   showMap();
   document.body.dataset.ready = "true";
 }

@@ -5,8 +5,22 @@ import { KINDS, LEVELS } from "./words.js";
 
 const SHOWN = 4;
 const MOST = 400;
+// What usually moves a robot stands first, then what is open to everybody; what only one side may
+// use is last.  Each part is in the order of names.
+const MOVES = /(^|\/)(cmd_vel|[^/]*commands?$|joint_trajectory|follow_joint_trajectory)/;
 
-function list(texts, none) {
+function rank(row) {
+  return row.names.some((name) => MOVES.test(name)) ? 0 : row.all_send || row.all_receive ? 1 : row.lacks ? 3 : 2;
+}
+
+function mentions(row, text) {
+  return [row.names, row.senders, row.receivers, row.denied].some((all) =>
+    all.some((name) => name.toLowerCase().includes(text)),
+  );
+}
+
+function list(texts, none, all) {
+  if (all) return [el("div", { class: "lack", text: "everybody with an identity" }), ...(texts.length ? list(texts, none) : [])];
   if (!texts.length) return el("span", { class: "soft", text: none });
   const rest = texts.length - SHOWN;
   return [
@@ -18,20 +32,27 @@ function list(texts, none) {
 // `lacking` is the number of names that only one side may use;
 // `opens(kind, name)` returns what shows a name, or nothing for one that stands for several.
 export function namesTable(rows, lacking, opens) {
+  const ordered = rows.map((row) => [rank(row), row]).sort((a, b) => a[0] - b[0]).map(([, row]) => row);
   const body = el("tbody");
+  const search = el("input", { type: "search", id: "search-names", autocomplete: "off", spellcheck: "false", placeholder: "such as cmd_vel" });
   const only = el("input", { type: "checkbox", id: "only-lacking" });
   const basics = el("input", { type: "checkbox", id: "with-common" });
   const status = el("p", { class: "soft", role: "status" });
   function show() {
-    const fit = rows.filter((row) => (basics.checked || !row.common) && (row.lacks || !only.checked));
+    const text = search.value.trim().toLowerCase();
+    const fit = ordered.filter(
+      (row) => (basics.checked || !row.common) && (row.lacks || !only.checked) && (!text || mentions(row, text)),
+    );
     body.replaceChildren(...fit.slice(0, MOST).map((row) => line(row, opens)));
     status.textContent = fit.length > MOST ? `The first ${MOST} of ${fit.length} rows.` : counted(fit.length, "row");
   }
+  search.addEventListener("input", show);
   only.addEventListener("change", show);
   basics.addEventListener("change", show);
   show();
   const head = ["Name", "May send", "May receive", "Protection"].map((text) => el("th", { scope: "col", text }));
   return [
+    el("label", { class: "search" }, "Name or enclave ", search),
     el("p", {}, lacking ? `${counted(lacking, "name")} may be used by one side only.` : "Every name has a sender and a receiver."),
     el("p", { class: "choices" }, el("label", {}, only, " only names without a sender or a receiver"), el("label", {}, basics, " also names that every node needs")),
     status,
@@ -58,8 +79,8 @@ function line(row, opens) {
       names,
       rest > 0 ? el("div", { class: "soft", text: `and ${rest} more` }) : null,
     ),
-    el("td", { "data-head": "May send" }, list(row.senders, "nobody")),
-    el("td", { "data-head": "May receive" }, list(row.receivers, "nobody"), denied),
+    el("td", { "data-head": "May send" }, list(row.senders, "nobody", row.all_send)),
+    el("td", { "data-head": "May receive" }, list(row.receivers, "nobody", row.all_receive), denied),
     el("td", { "data-head": "Protection" }, LEVELS[row.level].replace("protection ", "")),
   );
 }
