@@ -228,7 +228,8 @@ def diff_policy(
     terms; the signature of permissions is verified if the permissions CA is next to them. "!" is a
     right of B that needs a counterpart, such as a subscriber, which only A has. If A or B covers
     only some enclaves, only these are compared. Lines that differ only in the robot of a fleet are
-    shown as one. For two policies, the protection that they demand is compared, too.
+    shown as one. For two policies, the protection that they demand is compared, too; of two
+    keystores, whether the governance differs.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
 
@@ -266,7 +267,7 @@ def diff_policy(
     with progress("reading"):
         fleets = fleets_of(fleet_files)
         first, second = load_rights(a, fleets[0]), load_rights(b, fleets[-1])
-    compared = compare_sources(first, second)
+    compared = compare_sources(first, second, governance=True)
     difference, protections = compared.rights, compared.protections
     if form == "json":
         print_json(policy_difference(first, second, compared))
@@ -288,6 +289,9 @@ def diff_policy(
             echo(f"the ROS domains of {number} differ", err=True)
         if protections:
             echo("what the policies say about protection differs", err=True)
+        if compared.governance_differs:
+            command = f"sros diff_policy --no-new-access {quote(str(a))} {quote(str(b))}"
+            echo(f"the governance differs: `{command}` shows what B opens", err=True)
     print_notes((*first.notes, *second.notes))
     return 0 if not compared and first.sound and second.sound else 1
 
@@ -319,6 +323,8 @@ def rights_markdown(first: RightsSource, second: RightsSource, compared: Sources
             parts.append(bounded(map(code, signed), _MOST_LINES, rest))
     if unanswered := list(unanswered_lines(compared, second.fleet)):
         parts += ["**Nobody answers any more**", bounded(map(code, unanswered), _MOST_LINES, rest)]
+    if compared.governance_differs:
+        parts.append("**The governance differs**: see `sros diff_policy --no-new-access`")
     notes = [f"{note.id}: {note.text}" for note in (*first.notes, *second.notes)]
     if notes:
         parts += ["**Notes**", bounded(map(code, notes), 4000, rest)]

@@ -27,6 +27,7 @@ from sros_tool.fleet.robots import Fleet, robot_of
 from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import (
     CLOSED_OBSERVER,
+    GOVERNANCE_P7S,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
     ROUTER_FILE,
@@ -576,6 +577,8 @@ class PolicyDifference(NamedTuple):
     enclave of B."""
     domains: Sequence[DifferentDomains]
     """Enclaves of both sides whose ROS domains differ; only where both sides state them."""
+    governance_differs: bool
+    """Whether A and B are keystores, no exports, whose governance differs or cannot be read."""
 
 
 class SourcesDifference(NamedTuple):
@@ -590,16 +593,22 @@ class SourcesDifference(NamedTuple):
     """As in `PolicyDifference`; empty if only some enclaves were compared."""
     domains: Sequence[DifferentDomains] = ()
     """As in `PolicyDifference`."""
+    governance_differs: bool = False
+    """As in `PolicyDifference`."""
 
     def __bool__(self) -> bool:
-        return bool(self.rights or self.protections or self.domains)
+        parts = self.rights, self.protections, self.domains, self.governance_differs
+        return any(map(bool, parts))
 
 
-def compare_sources(first: RightsSource, second: RightsSource) -> SourcesDifference:
+def compare_sources(
+    first: RightsSource, second: RightsSource, *, governance: bool = False
+) -> SourcesDifference:
     """Return the difference between two sources of rights.
 
     If a source is only for some enclaves, only these are compared.  The observer of a closed robot
-    is left out, because only its keystore and export have it.
+    is left out, because only its keystore and export have it.  With ``governance``, the governance
+    documents of two keystores are compared, too.
     """
     first, second = _without_observer(first, second), _without_observer(second, first)
     scope = None
@@ -609,7 +618,20 @@ def compare_sources(first: RightsSource, second: RightsSource) -> SourcesDiffere
     unanswered = _unanswered(first.rights, second.rights, difference) if scope is None else ()
     protections = _protection_differences(first, second)
     domains = _domain_differences(first, second, scope)
-    return SourcesDifference(scope, difference, protections, unanswered, domains)
+    governed = governance and _governance_differs(first, second)
+    return SourcesDifference(scope, difference, protections, unanswered, domains, governed)
+
+
+def _governance_differs(first: RightsSource, second: RightsSource) -> bool:
+    """Return whether the governance of two keystores differs, or cannot be read."""
+    keystores = [Keystore(s.path) for s in (first, second) if s.kind == "keystore"]
+    if len(keystores) < 2 or not all(keystore.has(GOVERNANCE_P7S) for keystore in keystores):
+        return False  # an export has the governance in the folders of its enclaves
+    try:
+        before, after = (keystore.governance for keystore in keystores)
+    except SrosError:
+        return True
+    return before != after
 
 
 def _without_observer(source: RightsSource, other: RightsSource) -> RightsSource:
@@ -721,6 +743,7 @@ def policy_difference(
         [DifferentProtection(_SIDES[sign], stated) for sign, stated in compared.protections],
         compared.unanswered,
         compared.domains,
+        compared.governance_differs,
     )
 
 

@@ -16,7 +16,7 @@ from sros_tool.policy.merge import merge_into
 from sros_tool.policy.minimize import minimize
 from sros_tool.policy.model import ALLOW, Policy, stated_protections
 from sros_tool.policy.rights import Right
-from tests.support.harness import sros
+from tests.support.harness import copy_of, sros
 
 SIGN, ENCRYPT = '<?sros protect="sign"?>', '<?sros protect="encrypt"?>'
 
@@ -194,3 +194,21 @@ def test_policies_that_differ_in_it_differ(tmp_path: Path) -> None:
     value = json.loads(sros("diff_policy", one, other, "--json").out)
     assert not value["equal"]
     assert [each["level"] for each in value["protections"]] == ["ENCRYPT", "SIGN"]
+
+
+def test_a_different_governance_of_equal_rights_is_said(keystore: Path, tmp_path: Path) -> None:
+    opened = copy_of(keystore, tmp_path / "open")
+    assert sros("diff_policy", keystore, opened).ok().err == "the rights are the same\n"
+    sros(
+        "update_keystore",
+        opened,
+        "--set",
+        "protection.default.read_access_control=false",
+        "--allow-looser",
+    ).ok()
+    ended = sros("diff_policy", keystore, opened)
+    assert (ended.status, ended.out) == (1, "")
+    command = f"sros diff_policy --no-new-access {keystore} {opened}"
+    assert f"the governance differs: `{command}` shows what B opens" in ended.err
+    found = json.loads(sros("diff_policy", keystore, opened, "--json").out)
+    assert (found["equal"], found["governance_differs"]) == (False, True)
