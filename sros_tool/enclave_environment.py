@@ -737,18 +737,19 @@ def other_node(
 ) -> tuple[Note, ...]:
     """Return a note if a command gives its nodes a name that the enclave's permissions lack.
 
-    Without a ledger with the permissions, only nodes show that offer their standard services: then
-    a node is missed only if the permissions have its name in another namespace.
+    A command that names no namespace counts as one for "/", if it certainly starts nodes.  Without
+    a ledger with the permissions, only nodes show that offer their standard services: then a node
+    is missed only if the permissions have its name in another namespace.
     """
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.rights import RecordedRights
     from sros_tool.policy.patterns import overlap
     from sros_tool.policy.rights import nodes_from_text, nodes_of_rights
-    from sros_tool.runtime.environment import node_rules
+    from sros_tool.runtime.environment import node_rules, starts_nodes
     from sros_tool.translate import grant_rights
 
     ns, name = node_rules(command)
-    if not (ns or name):
+    if not (ns or name or starts_nodes(command)):
         return ()
     keystore = Keystore(root)
     state = keystore.enclave(enclave, now=now)
@@ -761,15 +762,20 @@ def other_node(
         known += nodes_from_text(recorded.nodes)
     else:
         known = tuple(node for node in known if name and overlap(node.name, name))
-    if not known or any(
-        (not ns or overlap(node.ns, f"/{ns.strip('/')}")) and (not name or overlap(node.name, name))
-        for node in known
-    ):
+    named = [node for node in known if not name or overlap(node.name, name)]
+    if not known or any(overlap(node.ns, f"/{ns.strip('/')}") for node in named):
         return ()
+    nodes = first_few([_full_name(*node) for node in named or known], 3)
+    if named and not ns:
+        text = (
+            f"the command names no namespace, and the permissions of enclave {enclave} are for "
+            f"{nodes}: write `-r __ns:={quote(named[0].ns)}` after --ros-args, unless the program "
+            "sets its namespace itself."
+        )
+        return (Note("run.other-node", text),)
     started = f"the node {_full_name(ns, name)}" if ns and name else f"a node in the namespace {ns}"
     if not ns:
         started = f"a node with the name {name}"
-    nodes = first_few([_full_name(*node) for node in known], 3)
     text = (
         f"the command starts {started}, which may not offer its parameter services: the "
         f"permissions of enclave {enclave} are for the node{'s' * (len(known) > 1)} {nodes}. "

@@ -1002,8 +1002,9 @@ def _silence(log: str) -> str:
         )
     return (
         f"a node ran in '{found['folder']}'. Where its peers refuse it, it often logs nothing: "
-        "explain the log of the other node, too, and compare the identity CA and the domains in "
-        "`sros inspect KEYSTORE ENCLAVE` of both"
+        "explain the log of the other node, too. `sros check FOLDER OTHER` finds keystores and "
+        "exports that do not trust each other; `sros explain KEYSTORE --who publish NAME` says "
+        "whether anybody may send"
     )
 
 

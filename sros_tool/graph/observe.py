@@ -203,7 +203,7 @@ def _require(module: str) -> None:
         f"Python is {sys.executable}.",
         "On a machine with ROS 2, source its setup file first (. /opt/ros/jazzy/setup.bash); "
         "elsewhere: `pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-std-msgs`. "
-        "A policy can still be learned from logs with --from-log.",
+        "A policy can still be learned from logs: `sros generate_policy POLICY --from-log LOG`.",
     )
 
 

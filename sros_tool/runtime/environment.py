@@ -188,16 +188,19 @@ def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
     commands that already name an enclave, are returned unchanged.
     """
     command = tuple(command)
-    if Path(command[0]).name == "ros2" and not _is_ros2_run(command):
-        return command
     ros_args = command[command.index(ROS_ARGS) :] if ROS_ARGS in command else ()
-    if any(_ENCLAVE_OPTION.match(word) for word in ros_args):
+    if not starts_nodes(command) or any(_ENCLAVE_OPTION.match(word) for word in ros_args):
         return command
+    return (*command, ROS_ARGS, "--enclave", enclave)
+
+
+def starts_nodes(command: Sequence[str]) -> bool:
+    """Return whether a command certainly starts ROS nodes, as `with_enclave` says."""
+    if Path(command[0]).name == "ros2":
+        return _is_ros2_run(command)
     if any(Path(word).name == _ZENOH_ROUTER for word in command):
-        return command
-    if ros_args or _is_ros2_run(command) or _is_of_package(command):
-        return (*command, ROS_ARGS, "--enclave", enclave)
-    return command
+        return False
+    return ROS_ARGS in command or _is_of_package(command)
 
 
 def enclave_argument(command: Sequence[str]) -> str:
