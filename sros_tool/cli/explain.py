@@ -874,10 +874,12 @@ def _who_lines(
         wildcard = f"  by the wildcard {outcome.wildcard}" if outcome.wildcard else ""
         where = f"  in domain {outcome.domains}" if by_domains else ""
         lines.append((outcome.enclave, f"{outcome.enclave}{wildcard}{where}"))
-    for outcome in everybody.outcomes:
-        if outcome.stopped:
-            lines.append((outcome.enclave, f"  not now: {outcome.enclave}  {outcome.stopped}"))
+    stopped = [outcome for outcome in everybody.outcomes if outcome.stopped]
+    for outcome in stopped[:_MOST_SHOWN]:
+        lines.append((outcome.enclave, f"  cannot start: {outcome.enclave}  {outcome.stopped}"))
     yield from folded(fleet, lines)
+    if more := stopped[_MOST_SHOWN:]:
+        yield f"  cannot start: {counted(len(more), 'more enclave')}"
     count = counted(len(everybody.outcomes), "enclave")
     where = "" if domain is None else f" in domain {domain}"
     if by_domains:

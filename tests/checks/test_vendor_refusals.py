@@ -393,7 +393,7 @@ def test_a_crash_of_peers_is_said_with_whom_it_hits(bench: Bench) -> None:
     assert (said["outcome"], said["reason"]) == ("crashes", "open-range")
     assert said["denied_by"].endswith("the node starts, and the processes of its peers crash")
     words = ("--who", "publish", "/free", "--vendor", "cyclonedds", "--domain", "0")
-    assert "not now: /base  " in (listed := sros("explain", bench.root, *words).out)
+    assert "cannot start: /base  " in (listed := sros("explain", bench.root, *words).out)
     assert "crashes the processes of its peers" in listed
     assert "portable.domain-range" in {each.id for each in worst(bench)}
     assert not ABOUT_VENDORS & {each.id for each in worst(bench)}

@@ -711,7 +711,7 @@ def test_who_tells_wildcards_and_what_cannot_run(keystore: Path) -> None:
     BREAKAGES["certificate expired"](Enclave(keystore))
     found = explain(keystore, "--who", "publish", "/chatter")
     assert "/open  by the wildcard rt/*" in found.out
-    assert f"not now: {ENCLAVE}  cert.pem: it expired" in found.out
+    assert f"cannot start: {ENCLAVE}  cert.pem: it expired" in found.out
     assert "1 of 3 enclaves may publish topic /chatter" in found.out
 
 
