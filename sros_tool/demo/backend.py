@@ -253,8 +253,8 @@ def _observing_rmw() -> str | None:
 def _why_not(stacks: Sequence[Stack]) -> str:
     if not any(stack.present for stack in stacks):
         return "rclpy is not installed here"
-    seen = "; ".join(f"{stack.rmw or 'its RMW'}: {stack.evidence}" for stack in stacks)
-    return f"rclpy does not enforce security here ({seen})"
+    names = " and ".join(stack.rmw or "its RMW" for stack in stacks)
+    return f"rclpy with {names} does not enforce security here (`sros doctor` shows why)"
 
 
 _SIGNERS_CHECKED = ((2, 1, 4), (2, 6, 5), (2, 8, 2), (2, 9, 2))
