@@ -335,6 +335,11 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     assert undone.err.count("removed ") == 2
     robot.close("--proof", status=1)
     assert made(robot.folder) == MADE
+    opens = "protection.default.write_access_control=false"
+    loosened = ("update_keystore", "robot/keystore", "--set", opens, "--allow-looser")
+    sros(*loosened, cwd=robot.folder).ok()
+    said = robot.close().out
+    assert "every enclave may publish DDS topic *: the governance of the keystore leaves" in said
 
 
 @sometimes("what_systemd_does_not_start_is_done_by_hand", 1 / 2)
