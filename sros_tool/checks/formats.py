@@ -43,7 +43,39 @@ _SIGNS = {"error": "🔴", "warning": "🟠", "note": "🔵"}
 _Kinds = Mapping[str, tuple[Hashable, Hashable]]
 
 
-def by_robot(
+def folded_findings(
+    groups: Iterable[tuple[Finding, ...]], fleet: Fleet | None
+) -> Iterator[tuple[tuple[Finding, ...], str]]:
+    """Merge single findings that differ only in one robot or one enclave; yield the first of each.
+
+    The text that comes with it names the other robots or enclaves; it is "" if there are none.
+    Findings that share a cause, or that have a line or related places, stay as they are.
+    """
+    alike: dict[Hashable, list[tuple[tuple[Finding, ...], str]]] = {}
+    for group, others in _by_robot(groups, fleet):
+        kind = group if others else _for_any_enclave(group)
+        alike.setdefault(kind, []).append((group, others))
+    for members in alike.values():
+        first, *more = members
+        if len(more) < _FEWEST_ENCLAVES:
+            yield from members
+        else:
+            names = first_few([group[0].subject for group, _ in more], _MOST_ROBOTS, joint=", and ")
+            yield first[0], f"the same for {counted(len(more), 'more enclave')}: {names}"
+
+
+def _for_any_enclave(group: tuple[Finding, ...]) -> Hashable:
+    """Return a key that findings share if they differ only in the enclave that they are about."""
+    finding = group[0]
+    enclave = finding.subject
+    is_enclave = enclave.startswith("/") and enclave not in ("/", finding.file)
+    if len(group) > 1 or finding.line or finding.related or not is_enclave:
+        return group
+    texts = (finding.text, finding.file, finding.remedy)
+    return (finding.id, finding.accepted, *(text.replace(enclave, "{}") for text in texts))
+
+
+def _by_robot(
     groups: Iterable[tuple[Finding, ...]], fleet: Fleet | None
 ) -> Iterator[tuple[tuple[Finding, ...], str]]:
     """Merge single findings that differ only in one robot; yield the first of each kind.
@@ -85,6 +117,7 @@ def by_robot(
 
 
 _MOST_ROBOTS = 10
+_FEWEST_ENCLAVES = 2  # more enclaves with the same finding; fewer are shown one by one
 _MOST_SIMILAR = 5  # findings that differ in further robots; more become one
 
 
@@ -114,7 +147,7 @@ def findings_markdown(chosen: ChosenFindings, fleet: Fleet | None = None) -> str
     Findings that differ only in one robot of ``fleet`` are one item.
     """
     rest = "which `sros check` shows"
-    groups = by_robot(by_cause(chosen.shown), fleet)
+    groups = folded_findings(by_cause(chosen.shown), fleet)
     listed = bounded((_item(group, others) for group, others in groups), _MOST, rest)
     title = f"### Findings: {plain(chosen.summary())}"
     return "\n\n".join(part for part in (title, listed) if part) + "\n"

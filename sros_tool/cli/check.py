@@ -33,6 +33,7 @@ from sros_tool.cli.common import (
     domain_of,
     dry_run_option,
     echo_findings,
+    echo_folded,
     fleet_option,
     force_option,
     json_option,
@@ -728,14 +729,9 @@ def _print_all(chosen: ChosenFindings, _selection: FindingFilter) -> None:
 
 
 def _print_text(chosen: ChosenFindings, fleet: Fleet | None = None) -> None:
-    from sros_tool.checks.formats import by_robot
     from sros_tool.checks.kind import by_cause
 
-    groups = sorted(by_cause(chosen.shown), key=lambda group: len(group) == 1)
-    for group, others in by_robot(groups, fleet):
-        echo_findings(group)
-        if others:
-            echo(f"    {others}")
+    echo_folded(sorted(by_cause(chosen.shown), key=lambda group: len(group) == 1), fleet)
     for choice in dict.fromkeys(finding.accepted for finding in chosen.accepted):
         kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
         kinds_text = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())

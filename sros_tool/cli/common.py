@@ -944,6 +944,16 @@ def echo_findings(findings: Sequence[Finding], *, err: bool = False) -> None:
         echo(line, err=err)
 
 
+def echo_folded(groups: Iterable[tuple[Finding, ...]], fleet: Fleet | None = None) -> None:
+    """Print findings; those that differ only in one robot or one enclave are printed once."""
+    from sros_tool.checks.formats import folded_findings
+
+    for group, others in folded_findings(groups, fleet):
+        echo_findings(group)
+        if others:
+            echo(f"    {others}")
+
+
 def finding_lines(finding: Finding) -> list[str]:
     """Return a finding as lines: place and title, reason, remedy, and related places."""
     head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"

@@ -232,7 +232,7 @@ def verify(
       $ sros verify robot --at 2027-06-01 || echo 'renew before June'
     """
     from sros_tool.checks.keystores.arrival import verify_arrival
-    from sros_tool.cli.common import echo_findings, local_zone
+    from sros_tool.cli.common import echo_folded, local_zone
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.selection import select_enclaves
     from sros_tool.validity import iso
@@ -264,8 +264,7 @@ def verify(
         )
         place = f", key on the token {enclave.token}" if enclave.token else ""
         echo(f"{enclave.name}  ", state, place)
-    for finding in arrival.findings:
-        echo_findings([finding])
+    echo_folded((finding,) for finding in arrival.findings)
     return 1 if arrival.findings else 0
 
 

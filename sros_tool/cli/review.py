@@ -419,7 +419,7 @@ def _reasons(step: ReviewStep) -> list[str]:
     """Return what a reviewer has to read: new access and dropped requirements, also if they are
     allowed; rights that nobody answers any more; the findings of a failed step.
     """
-    from sros_tool.checks.formats import by_robot
+    from sros_tool.checks.formats import folded_findings
     from sros_tool.checks.registry import ChosenFindings
     from sros_tool.cli.policy import added_lines, domain_lines, folded_differences, unanswered_lines
     from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange
@@ -438,7 +438,7 @@ def _reasons(step: ReviewStep) -> list[str]:
             singly = ((finding,) for finding in chosen.shown)
             return [
                 f"{_finding_line(finding)}{others and f' ({others})'}"
-                for (finding, *_), others in by_robot(singly, step.fleet)
+                for (finding, *_), others in folded_findings(singly, step.fleet)
             ]
     return []
 

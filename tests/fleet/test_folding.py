@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.checks.formats import by_robot
+from sros_tool.checks.formats import folded_findings
 from sros_tool.checks.requirements import VIOLATED
 from sros_tool.cli.changed import print_plan
 from sros_tool.fleet.robots import Fleet, Robot, folded
@@ -189,7 +189,7 @@ def test_findings_that_also_differ_in_other_robots_are_one_if_they_are_many() ->
 
     def told(pairs: list[tuple[str, str]]) -> list[str]:
         found = ((VIOLATED.found(f"/{a}/nav", f"may publish /{b}/go"),) for a, b in pairs)
-        return [f"{group[0].subject} {others}" for group, others in by_robot(found, fleet)]
+        return [f"{group[0].subject} {others}" for group, others in folded_findings(found, fleet)]
 
     assert told([("r0", name) for name in names[1:]]) == [
         "/r0/nav the same for 6 more robots: r2, r3, r4, r5, r6, r7"
@@ -277,3 +277,14 @@ def test_check_and_view_read_a_policy_for_a_fleet(made: Path) -> None:
     of_keystore = sros("view", "ks", "--format", "mermaid", cwd=made).ok().out
     assert "3 equal robots are drawn as one" in drawn
     assert "3 equal robots are drawn as one" in of_keystore
+
+
+def test_findings_that_differ_only_in_their_enclave_are_one_if_they_are_three() -> None:
+    def told(*pairs: tuple[str, str]) -> list[str]:
+        found = ((VIOLATED.found(a, text.format(a), f"ks/enclaves{a}"),) for a, text in pairs)
+        return [f"{group[0].subject} {others}" for group, others in folded_findings(found, None)]
+
+    same = [(enclave, "{} may publish /go") for enclave in ("/a", "/b", "/c")]
+    assert told(*same) == ["/a the same for 2 more enclaves: /b, /c"]
+    assert told(*same[:2]) == ["/a ", "/b "]
+    assert told(*same[:2], ("/c", "{} may publish /stop")) == ["/a ", "/b ", "/c "]
