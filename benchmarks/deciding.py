@@ -88,4 +88,4 @@ def _access(vendor: Vendor, topics: int, wildcards: int) -> Access:
     topic_rule = TopicRule("*", True, True, True, True, kind, kind)
     domain_rule = DomainRule(_DOMAINS, False, True, kind, kind, kind, (topic_rule,))
     governance = Governance((domain_rule,))
-    return Access(GovernedDomain(vendor, governance, 0), permissions, "CN=/robot", at=_NOW)
+    return Access(GovernedDomain(vendor, governance, 0), permissions, "CN=/robot", moment=_NOW)

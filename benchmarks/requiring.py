@@ -25,7 +25,7 @@ def requiring(folder: Path, enclaves: int, rounds: int) -> list[Figure]:
     def work() -> float:
         begin = time.process_time()
         found = decide_all(
-            parse_requirements(text, "required.toml"), load_system(policy, at=datetime.now(UTC))
+            parse_requirements(text, "required.toml"), load_system(policy, moment=datetime.now(UTC))
         )
         taken = time.process_time() - begin
         assert len(found.violations) == 1

@@ -130,7 +130,7 @@ def create_keystore(
         domains=DomainSet.parse(str(domains), "domains"),
         now=_time_or_now(now),
         keyring=_keyring(secrets, identity_key, encrypt=encrypt_ca_keys, short=short_passphrase),
-        imported={} if identity_ca is None else {"identity": _content(identity_ca)},
+        imported_cas={} if identity_ca is None else {"identity": _content(identity_ca)},
     )
     return Keystore(result.root, result.notes)
 
@@ -748,11 +748,11 @@ def check_requirements(
     files = [requirements] if isinstance(requirements, str | PathLike) else requirements
     system = load_system(
         [Path(path)] if isinstance(path, str | PathLike) else list(map(Path, path)),
-        at=_time_or_now(now),
+        moment=_time_or_now(now),
         zone=zone,
         domain=of,
         fleet=read_fleet(Path(fleet)) if fleet else None,
-        only=only,
+        only_enclaves=only,
         template=load_template(template) if template else None,
     )
     findings = requirement_findings(read_all_requirements(map(Path, files), system.fleet), system)

@@ -286,10 +286,10 @@ def _moves(edges: Iterable[tuple[int, int]]) -> _Moves:
     return found
 
 
-def _moved_places(reached: int, moves: _Moves) -> int:
+def _moved_places(positions: int, moves: _Moves) -> int:
     following = 0
     for by, places in moves.items():
-        some = reached & places
+        some = positions & places
         following |= some << by if by >= 0 else some >> -by
     return following
 
@@ -325,17 +325,17 @@ class _Some:
             for automaton in self._by_prefix.get(name[:length], ())
         )
 
-    def meeting(self, own: Automaton) -> Iterator[Automaton]:
-        """Yield the automata that may accept a name that ``own`` accepts."""
-        begin = own.prefix
+    def meeting(self, automaton: Automaton) -> Iterator[Automaton]:
+        """Yield the automata that may accept a name that ``automaton`` accepts."""
+        begin = automaton.prefix
         for length in self._lengths:
             if length < len(begin):
-                yield from filter(own.may_meet, self._by_prefix.get(begin[:length], ()))
+                yield from filter(automaton.may_meet, self._by_prefix.get(begin[:length], ()))
         prefixes = self._prefixes
         for at in range(bisect_left(prefixes, begin), len(prefixes)):
             if not prefixes[at].startswith(begin):
                 break
-            yield from filter(own.may_meet, self._by_prefix[prefixes[at]])
+            yield from filter(automaton.may_meet, self._by_prefix[prefixes[at]])
 
     @cached_property
     def _by_prefix(self) -> dict[str, list[Automaton]]:
@@ -449,9 +449,9 @@ _Node = _Some | _Not | _Intersection | _First | _AtLeast
 class SearchLimit:
     """A limit on the number of search steps of one question."""
 
-    def __init__(self, most: int = 600_000) -> None:
-        """Set the limit to ``most`` steps; the default takes about ten seconds."""
-        self._left = most
+    def __init__(self, maximum: int = 600_000) -> None:
+        """Set the limit to ``maximum`` steps; the default takes about ten seconds."""
+        self._left = maximum
 
     def spend(self, steps: int) -> None:
         """Subtract ``steps`` from the steps that are left.
@@ -481,9 +481,9 @@ class NameSet:
 
     __slots__ = ("_node",)
 
-    def __init__(self, exact: Iterable[str] = (), automata: Iterable[Automaton] = ()) -> None:
-        """Create the set of the ``exact`` names and of all names that an automaton accepts."""
-        self._node: _Node = _Some(frozenset(exact), frozenset(automata))
+    def __init__(self, exact_names: Iterable[str] = (), automata: Iterable[Automaton] = ()) -> None:
+        """Create the set of the ``exact_names`` and of all names that an automaton accepts."""
+        self._node: _Node = _Some(frozenset(exact_names), frozenset(automata))
 
     @classmethod
     def _of(cls, node: _Node) -> NameSet:
@@ -644,24 +644,24 @@ class Surroundings:
 
 
 def _including_set(
-    node: _Node, best: Callable[[Surroundings], tuple[int, int]]
+    node: _Node, rank: Callable[[Surroundings], tuple[int, int]]
 ) -> Surroundings | None:
-    """Return a simple set that includes ``node``, or None; of several, the smallest by ``best``."""
+    """Return a simple set that includes ``node``, or None; of several, the smallest by ``rank``."""
     match node:
         case _Some():
             return Surroundings(node.exact, node.automata)
         case _Not():
             return None
         case _Intersection():
-            parts = (_including_set(part, best) for part in node.of)
-            return min(filter(None, parts), key=best, default=None)
+            parts = (_including_set(part, rank) for part in node.of)
+            return min(filter(None, parts), key=rank, default=None)
         case _First():
             operands = [part for part, kept in node.of if kept]
             if node.last:
                 return None
         case _AtLeast():
             operands = list(node.of)
-    found = [_including_set(operand, best) for operand in operands]
+    found = [_including_set(operand, rank) for operand in operands]
     known = [surroundings for surroundings in found if surroundings is not None]
     if len(known) < len(found):
         return None
@@ -692,35 +692,37 @@ def _leaves(node: _Node) -> Iterator[_Some]:
 
 
 def _reduced(
-    node: _Node, sure: frozenset[Automaton], possible: frozenset[Automaton] | None
+    node: _Node,
+    certain_automata: frozenset[Automaton],
+    possible_automata: frozenset[Automaton] | None,
 ) -> _Node | bool:
     """Return a set in which automata are replaced by what is known about them.
 
-    Every considered name is accepted by the automata ``sure``; of all others, only automata in
-    ``possible`` may accept it (None: any).  The exact names of the set are left out.  Returns True
-    or False if the set then has all names or none.
+    Every considered name is accepted by the automata ``certain_automata``; of all others, only
+    automata in ``possible_automata`` may accept it (None: any).  The exact names of the set are
+    left out. Returns True or False if the set then has all names or none.
     """
     if isinstance(node, _Some):
-        if not sure.isdisjoint(node.automata):
+        if not certain_automata.isdisjoint(node.automata):
             return True
-        left = node.automata if possible is None else possible & node.automata
+        left = node.automata if possible_automata is None else possible_automata & node.automata
         if not left:
             return False
         return _Some(automata=left) if len(left) < len(node.automata) or node.exact else node
     if isinstance(node, _Not):
-        inner = _reduced(node.of, sure, possible)
+        inner = _reduced(node.of, certain_automata, possible_automata)
         return not inner if isinstance(inner, bool) else _Not(inner)
     if isinstance(node, _Intersection):
         kept: list[_Node] = []
         for part in node.of:
-            inner = _reduced(part, sure, possible)
+            inner = _reduced(part, certain_automata, possible_automata)
             if inner is False:
                 return False
             if not isinstance(inner, bool):
                 kept.append(inner)
         return (kept[0] if len(kept) == 1 else _Intersection(tuple(kept))) if kept else True
     if isinstance(node, _AtLeast):
-        parts = [_reduced(part, sure, possible) for part in node.of]
+        parts = [_reduced(part, certain_automata, possible_automata) for part in node.of]
         count = node.count - parts.count(True)
         open_ones = tuple(part for part in parts if not isinstance(part, bool))
         if count <= 0 or len(open_ones) < count:
@@ -729,7 +731,7 @@ def _reduced(
     rules: list[tuple[_Node, bool]] = []
     last = node.last
     for part, says in node.of:
-        inner = _reduced(part, sure, possible)
+        inner = _reduced(part, certain_automata, possible_automata)
         if inner is True:
             last = says
             break
@@ -821,9 +823,9 @@ def _in_all(sets: Iterable[frozenset[Automaton]]) -> frozenset[Automaton]:
     return first.intersection(*others)
 
 
-def _accepted_names(own: Automaton, left: _Node | bool) -> _Node:
-    """Return the names of the set ``left`` that ``own`` accepts; True stands for all names."""
-    node = _Some(automata=frozenset((own,)))
+def _accepted_names(automaton: Automaton, left: _Node | bool) -> _Node:
+    """Return the names of the set ``left`` (True: all names) that ``automaton`` accepts."""
+    node = _Some(automata=frozenset((automaton,)))
     return node if isinstance(left, bool) else _Intersection((node, left))
 
 
@@ -877,15 +879,17 @@ class _Search:
                     heapq.heappush(row, (paid + left, -paid, next(number), new))
         return None
 
-    def _left(self, reached: int) -> int | None:
+    def _left(self, positions: int) -> int | None:
         """Return the fewest letters that complete a name, or None if no name begins in this way."""
         left = 0
         for need in self._needed:
-            some = self._machine.left(need, reached)
+            some = self._machine.left(need, positions)
             if some is None:
                 return None
             left = max(left, some)
-        return None if self._node.truth(self._machine.accepting_longer(reached)) is False else left
+        return (
+            None if self._node.truth(self._machine.accepting_longer(positions)) is False else left
+        )
 
 
 def _contains_test(name: str) -> _Test:
@@ -941,28 +945,28 @@ class _Machine:
             for at, letters, to in a.edges
         )
 
-    def accepting(self, reached: int) -> _Test:
+    def accepting(self, positions: int) -> _Test:
         """Return a test whether an automaton of a set accepts the text read so far."""
-        return lambda some: any(reached & self._ends[automaton] for automaton in some.automata)
+        return lambda some: any(positions & self._ends[automaton] for automaton in some.automata)
 
-    def accepting_longer(self, reached: int) -> _Test:
+    def accepting_longer(self, positions: int) -> _Test:
         """Return a test whether an automaton of a set may accept a longer text."""
 
         def ask(some: _Some) -> _Truth:
-            if any(reached & self._endless[automaton] for automaton in some.automata):
+            if any(positions & self._endless[automaton] for automaton in some.automata):
                 return True
             return (
                 None
-                if any(reached & self._span[automaton] for automaton in some.automata)
+                if any(positions & self._span[automaton] for automaton in some.automata)
                 else False
             )
 
         return ask
 
-    def left(self, automaton: Automaton, reached: int) -> int | None:
+    def left(self, automaton: Automaton, positions: int) -> int | None:
         """Return the fewest letters after which an automaton accepts; None if there is no way."""
         for distance, places in self._levels[automaton]:
-            if reached & places:
+            if positions & places:
                 return distance
         return None
 
@@ -989,15 +993,15 @@ def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
     return tuple(sorted(found, key=lambda each: _letter_rank(each.best)))
 
 
-def _best(letters: Letters, without: Container[str] = ()) -> str:
+def _best(letters: Letters, excluded: Container[str] = ()) -> str:
     """Return the best letter for an example, or "" if all of them are excluded."""
     for letter in _PREFERRED:
-        if letter in letters and letter not in without:
+        if letter in letters and letter not in excluded:
             return letter
     # Control characters come last.
     ranges = sorted(letters.ranges, key=lambda pair: (pair[1] < ord(" "), pair))
     every = (chr(number) for low, high in ranges for number in range(low, high + 1))
-    return next((letter for letter in every if letter not in without), "")
+    return next((letter for letter in every if letter not in excluded), "")
 
 
 def _letter_rank(letter: str) -> tuple[int, str]:

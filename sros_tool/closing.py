@@ -597,7 +597,7 @@ def access_lines(policy: Policy, folder: Path) -> list[str]:
     return [*lines[:_MOST_LINES], *([f"and {counted(more, 'more name')}"] if more > 0 else [])]
 
 
-def forbidding(robot: Path, addition: str, at: datetime) -> list[Requirement]:
+def forbidding(robot: Path, addition: str, moment: datetime) -> list[Requirement]:
     """Return the requirements in the folder of a closed robot that more rights would break.
 
     ``addition`` is the policy document with these rights.  None if the folder has no requirements,
@@ -611,7 +611,7 @@ def forbidding(robot: Path, addition: str, at: datetime) -> list[Requirement]:
         merged = merge_into(path, read_policy(path, addition.encode())).document
 
         def broken(policy: Policy) -> dict[Requirement, None]:
-            decided = decide_all(needed, policy_system(policy, at=at, template=template))
+            decided = decide_all(needed, policy_system(policy, moment=moment, template=template))
             return dict.fromkeys(violation.requirement for violation in decided.violations)
 
         if after := broken(read_policy(path, merged)):

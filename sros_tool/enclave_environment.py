@@ -224,7 +224,7 @@ def _check_joining(
 
     vendors = (vendor,) if vendor else TESTED
     evaluation = evaluated(
-        name, folder, state, at=context.at, domain=context.domain, vendors=vendors
+        name, folder, state, moment=context.at, domain=context.domain, vendors=vendors
     )
     # `_check_token_used` says that a vendor reads no token.
     refusals = evaluation.stopped(ignored=(Fault.KEY_ON_TOKEN.id,))
@@ -247,7 +247,7 @@ def _check_dates_here(name: str, keystore: Keystore, vendor: Vendor, context: Jo
 
     if not context.zone.utcoffset(context.at.replace(tzinfo=None)):
         return
-    enclave = load_enclave_of(keystore, name, at=context.at)
+    enclave = load_enclave_of(keystore, name, moment=context.at)
     answer = Evaluator(vendor, enclave, context).answer(ask("join"))
     if not answer.allowed and answer.decision.reason in ("expired", "not-yet-valid"):
         raise KeystoreError(
@@ -404,50 +404,51 @@ def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
         )
 
 
-def _choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
+def _choose_domain(domains: DomainSet, wanted_domain: int | None, root: Path) -> int:
     """Return the ROS domain for a process that uses a keystore, which is for ``domains``.
 
-    Without a ``wanted`` domain from an option or ROS_DOMAIN_ID, this is 0, the default of ROS, if
-    the keystore is for it, else the keystore's first domain.
+    Without a ``wanted_domain`` domain from an option or ROS_DOMAIN_ID, this is 0, the default of
+    ROS, if the keystore is for it, else the keystore's first domain.
 
     Raises:
-        KeystoreError: the keystore is not for the ``wanted`` domain.
+        KeystoreError: the keystore is not for the ``wanted_domain`` domain.
     """
     from sros_tool.keystore.layout import adding_domains
 
-    if wanted is None:
+    if wanted_domain is None:
         return domains.preferred()
-    if wanted in domains:
-        return wanted
+    if wanted_domain in domains:
+        return wanted_domain
     raise KeystoreError(
-        f"keystore '{root}' is for domain {domains}, not for {wanted}",
+        f"keystore '{root}' is for domain {domains}, not for {wanted_domain}",
         "DDS would refuse the node.",
         f"Set ROS_DOMAIN_ID to {next(iter(domains))}, or "
-        f"{adding_domains(root, f'{domains},{wanted}')}.",
+        f"{adding_domains(root, f'{domains},{wanted_domain}')}.",
     )
 
 
 def _zenoh_domain(
-    root: Path, zenoh: OpenedZenoh, wanted: int | None, domains: DomainSet
+    root: Path, zenoh: OpenedZenoh, wanted_domain: int | None, domains: DomainSet
 ) -> int | None:
     """Return the ROS domain for a process, one of the domains of its Zenoh configuration.
 
     Raises:
-        KeystoreError: the configuration is not for the ``wanted`` domain.
+        KeystoreError: the configuration is not for the ``wanted_domain`` domain.
     """
     own = zenoh.domains()
     if not own:
-        return wanted
-    if wanted is None:
+        return wanted_domain
+    if wanted_domain is None:
         return next((own_domain for own_domain in own if own_domain in domains), own[0])
-    if wanted not in own:
+    if wanted_domain not in own:
         raise KeystoreError(
-            f"the Zenoh configuration is for domain {', '.join(map(str, own))}, not for {wanted}",
+            f"the Zenoh configuration is for domain {', '.join(map(str, own))}, not for "
+            f"{wanted_domain}",
             "Its rules deny everything in any other domain.",
             f"Set ROS_DOMAIN_ID to {own[0]}, or write the files for more domains: `sros zenoh "
             f"{quote(str(root))} --domain ID`.",
         )
-    return wanted
+    return wanted_domain
 
 
 def _zenoh_environment(

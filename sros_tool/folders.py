@@ -128,13 +128,13 @@ class Folder:
         with os.scandir(self.handle(path)) as entries:
             return [entry.name for entry in entries if entry.is_symlink()]
 
-    def read(self, path: str, *, most: int = _MOST_BYTES) -> bytes:
-        """Return the content of the regular file at ``path``, of at most ``most`` bytes."""
+    def read(self, path: str, *, max_bytes: int = _MOST_BYTES) -> bytes:
+        """Return the content of the regular file at ``path``, of at most ``max_bytes`` bytes."""
         with self._naming(path), self.open(path) as file:
             state = os.fstat(file.fileno())
             if not stat.S_ISREG(state.st_mode):
                 raise OSError(errno.EINVAL, "it is not a regular file", str(self.path / path))
-            if state.st_size > most:
+            if state.st_size > max_bytes:
                 raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(self.path / path))
             return file.read(state.st_size)
 

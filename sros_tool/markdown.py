@@ -35,14 +35,14 @@ def fenced(text: str, language: str = "text") -> str:
     return f"{fence}{language}\n{lines}\n{fence}"
 
 
-def bounded(items: Iterable[str], most: int, rest: str) -> str:
-    """Return ``items`` as a Markdown list of at most ``most`` characters.
+def bounded(items: Iterable[str], maximum: int, rest: str) -> str:
+    """Return ``items`` as a Markdown list of at most ``maximum`` characters.
 
     A last item counts those that do not fit, followed by ``rest``, a clause that says where to
     read them.
     """
     lines: list[str] = []
-    left, out = most, 0
+    left, out = maximum, 0
     for item in items:
         left -= len(item) + 3
         if left < 0:

@@ -18,33 +18,33 @@ _ROOT = frozenset({0})
 _MOST_LINKS = 40
 
 
-def other_writers(state: os.stat_result, trusted: frozenset[int]) -> str:
-    """Return why other users than ``trusted`` (user ids) can change a file or folder, or "".
+def other_writers(state: os.stat_result, trusted_users: frozenset[int]) -> str:
+    """Return why other users than ``trusted_users`` (user ids) can change a file or folder, or "".
 
     The group counts unless it is the private group of a trusted user, which Debian and others give
     to each user and write with (umask 002).
     """
-    if state.st_uid not in trusted:
+    if state.st_uid not in trusted_users:
         return f"it belongs to {user_name(state.st_uid)}"
     if stat.S_ISLNK(state.st_mode):
         return ""
     mode = f"its mode is {stat.S_IMODE(state.st_mode):04o}"
     if state.st_mode & stat.S_IWOTH:
         return f"{mode}, so everybody can write"
-    if state.st_mode & stat.S_IWGRP and not _is_private(state.st_gid, trusted):
+    if state.st_mode & stat.S_IWGRP and not _is_private(state.st_gid, trusted_users):
         return f"{mode}, so the group {_group_name(state.st_gid)} can write"
     return ""
 
 
-def replaceable_on_the_way(path: Path, trusted: frozenset[int]) -> Iterator[tuple[Path, str]]:
+def replaceable_on_the_way(path: Path, trusted_users: frozenset[int]) -> Iterator[tuple[Path, str]]:
     """Yield the folders and links above ``path`` through which others can replace it, and why.
 
     A sticky folder such as ``/tmp``, in which only the owner of a file can rename it, counts only
     if others own the next part of the path in it.
     """
     for step, state in _way(path):
-        kept = state.st_mode & stat.S_ISVTX and state.st_uid in trusted
-        if not kept and (why := other_writers(state, trusted)):
+        kept = state.st_mode & stat.S_ISVTX and state.st_uid in trusted_users
+        if not kept and (why := other_writers(state, trusted_users)):
             yield step, why
 
 
@@ -91,10 +91,10 @@ def _way(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
 
 
 @lru_cache
-def _is_private(group: int, trusted: frozenset[int]) -> bool:
+def _is_private(group: int, trusted_users: frozenset[int]) -> bool:
     """Return whether a group is the private group of a trusted user, without other members."""
     users = []
-    for user in trusted:
+    for user in trusted_users:
         with suppress(KeyError):
             users.append(pwd.getpwuid(user))
     try:

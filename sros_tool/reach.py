@@ -216,13 +216,13 @@ class Network:
         self,
         rights: Iterable[Right] | DomainRights,
         *,
-        without: Collection[str] = (),
+        excluded: Collection[str] = (),
         questions: Collection[str] = (),
         unguarded: Iterable[Unguarded] = (),
         everybody: Iterable[str] = (),
         links: RouterLinks | None = None,
     ) -> None:
-        ignored = ["rt" + name for name in without]
+        ignored = ["rt" + name for name in excluded]
         ignored += [f"rq/{name.lstrip('/')}{SERVICE_ENDS['rq']}" for name in questions]
         by_domains: DomainRights = rights if isinstance(rights, Mapping) else {None: [*rights]}
         ends = _writers_and_readers(by_domains, ignored)
@@ -273,8 +273,8 @@ class Network:
         """Return all others that can influence these enclaves, each with a shortest path."""
         return self._search(enclaves, False)
 
-    def _search(self, starts: Collection[str], forward: bool) -> dict[str, HopPath]:
-        paths: dict[str, HopPath] = dict.fromkeys(sorted(starts), ())
+    def _search(self, start_enclaves: Collection[str], forward: bool) -> dict[str, HopPath]:
+        paths: dict[str, HopPath] = dict.fromkeys(sorted(start_enclaves), ())
         used: _Used = set()
         queue = deque(paths)
         while queue:
@@ -287,19 +287,19 @@ class Network:
         return {enclave: path for enclave, path in paths.items() if path}
 
     def _steps(
-        self, enclave: str, forward: bool, used: _Used, known: Container[str]
+        self, enclave: str, forward: bool, used_hops: _Used, known: Container[str]
     ) -> Iterator[Hop]:
         """Yield the hops from an enclave (``forward``) or to it, except with ``known`` enclaves.
 
-        Topics that were ``used`` before cannot lead to other enclaves, and are left out, too.
+        Topics that were ``used_hops`` before cannot lead to other enclaves, and are left out, too.
         """
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
         own, others = (self._sides[direction] for direction in directions)
         for end in own.of.get(enclave, ()):
             like = (end.topic, end.without, self._router_of.get(enclave, ""), end.domains)
-            if like in used:
+            if like in used_hops:
                 continue
-            used.add(like)
+            used_hops.add(like)
             for other in others.meeting(end.topic):
                 if other.enclave in known:
                     continue
@@ -403,16 +403,16 @@ def _shared(*accesses: _Access) -> str:
 
 
 @lru_cache(maxsize=4096)
-def _shared_by_wildcards(topics: tuple[str, ...], outside: tuple[str, ...]) -> str:
+def _shared_by_wildcards(topics: tuple[str, ...], wildcards_outside: tuple[str, ...]) -> str:
     for prefix, (_, _, end) in _WRITER_RIGHTS.items():
         # In ROS terms first, so that the result is a valid ROS name.
         inner = [_ros_part(topic, prefix, end) for topic in topics]
-        outer = [_ros_part(excluded, prefix, end) for excluded in outside]
+        outer = [_ros_part(excluded, prefix, end) for excluded in wildcards_outside]
         name = common_name(inner, filter(None, outer)) if all(inner) else ""
         topic = f"{prefix}{name}{end}"
-        if name and not any(matches(excluded, topic) for excluded in outside):
+        if name and not any(matches(excluded, topic) for excluded in wildcards_outside):
             return topic
-    return common_name(topics, outside, absolute=False) or ""
+    return common_name(topics, wildcards_outside, absolute=False) or ""
 
 
 def _ros_part(topic: str, prefix: str, end: str) -> str:
@@ -436,7 +436,7 @@ def _in_ros_terms(topic: str) -> tuple[str, str, str]:
     return kind, right, name
 
 
-def _hop(said: _Access, heard: _Access, topic: str) -> Hop:
+def _hop(writer: _Access, reader: _Access, topic: str) -> Hop:
     kind, right, name = _in_ros_terms(topic)
-    ends = (_in_ros_terms(end.topic)[2] for end in (said, heard))
-    return Hop(said.enclave, heard.enclave, kind, right, name, *ends)
+    ends = (_in_ros_terms(end.topic)[2] for end in (writer, reader))
+    return Hop(writer.enclave, reader.enclave, kind, right, name, *ends)

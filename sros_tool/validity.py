@@ -69,21 +69,21 @@ class Window:
         """
         return self.not_after - min(_SOON, (self.not_after - self.not_before) / 3)
 
-    def life(self, made: datetime | None = None) -> timedelta:
+    def life(self, made_at: datetime | None = None) -> timedelta:
         """Return how long a document with this validity is valid after it was made.
 
-        ``made`` is when it was made, or when its file came here; a time long before the validity
+        ``made_at`` is when it was made, or when its file came here; a time long before the validity
         does not count.  A document that sros makes is valid from `BACKDATE` before that time; a
-        document of another program may be valid from that time on, which only ``made`` shows.
+        document of another program may be valid from that time on, which only ``made_at`` shows.
         sros makes no document whose validity is not longer than `BACKDATE`.
         """
         latest = self.not_before + BACKDATE
         if latest >= self.not_after:
             latest = self.not_before
-        if made is None or made < self.not_before - BACKDATE:
+        if made_at is None or made_at < self.not_before - BACKDATE:
             begin = latest
         else:
-            begin = min(max(made, self.not_before), latest)
+            begin = min(max(made_at, self.not_before), latest)
         return self.not_after - begin
 
     def within(self, outer: Window) -> Window:

@@ -13,10 +13,12 @@ def counted(number: int, thing: str, things: str = "") -> str:
     return f"{number} {thing if number == 1 else things or f'{thing}s'}"
 
 
-def first_few(texts: Sequence[str], most: int, separator: str = ", ", joint: str = " and ") -> str:
-    """Return at most ``most`` texts and the number of the others: "a, b and 3 more"."""
-    others = len(texts) - most
-    return separator.join(texts[:most]) + (f"{joint}{others} more" if others > 0 else "")
+def first_few(
+    texts: Sequence[str], maximum: int, separator: str = ", ", joint: str = " and "
+) -> str:
+    """Return at most ``maximum`` texts and the number of the others: "a, b and 3 more"."""
+    others = len(texts) - maximum
+    return separator.join(texts[:maximum]) + (f"{joint}{others} more" if others > 0 else "")
 
 
 def enumerated(texts: Sequence[str], joint: str = " and ") -> str:

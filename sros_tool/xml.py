@@ -34,53 +34,55 @@ def _parser(instructions: bool) -> etree.XMLParser:
     )
 
 
-def read_bytes(path: Path, what: str, *, owner: int | None = None, most: int = MAX_BYTES) -> bytes:
-    """Return the content of a regular file of at most ``most`` bytes (default: 16 MiB).
+def read_bytes(
+    path: Path, label: str, *, owner: int | None = None, max_bytes: int = MAX_BYTES
+) -> bytes:
+    """Return the content of a regular file of at most ``max_bytes`` bytes (default: 16 MiB).
 
-    ``what`` describes the file in errors, such as "policy".  A file whose size is 0 counts as
+    ``label`` describes the file in errors, such as "policy".  A file whose size is 0 counts as
     empty, also a file of the kernel (proc(5)), which may have no end.  With ``owner``, a user id,
     the file has to belong to that user.
 
     Raises:
         DocumentError: the file does not exist, cannot be read, is too large or not a regular file.
     """
-    return read_file(path, what, owner=owner, most=most)[1]
+    return read_file(path, label, owner=owner, max_bytes=max_bytes)[1]
 
 
 def read_file(
-    path: Path, what: str, *, owner: int | None = None, most: int = MAX_BYTES
+    path: Path, label: str, *, owner: int | None = None, max_bytes: int = MAX_BYTES
 ) -> tuple[os.stat_result, bytes]:
     """Return the fstat(2) of a regular file, and its content as `read_bytes` does."""
     try:
         # Looked at first, because opening a pipe would wait for its writer.
         there, data = path.stat(), b""
-        if stat.S_ISREG(there.st_mode) and 0 < there.st_size <= most:
-            there, data = _read_open(path, most)
+        if stat.S_ISREG(there.st_mode) and 0 < there.st_size <= max_bytes:
+            there, data = _read_open(path, max_bytes)
         if not stat.S_ISREG(there.st_mode):
-            raise DocumentError(f"the {what} '{path}' is not a regular file")
+            raise DocumentError(f"the {label} '{path}' is not a regular file")
         if owner not in (None, there.st_uid):
             raise DocumentError(
-                f"the {what} '{path}' belongs to another user",
+                f"the {label} '{path}' belongs to another user",
                 f"It belongs to user {there.st_uid}, not to user {owner}.",
             )
     except (OSError, ValueError) as error:
         number = getattr(error, "errno", errno.ENOENT)  # ValueError: the path contains a NUL
         if number in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP):
-            raise DocumentError(f"the {what} '{path}' does not exist") from error
+            raise DocumentError(f"the {label} '{path}' does not exist") from error
         raise DocumentError(
-            f"the {what} '{path}' cannot be read", f"{os.strerror(number)}."
+            f"the {label} '{path}' cannot be read", f"{os.strerror(number)}."
         ) from error
-    if max(there.st_size, len(data)) > most:
+    if max(there.st_size, len(data)) > max_bytes:
         raise DocumentError(
-            f"the {what} '{path}' is too large",
-            f"It has more than {most // 1024**2} MiB.",
+            f"the {label} '{path}' is too large",
+            f"It has more than {max_bytes // 1024**2} MiB.",
         ) from OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
-    log_step("DEBUG", __name__, "read the %s '%s', %d bytes", what, path, len(data))
+    log_step("DEBUG", __name__, "read the %s '%s', %d bytes", label, path, len(data))
     return there, data
 
 
-def _read_open(path: Path, most: int) -> tuple[os.stat_result, bytes]:
-    """Return the fstat(2) of a file, and its first ``most`` + 1 bytes.
+def _read_open(path: Path, max_bytes: int) -> tuple[os.stat_result, bytes]:
+    """Return the fstat(2) of a file, and its first ``max_bytes`` + 1 bytes.
 
     The content is empty if it is not a regular file, which happens if somebody just replaced it.
     """
@@ -89,7 +91,7 @@ def _read_open(path: Path, most: int) -> tuple[os.stat_result, bytes]:
         state = os.fstat(handle)
         if not stat.S_ISREG(state.st_mode):
             return state, b""
-        parts, left = [], most + 1
+        parts, left = [], max_bytes + 1
         while left and (part := os.read(handle, min(left, max(state.st_size + 1, 4096)))):
             parts.append(part)
             left -= len(part)
@@ -155,7 +157,7 @@ def parse(
     return root
 
 
-def require_child(root: etree._Element, tag: str, name: str, what: str) -> etree._Element:
+def require_child(root: etree._Element, tag: str, name: str, label: str) -> etree._Element:
     """Return the child ``tag`` of the root ``<dds>`` of a document; ``name`` names it in errors.
 
     Raises:
@@ -176,7 +178,7 @@ def require_child(root: etree._Element, tag: str, name: str, what: str) -> etree
         )
     elif root.tag != "dds":
         why = f"It begins with <{tag_of(root)}>, and not with <dds><{tag}>."
-    raise DocumentError(f"{name} is not a {what} document", why)
+    raise DocumentError(f"{name} is not a {label} document", why)
 
 
 def serialize(root: etree._Element, *, indent: bool = True) -> bytes:

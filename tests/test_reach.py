@@ -121,7 +121,7 @@ def test_topics_that_ros_has_no_word_for() -> None:
 def test_names_that_do_not_count() -> None:
     found = rights("/a publish /parameter_events", "/b subscribe /*")
     assert set(Network(found).reach("/a").influences) == {"/b"}
-    assert Network(found, without=OF_EVERY_NODE).reach("/a").influences == {}
+    assert Network(found, excluded=OF_EVERY_NODE).reach("/a").influences == {}
 
 
 def test_nobody_reaches_itself_through_itself_and_circles_end() -> None:
@@ -212,7 +212,7 @@ def test_what_the_governance_leaves_open_carries_for_everybody() -> None:
     assert Network(guarded, unguarded=[open_x], everybody=["/b"]).reach("/b").influences == {}
     log = rights("/a subscribe /parameter_events")
     for left_out, reached in (((), {"/a"}), (OF_EVERY_NODE, set())):
-        network = Network(log, without=left_out, unguarded=[open_x], everybody=["/b"])
+        network = Network(log, excluded=left_out, unguarded=[open_x], everybody=["/b"])
         assert set(network.reach("/b").influences) == reached
 
 

@@ -193,7 +193,7 @@ def test_a_large_document_decides_as_a_small_one(enclave: Enclave) -> None:
     }
     for vendor in Vendor:
         governed = GovernedDomain(vendor, governance_for(DomainProtection(), DOMAINS), 7)
-        one, other = (Access(governed, each, "CN=/e", at=NOW) for each in (full, short))
+        one, other = (Access(governed, each, "CN=/e", moment=NOW) for each in (full, short))
         assert one.join().outcome is other.join().outcome is Outcome.ALLOWED
         for name, verb in product(names, ("publish", "subscribe")):
             before, after = (each.decide(AccessVerb(verb), name).outcome for each in (one, other))

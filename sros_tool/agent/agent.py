@@ -240,17 +240,17 @@ class _Round:
     def _save(self) -> None:
         self._attempt(lambda: write_state(self._folder, self._state))
 
-    def _clock(self, proven: datetime | None) -> RobotClock:
+    def _clock(self, proven_time: datetime | None) -> RobotClock:
         now = self._machine.now
-        if proven and now + _TOLERANCE < proven:
+        if proven_time and now + _TOLERANCE < proven_time:
             what = (
                 "documents that this robot verified were made at"
                 if self._state.latest
                 else "its certificates are not valid before"
             )
             self._problems.append(
-                f"The clock shows {iso(now)}, but {what} {iso(proven)}: the clock is at least "
-                f"{elapsed(proven - now)} behind. Nothing is restarted; set the clock."
+                f"The clock shows {iso(now)}, but {what} {iso(proven_time)}: the clock is at least "
+                f"{elapsed(proven_time - now)} behind. Nothing is restarted; set the clock."
             )
             return RobotClock.BEHIND
         return self._machine.clock()
@@ -269,7 +269,7 @@ class _Round:
                 begins.append(validity_of(read_certificate(path)).not_before)
         return min(begins, default=None)
 
-    def _fetch_and_install(self, certain: datetime) -> tuple[Installation, bool]:
+    def _fetch_and_install(self, certain_time: datetime) -> tuple[Installation, bool]:
         """Fetch and install a release; return what changed, and whether the source was reached."""
         settings, state = self._settings, self._state
         others = self._other_files()
@@ -279,7 +279,7 @@ class _Round:
                 agent_folder(self._folder),
                 settings.source,
                 settings.robot,
-                now=certain,
+                now=certain_time,
                 installed=0 if others or others is None else state.accepted,
                 client_certificate=certificate,
                 tls_ca=Path(settings.tls_ca) if settings.tls_ca else None,
@@ -304,7 +304,7 @@ class _Round:
         if release is None:
             self._is_in_step = True
             return Installation(), True
-        installation = self._install(release, certain)
+        installation = self._install(release, certain_time)
         if release.number == state.accepted:
             repaired = (path for path in others or () if enclave_of(path) in installation.changed)
             self._note_repaired(release.number, tuple(repaired))
@@ -340,7 +340,7 @@ class _Round:
             )
             self._state = replace(self._state, repaired=text, repaired_at=now)
 
-    def _install(self, release: Release, certain: datetime) -> Installation:
+    def _install(self, release: Release, certain_time: datetime) -> Installation:
         settings, state = self._settings, self._state
         if release.number == state.accepted and self._differs_from_accepted(release):
             self._problems.append(
@@ -363,7 +363,7 @@ class _Round:
                 self._folder,
                 release,
                 settings.robot,
-                now=self._time_to_be_valid_at(release, certain),
+                now=self._time_to_be_valid_at(release, certain_time),
                 installed=state.accepted,
                 pinned=frozenset(settings.authorities),
                 new_keys=keys,
@@ -397,14 +397,14 @@ class _Round:
         _drop_installed_keys(self._folder, keys)
         return installation
 
-    def _time_to_be_valid_at(self, release: Release, certain: datetime) -> datetime:
+    def _time_to_be_valid_at(self, release: Release, certain_time: datetime) -> datetime:
         """Return the time at which a release has to be valid.
 
         If documents have proven that the clock is behind, the keystore's clock counts, by which the
         release was made; a clock that may be right is never overruled.
         """
-        made = made_at(release) if self._machine.now < certain - _TOLERANCE else None
-        return max(certain, made) if made else certain
+        made = made_at(release) if self._machine.now < certain_time - _TOLERANCE else None
+        return max(certain_time, made) if made else certain_time
 
     def _differs_from_accepted(self, release: Release) -> bool:
         """Return whether the accepted release with the same number has other files.
@@ -440,16 +440,18 @@ class _Round:
             place = enclave_path(self._folder, name)
             with suppress(SrosError, OSError):
                 state = open_enclave(place, now=now, files=files)
-                evaluation = evaluated(name, place, state, at=now)
+                evaluation = evaluated(name, place, state, moment=now)
                 opened[name] = _Opened(evaluation.state, "; ".join(evaluation.problems_here))
         return opened
 
-    def _note_unusable(self, opened: Mapping[str, _Opened]) -> None:
-        for name, enclave in opened.items():
+    def _note_unusable(self, opened_enclaves: Mapping[str, _Opened]) -> None:
+        for name, enclave in opened_enclaves.items():
             if enclave.problem:
                 self._problems.append(f"{name} could not start: {enclave.problem}.")
 
-    def _restart(self, names: Iterable[str], opened: Mapping[str, _Opened]) -> Sequence[str]:
+    def _restart(
+        self, names: Iterable[str], opened_enclaves: Mapping[str, _Opened]
+    ) -> Sequence[str]:
         """Restart the units of enclaves whose restart is due.
 
         Return the enclaves whose units restarted and whose processes can be seen: other units run
@@ -467,7 +469,11 @@ class _Round:
             settings,
             still_due(self._state.due, seen),
             routers=routers,
-            unusable={name: enclave.problem for name, enclave in opened.items() if enclave.problem},
+            unusable={
+                name: enclave.problem
+                for name, enclave in opened_enclaves.items()
+                if enclave.problem
+            },
             systemd=machine.systemd or Systemd(settings.systemctl),
         )
         self._problems += done.problems
@@ -507,8 +513,8 @@ class _Round:
     def _confirm(
         self,
         names: Sequence[str],
-        opened: Mapping[str, _Opened],
-        seen: EnclaveProcesses,
+        opened_enclaves: Mapping[str, _Opened],
+        processes: EnclaveProcesses,
         clock: RobotClock,
         asked: Renewals,
     ) -> bool:
@@ -518,15 +524,19 @@ class _Round:
         self._state = replace(self._state, sequence=sequence)
         self._save()
         confirmation = make_confirmation(
-            self._folder, self._settings.robot, now=now, dds=seen.dds, unreadable=self._unreadable
+            self._folder,
+            self._settings.robot,
+            now=now,
+            dds=processes.dds,
+            unreadable=self._unreadable,
         )
         confirmation = replace(
             confirmation,
             restart=self._state.due,
             sequence=sequence,
             release=self._state.release,
-            expiry={name: _expiry(opened.get(name)) for name in names},
-            running=seen.states,
+            expiry={name: _expiry(opened_enclaves.get(name)) for name in names},
+            running=processes.states,
             clock=clock,
             problems=_shortened_problems(self._problems),
             requests=asked.requests,
@@ -561,7 +571,7 @@ class _Round:
             path = agent_folder(self._folder) / _REPLACED_LIST
             since = time_of_file(path.stat().st_mtime)
             if abs(self._machine.now - since) < _REPLACED_FOR:
-                return read_bytes(path, "revocation list", most=LONGEST_LIST).decode()
+                return read_bytes(path, "revocation list", max_bytes=LONGEST_LIST).decode()
         return None
 
     def _keep_replaced_list(self, text: str | None) -> None:

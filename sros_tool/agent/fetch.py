@@ -206,7 +206,7 @@ def _transport(
             "",
             "Write it as in https://HOST/fleet, or as the path of a folder.",
         )
-    return FolderTransport(Path(source), most=OF_ONE_ROBOT.packed)
+    return FolderTransport(Path(source), max_bytes=OF_ONE_ROBOT.packed)
 
 
 def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datetime) -> Updater:
@@ -231,7 +231,7 @@ def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datet
         target_base_url=f"{transport.base}/targets/",
         fetcher=transport,
         config=UpdaterConfig(targets_max_length=_MOST_METADATA),
-        bootstrap=read_bytes(path, "root metadata", most=_MOST_METADATA),
+        bootstrap=read_bytes(path, "root metadata", max_bytes=_MOST_METADATA),
     )
     # The present time is passed in; the client would ask the clock of the machine.
     updater._trusted_set.reference_time = now
@@ -276,7 +276,7 @@ def _number(target: TargetFile | None, source: str, robot: str) -> int:
 def _read(path: Path, robot: str, number: int) -> Release:
     """Return the release in the verified archive at ``path``, which has to be this robot's."""
     try:
-        release = read_release(read_bytes(path, "release", most=OF_ONE_ROBOT.packed))
+        release = read_release(read_bytes(path, "release", max_bytes=OF_ONE_ROBOT.packed))
     except SrosError as error:
         raise FetchError(FetchProblem.NOT_SIGNED, error.what, error.why, error.remedy) from error
     if release.robot != robot:

@@ -105,7 +105,7 @@ def _state(processes: Iterable[Process]) -> RunningFiles:
     return RunningFiles.CURRENT if seen else RunningFiles.NOT_SEEN
 
 
-def still_due(due: Iterable[str], seen: EnclaveProcesses) -> tuple[str, ...]:
+def still_due(due_enclaves: Iterable[str], processes: EnclaveProcesses) -> tuple[str, ...]:
     """Return the enclaves whose processes have to be restarted.
 
     A restart is done when the processes of the enclave were seen with the installed files, or when
@@ -114,9 +114,13 @@ def still_due(due: Iterable[str], seen: EnclaveProcesses) -> tuple[str, ...]:
     return tuple(
         sorted(
             name
-            for name, state in seen.states.items()
+            for name, state in processes.states.items()
             if state is RunningFiles.EARLIER
-            or (name in set(due) and state is RunningFiles.NOT_SEEN and not seen.complete)
+            or (
+                name in set(due_enclaves)
+                and state is RunningFiles.NOT_SEEN
+                and not processes.complete
+            )
         )
     )
 
@@ -203,17 +207,24 @@ class Systemd:
 
 
 def _due_units(
-    settings: AgentSettings, due: Sequence[str], routers: Iterable[str], active: Iterable[str]
+    settings: AgentSettings,
+    due_enclaves: Sequence[str],
+    routers: Iterable[str],
+    active: Iterable[str],
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield the units to restart and their enclaves, those of Zenoh routers first.
 
     The order is otherwise that of the settings; then come the units of `sros units` in ``active``
     that run in enclaves without a unit in the settings.
     """
-    units = [(unit.name, unit.enclaves) for unit in settings.units if set(unit.enclaves) & set(due)]
+    units = [
+        (unit.name, unit.enclaves)
+        for unit in settings.units
+        if set(unit.enclaves) & set(due_enclaves)
+    ]
     named = {name for _, enclaves in units for name in enclaves}
     known = set(active)
-    for name in due:
+    for name in due_enclaves:
         if name not in named and (unit := f"sros@{unit_instance(name)}.service") in known:
             units.append((unit, (name,)))
     first = set(routers)
@@ -229,7 +240,7 @@ class Restarts(NamedTuple):
 
 def restart_units(
     settings: AgentSettings,
-    due: Sequence[str],
+    due_enclaves: Sequence[str],
     *,
     routers: Iterable[str],
     unusable: Mapping[str, str],
@@ -242,7 +253,7 @@ def restart_units(
     """
     restarted: list[str] = []
     problems: list[str] = []
-    if not due or not settings.restart:
+    if not due_enclaves or not settings.restart:
         return Restarts()
     if settings.restart_if:
         try:
@@ -263,7 +274,7 @@ def restart_units(
     except UnavailableError as error:
         active = frozenset()
         problems.append(str(error))
-    for unit, enclaves in _due_units(settings, due, routers, active):
+    for unit, enclaves in _due_units(settings, due_enclaves, routers, active):
         if broken := [name for name in enclaves if name in unusable]:
             why = f"{broken[0]} could not start: {unusable[broken[0]]}"
             problems.append(f"{unit} is not restarted: {why}.")

@@ -177,8 +177,8 @@ _TRUTHS = {"new_key", "restart"}
 _LISTS = {"authorities", "restart_if", "systemctl"}
 
 
-def settings_from(value: Mapping[str, Any], what: str) -> AgentSettings:
-    """Return the settings in a TOML document; ``what`` names it in errors.
+def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
+    """Return the settings in a TOML document; ``label`` names it in errors.
 
     Raises:
         DocumentError: a key is missing, unknown or of another form.
@@ -192,36 +192,36 @@ def settings_from(value: Mapping[str, Any], what: str) -> AgentSettings:
         elif key in _LISTS and _is_texts(entry):
             fields[key] = tuple(entry)
         elif key == "unit" and isinstance(entry, list):
-            fields["units"] = tuple(_unit(unit, what) for unit in entry)
+            fields["units"] = tuple(_unit(unit, label) for unit in entry)
         else:
-            raise _wrong(what, f"{key} is not a known key, or its value has the wrong form")
+            raise _wrong(label, f"{key} is not a known key, or its value has the wrong form")
     if missing := [key for key in ("robot", "from", "inbox") if _TEXTS[key] not in fields]:
-        raise _wrong(what, f"it lacks {', '.join(missing)}")
+        raise _wrong(label, f"it lacks {', '.join(missing)}")
     settings = AgentSettings(**fields)
     if problem := name_problem(settings.robot):
-        raise _wrong(what, f"{settings.robot!r} is not the name of a robot: {problem}")
+        raise _wrong(label, f"{settings.robot!r} is not the name of a robot: {problem}")
     for place in (settings.source, settings.inbox):
         if not _SOURCE.match(place):
-            raise _wrong(what, f"{place!r} is neither a URL (https, http) nor an absolute path")
+            raise _wrong(label, f"{place!r} is neither a URL (https, http) nor an absolute path")
     if not all(map(_DIGEST.match, settings.authorities)):
-        raise _wrong(what, "authorities are the SHA-256 of CAs, in lower-case hexadecimal")
+        raise _wrong(label, "authorities are the SHA-256 of CAs, in lower-case hexadecimal")
     if not settings.systemctl:
-        raise _wrong(what, "systemctl is empty")
+        raise _wrong(label, "systemctl is empty")
     return settings
 
 
-def _unit(value: Any, what: str) -> Unit:
+def _unit(value: Any, label: str) -> Unit:
     if not isinstance(value, dict) or value.keys() != {"name", "enclaves"}:
-        raise _wrong(what, "a unit has the keys name and enclaves")
+        raise _wrong(label, "a unit has the keys name and enclaves")
     name, enclaves = value["name"], value["enclaves"]
     if not isinstance(name, str) or not _UNIT.match(name):
-        raise _wrong(what, f"{name!r} is not the name of a service or target of systemd")
+        raise _wrong(label, f"{name!r} is not the name of a service or target of systemd")
     if not _is_texts(enclaves):
-        raise _wrong(what, f"the enclaves of {name} are not a list of names")
+        raise _wrong(label, f"the enclaves of {name} are not a list of names")
     try:
         return Unit(name, tuple(map(check_enclave_name, enclaves)))
     except InvalidNameError as error:
-        raise _wrong(what, str(error)) from error
+        raise _wrong(label, str(error)) from error
 
 
 def _is_texts(value: object) -> bool:

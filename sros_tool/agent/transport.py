@@ -36,10 +36,10 @@ class FolderTransport(FetcherInterface):
     base = "folder:"
     connection = nullcontext()
 
-    def __init__(self, folder: Path, *, most: int) -> None:
-        """Read from ``folder``, files of at most ``most`` bytes each."""
+    def __init__(self, folder: Path, *, max_bytes: int) -> None:
+        """Read from ``folder``, files of at most ``max_bytes`` bytes each."""
         self._folder = folder
-        self._most = most
+        self._most = max_bytes
 
     def _fetch(self, url: str) -> Iterator[bytes]:
         path = url.removeprefix(f"{self.base}/")
@@ -49,7 +49,7 @@ class FolderTransport(FetcherInterface):
             raise DownloadError(f"'{self._folder}': {error.strerror}") from error
         with folder:
             try:
-                yield folder.read(path, most=self._most)
+                yield folder.read(path, max_bytes=self._most)
             except FileNotFoundError as error:
                 raise DownloadHTTPError(f"'{self._folder / path}' does not exist", 404) from error
             except OSError as error:

@@ -308,7 +308,7 @@ def _enclave(
     if sourced and stated and sourced not in stated:
         text = f"{value_text(environment, ROS_DISTRO)}; {name} is for {', '.join(stated)}"
         yield OTHER_DISTRIBUTION.found(ROS_DISTRO, text)
-    findings = keystore_findings(keystore, now=now, zone=zone, domain=domain, only=(name,))
+    findings = keystore_findings(keystore, now=now, zone=zone, domain=domain, only_enclaves=(name,))
     for finding in findings:
         if finding.id == "enclave.governance-domain":
             yield DOMAIN_NOT_GOVERNED.found(DOMAIN, finding.text, finding.file)
@@ -450,14 +450,14 @@ def _secured_by_zenoh(environment: Mapping[str, str], folder: Path) -> Iterator[
         yield f"{named} has security"
 
 
-def _said_in(sought: bytes, name: str, place: bytes | Path) -> Iterator[str]:
+def _said_in(sought_text: bytes, name: str, place: bytes | Path) -> Iterator[str]:
     """Yield that a configuration has security, or cannot be read."""
     try:
         data = place if isinstance(place, bytes) else read_bytes(place, "configuration")
     except SrosError as error:
         yield f"{name} is set, and sros cannot read it ({error.what})"
         return
-    if re.search(sought, data):
+    if re.search(sought_text, data):
         yield f"{name} has security"
 
 

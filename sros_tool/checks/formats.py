@@ -141,15 +141,15 @@ def _kinds(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:
     return kinds
 
 
-def findings_markdown(chosen: ChosenFindings, fleet: Fleet | None = None) -> str:
+def findings_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None = None) -> str:
     """Return the findings as Markdown, under a heading with their numbers.
 
     Findings that differ only in one robot of ``fleet`` are one item.
     """
     rest = "which `sros check` shows"
-    groups = folded_findings(by_cause(chosen.shown), fleet)
+    groups = folded_findings(by_cause(chosen_findings.shown), fleet)
     listed = bounded((_item(group, others) for group, others in groups), _MOST, rest)
-    title = f"### Findings: {plain(chosen.summary())}"
+    title = f"### Findings: {plain(chosen_findings.summary())}"
     return "\n\n".join(part for part in (title, listed) if part) + "\n"
 
 

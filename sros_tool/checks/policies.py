@@ -260,9 +260,9 @@ _ALL = re.compile(r"/?[*?]*\*[*?]*\Z")
 _ASKING_SIDE = {offering: asking for asking, offering in OFFERING_SIDE.items()}
 
 
-def _check_names(checked: _CheckedPolicy) -> Iterator[Finding]:
+def _check_names(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about single names."""
-    for statement in checked.statements:
+    for statement in checked_policy.statements:
         if reason := _impossible_because(statement.name):
             yield statement.found(NEVER_MATCHES, f"{statement.name} matches nothing: {reason}")
         if _DDS_PREFIX.match(statement.written):
@@ -278,10 +278,10 @@ def _check_names(checked: _CheckedPolicy) -> Iterator[Finding]:
             yield from _broad_right(statement)
 
 
-def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
+def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about subscribed or called names that no enclave may publish or serve."""
     names: dict[str, set[str]] = {right: set() for pair in RIGHTS.values() for right in pair}
-    for statement in checked.statements:
+    for statement in checked_policy.statements:
         if statement.allows:
             names[statement.right.right].add(statement.name)
     sides = {right: Names(sorted(found)) for right, found in names.items()}
@@ -295,7 +295,7 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
 
     alone = [
         statement
-        for statement in checked.statements
+        for statement in checked_policy.statements
         if (other := _ASKING_SIDE.get(statement.right.right)) and is_alone(statement, other)
     ]
     yield from _offered_by_others(alone)
@@ -304,7 +304,7 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
         if not _is_of_a_node(statement.name):
             offered[statement.name].append(statement)
     near = NearNames(offered)
-    for statement in checked.statements:
+    for statement in checked_policy.statements:
         other = OFFERING_SIDE.get(statement.right.right)
         if not other or not is_alone(statement, other):
             continue
@@ -360,14 +360,14 @@ def _is_of_a_node(name: str) -> bool:
     return name.rpartition("/")[2] in NODE_SERVICES
 
 
-def _offered_by_others(unused: Iterable[_Statement]) -> Iterator[Finding]:
+def _offered_by_others(unused_statements: Iterable[_Statement]) -> Iterator[Finding]:
     """Yield findings about services that nobody calls, offered by their node and by others."""
     owners = {
         (statement.right.right, statement.name): statement
-        for statement in unused
+        for statement in unused_statements
         if statement.right.kind != "topics" and statement.is_private
     }
-    for statement in unused:
+    for statement in unused_statements:
         owner = owners.get((statement.right.right, statement.name))
         if owner and not statement.is_private and statement.right.enclave != owner.right.enclave:
             asking = _ASKING_SIDE[statement.right.right]
@@ -409,9 +409,9 @@ def _source_place(source: Source) -> tuple[str, int | None]:
     return source.file, source.line or None
 
 
-def _check_instances(checked: _CheckedPolicy) -> Iterator[Finding]:
+def _check_instances(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about enclaves that have a node in several namespaces."""
-    enclaves = checked.policy.enclaves
+    enclaves = checked_policy.policy.enclaves
     for (enclave, node), profiles in instances(enclaves).items():
         names = [profile.ns for profile in profiles]
         source = profiles[-1].source
@@ -419,10 +419,10 @@ def _check_instances(checked: _CheckedPolicy) -> Iterator[Finding]:
         yield SEVERAL_INSTANCES.found(enclave, text, source.file, source.line)
 
 
-def _check_protection(checked: _CheckedPolicy) -> Iterator[Finding]:
+def _check_protection(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about names with contradicting protect= values."""
     for protection, other in islice(
-        contradictions(stated_protections(checked.policy.enclaves)), _MANY
+        contradictions(stated_protections(checked_policy.policy.enclaves)), _MANY
     ):
         text = (
             f"{other} has protect={other.word}, "
@@ -554,7 +554,7 @@ _LISTENER = "transform_listener_impl_"
 _OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
 
 
-def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
+def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about nodes whose enclave lacks a right that every node needs.
 
     Nodes whose names begin with an underscore are skipped: they are hidden nodes of tools such as
@@ -563,10 +563,10 @@ def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
     """
     lacking = [
         gap
-        for enclave in checked.policy.enclaves
+        for enclave in checked_policy.policy.enclaves
         for profile in enclave.all_profiles()
         if profile.node and profile.ns.startswith("/") and not profile.node.startswith("_")
-        for gap in _basics(checked, enclave, profile)
+        for gap in _basics(checked_policy, enclave, profile)
     ]
     groups: dict[tuple[str, str], list[_Lacking]] = defaultdict(list)
     differs = cache(_is_not_shipped)
@@ -581,7 +581,7 @@ def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
             shared = cause if len(gaps) > 1 else None
             gap.finding = gap.finding._replace(cause=shared, own_remedy=remedy)
     yield from (gap.finding for gap in lacking)
-    for statement in checked.statements:
+    for statement in checked_policy.statements:
         if (
             statement.written in _GLOBAL
             and statement.profile.ns != "/"
@@ -683,17 +683,21 @@ def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
     )
 
 
-def _basics(checked: _CheckedPolicy, enclave: Enclave, profile: Profile) -> Iterator[_Lacking]:
+def _basics(
+    checked_policy: _CheckedPolicy, enclave: Enclave, profile: Profile
+) -> Iterator[_Lacking]:
     node = expand("~", profile.ns, profile.node)
     listener = profile.node.startswith(_LISTENER)
     lacks_others = False
     for kind, right, names in _BASICS:
         if listener and kind not in _OF_LISTENERS:
             continue
-        if kind is NO_TYPE_DESCRIPTION and not has_type_descriptions(checked.distribution):
+        if kind is NO_TYPE_DESCRIPTION and not has_type_descriptions(checked_policy.distribution):
             continue
         wanted = (expand(name, profile.ns, profile.node) for name in names)
-        missing = [name for name in wanted if not checked.rules.allow(enclave.path, right, name)]
+        missing = [
+            name for name in wanted if not checked_policy.rules.allow(enclave.path, right, name)
+        ]
         if not missing:
             continue
         if kind is NO_PARAMETER_SERVICES and len(missing) == len(names) and not lacks_others:
@@ -795,17 +799,17 @@ ROOT_ENCLAVE = FindingKind(
 )
 
 
-def _check_root_enclave(checked: _CheckedPolicy) -> Iterator[Finding]:
+def _check_root_enclave(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield a finding about an enclave / that has the rights of nodes, or of other enclaves.
 
     A single node counts only if it has a plain name, and rights that not every node needs: tools
     (``_ros2cli_*``) and a profile for any node have no better enclave.
     """
-    root = checked.policy.enclave("/")
+    root = checked_policy.policy.enclave("/")
     if root is None:
         return
     nodes = {expand("~", profile.ns, profile.node) for profile in root.all_profiles()}
-    text = within_root(policy_rights(checked.policy))
+    text = within_root(policy_rights(checked_policy.policy))
     if not text and len(nodes) > 1:
         text = f"/ has the rights of {len(nodes)} nodes"
     elif not text and not only_basic(policy_rights(Policy((root,)))):
@@ -850,9 +854,9 @@ def _basic_rights() -> Rules:
 _NAMES_SHOWN = 3
 
 
-def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
+def _check_portability(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about the permissions that would be signed for each enclave."""
-    for enclave in checked.policy.enclaves:
+    for enclave in checked_policy.policy.enclaves:
         source = enclave.source
         permissions = permissions_for(
             enclave,
@@ -862,22 +866,28 @@ def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
         )
         size = _signed_bytes(enclave)
         for finding in outside_findings(permissions, size, enclave.path, source.file, source.line):
-            yield _located_at_denial(finding, checked) if finding.kind is DENY_BLOCKS else finding
+            yield (
+                _located_at_denial(finding, checked_policy)
+                if finding.kind is DENY_BLOCKS
+                else finding
+            )
         if len(enclave.profiles) > 1:
             text = f"it has {len(enclave.profiles)} <profiles>"
             yield SEVERAL_PROFILES.found(enclave.path, text, source.file, source.line)
-    if pairs := mistaken_names(enclave.path for enclave in checked.policy.enclaves):
+    if pairs := mistaken_names(enclave.path for enclave in checked_policy.policy.enclaves):
         text = f"Cyclone DDS mistakes {some_pairs(pairs)}"
-        first = checked.policy.enclave(pairs[0][0])
+        first = checked_policy.policy.enclave(pairs[0][0])
         line = first.source.line if first else None
-        yield ENCLAVE_NAMES.found(pairs[0][0], text, checked.policy.file, line)
+        yield ENCLAVE_NAMES.found(pairs[0][0], text, checked_policy.policy.file, line)
 
 
-def _located_at_denial(found: Finding, checked: _CheckedPolicy) -> Finding:
+def _located_at_denial(finding: Finding, checked_policy: _CheckedPolicy) -> Finding:
     """Return the finding with the file and line of the first denial in its enclave."""
-    denials = (s for s in checked.statements if s.right.enclave == found.subject and not s.allows)
+    denials = (
+        s for s in checked_policy.statements if s.right.enclave == finding.subject and not s.allows
+    )
     source = next(denials).source
-    return found._replace(file=source.file, line=source.line)
+    return finding._replace(file=source.file, line=source.line)
 
 
 def outside_findings(
@@ -946,14 +956,14 @@ HALF_ACTION = FindingKind(
 )
 
 
-def _check_rules(checked: _CheckedPolicy) -> Iterator[Finding]:
+def _check_rules(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about contradicting, unused and repeated statements of an enclave."""
-    for statement in checked.statements:
+    for statement in checked_policy.statements:
         if statement.allows:
-            yield from _permission(statement, checked.rules)
-        elif not checked.rules.meet(statement.right._replace(qualifier=ALLOW)):
+            yield from _permission(statement, checked_policy.rules)
+        elif not checked_policy.rules.meet(statement.right._replace(qualifier=ALLOW)):
             yield statement.found(NO_EFFECT, f"no rule allows to {statement.right.describe()}")
-    yield from _redundant(checked)
+    yield from _redundant(checked_policy)
 
 
 def _permission(statement: _Statement, rules: Rules) -> Iterator[Finding]:
@@ -975,14 +985,14 @@ def _permission(statement: _Statement, rules: Rules) -> Iterator[Finding]:
             yield statement.found(HALF_ACTION, text)
 
 
-def _redundant(checked: _CheckedPolicy) -> Iterator[Finding]:
+def _redundant(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     wild: dict[tuple[int, str], list[str]] = defaultdict(list)
-    for statement in checked.statements:
+    for statement in checked_policy.statements:
         if statement.allows and is_expression(statement.name):
             wild[id(statement.profile), statement.right.right].append(statement.name)
     limit = ComparisonLimit()
     names = {place: Names(found, limit) for place, found in wild.items()}
-    for statement in checked.statements:
+    for statement in checked_policy.statements:
         # Included rights are the same for all nodes, so a redundant one is not a mistake.
         if not statement.allows or statement.source.file != statement.profile.source.file:
             continue

@@ -232,10 +232,10 @@ class _Loaded:
     unknown: str = ""
 
 
-def _loaded(enclave: ProcessEnclave, newer: Sequence[str], started: datetime) -> _Loaded:
+def _loaded(enclave: ProcessEnclave, newer_files: Sequence[str], started: datetime) -> _Loaded:
     """Return the files that a process loaded; the ledger has those that changed since."""
     windows: dict[str, Window] = {}
-    changed = {file.split()[0] for file in newer}
+    changed = {file.split()[0] for file in newer_files}
     certificate = next(iter(_certificates_in(enclave, CERTIFICATE_FILE)), None)
     entries, unknown = _entries(enclave)
     before = [entry for entry in entries if entry.time <= iso(started)]
@@ -335,11 +335,11 @@ def _grant(enclave: ProcessEnclave, subject: str) -> Grant | None:
 
 
 def _local_time(
-    process: Process, loaded: _Loaded, now: datetime, zone: tzinfo
+    process: Process, loaded_files: _Loaded, now: datetime, zone: tzinfo
 ) -> Iterator[Finding]:
     """Yield a finding if permissions, read in local time as Fast DDS does, are not valid."""
-    grant = loaded.grant
-    window = loaded.windows.get("its permissions")
+    grant = loaded_files.grant
+    window = loaded_files.windows.get("its permissions")
     if not grant or not window or not window.contains(now):
         return
     if vendor_of(process.rmw) is not Vendor.FAST:

@@ -192,19 +192,21 @@ class ShownFindings(NamedTuple):
     """The numbers of findings."""
 
 
-def shown_findings(chosen: ChosenFindings) -> ShownFindings:
+def shown_findings(chosen_findings: ChosenFindings) -> ShownFindings:
     """Return the findings in the form that ``--json`` prints."""
-    place = {id(finding): index for index, finding in enumerate(chosen.shown)}
+    place = {id(finding): index for index, finding in enumerate(chosen_findings.shown)}
     causes = [
         SharedCause(
             cause.title, cause.text, cause.remedy, [place[id(finding)] for finding in group]
         )
-        for group in by_cause(chosen.shown)
+        for group in by_cause(chosen_findings.shown)
         if len(group) > 1 and (cause := group[0].cause)
     ]
-    error, warning, note = chosen.numbers().values()
-    counts = FindingCounts(error, warning, note, len(chosen.accepted), chosen.hidden)
-    return ShownFindings(chosen.shown, causes, chosen.accepted, counts)
+    error, warning, note = chosen_findings.numbers().values()
+    counts = FindingCounts(
+        error, warning, note, len(chosen_findings.accepted), chosen_findings.hidden
+    )
+    return ShownFindings(chosen_findings.shown, causes, chosen_findings.accepted, counts)
 
 
 class AllKinds(NamedTuple):

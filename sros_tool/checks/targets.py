@@ -57,7 +57,7 @@ class Circumstances:
         return self.opened.setdefault(root, Keystore(root))
 
 
-def path_findings(paths: Iterable[Path], at: Circumstances) -> list[Finding]:
+def path_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[Finding]:
     """Return the findings at paths: policies, folders of policies, keystores, or enclaves.
 
     All policies count as the policies of one robot or fleet: a name may have its counterpart in
@@ -68,52 +68,52 @@ def path_findings(paths: Iterable[Path], at: Circumstances) -> list[Finding]:
     findings: list[Finding] = []
     policies, paths = [], tuple(paths)
     for path in paths:
-        found = _no_policy_findings(path, at)
+        found = _no_policy_findings(path, circumstances)
         if found is None:
             policies.append(path)
         else:
             findings += found
     if policies:
-        findings += policy_findings(policies, at)
-    findings += stranger_findings(paths, at)
+        findings += policy_findings(policies, circumstances)
+    findings += stranger_findings(paths, circumstances)
     return list(dict.fromkeys(findings))
 
 
-def stranger_findings(paths: Iterable[Path], at: Circumstances) -> list[Finding]:
+def stranger_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[Finding]:
     """Return findings about folders among the paths whose enclaves do not trust each other."""
     targets: dict[str, tuple[Keystore, Sequence[str]]] = {}
     for path in filter(Path.is_dir, paths):
         if is_keystore(path):
-            keystore = at.keystore(path)
+            keystore = circumstances.keystore(path)
             targets[str(path)] = keystore, keystore.names
         elif is_enclave(path):
             root, name = locate_enclave(path)
-            targets[str(path)] = at.keystore(root), (name,)
+            targets[str(path)] = circumstances.keystore(root), (name,)
     if len(targets) < 2:
         return []
     from sros_tool.checks.keystores.trust import strangers
 
-    return list(strangers(targets, on_zenoh=at.vendors == (ZENOH,)))
+    return list(strangers(targets, on_zenoh=circumstances.vendors == (ZENOH,)))
 
 
-def _no_policy_findings(path: Path, at: Circumstances) -> list[Finding] | None:
+def _no_policy_findings(path: Path, circumstances: Circumstances) -> list[Finding] | None:
     """Return the findings at a path; None if it has to be a policy, or a folder of policies."""
     if path.suffix in (".json5", ".json", ".yaml", ".yml") and not path.is_dir():
         from sros_tool.checks.zenoh import configuration_findings
 
         return list(configuration_findings(path))
     if is_keystore(path):
-        return _keystore(path, at, None)
+        return _keystore(path, circumstances, None)
     enclave = path if path.is_dir() else path.parent
     if (is_enclave(enclave) or (enclave / PERMISSIONS_FILE).exists()) and (
         path.is_dir() or path.name in _ENCLAVE_FILES
     ):
         root, name = locate_enclave(enclave)
-        return _keystore(root, at, name)
+        return _keystore(root, circumstances, name)
     return None
 
 
-def policy_findings(paths: Iterable[Path], at: Circumstances) -> list[Finding]:
+def policy_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[Finding]:
     """Return the findings about policy files, and about the policies in folders, all together.
 
     Raises:
@@ -123,7 +123,10 @@ def policy_findings(paths: Iterable[Path], at: Circumstances) -> list[Finding]:
 
     files = [file for path in paths for file in _policies_at(path)]
     findings = policy_file_findings(
-        *files, distribution=at.distribution, fleet=at.fleet, on_zenoh=ZENOH in at.vendors
+        *files,
+        distribution=circumstances.distribution,
+        fleet=circumstances.fleet,
+        on_zenoh=ZENOH in circumstances.vendors,
     )
     return list(dict.fromkeys(findings))
 
@@ -143,16 +146,16 @@ def _policies_at(path: Path) -> list[Path]:
     )
 
 
-def _keystore(root: Path, at: Circumstances, only: str | None) -> list[Finding]:
+def _keystore(root: Path, circumstances: Circumstances, only: str | None) -> list[Finding]:
     return keystore_findings(
-        at.keystore(root),
-        now=at.now,
-        zone=at.zone,
-        domain=at.domain,
-        policies=at.policies,
-        fleet=at.fleet,
-        distribution=at.distribution,
-        vendors=at.vendors,
-        only=None if only is None else (only,),
-        sample=at.sample,
+        circumstances.keystore(root),
+        now=circumstances.now,
+        zone=circumstances.zone,
+        domain=circumstances.domain,
+        policies=circumstances.policies,
+        fleet=circumstances.fleet,
+        distribution=circumstances.distribution,
+        vendors=circumstances.vendors,
+        only_enclaves=None if only is None else (only,),
+        sample=circumstances.sample,
     )

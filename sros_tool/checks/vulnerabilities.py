@@ -219,20 +219,22 @@ def _users(
     return users
 
 
-def _counted_vulnerabilities(known: Sequence[Advisory], version: str) -> str:
+def _counted_vulnerabilities(advisories: Sequence[Advisory], version: str) -> str:
     """Return a clause with the number of vulnerabilities, what they need, and their ids."""
-    secured = sum("security" in advisory.needs for advisory in known)
-    needs = [f"{len(known) - secured} concern all processes"] if secured < len(known) else []
+    secured = sum("security" in advisory.needs for advisory in advisories)
+    needs = (
+        [f"{len(advisories) - secured} concern all processes"] if secured < len(advisories) else []
+    )
     needs += [f"{secured} only those with DDS Security"] if secured else []
     numbers = version_numbers(version)
     major = numbers[0] if numbers else ""
-    releases = Counter(advisory.fixed_in(numbers) if numbers else "" for advisory in known)
+    releases = Counter(advisory.fixed_in(numbers) if numbers else "" for advisory in advisories)
     fixes = [
         f"{number} in {release}" if release else f"{number} in no known release {major}.x"
         for release, number in sorted(releases.items(), reverse=True)
     ]
-    ids = ", ".join(advisory.id for advisory in known)
-    count = counted(len(known), "known vulnerability", "known vulnerabilities")
+    ids = ", ".join(advisory.id for advisory in advisories)
+    count = counted(len(advisories), "known vulnerability", "known vulnerabilities")
     return f"{count} ({'; '.join(needs)}), fixed: {', '.join(fixes)}: {ids}"
 
 

@@ -469,10 +469,10 @@ def _wildcard_past(
 
 
 def _overruled(
-    rule: AclRule, others: Sequence[AclSubject], access: Enforcement, limit: ComparisonLimit
+    rule: AclRule, other_subjects: Sequence[AclSubject], access: Enforcement, limit: ComparisonLimit
 ) -> str:
-    """Return the subject among ``others`` that allows a message which ``rule`` denies, or ""."""
-    for other, flow, message in product(others, rule.flows, rule.messages):
+    """Return one of ``other_subjects`` that allows a message which ``rule`` denies, or ""."""
+    for other, flow, message in product(other_subjects, rule.flows, rule.messages):
         same = _rules_for(access.rules_of(other.id), flow, message)
         denied, allowed = _keys(same, allows=False), _keys(same, allows=True)
         for key in rule.key_expressions:
@@ -569,13 +569,13 @@ class ReadConfiguration(NamedTuple):
     notes: Notes
 
 
-def subject_rights(behind: RightsBehindRules) -> SubjectRights:
+def subject_rights(rights_behind: RightsBehindRules) -> SubjectRights:
     """Return the rights of a subject as the JSON output has them."""
     return SubjectRights(
-        behind.subject or None,
-        behind.names,
-        behind.self_limiting,
-        [AllowedName(VERBS[r.right], r.name, r.domain, r.lacks) for r in behind.rights],
-        unsaid=[KeyRight(VERBS[right], key) for right, key in behind.unsaid],
-        denied=[KeyRight(VERBS[right], key) for right, key in behind.denied],
+        rights_behind.subject or None,
+        rights_behind.names,
+        rights_behind.self_limiting,
+        [AllowedName(VERBS[r.right], r.name, r.domain, r.lacks) for r in rights_behind.rights],
+        unsaid=[KeyRight(VERBS[right], key) for right, key in rights_behind.unsaid],
+        denied=[KeyRight(VERBS[right], key) for right, key in rights_behind.denied],
     )

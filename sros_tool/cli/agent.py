@@ -187,7 +187,7 @@ def _init(
     settings_from(parse_toml(render_settings(settings).decode()), "these options")
     if tls_ca and not tls_ca.is_file():
         raise UsageError(f"'{tls_ca}' is not a file")
-    root = read_named(root_file, "root metadata", most=_MOST_ROOT)
+    root = read_named(root_file, "root metadata", max_bytes=_MOST_ROOT)
     path = agent_folder(folder) / SETTINGS_FILE
     existed = path.exists()
     if existed and not force:
@@ -293,33 +293,41 @@ def _round(folder: Path, settings: AgentSettings, *, restarted: bool = False) ->
     return run_round(folder, settings, machine)
 
 
-def _show(folder: Path, done: Round, *, as_json: bool) -> None:
+def _show(folder: Path, finished_round: Round, *, as_json: bool) -> None:
     if as_json:
-        print_json(done)
+        print_json(finished_round)
         return
-    for line in _round_lines(folder, done):
+    for line in _round_lines(folder, finished_round):
         echo(visible_line(line))
-    for problem in done.problems:
+    for problem in finished_round.problems:
         echo(visible_line(problem), err=True)
 
 
-def _round_lines(folder: Path, done: Round) -> Iterator[str]:
-    release = f"release {done.release}" if done.release else "no release"
-    changes = [f"changed {counted(len(done.changed), 'enclave')}"] if done.changed else []
-    changes += [f"removed {counted(len(done.removed), 'enclave')}"] if done.removed else []
+def _round_lines(folder: Path, finished_round: Round) -> Iterator[str]:
+    release = f"release {finished_round.release}" if finished_round.release else "no release"
+    changes = (
+        [f"changed {counted(len(finished_round.changed), 'enclave')}"]
+        if finished_round.changed
+        else []
+    )
+    changes += (
+        [f"removed {counted(len(finished_round.removed), 'enclave')}"]
+        if finished_round.removed
+        else []
+    )
     nothing = "nothing could be fetched"
-    if done.fetched:
-        nothing = "nothing changed" if done.problems else "nothing new"
+    if finished_round.fetched:
+        nothing = "nothing changed" if finished_round.problems else "nothing new"
     yield f"{release}: {', '.join(changes) or nothing}"
-    yield from _due_lines(folder, done.restart, done.unseen)
-    if done.requests:
-        yield f"asked for renewal of {counted(done.requests, 'enclave')}"
-    yield "message sent" if done.sent else "message not sent"
+    yield from _due_lines(folder, finished_round.restart, finished_round.unseen)
+    if finished_round.requests:
+        yield f"asked for renewal of {counted(finished_round.requests, 'enclave')}"
+    yield "message sent" if finished_round.sent else "message not sent"
 
 
-def _due_lines(folder: Path, due: Sequence[str], unseen: Sequence[str]) -> Iterator[str]:
-    if due:
-        yield f"restart due: {first_few(due, _MOST_SHOWN)}"
+def _due_lines(folder: Path, due_enclaves: Sequence[str], unseen: Sequence[str]) -> Iterator[str]:
+    if due_enclaves:
+        yield f"restart due: {first_few(due_enclaves, _MOST_SHOWN)}"
     if unseen:
         yield (
             "sros cannot see all processes here; once the processes of "

@@ -254,7 +254,7 @@ def _added_by_hand(sources: Sequence[Path], fleet: Fleet, audited: Audit) -> str
 # ── output ──────────────────────────────────────────────────────────────────────────────
 
 
-def _show(audited: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> None:
+def _show(audited: Audit, enclaves: AuditedEnclaves, changing_seconds: float) -> None:
     """Print denied rights, unseen nodes and a verdict that says what the audit did not cover."""
     for line in (*audited.lines().values(), *(f"not seen: {node}" for node in audited.unseen)):
         echo(line)
@@ -271,8 +271,8 @@ def _show(audited: Audit, enclaves: AuditedEnclaves, kept_changing: float) -> No
         verdict = f"only {seen} {'was' if 1 in (of, number) else 'were'} seen: {verdict}"
     if audited.unjudged:
         verdict += f"; not judged: {', '.join(audited.unjudged)}"
-    if kept_changing:
-        verdict += f"; the ROS graph kept changing for {kept_changing:.0f} s"
+    if changing_seconds:
+        verdict += f"; the ROS graph kept changing for {changing_seconds:.0f} s"
     echo(verdict, err=True)
     if any(denied_right.by_rule for denied_right in audited.denied):
         echo("some of it is denied by a DENY, which no added right overrides", err=True)

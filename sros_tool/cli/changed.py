@@ -168,15 +168,17 @@ def _print_closed(root: Path, changes: Sequence[Change]) -> None:
         )
 
 
-def rights_lines(root: Path, replaced: Sequence[ReplacedRights], *, dry_run: bool) -> Iterator[str]:
+def rights_lines(
+    root: Path, replaced_rights: Sequence[ReplacedRights], *, dry_run: bool
+) -> Iterator[str]:
     """Yield a line for each lost or gained right; the robots of a fleet share a line."""
     from sros_tool.fleet.robots import folded
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.reader import Keystore
 
-    fleet = load_fleet(Keystore(root)) if replaced else None
+    fleet = load_fleet(Keystore(root)) if replaced_rights else None
     together: dict[tuple[str, str], list[str]] = {}
-    for rights in replaced:
+    for rights in replaced_rights:
         for verb, text in (("lose", rights.loses(fleet)), ("gain", rights.gains(fleet))):
             if text:
                 together.setdefault((verb, text), []).append(rights.enclave)

@@ -392,13 +392,17 @@ def _requirements(
     return decide
 
 
-def _status(chosen: ChosenFindings, fail_on: str) -> int:
+def _status(chosen_findings: ChosenFindings, fail_on: str) -> int:
     """Return the exit status: 1 for findings, and `NOT_DONE` if some processes were not seen."""
     from sros_tool.checks.kind import Severity
 
     if fail_on == "never":
         return 0
-    failing = [finding for finding in chosen.shown if finding.severity >= Severity[fail_on.upper()]]
+    failing = [
+        finding
+        for finding in chosen_findings.shown
+        if finding.severity >= Severity[fail_on.upper()]
+    ]
     if failing and all(finding.id == "runtime.process-not-seen" for finding in failing):
         return NOT_DONE
     return 1 if failing else 0
@@ -437,18 +441,20 @@ def _one_robot(family: str, paths: tuple[Path, ...], option: str) -> tuple[Path,
     return paths
 
 
-def _system(paths: Sequence[Path], at: Circumstances, template: str | None = None) -> System:
+def _system(
+    paths: Sequence[Path], circumstances: Circumstances, template: str | None = None
+) -> System:
     from sros_tool.keystore.template import load_template
     from sros_tool.proof.system import load_system
 
     return load_system(
         paths,
-        opened=at.opened.get(paths[0]),
-        at=at.now,
-        zone=at.zone,
-        domain=at.domain,
-        fleet=at.fleet,
-        only=at.vendors,
+        keystore=circumstances.opened.get(paths[0]),
+        moment=circumstances.now,
+        zone=circumstances.zone,
+        domain=circumstances.domain,
+        fleet=circumstances.fleet,
+        only_enclaves=circumstances.vendors,
         template=load_template(template) if template else None,
     )
 
@@ -516,19 +522,24 @@ def _circumstances(
     return Circumstances(moment_of(moment), zone, wanted, tuple(read), fleet=fleet)
 
 
-def _stated_differences(paths: Sequence[Path], at: Circumstances) -> Iterator[Finding]:
+def _stated_differences(paths: Sequence[Path], circumstances: Circumstances) -> Iterator[Finding]:
     """Yield where keystores are decided differently on the distributions that they are for."""
     from sros_tool.keystore.fleet import of_several_distributions
     from sros_tool.keystore.layout import is_keystore
 
     for path in paths or filter(None, (Path(os.environ.get(KEYSTORE_VARIABLE, "")),)):
-        if at.vendors or not is_keystore(path):
+        if circumstances.vendors or not is_keystore(path):
             continue
-        keystore = at.keystore(path)
+        keystore = circumstances.keystore(path)
         if of_several_distributions(keystore):
             from sros_tool.proof.upgrade import check_distributions
 
-            yield from check_distributions(keystore, at=at.now, zone=at.zone, domain=at.domain)
+            yield from check_distributions(
+                keystore,
+                moment=circumstances.now,
+                zone=circumstances.zone,
+                domain=circumstances.domain,
+            )
 
 
 def _nodes_of(distro: Distribution | None, *, all_distros: bool) -> str:
@@ -558,17 +569,17 @@ def _refuse_besides_upgrade() -> None:
             raise UsageError(f"--upgrade-to and --{name} exclude each other", "", "Choose one.")
 
 
-def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[Finding]:
+def _findings(family: str, paths: tuple[Path, ...], circumstances: Circumstances) -> list[Finding]:
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.targets import path_findings, policy_findings, stranger_findings
     from sros_tool.keystore.layout import is_keystore
 
     if family == "runtime":
-        return _runtime(at)
+        return _runtime(circumstances)
     if family == "policy":
         if not paths:
             raise UsageError("no policy is named", "", "Name a file, or a folder of policies.")
-        return policy_findings(paths, at)
+        return policy_findings(paths, circumstances)
     if family == "keystore":
         if not paths and not os.environ.get(KEYSTORE_VARIABLE) and not Path(family).exists():
             raise UsageError(
@@ -581,31 +592,36 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
             finding
             for root in roots
             for finding in keystore_findings(
-                at.keystore(root),
-                now=at.now,
-                zone=at.zone,
-                domain=at.domain,
-                policies=at.policies,
-                fleet=at.fleet,
-                distribution=at.distribution,
-                vendors=at.vendors,
+                circumstances.keystore(root),
+                now=circumstances.now,
+                zone=circumstances.zone,
+                domain=circumstances.domain,
+                policies=circumstances.policies,
+                fleet=circumstances.fleet,
+                distribution=circumstances.distribution,
+                vendors=circumstances.vendors,
             )
         ]
-        return [*findings, *stranger_findings(roots, at)]
+        return [*findings, *stranger_findings(roots, circumstances)]
     if paths:
-        return path_findings(paths, at)
-    findings = _runtime(at)
+        return path_findings(paths, circumstances)
+    findings = _runtime(circumstances)
     root = os.environ.get("ROS_SECURITY_KEYSTORE")
     if root and is_keystore(Path(root)):
-        findings += path_findings([Path(root)], at)
+        findings += path_findings([Path(root)], circumstances)
     elif not root:
         looked = "checked the runtime only: no path is given and ROS_SECURITY_KEYSTORE is not set"
         echo(looked, err=True)
     return list(dict.fromkeys(findings))
 
 
-def _runtime(at: Circumstances) -> list[Finding]:
-    return _findings_here(_environment(at.domain), at.now, {}, advisories=at.advisories)
+def _runtime(circumstances: Circumstances) -> list[Finding]:
+    return _findings_here(
+        _environment(circumstances.domain),
+        circumstances.now,
+        {},
+        advisories=circumstances.advisories,
+    )
 
 
 def _environment(domain: int | None) -> dict[str, str]:
@@ -685,24 +701,24 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     return NOT_DONE if found.unreadable else 1 if found.due else 0
 
 
-def renewal_markdown(lines: Sequence[str], none: str, text: str) -> str:
+def renewal_markdown(lines: Sequence[str], text_if_none: str, text: str) -> str:
     """Return the enclaves to renew soon as Markdown, or a sentence that there are none."""
     from sros_tool.markdown import bounded, code, plain
 
     if not lines:
-        return f"### Certificates: {plain(none)}\n"
+        return f"### Certificates: {plain(text_if_none)}\n"
     count = "1 enclave needs" if len(lines) == 1 else f"{len(lines)} enclaves need"
     listed = bounded(map(code, lines), 4000, "which `sros check --needs-renewal` shows")
     return f"### Certificates: {count} to be renewed {plain(f'({text})')}\n\n{listed}\n"
 
 
-def _print_markdown(chosen: ChosenFindings, fleet: Fleet | None) -> None:
+def _print_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None) -> None:
     from sros_tool.checks.formats import findings_markdown
 
-    echo_lines(findings_markdown(chosen, fleet))
+    echo_lines(findings_markdown(chosen_findings, fleet))
 
 
-def _fleet_of(at: Circumstances, paths: Sequence[Path]) -> Fleet | None:
+def _fleet_of(circumstances: Circumstances, paths: Sequence[Path]) -> Fleet | None:
     """Return the fleet of policy files, with the enclave paths that they define, or of a keystore.
 
     It is None if there is none, or if it cannot be read.
@@ -711,45 +727,45 @@ def _fleet_of(at: Circumstances, paths: Sequence[Path]) -> Fleet | None:
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.policy.document import policy_files
 
-    if at.fleet is None:
-        opened = [at.opened[path] for path in paths if path in at.opened]
+    if circumstances.fleet is None:
+        opened = [circumstances.opened[path] for path in paths if path in circumstances.opened]
         with suppress(SrosError):  # what is wrong with it is a finding
             return load_fleet(opened[0]) if len(opened) == 1 else None
         return None
     files: list[Path] = []
     for path in paths:
-        if path not in at.opened:
+        if path not in circumstances.opened:
             with suppress(SrosError):  # what is wrong with it is a finding
                 files += policy_files(path)
-    return fleet_with_enclaves(at.fleet, files)
+    return fleet_with_enclaves(circumstances.fleet, files)
 
 
-def _print_all(chosen: ChosenFindings, _selection: FindingFilter) -> None:
-    _print_text(chosen)
+def _print_all(chosen_findings: ChosenFindings, _selection: FindingFilter) -> None:
+    _print_text(chosen_findings)
 
 
-def _print_text(chosen: ChosenFindings, fleet: Fleet | None = None) -> None:
+def _print_text(chosen_findings: ChosenFindings, fleet: Fleet | None = None) -> None:
     from sros_tool.checks.kind import by_cause
 
-    echo_folded(sorted(by_cause(chosen.shown), key=lambda group: len(group) == 1), fleet)
-    for choice in dict.fromkeys(finding.accepted for finding in chosen.accepted):
-        kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
+    echo_folded(sorted(by_cause(chosen_findings.shown), key=lambda group: len(group) == 1), fleet)
+    for choice in dict.fromkeys(finding.accepted for finding in chosen_findings.accepted):
+        kinds = {e.id: e.kind.title for e in chosen_findings.accepted if e.accepted == choice}
         kinds_text = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
         echo(f"accepted by the {choice}: {kinds_text}")
-    echo(chosen.summary(), err=True)
+    echo(chosen_findings.summary(), err=True)
 
 
-def _print_json(chosen: ChosenFindings, _selection: FindingFilter) -> None:
+def _print_json(chosen_findings: ChosenFindings, _selection: FindingFilter) -> None:
     from sros_tool.checks.registry import shown_findings
 
-    print_json(shown_findings(chosen))
+    print_json(shown_findings(chosen_findings))
 
 
-def _print_sarif(chosen: ChosenFindings, selection: FindingFilter) -> None:
+def _print_sarif(chosen_findings: ChosenFindings, selection: FindingFilter) -> None:
     from sros_tool.checks.formats import sarif
     from sros_tool.checks.registry import select_kinds
 
-    kinds, findings = select_kinds(selection), (*chosen.shown, *chosen.accepted)
+    kinds, findings = select_kinds(selection), (*chosen_findings.shown, *chosen_findings.accepted)
     echo_lines(json_text(sarif(findings, kinds, version=__version__, base=Path.cwd())))
 
 

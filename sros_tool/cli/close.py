@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from sros_tool.policy.model import Policy
 
 
-def _run(words: Sequence[str], live: bool) -> tuple[int, str, str]:
+def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
     """Run a verb of sros in this process; return its status, its output and its messages."""
     from sros_tool.cli.program import program
 
@@ -42,7 +42,7 @@ def _run(words: Sequence[str], live: bool) -> tuple[int, str, str]:
         io.TextIOWrapper(output, "utf-8", "surrogateescape", write_through=True)
         for output in outputs
     )
-    with redirect_stderr(sys.stderr if live else err), redirect_stdout(out):
+    with redirect_stderr(sys.stderr if shows_output else err), redirect_stdout(out):
         status = program.main(list(words), prog_name="sros", standalone_mode=False)
         texts = [output.getvalue().decode("utf-8", "surrogateescape") for output in outputs]
     return (status if isinstance(status, int) else 0), texts[0], texts[1]

@@ -805,10 +805,10 @@ def _first_line(path: Path) -> str:
 # ── files and pipes that the user names ─────────────────────────────────────────────────────
 
 
-def read_named(path: Path, what: str, *, most: int = 16 * 1024 * 1024) -> bytes:
+def read_named(path: Path, what: str, *, max_bytes: int = 16 * 1024 * 1024) -> bytes:
     """Return the bytes of a file, or of standard input for "-"; ``what`` describes it in errors.
 
-    At most one byte more than ``most`` (16 MiB) is read from standard input.
+    At most one byte more than ``max_bytes`` (16 MiB) is read from standard input.
 
     Raises:
         DocumentError: the file cannot be read, is too large or is not a regular file, or standard
@@ -817,8 +817,8 @@ def read_named(path: Path, what: str, *, most: int = 16 * 1024 * 1024) -> bytes:
     from sros_tool.xml import read_bytes
 
     if path != Path("-"):
-        return read_bytes(path, what, most=most)
-    data = sys.stdin.buffer.read(most + 1) if sys.stdin else b""
+        return read_bytes(path, what, max_bytes=max_bytes)
+    data = sys.stdin.buffer.read(max_bytes + 1) if sys.stdin else b""
     if not data:
         raise DocumentError(
             f"the {what} is empty",

@@ -247,7 +247,7 @@ def verify(
             now=moment,
             domain=wanted,
             zone=zone,
-            only=only,
+            only_enclaves=only,
             secrets=secrets() if tokens else None,
         )
     if as_json:
@@ -424,7 +424,7 @@ def sign_request(
         read_named(request, "signing request"),
         now=now(),
         policy=_policy(policy_file, fleet_file),
-        only=only,
+        only_enclaves=only,
         refuse_revoked=refuse_revoked,
         renew=renew,
         answer=None if stream else output,
@@ -511,7 +511,7 @@ def _certify(
         read_named(request, "signing request"),
         now=now(),
         policy=policy,
-        only=only,
+        only_enclaves=only,
         refuse_revoked=refuse_revoked,
         renew=renew,
         domain=domain_from(os.environ),
@@ -585,14 +585,15 @@ def import_verb(
     print_changed(done, None, _imported_lines(done, pinned=bool(pinned)), exported=False)
 
 
-def _imported_lines(done: ImportedEnclave, *, pinned: bool) -> Iterator[str]:
+def _imported_lines(imported_enclave: ImportedEnclave, *, pinned: bool) -> Iterator[str]:
     from sros_tool.validity import iso
 
-    yield f"imported enclave {done.name}, which can run until {iso(done.until)}"
-    yield f"  it trusts {_ca_text(done.identity_ca)}"
-    if done.permissions_ca != done.identity_ca:
-        yield f"  and {_ca_text(done.permissions_ca)}"
-    if done.first and not pinned:
+    until = iso(imported_enclave.until)
+    yield f"imported enclave {imported_enclave.name}, which can run until {until}"
+    yield f"  it trusts {_ca_text(imported_enclave.identity_ca)}"
+    if imported_enclave.permissions_ca != imported_enclave.identity_ca:
+        yield f"  and {_ca_text(imported_enclave.permissions_ca)}"
+    if imported_enclave.first and not pinned:
         yield (
             "  compare both with the output of sign_request, or use --ca: otherwise they are "
             "not verified"

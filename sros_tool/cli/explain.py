@@ -426,40 +426,48 @@ def _open(root: Path | None, name: str, policy: Path | None, asking: AskingConte
     return open_to_ask(root, name, policy, asking)
 
 
-def _policy_alone(root: Path | None, asked: AskedEnclave, policy: Path | None) -> list[Note]:
+def _policy_alone(
+    root: Path | None, asked_enclave: AskedEnclave, policy: Path | None
+) -> list[Note]:
     """Return a note if the policy was explained although $ROS_SECURITY_KEYSTORE is set."""
     from sros_tool.runtime.variables import KEYSTORE
 
     default = os.environ.get(KEYSTORE)
-    if not default or root is not None or asked.enclave.signed or policy is None:
+    if not default or root is not None or asked_enclave.enclave.signed or policy is None:
         return []
     text = (
         f"this is decided by the policy '{policy}'. For the signed permissions, name the "
-        f"keystore: `sros explain {quote(default)} {asked.enclave.name} ...`."
+        f"keystore: `sros explain {quote(default)} {asked_enclave.enclave.name} ...`."
     )
     return [Note("explain.policy-alone", text)]
 
 
-def _question(root: Path | None, rest: tuple[str, ...], kind: str | None) -> Question:
+def _question(root: Path | None, words_after_root: tuple[str, ...], kind: str | None) -> Question:
     """Return the question in the words after the keystore: enclave, operation and name."""
     from sros_tool.explain.answer import ask
     from sros_tool.keystore.layout import is_keystore
 
-    if root is None and len(rest) > 1 and rest[1] in _WORDS and is_keystore(Path(rest[0])):
-        asked = " ".join(map(quote, rest[1:]))
+    if (
+        root is None
+        and len(words_after_root) > 1
+        and words_after_root[1] in _WORDS
+        and is_keystore(Path(words_after_root[0]))
+    ):
+        asked = " ".join(map(quote, words_after_root[1:]))
         raise UsageError(
             "no enclave is named",
             "",
-            f"Write `sros explain {quote(rest[0])} ENCLAVE {asked}`, or ask for all enclaves: "
-            f"`sros explain {quote(rest[0])} --who {asked}`.",
+            f"Write `sros explain {quote(words_after_root[0])} ENCLAVE {asked}`, or ask for all "
+            "enclaves: "
+            f"`sros explain {quote(words_after_root[0])} --who {asked}`.",
         )
-    if not 2 <= len(rest) <= 3:
+    if not 2 <= len(words_after_root) <= 3:
         remedy = "Write for example `sros explain /talker publish /chatter`."
-        if root and len(rest) == 1 and rest[0].startswith("/"):
-            folder = quote(f"{root}/enclaves{rest[0]}")
+        if root and len(words_after_root) == 1 and words_after_root[0].startswith("/"):
+            folder = quote(f"{root}/enclaves{words_after_root[0]}")
             remedy += f" `sros inspect {folder}` shows everything that this enclave may do."
         raise UsageError("explain takes an enclave, an operation and a name", "", remedy)
-    return ask(rest[1], rest[2] if len(rest) > 2 else "", kind)
+    return ask(words_after_root[1], words_after_root[2] if len(words_after_root) > 2 else "", kind)
 
 
 def _echo(lines: Iterator[str]) -> None:
@@ -494,12 +502,12 @@ def _vendor_lines(explanation: DdsExplanation) -> Iterator[str]:
     yield from _beside_lines(explanation.beside)
 
 
-def _beside_lines(beside: ZenohBeside | None) -> Iterator[str]:
-    if beside and beside.zenoh:
-        word = "yes" if beside.zenoh.allowed else f"no, {beside.zenoh.outcome}"
-        yield _row("zenoh", f"{word}: {beside.zenoh.text}")
-    elif beside:
-        yield _row("zenoh", f"not known: {beside.problem}")
+def _beside_lines(on_zenoh: ZenohBeside | None) -> Iterator[str]:
+    if on_zenoh and on_zenoh.zenoh:
+        word = "yes" if on_zenoh.zenoh.allowed else f"no, {on_zenoh.zenoh.outcome}"
+        yield _row("zenoh", f"{word}: {on_zenoh.zenoh.text}")
+    elif on_zenoh:
+        yield _row("zenoh", f"not known: {on_zenoh.problem}")
 
 
 def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
@@ -744,9 +752,9 @@ def _link_text(link: CheckedLink) -> str:
 
 def _show_who(
     root: Path | None,
-    rest: tuple[str, ...],
+    words_after_root: tuple[str, ...],
     kind: str | None,
-    chosen: tuple[Vendor, str] | None,
+    chosen_vendor: tuple[Vendor, str] | None,
     why_zenoh: str,
     asking: AskingContext,
     only: tuple[tuple[str, ...], tuple[str, ...]],
@@ -754,28 +762,28 @@ def _show_who(
 ) -> int:
     """Print which enclaves of the keystore may do something; return 0 if any may, else 1.
 
-    ``chosen`` is the vendor that decides, None for Zenoh; ``only`` are --match and --robot.
+    ``chosen_vendor`` is the vendor that decides, None for Zenoh; ``only`` are --match and --robot.
     """
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.layout import has_authorities
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.selection import select_enclaves
 
-    question = _question_to_all(rest, kind)
+    question = _question_to_all(words_after_root, kind)
     keystore = Keystore(root or keystore_from_environment())
     keystore.check()
     patterns, robots = only
     names = select_enclaves(keystore, (), patterns, robots=robots) if patterns or robots else None
     decider: Decider
-    if chosen:
+    if chosen_vendor:
         from sros_tool.explain.vendors import VendorOfKeystore
 
-        decider = VendorOfKeystore(keystore, *chosen, asking, names)
+        decider = VendorOfKeystore(keystore, *chosen_vendor, asking, names)
     else:
         from sros_tool.explain.zenoh import ZenohOfKeystore
 
         decider = ZenohOfKeystore(keystore, why_zenoh, asking, names)
-    fleet = load_fleet(keystore) if chosen else None
+    fleet = load_fleet(keystore) if chosen_vendor else None
     domains = keystore.domains if has_authorities(keystore.root) else None
     return _print_everybody(decider, question, kind, (fleet, asking.domain, domains), as_json)
 
@@ -783,9 +791,9 @@ def _show_who(
 def _show_who_in_policy(
     policy: Path,
     root: Path | None,
-    rest: tuple[str, ...],
+    words_after_root: tuple[str, ...],
     kind: str | None,
-    chosen: tuple[Vendor, str] | None,
+    chosen_vendor: tuple[Vendor, str] | None,
     asking: AskingContext,
     only: tuple[tuple[str, ...], tuple[str, ...]],
     as_json: bool,
@@ -798,29 +806,29 @@ def _show_who_in_policy(
     if root:
         text = "A keystore is asked about what it has signed."
         raise UsageError("--who takes a keystore or a policy", text, "Leave one of them out.")
-    if chosen is None:
+    if chosen_vendor is None:
         text = "A policy has no Zenoh files; `sros zenoh KEYSTORE` writes them."
         raise UsageError("--who on Zenoh takes no policy", text, "Name the keystore.")
     if robots:
         raise UsageError(
             "--robot takes a keystore", "", f"Add --match '/{robots[0]}/*' in place of it."
         )
-    question = _question_to_all(rest, kind)
+    question = _question_to_all(words_after_root, kind)
     fleet = fleet_of(asking.fleet_file, None)
     _, stated = policy_to_ask(policy, fleet)
-    decider = VendorOfPolicy(stated, *chosen, asking, patterns or ("*",))
+    decider = VendorOfPolicy(stated, *chosen_vendor, asking, patterns or ("*",))
     return _print_everybody(decider, question, kind, (fleet, asking.domain, None), as_json)
 
 
-def _question_to_all(rest: tuple[str, ...], kind: str | None) -> Question:
+def _question_to_all(words_after_root: tuple[str, ...], kind: str | None) -> Question:
     """Return the question in the words after the keystore: operation and name."""
     from sros_tool.explain.answer import ask
 
-    if not 1 <= len(rest) <= 2:
+    if not 1 <= len(words_after_root) <= 2:
         raise UsageError(
             "--who takes an operation and a name", "", "Write for example publish /cmd_vel."
         )
-    return ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
+    return ask(words_after_root[0], words_after_root[1] if len(words_after_root) > 1 else "", kind)
 
 
 def _print_everybody(
@@ -893,7 +901,7 @@ def _who_lines(
 def _show_reach(
     enclave: str,
     root: Path | None,
-    rest: tuple[str, ...],
+    words_after_root: tuple[str, ...],
     stated: tuple[Path | None, Path | None],
     infrastructure: bool,
     domain: int | None,
@@ -911,9 +919,9 @@ def _show_reach(
     from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 
     policy, fleet_file = stated
-    if root is None and len(rest) == 1:
-        root, rest = Path(rest[0]), ()
-    if rest:
+    if root is None and len(words_after_root) == 1:
+        root, words_after_root = Path(words_after_root[0]), ()
+    if words_after_root:
         raise UsageError("--reach takes an enclave, and no operation or name")
     if zenoh and policy:
         raise UsageError(
@@ -963,15 +971,19 @@ def _followed_lines(followed: FollowedReach) -> Iterator[str]:
 
 
 def _show_log(
-    log: str, root: Path | None, rest: tuple[str, ...], asking: AskingContext, as_json: bool
+    log: str,
+    root: Path | None,
+    words_after_root: tuple[str, ...],
+    asking: AskingContext,
+    as_json: bool,
 ) -> int:
     """Print explanations of a DDS log, or of standard input for "-"; return 1 if there are any."""
     from sros_tool.explain.log import explain_log_of
 
-    if len(rest) > 1:
+    if len(words_after_root) > 1:
         raise UsageError("--log takes at most a keystore and an enclave")
     text = read_log(log)
-    explained = explain_log_of(log, text, root, "".join(rest), asking)
+    explained = explain_log_of(log, text, root, "".join(words_after_root), asking)
     if as_json:
         print_json(explained)
         return 1 if explained.findings else 0

@@ -181,7 +181,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     root, file = root_and_file(words, "fleet confirm takes a keystore and one file")
     recorded_fleet(Keystore(root)).robot(robot)
     what = "standard input" if str(file) == "-" else f"'{file}'"
-    data = read_named(file, "confirmation", most=MAX_BYTES)
+    data = read_named(file, "confirmation", max_bytes=MAX_BYTES)
     received = receive(data, robot, what, now=now())
     path = confirmation_file(robot)
     changes = file_change(root / path, existed=(root / path).exists())
@@ -347,10 +347,10 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
             yield f"{enclave}: {request.outcome.replace('_', ' ')}: {request.why}"
 
 
-def _numbers(numbers: Mapping[str, int], outcomes: Sequence[str], would: str) -> str:
+def _numbers(numbers: Mapping[str, int], outcomes: Sequence[str], verb_form: str) -> str:
     """Return the number of messages or requests with each outcome, in words."""
     there = (outcome for outcome in outcomes if numbers.get(outcome))
-    return ", ".join(f"{numbers[name]} {would}{name.replace('_', ' ')}" for name in there)
+    return ", ".join(f"{numbers[name]} {verb_form}{name.replace('_', ' ')}" for name in there)
 
 
 def _durations(function: Decorated) -> Decorated:
@@ -466,7 +466,7 @@ def _publish(
     return 0 if published.is_complete(moment) else 1
 
 
-def _published_lines(published: PublishedFleet, at: datetime) -> Iterator[str]:
+def _published_lines(published: PublishedFleet, moment: datetime) -> Iterator[str]:
     """Yield what was published, which robots got no release, and what to do next."""
     from sros_tool.validity import iso
 
@@ -496,7 +496,7 @@ def _published_lines(published: PublishedFleet, at: datetime) -> Iterator[str]:
             again = f"`sros fleet publish {where} --root-key FILE`"
         yield (
             f"robots accept these files until {iso(end)}: {again} before then"
-            if end > at
+            if end > moment
             else f"robots refuse these files, because the root metadata has expired: {again}"
         )
 
@@ -657,16 +657,18 @@ _MOST_LINES, _MOST_GROUPS = 50, 3
 """Maximum number of listed files of a robot, and of listed groups or unrecorded enclaves."""
 
 
-def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) -> Iterator[str]:
+def _lines(
+    compared_fleet: ComparedFleet, robots: Sequence[str], *, findings: bool
+) -> Iterator[str]:
     """Yield the counts, the table of robots with what to do, and findings on their DDS.
 
     Unless ``findings`` is set or robots are named, the findings are only counted.
     """
-    status = compared.status
+    status = compared_fleet.status
     counts = ", ".join(f"{number} {_word(state)}" for state, number in status.counts.items())
     yield f"{counted(len(status.robots), 'robot')}: {counts}"
-    yield from _facts(compared)
-    rows = list(_rows(compared, robots))
+    yield from _facts(compared_fleet)
+    rows = list(_rows(compared_fleet, robots))
     widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
     for row in rows:
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=False))
@@ -674,28 +676,28 @@ def _lines(compared: ComparedFleet, robots: Sequence[str], *, findings: bool) ->
     for robot in status.robots if robots else ():
         yield from _details(robot)
     if robots or findings:
-        yield from _dds_findings(compared)
+        yield from _dds_findings(compared_fleet)
     else:
-        yield from _dds_counts(compared)
+        yield from _dds_counts(compared_fleet)
 
 
-def _facts(compared: ComparedFleet) -> Iterator[str]:
+def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield sentences about the fleet as a whole."""
     from sros_tool.validity import elapsed
 
-    status = compared.status
+    status = compared_fleet.status
     publication = status.publication
     folder = publication.folder if publication else ""
     publish = f"sros fleet publish {quote(str(status.keystore))} {quote(folder or 'PUB')}"
     root_end = publication.root_expires if publication else None
-    publish += " --root-key FILE" if root_end and root_end <= compared.at else ""
+    publish += " --root-key FILE" if root_end and root_end <= compared_fleet.at else ""
     restored = f"`{publish} --restored`; docs/howto/keystore_is_lost.md says what else"
     if status.older:
         yield f"the keystore is older than its robots: {status.older}. Publish with {restored}"
     elif any(robot.state == "later" for robot in status.robots):
         yield f"the keystore may be older than its robots: if it was restored, {restored}"
     elif publication and publication.accepted is False and publication.expires:
-        ago = elapsed(compared.at - publication.expires)
+        ago = elapsed(compared_fleet.at - publication.expires)
         yield f"what was published expired {ago} ago, so robots get no new files: `{publish}`"
     elif publication and publication.accepted is None:
         yield f"it is not known until when robots accept what was published: `{publish}`"
@@ -710,13 +712,13 @@ def _facts(compared: ComparedFleet) -> Iterator[str]:
         if waiting := sum(robot.has_list and not robot.crl_in_force for robot in robots):
             text += f"; {waiting} more have it, but may run processes that started before it"
         yield text
-    yield from _expiry_facts(compared)
+    yield from _expiry_facts(compared_fleet)
     if status.unassigned:
         number = counted(status.unassigned, "enclave")
         yield f"{number} of no robot, whose state no confirmation shows"
 
 
-def _expiry_facts(compared: ComparedFleet) -> Iterator[str]:
+def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield when the first file on a robot expires, if that is soon, and what to do."""
     from datetime import timedelta
 
@@ -725,16 +727,16 @@ def _expiry_facts(compared: ComparedFleet) -> Iterator[str]:
 
     soon = [
         robot
-        for robot in compared.status.robots
-        if robot.enclaves and robot.renew_from and robot.renew_from < compared.at
+        for robot in compared_fleet.status.robots
+        if robot.enclaves and robot.renew_from and robot.renew_from < compared_fleet.at
     ]
     if not soon:
         return
     end, first, kind = min(
         (end, robot.robot, kind) for robot in soon for kind, end in robot.expiry.items()
     )
-    root = compared.status.keystore
-    left = end - compared.at
+    root = compared_fleet.status.keystore
+    left = end - compared_fleet.at
     when = f"{end:%Y-%m-%d}" if left > timedelta(days=1) else iso(end)
     what = "first expiry on a robot" if left > timedelta(0) else "expired on a robot since"
     short_lived = [name for robot in soon for name in robot.short_lived]
@@ -772,23 +774,23 @@ class _Group(NamedTuple):
         """Names of the robots."""
         return [robot.robot for robot in self.robots]
 
-    def confirmed(self, at: datetime) -> RobotStatus:
+    def confirmed(self, moment: datetime) -> RobotStatus:
         """Return the robot whose last confirmation is the oldest."""
-        return min(self.robots, key=lambda robot: robot.received or at)
+        return min(self.robots, key=lambda robot: robot.received or moment)
 
 
-def _groups(compared: ComparedFleet, robots: Sequence[str]) -> list[_Group]:
+def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group]:
     """Group robots with the same state, remedy and summary; the last group has the current robots.
 
     If ``robots`` are named, each robot is a group of its own.
     """
-    status, places = compared.status, _robot_positions(compared.status.names)
+    status, places = compared_fleet.status, _robot_positions(compared_fleet.status.names)
     alike: dict[tuple[str, ...], list[RobotStatus]] = {}
     current: list[RobotStatus] = []
     whats: dict[str, str] = {}
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
         if robots or robot.state not in ("current", "none") or robot.notes or robot.problems:
-            clauses = (*_expired(robot, compared.at), *_summary(robot, status.stage))
+            clauses = (*_expired(robot, compared_fleet.at), *_summary(robot, status.stage))
             what = _CLOCK.sub("", _unnamed("; ".join(clauses), robot.robot))
             whats[robot.robot] = what
             row = (robot.state.value, robot.to_do, _DURATION.sub("", what))
@@ -802,30 +804,30 @@ def _groups(compared: ComparedFleet, robots: Sequence[str]) -> list[_Group]:
     return [*groups, _Group(current, "current", "", "")] if current else groups
 
 
-def _rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
+def _rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Yield the head and the rows of a table, or nothing if no robot needs a row."""
-    groups = _groups(compared, robots)
+    groups = _groups(compared_fleet, robots)
     if not robots and all(group.state == "current" for group in groups):
         groups = [group for group in groups if group.what]
     if not groups:
         return
     yield "robot", "state", "confirmed", "to do", "what"
     for group in groups:
-        names = _robot_names(group.names, compared.status.names, compared.status.groups)
-        age = _age(group.confirmed(compared.at), compared.at)
+        names = _robot_names(group.names, compared_fleet.status.names, compared_fleet.status.groups)
+        age = _age(group.confirmed(compared_fleet.at), compared_fleet.at)
         yield names, _word(group.state), age, group.to_do, group.what
 
 
-def _page_rows(compared: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
+def _page_rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Yield the state of each group of robots, their names, when the first of them confirmed and
     when the first of their files expires, what to do, and why.
     """
     from sros_tool.validity import iso
 
-    for group in _groups(compared, robots):
-        status, most = compared.status, len(group.robots)
+    for group in _groups(compared_fleet, robots):
+        status, most = compared_fleet.status, len(group.robots)
         names = _robot_names(group.names, status.names, status.groups, most)
-        received = group.confirmed(compared.at).received
+        received = group.confirmed(compared_fleet.at).received
         expiry = [moment for robot in group.robots for moment in robot.expiry.values()]
         yield (
             group.state,
@@ -891,9 +893,9 @@ def _robot_names(
     names: Iterable[str],
     everybody: Iterable[str],
     groups: Mapping[str, Sequence[str]] = MappingProxyType({}),
-    most: int = _MOST_GROUPS,
+    maximum: int = _MOST_GROUPS,
 ) -> str:
-    """Return at most ``most`` names of robots; a whole group becomes "pickers (all 40)".
+    """Return at most ``maximum`` names of robots; a whole group becomes "pickers (all 40)".
 
     Many neighbors in the fleet, with names that differ in a number, become "r4 to r50".
     """
@@ -913,25 +915,25 @@ def _robot_names(
             runs.append([name])
     for run in runs:
         words += [f"{run[0]} to {run[-1]}"] if len(run) > _MOST_GROUPS else run
-    shown = ", ".join(words[:most]) + (", ..." if len(words) > most else "")
+    shown = ", ".join(words[:maximum]) + (", ..." if len(words) > maximum else "")
     if number <= _MOST_GROUPS or (len(words) == 1 and not runs):
         return shown
     return f"{shown} ({number} robots)"
 
 
-def _dds_findings(compared: ComparedFleet) -> Iterator[str]:
+def _dds_findings(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield the findings on the DDS of robots, except notes that need no attention."""
     from sros_tool.checks.kind import WARNING
     from sros_tool.checks.vulnerabilities import NOTES_ON_LIBRARIES
 
-    for finding in compared.findings:
+    for finding in compared_fleet.findings:
         if finding.severity >= WARNING or finding.kind in NOTES_ON_LIBRARIES:
             yield from finding_lines(finding)
 
 
-def _dds_counts(compared: ComparedFleet) -> Iterator[str]:
+def _dds_counts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield the robots with an outdated DDS, or the number of findings on the DDS of robots."""
-    status, outdated = compared.status, compared.outdated_dds
+    status, outdated = compared_fleet.status, compared_fleet.outdated_dds
     if outdated:
         robots = _robot_names(outdated, status.names, status.groups)
         only = "the exit status is 1 only because " if status.complete else ""
@@ -939,19 +941,19 @@ def _dds_counts(compared: ComparedFleet) -> Iterator[str]:
             f"{only}a later release fixes known vulnerabilities in the DDS of {robots}; "
             f"`sros fleet status {quote(str(status.keystore))} --robot {outdated[0]}` lists them"
         )
-    elif list(_dds_findings(compared)):
-        severities = Counter(finding.severity.word for finding in compared.findings)
+    elif list(_dds_findings(compared_fleet)):
+        severities = Counter(finding.severity.word for finding in compared_fleet.findings)
         words = ", ".join(counted(number, word) for word, number in severities.items())
         yield f"on the DDS of robots: {words}; see --robot NAME, or --json"
 
 
-def _expired(robot: RobotStatus, at: datetime) -> Iterator[str]:
+def _expired(robot: RobotStatus, moment: datetime) -> Iterator[str]:
     """Yield a clause for each kind of file on a robot that has expired."""
     from sros_tool.validity import elapsed
 
     for kind, end in robot.expiry.items() if robot.state == "expired" else ():
-        if end <= at:
-            yield f"{_KINDS.get(kind, kind)} expired {elapsed(at - end)} ago"
+        if end <= moment:
+            yield f"{_KINDS.get(kind, kind)} expired {elapsed(moment - end)} ago"
 
 
 def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:

@@ -255,9 +255,9 @@ def _enclave(enclave: DescribedEnclave) -> Iterator[str]:
             yield f"    {problem}"
 
 
-def _certificates(described: DescribedCertificates) -> Iterator[str]:
-    file = described.file
-    yield f"{'CA certificate' if file.first.is_ca else 'certificate'} {described.path}"
+def _certificates(certificates: DescribedCertificates) -> Iterator[str]:
+    file = certificates.file
+    yield f"{'CA certificate' if file.first.is_ca else 'certificate'} {certificates.path}"
     yield from _indented(_certificate(file.first))
     for other in file.further or ():
         yield "next to it, in the same file"
@@ -276,9 +276,9 @@ def _certificate(certificate: CertificateFacts) -> Iterator[str]:
     yield f"SHA-256 {certificate.sha256}"
 
 
-def _revocation_list(described: DescribedList) -> Iterator[str]:
-    yield _list(described.facts)
-    for serial in described.facts.revoked:
+def _revocation_list(described_list: DescribedList) -> Iterator[str]:
+    yield _list(described_list.facts)
+    for serial in described_list.facts.revoked:
         yield f"  {serial}"
 
 
@@ -301,8 +301,8 @@ def _place(place: TokenPlace) -> str:
     return f"key {place.object} on the token {place.token}{pin}"
 
 
-def _token(described: DescribedToken) -> Iterator[str]:
-    yield f"{described.path}: {_place(described.place)}"
+def _token(described_token: DescribedToken) -> Iterator[str]:
+    yield f"{described_token.path}: {_place(described_token.place)}"
 
 
 def _permissions(permissions: DescribedPermissions) -> Iterator[str]:
@@ -318,31 +318,31 @@ def _governance(governance: DescribedGovernance) -> Iterator[str]:
     yield from _indented(_domain_rules(governance))
 
 
-def _configuration(described: DescribedConfiguration) -> Iterator[str]:
-    yield f"Zenoh configuration {described.path}"
-    yield from _indented(_signature(described.signature))
-    for problem in described.problems:
+def _configuration(described_configuration: DescribedConfiguration) -> Iterator[str]:
+    yield f"Zenoh configuration {described_configuration.path}"
+    yield from _indented(_signature(described_configuration.signature))
+    for problem in described_configuration.problems:
         yield f"  {problem}"
-    if not described.made_by_sros:
+    if not described_configuration.made_by_sros:
         yield "  differs from what sros writes: run `sros check` on the file"
     places = [
         f"{word} {', '.join(endpoints)}"
         for word, endpoints in (
-            ("listens at", described.listen),
-            ("connects to", described.connect),
+            ("listens at", described_configuration.listen),
+            ("connects to", described_configuration.connect),
         )
         if endpoints
     ]
-    yield f"  {described.mode}, {', '.join(places) or 'without an endpoint'}"
-    access = described.access_control
+    yield f"  {described_configuration.mode}, {', '.join(places) or 'without an endpoint'}"
+    access = described_configuration.access_control
     state = "" if access.enabled else "OFF: "
     yield (
         f"  access control: {state}{counted(access.rules, 'rule')} for "
         f"{counted(access.subjects, 'subject')}, everything else: {access.default.upper()}"
     )
-    if described.domains:
-        yield f"  domain {', '.join(map(str, described.domains))}"
-    for remote in described.rights:
+    if described_configuration.domains:
+        yield f"  domain {', '.join(map(str, described_configuration.domains))}"
+    for remote in described_configuration.rights:
         yield from _indented(_remote(remote))
 
 

@@ -512,7 +512,7 @@ def create_keystore(
         domains=domains,
         now=now(),
         keyring=keyring(identity_key, permissions_key, encrypt=encrypt_ca_keys),
-        imported=imported,
+        imported_cas=imported,
         dry_run=dry_run,
     )
     shown = None
@@ -789,7 +789,7 @@ def update_keystore(
             allow_looser=allow_looser,
             revoke_old=revoke_old,
             replace_edits=take_edits or discard_edits,
-            seen=present,
+            seen_settings=present,
             keyring=keyring(),
             allow_refusal=allow_refusal,
             dry_run=dry_run,

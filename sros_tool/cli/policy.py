@@ -303,17 +303,19 @@ A comment on GitHub has at most 65,536 characters; Mermaid draws at most 50,000,
 """
 
 
-def rights_markdown(first: RightsSource, second: RightsSource, compared: SourcesDifference) -> str:
+def rights_markdown(
+    first_source: RightsSource, second_source: RightsSource, difference: SourcesDifference
+) -> str:
     """Return how rights differ as Markdown, with a picture."""
     from sros_tool.markdown import bounded, code, fenced, plain
     from sros_tool.report.sources import drawn_difference
 
     drawn = drawn_difference(
-        first, second, compared.rights, letters=_MOST_PICTURE, arrows=_MOST_LINKS
+        first_source, second_source, difference.rights, letters=_MOST_PICTURE, arrows=_MOST_LINKS
     )
-    lines = folded_differences(first, second, compared.rights)
-    lines += domain_lines(compared, first.fleet or second.fleet)
-    lines += _protection_lines(compared.protections)
+    lines = folded_differences(first_source, second_source, difference.rights)
+    lines += domain_lines(difference, first_source.fleet or second_source.fleet)
+    lines += _protection_lines(difference.protections)
     parts = []
     rest = "which `sros diff_policy` shows"
     for sign, title in (("~", "renamed"), ("+", "added"), ("-", "removed")):
@@ -321,11 +323,11 @@ def rights_markdown(first: RightsSource, second: RightsSource, compared: Sources
         if signed:
             parts.append(f"**{len(signed)} {title}**")
             parts.append(bounded(map(code, signed), _MOST_LINES, rest))
-    if unanswered := list(unanswered_lines(compared, second.fleet)):
+    if unanswered := list(unanswered_lines(difference, second_source.fleet)):
         parts += ["**Nobody answers any more**", bounded(map(code, unanswered), _MOST_LINES, rest)]
-    if compared.governance_differs:
+    if difference.governance_differs:
         parts.append("**The governance differs**: see `sros diff_policy --no-new-access`")
-    notes = [f"{note.id}: {note.text}" for note in (*first.notes, *second.notes)]
+    notes = [f"{note.id}: {note.text}" for note in (*first_source.notes, *second_source.notes)]
     if notes:
         parts += ["**Notes**", bounded(map(code, notes), 4000, rest)]
     differ = counted(len(lines), "difference") if lines else "no difference"
@@ -339,18 +341,18 @@ def rights_markdown(first: RightsSource, second: RightsSource, compared: Sources
     return "\n\n".join((title, *parts)) + "\n"
 
 
-def domain_lines(compared: SourcesDifference, fleet: Fleet | None) -> list[str]:
+def domain_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[str]:
     """Return the lines for enclaves whose ROS domains differ; equal lines of robots are merged."""
     from sros_tool.fleet.robots import folded
 
     sides = [
-        [(each.enclave, f"- {each.enclave} in domain {each.a}") for each in compared.domains],
-        [(each.enclave, f"+ {each.enclave} in domain {each.b}") for each in compared.domains],
+        [(each.enclave, f"- {each.enclave} in domain {each.a}") for each in difference.domains],
+        [(each.enclave, f"+ {each.enclave} in domain {each.b}") for each in difference.domains],
     ]
     return [text for lines in sides for text in folded(fleet, lines)]
 
 
-def unanswered_lines(compared: SourcesDifference, fleet: Fleet | None) -> Iterator[str]:
+def unanswered_lines(difference: SourcesDifference, fleet: Fleet | None) -> Iterator[str]:
     """Yield a line for each right that the change leaves without a counterpart.
 
     Lines that differ only in the robot are merged.
@@ -359,7 +361,7 @@ def unanswered_lines(compared: SourcesDifference, fleet: Fleet | None) -> Iterat
     from sros_tool.policy.model import OTHER_SIDE
 
     lines = []
-    for right in compared.unanswered:
+    for right in difference.unanswered:
         other = OTHER_SIDE[right.right].replace("reply", "serve")
         text = f"{right.enclave} may {right.right} {right.name}, but no enclave may {other} it"
         lines.append((right.enclave, f"! {text} any more"))
@@ -401,19 +403,19 @@ def _difference_lines(
 
 
 def folded_differences(
-    first: RightsSource,
-    second: RightsSource,
+    first_source: RightsSource,
+    second_source: RightsSource,
     difference: RightsDifference,
     sides: tuple[str, str] = ("A", "B"),
 ) -> list[str]:
     """Return the lines for a difference, with one line for each enclave that was renamed."""
     from sros_tool.policy.rights import renamed_enclaves
 
-    renamed = renamed_enclaves(first.rights, second.rights)
+    renamed = renamed_enclaves(first_source.rights, second_source.rights)
     others = difference.without({*renamed, *renamed.values()})
     return [
-        *_renamed_lines(renamed, second.fleet),
-        *_difference_lines(others, first.fleet, second.fleet, sides),
+        *_renamed_lines(renamed, second_source.fleet),
+        *_difference_lines(others, first_source.fleet, second_source.fleet, sides),
     ]
 
 

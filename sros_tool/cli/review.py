@@ -538,10 +538,10 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
         RightsChange,
     )
 
-    def findings(chosen: ChosenFindings) -> str:
-        shown = tuple(map(result.shown_finding, chosen.shown))
-        chosen = ChosenFindings(shown, chosen.accepted, chosen.hidden)
-        return findings_markdown(chosen, step.fleet)
+    def findings(chosen_findings: ChosenFindings) -> str:
+        shown = tuple(map(result.shown_finding, chosen_findings.shown))
+        chosen_findings = ChosenFindings(shown, chosen_findings.accepted, chosen_findings.hidden)
+        return findings_markdown(chosen_findings, step.fleet)
 
     rest = "which `sros review` prints"
     match step.content:

@@ -227,11 +227,11 @@ def _refuse_with_from(*given: object) -> None:
 
 def _network(
     settings: Template,
-    given: dict[str, str],
+    given_values: dict[str, str],
     routers: Sequence[tuple[str, str]],
     crossing: Sequence[str],
 ) -> ZenohNetwork:
-    """Return the network of the settings, or the default network, with the ``given`` values.
+    """Return the network of the settings, or the default network, with the ``given_values`` values.
 
     ``routers`` are further routers with their endpoints; an empty endpoint removes a router.
     """
@@ -243,7 +243,7 @@ def _network(
         network = replace(network, crossing=tuple(filter(None, crossing)))
     for name, endpoint in routers:
         network = _with_router(network, name, endpoint)
-    chosen = with_values(replace(settings, zenoh=network), list(given.items())).zenoh
+    chosen = with_values(replace(settings, zenoh=network), list(given_values.items())).zenoh
     return chosen or network
 
 

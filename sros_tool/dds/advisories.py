@@ -155,7 +155,7 @@ def read_advisories(path: Path) -> tuple[Advisory, ...]:
         DocumentError: The file cannot be read, is not of the OSV format, or is about no product
             that sros knows.
     """
-    newer = parse_advisories(read_bytes(path, "advisories", most=_MOST_BYTES), f"'{path}'")
+    newer = parse_advisories(read_bytes(path, "advisories", max_bytes=_MOST_BYTES), f"'{path}'")
     if not newer:
         *products, last = _REPOSITORIES.values()
         raise DocumentError(
@@ -169,8 +169,8 @@ def read_advisories(path: Path) -> tuple[Advisory, ...]:
     return (*kept, *newer)
 
 
-def parse_advisories(data: bytes, what: str) -> tuple[Advisory, ...]:
-    """Return the advisories in an OSV record or a list of records; errors call it ``what``.
+def parse_advisories(data: bytes, label: str) -> tuple[Advisory, ...]:
+    """Return the advisories in an OSV record or a list of records; errors call it ``label``.
 
     Records with the same id become one advisory, which has the releases of all of them.  A
     withdrawn record affects no release.  Products that sros does not know are left out.
@@ -192,7 +192,7 @@ def parse_advisories(data: bytes, what: str) -> tuple[Advisory, ...]:
         return tuple(merged.values())
     except ValueError as error:
         raise DocumentError(
-            f"{what} has no advisories in the OSV format",
+            f"{label} has no advisories in the OSV format",
             str(error).partition("\n")[0][:_LONGEST_SUMMARY],
             "Give a JSON file with an OSV record, or with a list of them.",
         ) from error

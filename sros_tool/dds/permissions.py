@@ -329,10 +329,10 @@ _LONGEST_TOPIC = 251  # bytes, of DDS names
 _LONGEST_NAME = 8  # parts; a longer enclave name has too many subsets to compare
 
 
-def document_notes(what: str, permissions: Permissions, signed_bytes: int) -> Iterator[Note]:
-    """Yield notes on a permissions document named ``what``; ``signed_bytes`` is its size."""
+def document_notes(label: str, permissions: Permissions, signed_bytes: int) -> Iterator[Note]:
+    """Yield notes on a permissions document named ``label``; ``signed_bytes`` is its size."""
     for identity, fact in outside(permissions, signed_bytes):
-        yield Note(identity, f"{what}: {fact}{_CONSEQUENCES[identity]}")
+        yield Note(identity, f"{label}: {fact}{_CONSEQUENCES[identity]}")
 
 
 _CONSEQUENCES = {

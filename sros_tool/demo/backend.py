@@ -177,24 +177,24 @@ class Backend:
         return variables
 
 
-def choose_backend(wish: str, probe: ProbeEnclave) -> Backend:
-    """Try the backends that ``wish`` allows, and return the first that enforces security.
+def choose_backend(wished_backend: str, probe: ProbeEnclave) -> Backend:
+    """Try the backends that ``wished_backend`` allows, and return the first that enforces security.
 
-    ``wish`` is `AUTO`, `RCLPY` or `CYCLONE`.
+    ``wished_backend`` is `AUTO`, `RCLPY` or `CYCLONE`.
 
     Raises:
         UnavailableError: no such backend enforces security here.
     """
-    if wish == CYCLONE:
+    if wished_backend == CYCLONE:
         return _cyclone(cyclone_stack(probe), _ASKED)
     stacks = []
     for stack in rclpy_stacks(probe):
         stacks.append(stack)
         if stack.enforces:
-            why = _ASKED if wish == RCLPY else f"{stack.name} enforces security here"
+            why = _ASKED if wished_backend == RCLPY else f"{stack.name} enforces security here"
             return Backend(RCLPY, f"{stack.dds} {stack.version}".strip(), why, stack.rmw)
     reason = _why_not(stacks)
-    if wish == RCLPY:
+    if wished_backend == RCLPY:
         raise UnavailableError("no RMW under rclpy enforces security here", reason, _NO_RCLPY)
     return _cyclone(cyclone_stack(probe), reason)
 

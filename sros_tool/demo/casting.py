@@ -662,17 +662,17 @@ def node_names(role: Role, grant: Grant | None) -> tuple[str, ...]:
 
 
 def _names(
-    wanted: Sequence[str], kept: set[str], free: list[str], named: Sequence[str]
+    wanted_names: Sequence[str], kept: set[str], free_names: list[str], named: Sequence[str]
 ) -> Iterator[str]:
-    for name in wanted:
+    for name in wanted_names:
         if name in kept or not named:
             yield name
             continue
         # With more nodes than names, two nodes share a name: DDS allows that in a process.
-        alike = [enclave for enclave in free if name[1:] in enclave.lower()]
-        chosen = (alike or free or named)[0]
-        if chosen in free:
-            free.remove(chosen)
+        alike = [enclave for enclave in free_names if name[1:] in enclave.lower()]
+        chosen = (alike or free_names or named)[0]
+        if chosen in free_names:
+            free_names.remove(chosen)
         yield chosen
 
 

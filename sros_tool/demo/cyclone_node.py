@@ -51,11 +51,13 @@ class CycloneNode:
         found = participant.publications() if of_publishers else participant.subscriptions()
         return [ros_type(endpoint.type_name) for endpoint in found if endpoint.topic == topic]
 
-    def count(self, name: str, kind: str, heard: Callable[[int], None]) -> str:
+    def count(self, name: str, kind: str, on_count: Callable[[int], None]) -> str:
         """Count the messages of a type."""
         package, _, name_of_type = kind.rpartition("/")
         type_name = f"{package.replace('/', '::')}::dds_::{name_of_type}_"
-        self._counters.append((self._participant.counter(self.wire_name(name), type_name), heard))
+        self._counters.append(
+            (self._participant.counter(self.wire_name(name), type_name), on_count)
+        )
         return ""
 
     def serve(self, name: str, answer: Callable[[str], str]) -> None:

@@ -179,10 +179,10 @@ class Node(Protocol):
     def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
         """Return the type of each discovered publisher, or else subscription, of a topic."""
 
-    def count(self, name: str, kind: str, heard: Callable[[int], None]) -> str:
+    def count(self, name: str, kind: str, on_count: Callable[[int], None]) -> str:
         """Count messages of a type that is no string; return why that cannot be done, or "".
 
-        ``heard`` is called with the number of messages that were received since.
+        ``on_count`` is called with the number of messages that were received since.
         """
 
     def serve(self, name: str, answer: Callable[[str], str]) -> None:
@@ -297,9 +297,9 @@ STRING = NodeOptions.type
 """The type of what talkers publish by default, and listeners read."""
 
 
-def ros_type(of_dds: str) -> str:
+def ros_type(dds_type: str) -> str:
     """Return the name in ROS of a type: std_msgs/msg/String of std_msgs::msg::dds_::String_."""
-    return of_dds.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
+    return dds_type.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
 
 
 class _Talker(NodeRole):

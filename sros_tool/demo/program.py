@@ -281,9 +281,9 @@ def _expected(row: Row, backend: Backend, template: Template, topic: str) -> Row
     return row.expected_under(conditions(backend, template, _dds_topic(row, topic)))
 
 
-def _gated(row: Row, strong: Row, options: DemoOptions) -> Row:
+def _gated(row: Row, strong_row: Row, options: DemoOptions) -> Row:
     """Return the row, marked as accepted, or as open although the default template prevents it."""
-    opened = bool(row.open_because) and not strong.open_because
+    opened = bool(row.open_because) and not strong_row.open_because
     accepted = row.name in options.accept_open
     return replace(row, accepted=accepted, unaccepted=opened and not accepted)
 
@@ -315,13 +315,13 @@ def _check_accepted(options: DemoOptions) -> None:
             )
 
 
-def find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend:
+def find_backend(wished_backend: str, folder: Path, topic: str, now: datetime) -> Backend:
     """Return a backend that enforces security; a temporary keystore is used to try."""
     with TemporaryDirectory(dir=folder, prefix="probe-") as probed:
         domains = DomainSet.of((_DEFAULT_DOMAIN, _DEFAULT_DOMAIN))
         spec = KeystoreSpec(topic, domains, load_template(_DEFAULT_TEMPLATE), now)
         keystores = create_keystores(Path(probed), replace(ISOLATION, rows=()), spec)
-        return choose_backend(wish, keystores.probe(topic, _DEFAULT_DOMAIN))
+        return choose_backend(wished_backend, keystores.probe(topic, _DEFAULT_DOMAIN))
 
 
 def _user_keystore(options: DemoOptions, now: datetime) -> UserKeystore | None:
@@ -724,7 +724,7 @@ class _Runner:
             folder,
             topic=topic,
             text=text,
-            through=backend.library(party.role, secured=secured),
+            dds_library=backend.library(party.role, secured=secured),
         )
 
     async def _watch(
@@ -935,13 +935,13 @@ class _PartyProcess:
         *,
         topic: str,
         text: str = "",
-        through: str = "",
+        dds_library: str = "",
     ) -> None:
         stem = name.replace(" ", "_")
         self.name = name
         self.topic = topic
         self.text = text
-        self._through = through
+        self._through = dds_library
         self._log = folder / f"{stem}.log"
         report = folder / f"{stem}.jsonl"
         self._reader = EventReader(report)

@@ -611,11 +611,11 @@ class DemoResult:
         """The known vulnerabilities with which the demo ran, in sentences."""
         return self.known_vulnerabilities(_ALL_IDS)
 
-    def known_vulnerabilities(self, most: int) -> str:
-        """Return the known vulnerabilities with which the demo ran, at most ``most`` by name."""
+    def known_vulnerabilities(self, maximum: int) -> str:
+        """Return the known vulnerabilities with which the demo ran, at most ``maximum`` by name."""
         if not self.libraries:
             return f"{self.dds} may have vulnerabilities: {_UNKNOWN}."
-        return " ".join(library.sentence(most) for library in self.libraries)
+        return " ".join(library.sentence(maximum) for library in self.libraries)
 
     @property
     def rows(self) -> tuple[RowResult, ...]:
@@ -656,8 +656,8 @@ class UsedLibrary(NamedTuple):
     unclear: Sequence[str]
     """Ids of vulnerabilities that this version may or may not have."""
 
-    def sentence(self, most: int) -> str:
-        """Return what is known of the library, with at most ``most`` ids."""
+    def sentence(self, maximum: int) -> str:
+        """Return what is known of the library, with at most ``maximum`` ids."""
         version = self.version or "of unknown version"
         name = f"{self.product} {version}, which the processes loaded,"
         if self.vulnerabilities is None:
@@ -666,7 +666,7 @@ class UsedLibrary(NamedTuple):
         if not self.vulnerabilities:
             return f"{name} has no known vulnerability{unclear}."
         number = counted(len(self.vulnerabilities), "known vulnerability", "known vulnerabilities")
-        ids = first_few(self.vulnerabilities, most)
+        ids = first_few(self.vulnerabilities, maximum)
         unless = ", unless its package fixes them" if self.packaged else ""
         return f"{name} has {number}{unless}: {ids}{unclear}."
 
@@ -881,7 +881,7 @@ def _verdict(result: DemoResult, wrong: Sequence[RowResult]) -> str:
     return ", ".join([*parts, *_left_out(result)]) + "."
 
 
-def _attacks(attacks: Sequence[RowResult], removed: Sequence[RowResult]) -> list[str]:
+def _attacks(attacks: Sequence[RowResult], rows_without_defence: Sequence[RowResult]) -> list[str]:
     closed = [row for row in attacks if not row.open_because]
     open_ = [row for row in attacks if row.open_because]
     lines = [
@@ -894,7 +894,9 @@ def _attacks(attacks: Sequence[RowResult], removed: Sequence[RowResult]) -> list
         "| --- | --- | --- | --- | --- |",
     ]
     for row in closed:
-        twins = "; ".join(_unique(_twin(twin) for twin in removed if twin.attack == row.attack))
+        twins = "; ".join(
+            _unique(_twin(twin) for twin in rows_without_defence if twin.attack == row.attack)
+        )
         lines.append(f"| {_cells(row)} | {row.mechanism} | {twins} |")
     if open_:
         lines += ["", "## Attacks known to succeed, and remedies", ""]

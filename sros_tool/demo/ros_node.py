@@ -166,8 +166,8 @@ def _message_class(kind: str) -> Any:
         raise ImportError(str(error)) from error
 
 
-def _types_of(infos: Callable[[str], Sequence[Any]], topic: str) -> Sequence[str]:
-    return [info.topic_type for info in infos(topic)]
+def _types_of(endpoint_infos: Callable[[str], Sequence[Any]], topic: str) -> Sequence[str]:
+    return [info.topic_type for info in endpoint_infos(topic)]
 
 
 def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
@@ -191,7 +191,7 @@ def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
     texts = node.create_subscription(String, options.topic, hear, qos_profile_sensor_data)
     types = partial(_types_of, node.get_publishers_info_by_topic, options.topic)
 
-    def count(kind: str, heard: Callable[[int], None]) -> str:
+    def count(kind: str, on_count: Callable[[int], None]) -> str:
         try:
             message = _message_class(kind)
         except ImportError as error:
@@ -199,7 +199,7 @@ def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
         if {*types()} != {kind}:
             return ", which this listener cannot hear next to another type: add --backend cyclone"
         node.destroy_subscription(texts)  # Fast DDS takes one type of a topic in a process
-        get = (message, options.topic, lambda _raw: heard(1), qos_profile_sensor_data)
+        get = (message, options.topic, lambda _raw: on_count(1), qos_profile_sensor_data)
         node.create_subscription(*get, raw=True)
         return ""
 

@@ -232,9 +232,9 @@ class _Injector:
         self._socket.close()
 
 
-def packets_of(kept: Sequence[_CapturedPacket], ports: Collection[int]) -> list[_CapturedPacket]:
+def packets_of(packets: Sequence[_CapturedPacket], ports: Collection[int]) -> list[_CapturedPacket]:
     """Return the captured packets that were sent from one of the ports, in order."""
-    return [each for each in kept if each.source in ports]
+    return [each for each in packets if each.source in ports]
 
 
 def with_changed_bit(packet: bytes, later: int, place: int, places: int) -> bytes | None:

@@ -138,11 +138,11 @@ class _ZenohNode:
         wire = self.wire_name(name)
         return [(of[10], of[11]) for of in chunks if len(of) > 11 and of[9] == wire]
 
-    def count(self, name: str, kind: str, heard: Callable[[int], None]) -> str:
+    def count(self, name: str, kind: str, on_count: Callable[[int], None]) -> str:
         """Count the messages of a type, by its hashes in the graph."""
         for typed in {typed for typed in self._types(name, "MP") if ros_type(typed[0]) == kind}:
             key = self._key_of(name, typed)
-            self._keep(self._session.declare_subscriber(key, lambda _: heard(1)))
+            self._keep(self._session.declare_subscriber(key, lambda _: on_count(1)))
         return ""
 
     def serve(self, name: str, answer: Callable[[str], str]) -> None:

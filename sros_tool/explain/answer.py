@@ -587,8 +587,8 @@ def lines_of_right(policy: Enclave, right: Right) -> tuple[PolicyLine, ...]:
     return tuple(map(_line, stated))
 
 
-def _line(placed: PlacedRight) -> PolicyLine:
-    right, written, source, group, profile = placed
+def _line(placed_right: PlacedRight) -> PolicyLine:
+    right, written, source, group, profile = placed_right
     return PolicyLine(source, right.qualifier, right.right, written, group, profile)
 
 

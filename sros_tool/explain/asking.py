@@ -190,7 +190,7 @@ def not_in_policy(policy: Policy, name: str, file: Path) -> PolicyError:
 
 
 def signed_enclave(
-    keystore: Keystore | None, name: str, at: datetime, *, planned: bool = False
+    keystore: Keystore | None, name: str, moment: datetime, *, planned: bool = False
 ) -> LoadedEnclave | None:
     """Load an enclave from a keystore, or from the folder ``name``.
 
@@ -199,17 +199,17 @@ def signed_enclave(
     """
     if keystore is None:
         folder = Path(name)
-        return _load_enclave(folder, at) if is_enclave(folder) else None
+        return _load_enclave(folder, moment) if is_enclave(folder) else None
     root = keystore.root
     if is_enclave(root) and not (root / "enclaves").is_dir():
-        enclave = _load_enclave(root, at)
+        enclave = _load_enclave(root, moment)
         if enclave.name != name:
             own = enclave.name or "no enclave"
             raise KeystoreError(f"'{root}' is the folder of {own}, not of {name}")
         return enclave
     keystore.check()
     if has_enclave(root, name):
-        return load_enclave_of(keystore, name, at=at)
+        return load_enclave_of(keystore, name, moment=moment)
     if planned:
         return None
     from sros_tool.keystore.selection import no_such_enclave
@@ -217,13 +217,13 @@ def signed_enclave(
     raise no_such_enclave(keystore, name, keystore.names)
 
 
-def _load_enclave(folder: Path, at: datetime) -> LoadedEnclave:
+def _load_enclave(folder: Path, moment: datetime) -> LoadedEnclave:
     """Load the enclave in a folder; its name is the common name of its certificate, or ""."""
     from sros_tool.pki.certificates import common_name_of
 
-    state = open_enclave(folder, now=at)
+    state = open_enclave(folder, now=moment)
     name = common_name_of(state.certificate.subject) if state.certificate else ""
-    return loaded_enclave(name, folder, state, at=at)
+    return loaded_enclave(name, folder, state, moment=moment)
 
 
 def planned_enclave(
@@ -241,24 +241,24 @@ def planned_enclave(
     from sros_tool.translate import governance_for
 
     if keystore:
-        return plan_enclave(policy, keystore.governance, at=asking.at)
+        return plan_enclave(policy, keystore.governance, moment=asking.at)
     domain = asking.context(None).domain
     stated = stated_protections([policy])
     protection = with_stated(load_template(DEFAULT_TEMPLATE).protection, stated)
     governance = governance_for(protection, DomainSet.of((domain, domain)))
-    return plan_enclave(policy, governance, at=asking.at)
+    return plan_enclave(policy, governance, moment=asking.at)
 
 
 # ── a service or an action ─────────────────────────────────────────────────────────────────
 
 
 def _action_meant(
-    evaluator: Evaluator, question: Question, others: Callable[[], Iterable[Right]]
+    evaluator: Evaluator, question: Question, read_other_rights: Callable[[], Iterable[Right]]
 ) -> Question | None:
     """Return the same question about an action if rights show that the name is one; else None.
 
-    The rights of the enclave are read first.  If they deny the service, ``others`` returns more
-    rights, such as those in its policy and keystore.
+    The rights of the enclave are read first.  If they deny the service, ``read_other_rights``
+    returns more rights, such as those in its policy and keystore.
     """
     if question.word not in ("call", "serve"):
         return None
@@ -267,7 +267,7 @@ def _action_meant(
     answer = evaluator.answer(question)
     rights = set(grant_rights(evaluator.enclave.name, answer.grant)) if answer.grant else set()
     if not answer.allowed:
-        rights.update(others())
+        rights.update(read_other_rights())
     return about_action(question, rights)
 
 
@@ -286,11 +286,13 @@ def taken_for_action(question: Question, action: Question) -> tuple[Note, ...]:
 
 
 def question_meant(
-    evaluator: Evaluator, asked: AskedEnclave, question: Question, kind: str | None
+    evaluator: Evaluator, asked_enclave: AskedEnclave, question: Question, kind: str | None
 ) -> tuple[Question, tuple[Note, ...]]:
     """Return the question to answer, and a note if it is not the question that was asked."""
     if not kind:
-        action = _action_meant(evaluator, question, lambda: asked.other_rights(question.name))
+        action = _action_meant(
+            evaluator, question, lambda: asked_enclave.other_rights(question.name)
+        )
         if action:
             return action, taken_for_action(question, action)
     return question, ()

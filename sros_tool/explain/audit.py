@@ -190,7 +190,7 @@ def policy_enclaves(
         enclave = policy.enclave(name)
         if enclave is None:
             raise PolicyError(f"unable to find enclave {name} in the policy '{policy.file}'")
-        return plan_enclave(enclave, governance, at=context.at)
+        return plan_enclave(enclave, governance, moment=context.at)
 
     return AuditedEnclaves("policy", EnclaveNodes(nodes), load, vendor, context)
 
@@ -210,7 +210,7 @@ def keystore_enclaves(
     nodes = {name: nodes_served(reply) for name, reply in replies.items()}
 
     def load(name: str) -> LoadedEnclave:
-        return load_enclave(name, enclave_path(source.path, name), at=context.at)
+        return load_enclave(name, enclave_path(source.path, name), moment=context.at)
 
     return AuditedEnclaves("keystore", EnclaveNodes(nodes), load, vendor, context)
 

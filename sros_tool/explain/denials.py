@@ -272,7 +272,7 @@ def learned_from_logs(
 
 
 def as_learned(
-    missing: MissingRights,
+    missing_rights: MissingRights,
     enclave: str,
     node: tuple[str, str] | None,
     policy: Policy | None,
@@ -291,7 +291,7 @@ def as_learned(
         UsageError: The log does not name the enclave of a denial, and ``enclave`` is "".
     """
     profiles, others, wholes = [], dict[str, str](), dict[str, str]()
-    for path, rights in sorted(_by_enclave(missing, enclave).items()):
+    for path, rights in sorted(_by_enclave(missing_rights, enclave).items()):
         present = _profiles(policy, path)
         for profile, denied in sorted(_by_profile(rights, node, present).items()):
             if present and node is None and profile not in (_ANY_NODE, *present):
@@ -307,7 +307,7 @@ def as_learned(
             profiles.append(LearnedProfile(path, *profile, denied | node_rights, parts, groups))
     elsewhere = {
         path: f"{len(rights)} right{'s' * (len(rights) > 1)}"
-        for path, rights in sorted(missing.rights.items())
+        for path, rights in sorted(missing_rights.rights.items())
         if enclave and path not in ("", enclave)
     }
     notes = [
@@ -319,13 +319,13 @@ def as_learned(
         )
         if found
     ]
-    return Learned(tuple(profiles), (*_notes(missing), *notes), source=RightsFound.LOG)
+    return Learned(tuple(profiles), (*_notes(missing_rights), *notes), source=RightsFound.LOG)
 
 
-def _by_enclave(missing: MissingRights, enclave: str) -> dict[str, frozenset[NodeRight]]:
+def _by_enclave(missing_rights: MissingRights, enclave: str) -> dict[str, frozenset[NodeRight]]:
     """Return the rights by enclave; only of ``enclave`` if it is not ""."""
     found: dict[str, frozenset[NodeRight]] = {}
-    for named, rights in missing.rights.items():
+    for named, rights in missing_rights.rights.items():
         if enclave and named not in ("", enclave):
             continue
         if not (named or enclave):
@@ -371,7 +371,7 @@ def _fqn(profile: tuple[str, str]) -> str:
 def _whole_parts(
     denied: frozenset[NodeRight],
     profile: tuple[str, str],
-    has: frozenset[NodeRight],
+    node_rights: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
     """Return the first common part of which a node has no right and was denied one, or ()."""
@@ -380,7 +380,7 @@ def _whole_parts(
     for part in _NODE_PARTS:
         if part in common.rights:
             rights = common.given([part], *profile)
-            if rights & denied and not rights & has:
+            if rights & denied and not rights & node_rights:
                 return (part,)
     return ()
 
@@ -397,29 +397,29 @@ def _profiles(policy: Policy | None, path: str) -> dict[tuple[str, str], frozens
     return profiles
 
 
-def _notes(missing: MissingRights) -> tuple[Note, ...]:
+def _notes(missing_rights: MissingRights) -> tuple[Note, ...]:
     texts = {
         "log.unclear": (
-            missing.unclear,
+            missing_rights.unclear,
             "not proposed, because the log does not say whether these topics were published or "
             "subscribed: {}",
         ),
         "log.denied-by-rule": (
-            missing.by_rule,
+            missing_rights.by_rule,
             "not proposed, because a DENY in the policy refuses these topics, and an ALLOW would "
             "not help: {}",
         ),
         "log.of-a-peer": (
-            missing.remote,
+            missing_rights.remote,
             "not proposed, because these topics were denied to a peer, and the log does not name "
             "its enclave: {}",
         ),
         "log.no-ros-name": (
-            missing.foreign,
+            missing_rights.foreign,
             "not proposed, because a policy cannot name these topics: {}",
         ),
     }
-    several = len(missing.rights) > 1
+    several = len(missing_rights.rights) > 1
     return (_SEVERAL,) * several + tuple(
         Note(name, text.format(", ".join(dict.fromkeys(map(_denial_text, denials)))))
         for name, (denials, text) in texts.items()

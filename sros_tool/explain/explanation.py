@@ -264,7 +264,7 @@ def _smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | Non
     lift: list[Right] = []
     while True:
         planned = plan_enclave(
-            policy_of(enclave.name, present), governance, at=evaluator.context.at
+            policy_of(enclave.name, present), governance, moment=evaluator.context.at
         )
         tried = Evaluator(evaluator.vendor, planned, evaluator.context).answer(question)
         if tried.allowed:
@@ -378,7 +378,7 @@ def likely_names(answer: Answer) -> tuple[str, ...]:
     """
     question = answer.question
     names = {right.name for right in named_rights(answer) if right.right == question.right}
-    return _similar(question.name, names - {question.name}, of_service=question.type == "service")
+    return _similar(question.name, names - {question.name}, is_service=question.type == "service")
 
 
 def meant_instead(right: Right, used: Collection[Right], named: Iterable[Right]) -> str:
@@ -395,7 +395,7 @@ def meant_instead(right: Right, used: Collection[Right], named: Iterable[Right])
             kind = "an action" if other.kind == "actions" else "a service"
             return f"the policy has it as {kind} ({other.right})"
     names = {other.name for other in others if other.right == right.right}
-    similar = _similar(right.name, names, of_service=right.kind == "services")
+    similar = _similar(right.name, names, is_service=right.kind == "services")
     return f"perhaps the policy means {' or '.join(similar)}" if similar else ""
 
 
@@ -406,10 +406,10 @@ def named_rights(answer: Answer) -> tuple[Right, ...]:
     return tuple(sorted(named, key=order))
 
 
-def _similar(name: str, names: Collection[str], *, of_service: bool) -> tuple[str, ...]:
+def _similar(name: str, names: Collection[str], *, is_service: bool) -> tuple[str, ...]:
     last = name.rpartition("/")[2]
     same = sorted(other for other in names if other.rpartition("/")[2] == last)
-    if (of_service and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
+    if (is_service and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
         return tuple(same) if len(same) <= _SHOWN else ()
     if not names:
         return ()
@@ -422,11 +422,11 @@ _SHOWN = 3
 """Highest number of names that are proposed."""
 
 
-def _edits(lift: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
-    """Yield a replacement for each group of the policy that has denials of ``lift``."""
+def _edits(lifted_rights: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
+    """Yield a replacement for each group of the policy that has denials of ``lifted_rights``."""
     groups: dict[Source, Group] = {}
     lifted: dict[Source, set[tuple[str, str]]] = {}
-    for right in lift:
+    for right in lifted_rights:
         for line in lines_of_right(policy, right):
             groups[line.group.source] = line.group
             lifted.setdefault(line.group.source, set()).add((line.name, line.right))

@@ -156,9 +156,9 @@ class Compared(Enum):
 
 
 def explain_on_dds(
-    asked: AskedEnclave,
+    asked_enclave: AskedEnclave,
     question: Question,
-    chosen: tuple[Vendor, str],
+    chosen_vendor: tuple[Vendor, str],
     context: JoinContext,
     *,
     kind: str | None = None,
@@ -166,13 +166,13 @@ def explain_on_dds(
 ) -> DdsExplanation:
     """Return the decision of the chosen vendor, or those of all vendors or distributions.
 
-    ``chosen`` is the vendor and the reason to choose it; ``kind`` is the kind of the name (topic,
-    service or action) if the user gave it; ``every`` says what is compared.
+    ``chosen_vendor`` is the vendor and the reason to choose it; ``kind`` is the kind of the name
+    (topic, service or action) if the user gave it; ``every`` says what is compared.
     """
-    vendor, why = chosen
-    enclave = asked.enclave
+    vendor, why = chosen_vendor
+    enclave = asked_enclave.enclave
     evaluator = Evaluator(vendor, enclave, context)
-    question, taken = question_meant(evaluator, asked, question, kind)
+    question, taken = question_meant(evaluator, asked_enclave, question, kind)
     answer = explain(evaluator, question)
     beside = _beside(enclave, question, context)
     notes = (
@@ -180,7 +180,7 @@ def explain_on_dds(
         *_provenance_notes(answer),
         *_exported(answer),
         *_other_type(evaluator, answer, kind),
-        *_no_topic(answer, asked),
+        *_no_topic(answer, asked_enclave),
         *_other_name(answer),
     )
     what = Asked(enclave.name, question, context)
@@ -258,12 +258,12 @@ def _other_type(evaluator: Evaluator, answer: Answer, kind: str | None) -> Itera
             yield Note("explain.an-action", text)
 
 
-def _no_topic(answer: Answer, asked: AskedEnclave) -> Iterator[Note]:
+def _no_topic(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[Note]:
     """Yield a note if a denied topic has the name of a service or an action."""
     name = answer.question.name
     if answer.question.type != "topic" or answer.allowed or answer.problems:
         return
-    kinds = {right.kind for right in asked.other_rights(name) if right.name == name}
+    kinds = {right.kind for right in asked_enclave.other_rights(name) if right.name == name}
     if kinds & {"services", "actions"} and "topics" not in kinds:
         what, word = ("an action", "execute") if "actions" in kinds else ("a service", "serve")
         text = f"{name} is {what} in the rights here, not a topic: ask about call or {word}."
@@ -292,7 +292,7 @@ def _beside(enclave: LoadedEnclave, question: Question, context: JoinContext) ->
     from sros_tool.explain.zenoh import ZenohEvaluator  # many keystores have no Zenoh
 
     try:
-        evaluator = ZenohEvaluator(keystore, at=context.at, domain=context.domain)
+        evaluator = ZenohEvaluator(keystore, moment=context.at, domain=context.domain)
         answer = evaluator.answer(enclave.name, question, reach=False, brief=True)
     except SrosError as error:
         return ZenohBeside(None, error.what)
@@ -462,7 +462,7 @@ class VendorOfKeystore(NamedTuple):
         from sros_tool.explain.who import decide_each, first_allowing_domain
 
         def outcome(name: str) -> VendorOutcome:
-            enclave = load_enclave_of(self.keystore, name, at=self.asking.at)
+            enclave = load_enclave_of(self.keystore, name, moment=self.asking.at)
 
             def decided(domain: int) -> VendorOutcome:
                 context = self.asking._replace(domain=domain).context(None)

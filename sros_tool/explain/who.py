@@ -263,7 +263,7 @@ def follow_reach(
     opened = tuple(unguarded(Keystore(source.path).governance)) if of_keystore else ()
     network = Network(
         rights,
-        without=without,
+        excluded=without,
         questions=questions,
         unguarded=opened if domain is None else _in_domain(opened, domain),
         everybody=names if of_keystore else (),
@@ -284,10 +284,10 @@ def follow_reach(
     return FollowedReach(source.path, (*without, *questions), domain, reach, source.fleet, notes)
 
 
-def _in_domain(opened: Iterable[Unguarded], domain: int) -> Iterator[Unguarded]:
+def _in_domain(unguarded_access: Iterable[Unguarded], domain: int) -> Iterator[Unguarded]:
     """Yield, as rights in one domain, the access that its governance leaves open."""
     only = DomainSet.of((domain, domain))
-    for topics in opened:
+    for topics in unguarded_access:
         if topics.domains is None or domain in topics.domains:
             yield replace(topics, domains=only)
 

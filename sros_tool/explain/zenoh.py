@@ -262,13 +262,13 @@ class ZenohEvaluator:
     router, or routers that are not connected to each other: what they enforce is then unknown.
     """
 
-    def __init__(self, keystore: Keystore, *, at: datetime, domain: int) -> None:
+    def __init__(self, keystore: Keystore, *, moment: datetime, domain: int) -> None:
         keystore.check()
         self.keystore = keystore
         self.root = keystore.root
         self.domain = domain
         self.names = keystore.names
-        self._at = at
+        self._at = moment
         self._file = cache(self._read)
         self._rendered = RenderedReader()
         self._is_signed = cache(self._verified)
@@ -425,7 +425,7 @@ class ZenohEvaluator:
                 domains,
                 authority,
                 self._at,
-                only=deciding,
+                only_enclaves=deciding,
                 # What may pass between routers depends on all enclaves on both sides.
                 among=() if network.routers else deciding | self._concerned(answer, ends),
                 reader=self._rendered,
@@ -521,10 +521,10 @@ class ZenohEvaluator:
         except SrosError:
             return False
 
-    def _unsigned(self, own: ZenohFile) -> tuple[str, ...]:
+    def _unsigned(self, zenoh_file: ZenohFile) -> tuple[str, ...]:
         return tuple(
             f"{file.enclave}/{file.file}"
-            for file in dict.fromkeys((own, *self.routers.values()))
+            for file in dict.fromkeys((zenoh_file, *self.routers.values()))
             if file.process
             and not self._is_signed(enclave_path(self.root, file.enclave) / file.file)
         )
@@ -532,7 +532,7 @@ class ZenohEvaluator:
     # ── decisions ──────────────────────────────────────────────────────────────────────────
 
     def _answer_for_router(
-        self, answer: ZenohAnswer, own: ZenohProcess, *, brief: bool
+        self, answer: ZenohAnswer, process: ZenohProcess, *, brief: bool
     ) -> ZenohAnswer:
         """Return the answer for a router's enclave, which may do what passes through the router.
 
@@ -542,13 +542,13 @@ class ZenohEvaluator:
         wanted = self._rights(answer.enclave, answer.question)
         believing: list[Reached] = []
         for name in self.names if wanted else ():
-            if name == own.name:
+            if name == process.name:
                 continue
             # The router's rules state the same rights, and are at hand.
-            deliveries = self._direct(own, _unrestricted(name, Mode.CLIENT), wanted)
+            deliveries = self._direct(process, _unrestricted(name, Mode.CLIENT), wanted)
             other = self._file(name, self._file_of(name)) if not brief else None
             if other and other.process and all(each.arrives for each in deliveries):
-                lawless = _unrestricted(own.name, Mode.ROUTER)
+                lawless = _unrestricted(process.name, Mode.ROUTER)
                 deliveries = self._direct(lawless, other.process, wanted)
             if all(each.arrives for each in deliveries):
                 believing.append(Reached(name, deliveries, other.problem if other else ""))
@@ -561,7 +561,7 @@ class ZenohEvaluator:
             check
             for delivery in believing[0].deliveries
             for check in (*delivery.checks, *delivery.replies)
-            if check.enforcer != own.name
+            if check.enforcer != process.name
         )
         text = (
             "sessions trust anyone with the router's key about everything that passes through the "
@@ -576,30 +576,35 @@ class ZenohEvaluator:
         )
 
     def _direct(
-        self, own: ZenohProcess, other: ZenohProcess, wanted: Sequence[Right]
+        self, process: ZenohProcess, other: ZenohProcess, wanted_rights: Sequence[Right]
     ) -> tuple[Delivery, ...]:
-        return tuple(self._delivery((own, other), right) for right in wanted)
+        return tuple(self._delivery((process, other), right) for right in wanted_rights)
 
     def _deciding_checks(
-        self, own: ZenohProcess, router: ZenohProcess, wanted: Sequence[Right], *, brief: bool
+        self,
+        process: ZenohProcess,
+        router: ZenohProcess,
+        wanted_rights: Sequence[Right],
+        *,
+        brief: bool,
     ) -> tuple[Check, ...]:
         """Return the checks that decide on the rights of an enclave.
 
         These are the checks on its link with the router.  If the router denies a right in peer
         mode, they are the checks on its link with the first peer that allows the right.
         """
-        checks = tuple(self._link_checks(own, router, wanted))
-        if own.mode is not Mode.PEER or brief or all(each.allowed for each in checks):
+        checks = tuple(self._link_checks(process, router, wanted_rights))
+        if process.mode is not Mode.PEER or brief or all(each.allowed for each in checks):
             return checks
         for name in self.names:
-            if name == own.name or name in self.routers:
+            if name == process.name or name in self.routers:
                 continue
             # What the session itself lets through comes first: it needs no other file.
-            alone = self._link_checks(own, _unrestricted(name, Mode.PEER), wanted)
+            alone = self._link_checks(process, _unrestricted(name, Mode.PEER), wanted_rights)
             if all(each.allowed for each in alone):
                 other = self._file(name, SESSION_FILE).process
                 if other and other.mode is Mode.PEER:
-                    direct = tuple(self._link_checks(own, other, wanted))
+                    direct = tuple(self._link_checks(process, other, wanted_rights))
                     if all(each.allowed for each in direct):
                         return direct
         return checks
@@ -609,88 +614,96 @@ class ZenohEvaluator:
         return parts(Right(enclave, ALLOW, question.right, question.name)) if question.right else ()
 
     def _link_checks(
-        self, own: ZenohProcess, other: ZenohProcess, wanted: Sequence[Right]
+        self, process: ZenohProcess, other: ZenohProcess, wanted_rights: Sequence[Right]
     ) -> Iterator[Check]:
         """Yield the checks by which both ends of a link decide on rights, or on joining."""
-        deliveries = self._direct(own, other, wanted)
-        for delivery in deliveries or self._graph(own, other):
+        deliveries = self._direct(process, other, wanted_rights)
+        for delivery in deliveries or self._graph(process, other):
             yield from (*delivery.checks, *delivery.replies)
 
-    def _delivery(self, way: Route, right: Right, key: str = "") -> Delivery:
-        """Return the delivery of a message, by a right of the first process on the route ``way``.
+    def _delivery(self, route: Route, right: Right, key: str = "") -> Delivery:
+        """Return the delivery of a message, by a right of the first process on the route ``route``.
 
         ``key`` is the key of the message; "" stands for the key of the right.
         """
         key = key or f"{self.domain}{right.name}/{ANY_TYPE}"
         match right.right:
             case "publish":
-                return publication(way, key)
+                return publication(route, key)
             case "subscribe":
-                return publication(way[::-1], key)
+                return publication(route[::-1], key)
             case "request":
-                return call(way, key)
+                return call(route, key)
             case _:
-                return call(way[::-1], key)
+                return call(route[::-1], key)
 
-    def _graph(self, own: ZenohProcess, other: ZenohProcess) -> tuple[Delivery, Delivery]:
-        """Return the deliveries that announce a node of ``own``, and that show it other nodes."""
+    def _graph(self, process: ZenohProcess, other: ZenohProcess) -> tuple[Delivery, Delivery]:
+        """Return the deliveries that announce a node of ``process`` and show it other nodes."""
         everything = f"@ros2_lv/{self.domain}/**"
-        router = self._router_of(own.name).process
+        router = self._router_of(process.name).process
         assert router
         access, announcing = router.access, (Flow.INGRESS, Message.LIVELINESS_TOKEN)
         node = example_token(
             self.domain,
-            own.name,
-            access.allowed_keys(own.name, *announcing),
-            lambda key: access.decide(Remote(own.name), *announcing, key).allowed,
+            process.name,
+            access.allowed_keys(process.name, *announcing),
+            lambda key: access.decide(Remote(process.name), *announcing, key).allowed,
         )
-        return token((own, other), node, everything), token((other, own), everything, everything)
+        return token((process, other), node, everything), token(
+            (other, process), everything, everything
+        )
 
-    def _reached_enclaves(self, own: ZenohFile, wanted: Sequence[Right]) -> Iterator[Reached]:
+    def _reached_enclaves(
+        self, zenoh_file: ZenohFile, wanted_rights: Sequence[Right]
+    ) -> Iterator[Reached]:
         """Yield the enclaves that have the right at the other end."""
-        for name in self.names if wanted else ():
-            if name == own.enclave or name in self.routers:
+        for name in self.names if wanted_rights else ():
+            if name == zenoh_file.enclave or name in self.routers:
                 continue
-            assert own.process
+            assert zenoh_file.process
             # What the others decide comes first: it needs no file of that enclave.
             deliveries = self._deliveries_between(
-                own.process, _unrestricted(name, own.process.mode), wanted
+                zenoh_file.process, _unrestricted(name, zenoh_file.process.mode), wanted_rights
             )
             if not all(each.arrives for each in deliveries):
                 continue
             other = self._file(name, SESSION_FILE)
             if other.process:
-                deliveries = self._deliveries_between(own.process, other.process, wanted)
+                deliveries = self._deliveries_between(
+                    zenoh_file.process, other.process, wanted_rights
+                )
             if all(each.arrives for each in deliveries):
                 yield Reached(name, deliveries, other.problem)
 
     def _deliveries_between(
-        self, own: ZenohProcess, other: ZenohProcess, wanted: Sequence[Right], key: str = ""
+        self, own: ZenohProcess, other: ZenohProcess, wanted_rights: Sequence[Right], key: str = ""
     ) -> tuple[Delivery, ...]:
         ends = [self._router_of(process.name).process for process in (own, other)]
         routers = [router for router in ends if router]
         way = route(own, other, routers[0], routers[-1])
-        return tuple(self._delivery(way, right, key) for right in wanted)
+        return tuple(self._delivery(way, right, key) for right in wanted_rights)
 
     def _wildcards(
         self,
-        own: ZenohProcess,
-        wanted: Sequence[Right],
+        process: ZenohProcess,
+        wanted_rights: Sequence[Right],
         checks: Sequence[Check],
-        reached: Sequence[Reached],
+        reached_enclaves: Sequence[Reached],
     ) -> Iterator[DecidingWildcard]:
         """Yield the deciding wildcards, with the enclaves that a message on the wildcard reaches.
 
         Only a put or a query can have a wildcard as its key.  It passes only where a rule includes
         the whole wildcard.
         """
-        asked = [each for each in wanted if each.right in ("publish", "request")]
+        asked = [each for each in wanted_rights if each.right in ("publish", "request")]
         for wide in dict.fromkeys(filter(None, map(self._wildcard, checks))):
             enclaves = [
                 each.enclave
-                for each in reached
+                for each in reached_enclaves
                 if (other := self._file(each.enclave, SESSION_FILE).process)
-                and any(one.arrives for one in self._deliveries_between(own, other, asked, wide))
+                and any(
+                    one.arrives for one in self._deliveries_between(process, other, asked, wide)
+                )
             ]
             yield DecidingWildcard(wide, tuple(enclaves))
 
@@ -796,14 +809,16 @@ class ZenohOfKeystore:
         self._why = why
         self._domain = asking.domain
         first = asking.context(keystore.domains).domain
-        one = ZenohEvaluator(keystore, at=asking.at, domain=first)
+        one = ZenohEvaluator(keystore, moment=asking.at, domain=first)
         self._evaluators = {first: one}
         self._parts: Sequence[DomainSet] = (DomainSet.of((first, first)),)
         if asking.domain is None:
             self._parts = tuple(_with_equal_rules(one, keystore.domains))
             for domain in (next(iter(part)) for part in self._parts):
                 if domain != first:
-                    self._evaluators[domain] = ZenohEvaluator(keystore, at=asking.at, domain=domain)
+                    self._evaluators[domain] = ZenohEvaluator(
+                        keystore, moment=asking.at, domain=domain
+                    )
         self._names = names or one.names
 
     @property
@@ -941,7 +956,7 @@ class ZenohExplanation(NamedTuple):
 
 
 def explain_on_zenoh(
-    asked: AskedEnclave,
+    asked_enclave: AskedEnclave,
     question: Question,
     why: str,
     context: JoinContext,
@@ -956,7 +971,7 @@ def explain_on_zenoh(
     Raises:
         UsageError: the user named no keystore with the enclave.
     """
-    enclave, keystore = asked.enclave, asked.enclave.keystore
+    enclave, keystore = asked_enclave.enclave, asked_enclave.enclave.keystore
     if keystore is None or enclave.state is None or not is_keystore(keystore.root):
         raise UsageError(
             "Zenoh needs a keystore with the enclave",
@@ -964,8 +979,8 @@ def explain_on_zenoh(
             "Name the keystore before the enclave.",
         )
     stated = Evaluator(Vendor.STANDARD, enclave, context)
-    question, taken = question_meant(stated, asked, question, kind)
-    evaluator = ZenohEvaluator(keystore, at=context.at, domain=context.domain)
+    question, taken = question_meant(stated, asked_enclave, question, kind)
+    evaluator = ZenohEvaluator(keystore, moment=context.at, domain=context.domain)
     answer = evaluator.answer(enclave.name, question)
     outdated = evaluator.out_of_date(answer)
     by_permissions = explain(stated, question)

@@ -155,10 +155,10 @@ class FleetPolicy(Mapping[str, Enclave]):
             return text
         return "".join(map(str, fill(parts_of(text), robot.name, robot.namespace)))
 
-    def _group(self, group: Group, robot: Robot | None, most: int) -> Group:
+    def _group(self, group: Group, robot: Robot | None, maximum: int) -> Group:
         """Return the group with its names filled in for a robot; it can end up empty.
 
-        Once it has more than ``most`` names, the rest is left out.
+        Once it has more than ``maximum`` names, the rest is left out.
         """
         if not any(map(has_placeholder, group.names)):
             return group
@@ -168,7 +168,7 @@ class FleetPolicy(Mapping[str, Enclave]):
             filled = self._several(self._one(name, robot), name, group.source_of(index))
             names += filled
             lines += group.lines[index : index + 1] * len(filled)
-            if len(names) > most:
+            if len(names) > maximum:
                 break
         return replace(group, names=tuple(names), lines=tuple(lines))
 
@@ -195,17 +195,21 @@ class FleetPolicy(Mapping[str, Enclave]):
             yield name
 
 
-def read_policy_for(path: Path, fleet: Fleet | None, read: PolicyFiles | None = None) -> Policy:
+def read_policy_for(
+    path: Path, fleet: Fleet | None, policy_files: PolicyFiles | None = None
+) -> Policy:
     """Return the policy in a file; with a fleet, its placeholders are filled in.
 
-    ``read`` returns the content of files that are not in the file system.
+    ``policy_files`` returns the content of files that are not in the file system.
 
     Raises:
         PolicyError: (or another `DocumentError`) as of `read_policy` and `FleetPolicy`.
     """
     if fleet is None:
-        return read_policy(path, read=read)
-    return FleetPolicy(read_policy(path, placeholders=True, read=read), fleet).policy()
+        return read_policy(path, policy_files=policy_files)
+    return FleetPolicy(
+        read_policy(path, placeholders=True, policy_files=policy_files), fleet
+    ).policy()
 
 
 def fleet_with_enclaves(fleet: Fleet, files: Iterable[Path]) -> Fleet:

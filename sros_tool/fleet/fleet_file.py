@@ -69,7 +69,7 @@ def read_fleet(path: Path) -> Fleet:
             key.
         UnavailableError: an inventory in YAML is named, and PyYAML is not installed.
     """
-    data, ending = read_bytes(path, "fleet file", most=MAX_BYTES), path.suffix.lower()
+    data, ending = read_bytes(path, "fleet file", max_bytes=MAX_BYTES), path.suffix.lower()
     if ending in _OF_INVENTORIES:
         what = f"the inventory '{path}'"
         table = _fleet_table(data, what, is_json=ending == ".json" or _is_json(data))
@@ -93,7 +93,7 @@ def read_connections(path: Path) -> dict[str, str]:
     Raises:
         SrosError: as `read_fleet`.
     """
-    data, ending = read_bytes(path, "fleet file", most=MAX_BYTES), path.suffix.lower()
+    data, ending = read_bytes(path, "fleet file", max_bytes=MAX_BYTES), path.suffix.lower()
     if ending not in _OF_INVENTORIES:
         return {}
     return _connections(
@@ -106,20 +106,20 @@ _INI_HOST = re.compile(rb"^[A-Za-z0-9_.-]+[ \t]*(?:$|[ \t][A-Za-z_]+=)", re.MULT
 """Matches a host line of an INI inventory: a host name, perhaps with variables after it."""
 
 
-def parse_fleet(data: bytes, what: str) -> Fleet:
-    """Return the fleet in a TOML document; ``what`` names it in errors.
+def parse_fleet(data: bytes, label: str) -> Fleet:
+    """Return the fleet in a TOML document; ``label`` names it in errors.
 
     Raises:
         DocumentError: it is not TOML, or a value in it is not valid.
     """
-    return _Reader(what).fleet(read_toml(data, what, longest=MAX_BYTES))
+    return _Reader(label).fleet(read_toml(data, label, longest=MAX_BYTES))
 
 
 class _Reader:
     """Reader of a fleet file; ``words`` maps its keys to the words of messages (`_SHOWN`)."""
 
-    def __init__(self, what: str, words: Mapping[str, str] = MappingProxyType({})) -> None:
-        self._what = what
+    def __init__(self, label: str, words: Mapping[str, str] = MappingProxyType({})) -> None:
+        self._what = label
         self._words = words
 
     def fleet(self, table: Mapping[str, Any]) -> Fleet:
@@ -233,13 +233,13 @@ class _Reader:
                 raise self._error(f"{key}.{name} is not a table", "", f"Write [{key}.{name}].")
         return tables
 
-    def _texts(self, table: Mapping[str, Any], key: str, at: str, most: int) -> tuple[str, ...]:
+    def _texts(self, table: Mapping[str, Any], key: str, at: str, maximum: int) -> tuple[str, ...]:
         values = table.get(key, [])
         where = f"{at}.{key}" if at else key
         if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
             raise self._error(f"{where} is not a list of names", "", f'Write {key} = ["NAME"].')
-        if len(values) > most:
-            raise self._error(f"{where} has more than {most} names")
+        if len(values) > maximum:
+            raise self._error(f"{where} has more than {maximum} names")
         return tuple(values)
 
     def _known(self, table: Mapping[str, Any], keys: Iterable[str], at: str) -> None:
@@ -338,29 +338,29 @@ _WRITE_OUT = (
 )
 
 
-def _fleet_table(data: bytes, what: str, *, is_json: bool) -> dict[str, Any]:
+def _fleet_table(data: bytes, label: str, *, is_json: bool) -> dict[str, Any]:
     """Convert an inventory into the tables of an equivalent fleet file.
 
     Args:
         data: the inventory.
-        what: its name in errors.
+        label: its name in errors.
         is_json: whether it is JSON; otherwise it is YAML.
 
     Raises:
         DocumentError: it is not an inventory, or one that only Ansible can read.
         UnavailableError: PyYAML is not installed.
     """
-    return _Inventory(_loaded(data, what, is_json=is_json), what).table()
+    return _Inventory(_loaded(data, label, is_json=is_json), label).table()
 
 
-def _connections(data: bytes, what: str, *, is_json: bool) -> dict[str, str]:
+def _connections(data: bytes, label: str, *, is_json: bool) -> dict[str, str]:
     """Return the settings of an inventory that decide how Ansible connects and delivers, by key.
 
     The settings of the fleet itself are left out (`_fleet_table`).  If a group has variables, its
     members are added, too.  If a value is a template, all values are returned.  Parameters and
     errors are those of `_fleet_table`.
     """
-    values = dict(_values_below(_loaded(data, what, is_json=is_json)))
+    values = dict(_values_below(_loaded(data, label, is_json=is_json)))
     known = {*_VARIABLES.values(), _ROBOT}
     kept = {
         path: text
@@ -388,29 +388,29 @@ def _values_below(top: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str
             yield path, str(value)
 
 
-def _loaded(data: bytes, what: str, *, is_json: bool) -> Mapping[str, Any]:
+def _loaded(data: bytes, label: str, *, is_json: bool) -> Mapping[str, Any]:
     if is_json:
         try:
             value = parse_json(data)
         except ValueError as error:
-            raise DocumentError(f"{what} is not valid JSON", f"{error}.") from error
+            raise DocumentError(f"{label} is not valid JSON", f"{error}.") from error
     else:
-        value = _load_yaml(data, what)
+        value = _load_yaml(data, label)
     if not isinstance(value, dict):
         raise DocumentError(
-            f"{what} is not an inventory in YAML or JSON",
+            f"{label} is not an inventory in YAML or JSON",
             "Its top level is not a mapping of groups; sros does not read INI inventories.",
             _WRITE_OUT,
         )
     return value
 
 
-def _load_yaml(data: bytes, what: str) -> Any:
+def _load_yaml(data: bytes, label: str) -> Any:
     try:
         import yaml
     except ImportError as error:
         raise UnavailableError(
-            f"{what} is in YAML, and PyYAML is not installed",
+            f"{label} is in YAML, and PyYAML is not installed",
             "PyYAML is part of ansible-core.",
             "Run `pip install ansible-core`, or name the JSON of `ansible-inventory --list`.",
         ) from error
@@ -423,7 +423,7 @@ def _load_yaml(data: bytes, what: str) -> Any:
             depth -= isinstance(event, yaml.CollectionEndEvent)
             if depth > _MOST_DEPTH or isinstance(event, yaml.AliasEvent):
                 raise DocumentError(
-                    f"{what} has an alias (*NAME), or is nested too deeply",
+                    f"{label} has an alias (*NAME), or is nested too deeply",
                     f"It is at {str(event.start_mark).strip()}.",
                     _WRITE_OUT,
                 )
@@ -431,7 +431,7 @@ def _load_yaml(data: bytes, what: str) -> Any:
     except (yaml.YAMLError, ValueError) as error:
         why = " ".join(str(error).split())
         raise DocumentError(
-            f"{what} is not valid YAML with only text, numbers, lists and mappings",
+            f"{label} is not valid YAML with only text, numbers, lists and mappings",
             f"{why}.",
             _WRITE_OUT,
         ) from error
@@ -441,8 +441,8 @@ _Variables = Mapping[str, tuple[int, Any]]
 
 
 class _Inventory:
-    def __init__(self, groups: Mapping[str, Any], what: str) -> None:
-        self._what = what
+    def __init__(self, groups: Mapping[str, Any], label: str) -> None:
+        self._what = label
         self._own: dict[str, dict[str, Any]] = {}
         """Host → variables set at the host itself."""
         self._inherited: dict[str, dict[str, tuple[int, Any]]] = {}
@@ -475,16 +475,21 @@ class _Inventory:
             if name != "_meta" and (name not in inside or name == "all"):
                 yield name
 
-    def _read(self, name: str, group: Any, above: tuple[str, ...], variables: _Variables) -> None:
-        """Read a group; it inherits ``variables`` from the groups ``above`` that contain it."""
+    def _read(
+        self, name: str, group: Any, parent_groups: tuple[str, ...], variables: _Variables
+    ) -> None:
+        """Read a group; it inherits ``variables`` from the ``parent_groups`` that contain it."""
         self._step()
-        if name in above or len(above) > _MOST_DEPTH:
+        if name in parent_groups or len(parent_groups) > _MOST_DEPTH:
             raise self._error(f"the group {name} is in itself, or in too many others")
         if not isinstance(group, dict):
             group = {"hosts": group} if isinstance(group, list) else self._mapping(group, name)
-        inside = (*above, name)
+        inside = (*parent_groups, name)
         set_here = self._known(group.get("vars"), f"{name}.vars")
-        variables = {**variables, **{key: (len(above), value) for key, value in set_here.items()}}
+        variables = {
+            **variables,
+            **{key: (len(parent_groups), value) for key, value in set_here.items()},
+        }
         if name not in _OF_ALL:
             self._groups.setdefault(name, set())
         hosts = group.get("hosts") or {}

@@ -978,15 +978,15 @@ def with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> by
     return document if same else merged
 
 
-def _beyond(given: frozenset[NodeRight], profile: Profile) -> tuple[Group, ...]:
-    """Return the groups of a profile, without the names whose rights are all in ``given``."""
+def _beyond(given_rights: frozenset[NodeRight], profile: Profile) -> tuple[Group, ...]:
+    """Return the groups of a profile without names whose rights are all in ``given_rights``."""
     groups = []
     for group in profile.groups:
         names = tuple(
             name
             for name in group.names
             if any(
-                NodeRight(right, expand(name, profile.ns, profile.node)) not in given
+                NodeRight(right, expand(name, profile.ns, profile.node)) not in given_rights
                 for right, _ in group.rights
             )
         )

@@ -207,9 +207,9 @@ def _require(module: str) -> None:
     )
 
 
-def _parse_listed(listed: Sequence[Sequence[str]]) -> tuple[Listed, ...]:
+def _parse_listed(listed_nodes: Sequence[Sequence[str]]) -> tuple[Listed, ...]:
     """Return the announced nodes in the observer's JSON, as (enclave, namespace, name)."""
-    return tuple((enclave, ns, name) for enclave, ns, name in listed)
+    return tuple((enclave, ns, name) for enclave, ns, name in listed_nodes)
 
 
 # ── for how long ────────────────────────────────────────────────────────────────────────
@@ -412,17 +412,17 @@ def _enclaves(
 
 
 def _by_order(
-    listed: Sequence[Listed],
+    listed_nodes: Sequence[Listed],
     processes: dict[str, frozenset[_Name]],
     candidates: dict[str, frozenset[str]],
 ) -> dict[str, frozenset[str]]:
-    """Return ``candidates`` with the enclaves that the order of ``listed`` decides.
+    """Return ``candidates`` with the enclaves that the order of ``listed_nodes`` decides.
 
     The nth listed node of a name belongs to the nth participant with a node of that name, if there
     are as many nodes as participants.  ``candidates`` stay unchanged if this contradicts them.
     """
     enclaves: dict[_Name, list[str]] = {}
-    for enclave, ns, name in listed:
+    for enclave, ns, name in listed_nodes:
         enclaves.setdefault((ns, name), []).append(enclave)
     by_owner: dict[str, set[str]] = {}
     for node, places in enclaves.items():

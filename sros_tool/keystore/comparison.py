@@ -140,8 +140,8 @@ def _governance_changes(old: Governance, new: Governance) -> Iterator[SettingCha
                 yield SettingChange(Effect.TIGHTER, key, "a rule", "no rule", text)
 
 
-def _domains_without(domains: DomainSet, removed: DomainSet) -> DomainSet:
-    return DomainSet.of(*((domain, domain) for domain in domains if domain not in removed))
+def _domains_without(domains: DomainSet, removed_domains: DomainSet) -> DomainSet:
+    return DomainSet.of(*((domain, domain) for domain in domains if domain not in removed_domains))
 
 
 def _rule_of(governance: Governance, domain: int) -> DomainRule:

@@ -315,21 +315,21 @@ def _json(value: Mapping[str, Any]) -> bytes:
 # ── in the keystore ─────────────────────────────────────────────────────────────────────────
 
 
-def parse_confirmation(data: bytes, what: str) -> Confirmation:
-    """Return the confirmation in a JSON document; ``what`` names it in errors.
+def parse_confirmation(data: bytes, label: str) -> Confirmation:
+    """Return the confirmation in a JSON document; ``label`` names it in errors.
 
     Raises:
         DocumentError: the document is too large or not a confirmation; the error names the fault.
     """
     if len(data) > MAX_BYTES:
         raise DocumentError(
-            f"{what} is too large", f"A confirmation has at most {MAX_BYTES // 1024**2} MiB."
+            f"{label} is too large", f"A confirmation has at most {MAX_BYTES // 1024**2} MiB."
         )
     try:
         value = parse_json(data)
     except ValueError as error:
-        raise _refused(what, "it is not JSON") from error
-    return _confirmation_from(value, what)
+        raise _refused(label, "it is not JSON") from error
+    return _confirmation_from(value, label)
 
 
 class LastMessage(NamedTuple):
@@ -386,22 +386,22 @@ class KeptConfirmation(NamedTuple):
     notes: Notes
 
 
-def receive(data: bytes, robot: str, what: str, *, now: datetime) -> Received:
+def receive(data: bytes, robot: str, label: str, *, now: datetime) -> Received:
     """Return the confirmation in ``data`` as received from ``robot`` at ``now``.
 
     Args:
         data: JSON that `render_confirmation` writes.
         robot: name of the robot.
-        what: name of the document in errors.
+        label: name of the document in errors.
         now: the present time.
 
     Raises:
         DocumentError: ``data`` is not a confirmation, or is the confirmation of another robot.
     """
-    confirmation = parse_confirmation(data, what)
+    confirmation = parse_confirmation(data, label)
     if confirmation.robot != robot:
         raise DocumentError(
-            f"{what} is the confirmation of {confirmation.robot}, not of {robot}",
+            f"{label} is the confirmation of {confirmation.robot}, not of {robot}",
             "A robot can confirm only its own files.",
             f"If it comes from {confirmation.robot}, name it with --robot {confirmation.robot}.",
         )
@@ -486,7 +486,7 @@ def refusals(root: Path) -> dict[str, RefusedMessage]:
     path = root / REFUSED
     if not os.path.lexists(path):
         return {}
-    data = read_bytes(path, "refused messages", most=_MOST_REFUSALS)
+    data = read_bytes(path, "refused messages", max_bytes=_MOST_REFUSALS)
     try:
         return {
             robot: RefusedMessage(parse_iso(refusal["time"]), str(refusal["why"]))
@@ -512,7 +512,7 @@ def last_confirmation(root: Path, robot: str) -> Received | None:
         return None
     what = f"'{path}'"
     try:
-        value = parse_json(read_bytes(path, "confirmation", most=2 * MAX_BYTES))
+        value = parse_json(read_bytes(path, "confirmation", max_bytes=2 * MAX_BYTES))
     except ValueError as error:
         raise _refused(what, "it is not JSON") from error
     if not isinstance(value, dict) or value.keys() - {"message"} != {"received", "confirmation"}:
@@ -524,70 +524,70 @@ def last_confirmation(root: Path, robot: str) -> Received | None:
     return Received(confirmation, _moment(value["received"], what), message)
 
 
-def _message_from(value: Any, what: str) -> LastMessage:
+def _message_from(value: Any, label: str) -> LastMessage:
     """Return the last message of a robot's agent in a JSON value.
 
     Raises:
         DocumentError: it is not of that form.
     """
     if not isinstance(value, dict) or value.keys() != set(LastMessage._fields):
-        raise _refused(what, 'the keys of its message are not "sequence", "sha256" and "enclave"')
+        raise _refused(label, 'the keys of its message are not "sequence", "sha256" and "enclave"')
     if not _is_digest(value["sha256"]):
-        raise _refused(what, "the digest of its message is not a SHA-256 digest")
-    sequence = _sequence_from(value["sequence"], what)
-    return LastMessage(sequence, value["sha256"], _enclave_from(value["enclave"], what))
+        raise _refused(label, "the digest of its message is not a SHA-256 digest")
+    sequence = _sequence_from(value["sequence"], label)
+    return LastMessage(sequence, value["sha256"], _enclave_from(value["enclave"], label))
 
 
-def _confirmation_from(value: Any, what: str) -> Confirmation:
-    """Return the confirmation in a JSON value; ``what`` names it in errors.
+def _confirmation_from(value: Any, label: str) -> Confirmation:
+    """Return the confirmation in a JSON value; ``label`` names it in errors.
 
     Raises:
         DocumentError: as `parse_confirmation`.
     """
     if not isinstance(value, dict):
-        raise _refused(what, "it is not a JSON object")
+        raise _refused(label, "it is not a JSON object")
     if value.get("format") != _FORMAT or type(value["format"]) is not int:
-        raise _refused(what, f"its format is not {_FORMAT}", "Use an sros of the same version.")
+        raise _refused(label, f"its format is not {_FORMAT}", "Use an sros of the same version.")
     if unknown := sorted(value.keys() - _KEYS - _OPTIONAL_KEYS):
-        raise _refused(what, f"it has the unknown key {_short(unknown[0])}")
+        raise _refused(label, f"it has the unknown key {_short(unknown[0])}")
     if missing := sorted(_KEYS - value.keys()):
-        raise _refused(what, f"it lacks {', '.join(missing)}")
+        raise _refused(label, f"it lacks {', '.join(missing)}")
     robot = value["robot"]
     if not isinstance(robot, str) or name_problem(robot):
-        raise _refused(what, f"{_short(robot)} is not the name of a robot")
-    files = dict(_entries(value, "files", what))
+        raise _refused(label, f"{_short(robot)} is not the name of a robot")
+    files = dict(_entries(value, "files", label))
     for path, digest in files.items():
         if not _is_digest(digest):
-            raise _refused(what, f"the digest of {path} is not a SHA-256 digest")
+            raise _refused(label, f"the digest of {path} is not a SHA-256 digest")
     certificates = {}
-    for path, digests in _entries({"certificates": {}, **value}, "certificates", what):
+    for path, digests in _entries({"certificates": {}, **value}, "certificates", label):
         if path not in files or path.rpartition("/")[2] not in _CERTIFICATE_FILES:
             raise _refused(
-                what, f"it lists certificates of {path}, which is not a certificate file"
+                label, f"it lists certificates of {path}, which is not a certificate file"
             )
         listed = isinstance(digests, list) and len(digests) <= _MOST_CERTIFICATES
         if not listed or not all(_is_digest(digest) for digest in digests):
-            raise _refused(what, f"the certificates of {path} are not a list of SHA-256 digests")
+            raise _refused(label, f"the certificates of {path} are not a list of SHA-256 digests")
         certificates[path] = tuple(digests)
-    dds = _dds_from(value["dds"], what) if "dds" in value else None
-    restart = _restart_from(value["restart"], what) if "restart" in value else None
-    time = _moment(value["time"], what)
-    agent = {key: _AGENT_READERS[key](value[key], what) for key in _OF_AGENT if key in value}
+    dds = _dds_from(value["dds"], label) if "dds" in value else None
+    restart = _restart_from(value["restart"], label) if "restart" in value else None
+    time = _moment(value["time"], label)
+    agent = {key: _AGENT_READERS[key](value[key], label) for key in _OF_AGENT if key in value}
     return Confirmation(robot, time, files, certificates, dds, restart, **agent)
 
 
-def _restart_from(value: Any, what: str) -> tuple[str, ...]:
+def _restart_from(value: Any, label: str) -> tuple[str, ...]:
     """Return the names of enclaves in a JSON value.
 
     Raises:
         DocumentError: it is not a list of such names.
     """
     if not isinstance(value, list):
-        raise _refused(what, "its restart is not a list")
-    return tuple(sorted({_enclave_from(name, what) for name in value}))
+        raise _refused(label, "its restart is not a list")
+    return tuple(sorted({_enclave_from(name, label) for name in value}))
 
 
-def _enclave_from(name: Any, what: str) -> str:
+def _enclave_from(name: Any, label: str) -> str:
     """Return the name of an enclave in a JSON value.
 
     Raises:
@@ -596,77 +596,77 @@ def _enclave_from(name: Any, what: str) -> str:
     try:
         return check_enclave_name(name if isinstance(name, str) else "")
     except InvalidNameError:
-        raise _refused(what, f"{_short(name)} is not the name of an enclave") from None
+        raise _refused(label, f"{_short(name)} is not the name of an enclave") from None
 
 
 # The readers of the keys that `sros agent` writes; each raises `DocumentError` for another form.
 
 
-def _sequence_from(value: Any, what: str) -> int:
+def _sequence_from(value: Any, label: str) -> int:
     if type(value) is not int or not 1 <= value <= _MOST_NUMBER:
-        raise _refused(what, "its sequence is not a positive number")
+        raise _refused(label, "its sequence is not a positive number")
     return value
 
 
-def _release_from(value: Any, what: str) -> int:
+def _release_from(value: Any, label: str) -> int:
     if type(value) is not int or not 0 <= value <= _MOST_NUMBER:
-        raise _refused(what, "its release is not a number")
+        raise _refused(label, "its release is not a number")
     return value
 
 
-def _expiry_from(value: Any, what: str) -> dict[str, EnclaveExpiry]:
+def _expiry_from(value: Any, label: str) -> dict[str, EnclaveExpiry]:
     if not isinstance(value, dict):
-        raise _refused(what, "its expiry is not an object")
+        raise _refused(label, "its expiry is not an object")
     expiry = {}
     for name, times in value.items():
         if not isinstance(times, dict) or times.keys() != set(EnclaveExpiry._fields):
-            raise _refused(what, 'the keys of an expiry are not "certificate" and "permissions"')
+            raise _refused(label, 'the keys of an expiry are not "certificate" and "permissions"')
         moments = (
-            None if times[file] is None else _moment(times[file], what)
+            None if times[file] is None else _moment(times[file], label)
             for file in EnclaveExpiry._fields
         )
-        expiry[_enclave_from(name, what)] = EnclaveExpiry(*moments)
+        expiry[_enclave_from(name, label)] = EnclaveExpiry(*moments)
     return expiry
 
 
-def _running_from(value: Any, what: str) -> dict[str, RunningFiles]:
+def _running_from(value: Any, label: str) -> dict[str, RunningFiles]:
     if not isinstance(value, dict):
-        raise _refused(what, "its running is not an object")
+        raise _refused(label, "its running is not an object")
     for state in value.values():
         if state not in tuple(RunningFiles):
-            raise _refused(what, f"{_short(state)} is not a state of running processes")
-    return {_enclave_from(name, what): RunningFiles(state) for name, state in value.items()}
+            raise _refused(label, f"{_short(state)} is not a state of running processes")
+    return {_enclave_from(name, label): RunningFiles(state) for name, state in value.items()}
 
 
-def _clock_from(value: Any, what: str) -> RobotClock:
+def _clock_from(value: Any, label: str) -> RobotClock:
     if value not in tuple(RobotClock):
-        raise _refused(what, f"{_short(value)} is not the state of a clock")
+        raise _refused(label, f"{_short(value)} is not the state of a clock")
     return RobotClock(value)
 
 
-def _problems_from(value: Any, what: str) -> tuple[str, ...]:
+def _problems_from(value: Any, label: str) -> tuple[str, ...]:
     if not isinstance(value, list) or len(value) > MOST_PROBLEMS:
-        raise _refused(what, f"its problems are not a list of at most {MOST_PROBLEMS}")
+        raise _refused(label, f"its problems are not a list of at most {MOST_PROBLEMS}")
     for text in value:
         if not (isinstance(text, str) and text.isprintable() and 0 < len(text) <= LONGEST_PROBLEM):
             raise _refused(
-                what, f"a problem is not printable text of at most {LONGEST_PROBLEM} characters"
+                label, f"a problem is not printable text of at most {LONGEST_PROBLEM} characters"
             )
     return tuple(value)
 
 
-def _requests_from(value: Any, what: str) -> tuple[str, ...]:
+def _requests_from(value: Any, label: str) -> tuple[str, ...]:
     if not isinstance(value, list) or len(value) > MOST_REQUESTS:
-        raise _refused(what, f"its requests are not a list of at most {MOST_REQUESTS}")
+        raise _refused(label, f"its requests are not a list of at most {MOST_REQUESTS}")
     for text in value:
         if not (isinstance(text, str) and len(text) <= _LONGEST_REQUEST and _REQUEST.match(text)):
-            raise _refused(what, "one of its requests is not exactly one signing request in PEM")
+            raise _refused(label, "one of its requests is not exactly one signing request in PEM")
     return tuple(value)
 
 
-def _crl_from(value: Any, what: str) -> str:
+def _crl_from(value: Any, label: str) -> str:
     if not (isinstance(value, str) and len(value) <= LONGEST_LIST and _LIST.match(value)):
-        raise _refused(what, "its crl is not one revocation list in PEM")
+        raise _refused(label, "its crl is not one revocation list in PEM")
     return value
 
 
@@ -682,39 +682,39 @@ _AGENT_READERS: Mapping[str, Callable[[Any, str], Any]] = {
 }
 
 
-def _dds_from(value: Any, what: str) -> RobotDds:
+def _dds_from(value: Any, label: str) -> RobotDds:
     """Return the DDS of a robot in a JSON value.
 
     Raises:
         DocumentError: it is not of that form.
     """
     if not isinstance(value, dict) or value.keys() != set(RobotDds._fields):
-        raise _refused(what, 'the keys of its dds are not "libraries" and "unseen"')
+        raise _refused(label, 'the keys of its dds are not "libraries" and "unseen"')
     listed, unseen = value["libraries"], value["unseen"]
     if type(unseen) is not int or not 0 <= unseen <= _MOST_UNSEEN:
-        raise _refused(what, "its number of unseen processes is not a number")
+        raise _refused(label, "its number of unseen processes is not a number")
     if not isinstance(listed, list) or len(listed) > _MOST_LIBRARIES:
-        raise _refused(what, f"its DDS libraries are not a list of at most {_MOST_LIBRARIES}")
+        raise _refused(label, f"its DDS libraries are not a list of at most {_MOST_LIBRARIES}")
     libraries = []
     for library in listed:
         if not isinstance(library, dict) or library.keys() != set(RobotLibrary._fields):
             raise _refused(
-                what, ('the keys of a library of its DDS are not "product", "version", ...')
+                label, ('the keys of a library of its DDS are not "product", "version", ...')
             )
         product, version, path, seen = (library[key] for key in RobotLibrary._fields)
         if product not in PRODUCTS:
-            raise _refused(what, f"{_short(product)} is not a DDS that confirmations name")
+            raise _refused(label, f"{_short(product)} is not a DDS that confirmations name")
         if not isinstance(version, str) or (version and not _LIBRARY_VERSION.match(version)):
-            raise _refused(what, f"{_short(version)} is not the version of a DDS")
+            raise _refused(label, f"{_short(version)} is not the version of a DDS")
         if not isinstance(path, str) or not _LIBRARY_PATH.match(path):
-            raise _refused(what, f"{_short(path)} is not the path of a library")
+            raise _refused(label, f"{_short(path)} is not the path of a library")
         if seen not in tuple(Seen):
-            raise _refused(what, f"{_short(seen)} does not say where a library was seen")
+            raise _refused(label, f"{_short(seen)} does not say where a library was seen")
         libraries.append(RobotLibrary(product, version, path, Seen(seen)))
     return RobotDds(tuple(libraries), unseen)
 
 
-def _entries(value: Mapping[str, Any], key: str, what: str) -> Iterator[tuple[str, Any]]:
+def _entries(value: Mapping[str, Any], key: str, label: str) -> Iterator[tuple[str, Any]]:
     """Yield the (path, value) pairs of the JSON object at ``key``.
 
     Raises:
@@ -722,16 +722,16 @@ def _entries(value: Mapping[str, Any], key: str, what: str) -> Iterator[tuple[st
     """
     entries = value[key]
     if not isinstance(entries, dict):
-        raise _refused(what, f"{key} is not an object")
+        raise _refused(label, f"{key} is not an object")
     known: set[str] = set()
     for path, entry in entries.items():
         folder, _, file = path.rpartition("/")
         if folder not in known:
             if not _is_enclave_folder(folder):
-                raise _refused(what, f"{_short(path)} is not the path of a file of an enclave")
+                raise _refused(label, f"{_short(path)} is not the path of a file of an enclave")
             known.add(folder)
         if file not in CONFIRMED_FILES:
-            raise _refused(what, f"{_short(path)} is not a file that a confirmation lists")
+            raise _refused(label, f"{_short(path)} is not a file that a confirmation lists")
         yield path, entry
 
 
@@ -751,13 +751,13 @@ def _is_digest(value: object) -> bool:
     return isinstance(value, str) and bool(_DIGEST.match(value))
 
 
-def _moment(text: object, what: str) -> datetime:
+def _moment(text: object, label: str) -> datetime:
     if isinstance(text, str) and _MOMENT.match(text):
         try:
             return parse_iso(text)
         except ValueError:
             pass
-    raise _refused(what, f"its time {_short(text)} does not have the form 2027-05-21T12:50:48Z")
+    raise _refused(label, f"its time {_short(text)} does not have the form 2027-05-21T12:50:48Z")
 
 
 _AGAIN = "Make the confirmation again on the robot."

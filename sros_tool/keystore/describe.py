@@ -548,7 +548,7 @@ def describe(
         of_enclave = (CERTIFICATE_FILE, PERMISSIONS_FILE, KEY_URI_FILE)
         if any((path / name).exists() for name in of_enclave):
             state = open_enclave(path, now=now, files=files)
-            evaluation = evaluated("", path, state, at=now)
+            evaluation = evaluated("", path, state, moment=now)
             elsewhere = state.key_on_robot
             facts = (
                 _facts_in_keystore(evaluation, state) if elsewhere else _enclave_facts(evaluation)
@@ -694,7 +694,7 @@ def _zenoh(folder: Path, now: datetime) -> ZenohFiles | None:
 def _enclave(keystore: Keystore, name: str, now: datetime) -> KeystoreEnclave:
     """Describe an enclave of a keystore."""
     state = keystore.enclave(name, now=now)
-    evaluation = evaluated(name, keystore.folder(name), state, at=now)
+    evaluation = evaluated(name, keystore.folder(name), state, moment=now)
     return KeystoreEnclave(name, state.key_on_robot, _facts_in_keystore(evaluation, state))
 
 
@@ -796,7 +796,7 @@ def _signature(
         )
         try:
             signed.verify(certificates[0])
-            reason = chain_fault(certificates[0], certificates, at=now, checks=Checks.DOCUMENTS)
+            reason = chain_fault(certificates[0], certificates, moment=now, checks=Checks.DOCUMENTS)
         except SrosError as error:
             reason = str(error)
         verified = not reason

@@ -269,6 +269,6 @@ def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
     return f"{lifetime.name}  {first} {word} {iso(lifetime.expires())}"
 
 
-def _elapsed(validity: Window, now: datetime, made: datetime | None) -> float:
+def _elapsed(validity: Window, now: datetime, made_at: datetime | None) -> float:
     """Return the elapsed fraction of a validity, without its back-dating; above 1 after expiry."""
-    return 1 - (validity.not_after - now) / validity.life(made)
+    return 1 - (validity.not_after - now) / validity.life(made_at)

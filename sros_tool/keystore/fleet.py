@@ -132,7 +132,7 @@ def _read(keystore: Keystore) -> bytes | None:
         return None
     from sros_tool.fleet.fleet_file import MAX_BYTES  # most keystores have no fleet
 
-    return keystore.files.read(path, "fleet file", most=MAX_BYTES)
+    return keystore.files.read(path, "fleet file", max_bytes=MAX_BYTES)
 
 
 def _parse(root: Path, data: bytes) -> Fleet:
@@ -209,11 +209,12 @@ class EnclaveDomains(NamedTuple):
 
 
 def with_routers_of_robots(
-    network: ZenohNetwork, before: Fleet | None, fleet: Fleet, gone: Collection[str] = ()
+    network: ZenohNetwork, before: Fleet | None, fleet: Fleet, gone_enclaves: Collection[str] = ()
 ) -> ZenohNetwork:
     """Return a Zenoh network with the routers of a fleet's robots, in place of those of ``before``.
 
-    Where a router listens stays as it is.  Routers whose enclaves are ``gone`` are left out.
+    Where a router listens stays as it is.  Routers whose enclaves are ``gone_enclaves`` are left
+    out.
     """
     from sros_tool.zenoh.configuration import ZenohRouter  # most fleets name no routers
 
@@ -222,7 +223,7 @@ def with_routers_of_robots(
         known.pop(name, None)
     listening = {router.name: router.listen for router in network.routers}
     for name, robot in _routers(fleet).items():
-        if name not in gone:
+        if name not in gone_enclaves:
             own = [enclave for enclave in enclaves_of(fleet, robot) if enclave != name]
             folder = fleet.routers.rpartition("/")[0]
             if has_placeholder(folder):

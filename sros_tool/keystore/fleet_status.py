@@ -661,9 +661,9 @@ class _KeystoreFiles:
     def _file(self, path: str) -> _KeystoreFile | None:
         return self._read(path, self._folder.read)
 
-    def _read(self, path: str, read: Callable[[str], bytes]) -> _KeystoreFile | None:
+    def _read(self, path: str, read_content: Callable[[str], bytes]) -> _KeystoreFile | None:
         try:
-            data = read(path)
+            data = read_content(path)
         except (SrosError, OSError):
             return None
         has_certificates = _kind_of(path) in (*_AUTHORITIES, "certificate")
@@ -685,7 +685,7 @@ class _Known:
     """Identification, by the ledger, of confirmed files that differ from the keystore."""
 
     def __init__(
-        self, keystore: Keystore, fleet: Fleet, compared: Sequence[_ComparedRobot]
+        self, keystore: Keystore, fleet: Fleet, compared_robots: Sequence[_ComparedRobot]
     ) -> None:
         self._keystore = keystore
         self._root = keystore.root
@@ -706,17 +706,19 @@ class _Known:
         self._issued: dict[str, Entry] = {}
         self._revoked_serials: set[str] = set()
         self._revoked: set[str] = set()
-        different = [file for robot in compared for file in robot.different if file.confirmed]
+        different = [
+            file for robot in compared_robots for file in robot.different if file.confirmed
+        ]
         wanted = {file.confirmed for file in different}
         wanted.update(certificate for file in different for certificate in file.certificates)
         wanted.update(
             certificate
-            for robot in compared
+            for robot in compared_robots
             for file in robot.different
             if _kind_of(file.path) == "certificate"
             for certificate in file.present
         )
-        for robot in compared:
+        for robot in compared_robots:
             wanted.update(*robot.expiring.values())
         wanted.discard("")  # of a file that the robot does not have
         ledger = keystore.ledger if wanted else keystore.ledger_with("what", "revocation")
@@ -729,7 +731,7 @@ class _Known:
                 self._revoked_serials.add(entry.serial)
                 if entry.enclave and entry.reason != SUPERSEDED:
                     self._revoked.add(entry.enclave)
-        robots = {robot.robot.name for robot in compared}
+        robots = {robot.robot.name for robot in compared_robots}
         self._unrecorded = unrecorded_enclaves(fleet, self._revoked, robots)
 
     def is_later(self, robot: str, release: int) -> bool:
@@ -737,14 +739,14 @@ class _Known:
         last = self.published.get(robot)
         return release > (self._last_release if last is None else last)
 
-    def has_release(self, compared: _ComparedRobot) -> bool:
+    def has_release(self, compared_robot: _ComparedRobot) -> bool:
         """Return whether the last release of a robot that fetches has the present files."""
-        published = self._published.get(compared.robot.name)
-        if published is None or not (compared.received and compared.received.message):
+        published = self._published.get(compared_robot.robot.name)
+        if published is None or not (compared_robot.received and compared_robot.received.message):
             return False
         from sros_tool.keystore.delivery.publish import is_all_published  # few robots need it
 
-        return is_all_published(self._root, published, compared.enclaves)
+        return is_all_published(self._root, published, compared_robot.enclaves)
 
     def older(self) -> str:
         """Return why the keystore is older than its robots, as a clause; "" if nothing shows it."""
@@ -756,20 +758,22 @@ class _Known:
 
         return later_in_folder(self._keystore)
 
-    def lacks_key(self, compared: _ComparedRobot) -> tuple[str, ...]:
+    def lacks_key(self, compared_robot: _ComparedRobot) -> tuple[str, ...]:
         """Return the enclaves whose certificate is for a key that the robot does not have.
 
         These are the enclaves of which it has no file, those with an earlier key, and those of
         which its agent says so.  If the keystore does not have the key, it was made on the robot,
         and a release is enough.
         """
-        confirmed = compared.confirmed
+        confirmed = compared_robot.confirmed
         if confirmed is None:
             return ()
         problems = [text for text in confirmed.problems or () if lacks_key(text)]
-        found = {name for name in compared.enclaves if any(f"{name} " in text for text in problems)}
+        found = {
+            name for name in compared_robot.enclaves if any(f"{name} " in text for text in problems)
+        }
         folders = {path.rpartition("/")[0] for path in confirmed.files}
-        for file in compared.different:
+        for file in compared_robot.different:
             if _kind_of(file.path) == "certificate" and file.own and file.present:
                 before = self._issued.get(file.certificates[0]) if file.certificates else None
                 now = self._issued.get(file.present[0])
@@ -779,13 +783,13 @@ class _Known:
         keys = {name: enclave_path(self._root, name) / KEY_FILE for name in found}
         return tuple(sorted(name for name, key in keys.items() if os.path.lexists(key)))
 
-    def reads_copy(self, compared: _ComparedRobot, heard: datetime | None) -> bool:
+    def reads_copy(self, compared_robot: _ComparedRobot, heard: datetime | None) -> bool:
         """Return whether a robot fetched long after the publication, and got an earlier release.
 
         Robots that report a problem say themselves why they got no release.
         """
-        confirmed = compared.confirmed
-        published = self.published.get(compared.robot.name)
+        confirmed = compared_robot.confirmed
+        published = self.published.get(compared_robot.robot.name)
         if not (confirmed and heard and published) or confirmed.problems:
             return False
         since = self._releases.get(published)
@@ -823,10 +827,10 @@ class _Known:
         template = self._keystore.template
         return tuple(sorted(name for name in names if template.longest_validity(name) is not None))
 
-    def validity(self, compared: _ComparedRobot) -> dict[str, _Expiring]:
+    def validity(self, compared_robot: _ComparedRobot) -> dict[str, _Expiring]:
         """Return the robot's file that expires first, by kind, by the ledger."""
         first: dict[str, _Expiring] = {}
-        for kind, digests in compared.expiring.items():
+        for kind, digests in compared_robot.expiring.items():
             entries = (self._issued.get(digest) for digest in digests)
             files = [
                 entry
@@ -889,79 +893,79 @@ class _Known:
 
 
 def _status(
-    compared: _ComparedRobot, known: _Known, stages: _Stages, unrecorded: Unrecorded
+    compared_robot: _ComparedRobot, known: _Known, stages: _Stages, unrecorded: Unrecorded
 ) -> RobotStatus:
-    different = tuple(known.file(compared.robot, file) for file in compared.different)
-    revoked = known.revoked(compared.robot)
+    different = tuple(known.file(compared_robot.robot, file) for file in compared_robot.different)
+    revoked = known.revoked(compared_robot.robot)
     counts: dict[str, Counter[State]] = {}
-    for kind, number in compared.current.items():
+    for kind, number in compared_robot.current.items():
         counts.setdefault(kind, Counter())[State.CURRENT] = number
     for file in different:
         counts.setdefault(file.kind, Counter())[file.state] += 1
-    restart = compared.restart()
-    if revoked and not compared.enclaves:
+    restart = compared_robot.restart()
+    if revoked and not compared_robot.enclaves:
         state = State.REVOKED  # whatever it says: it has nothing to have
     elif different:
         state = max((file.state for file in different), key=_BADNESS.__getitem__)
-    elif not compared.enclaves:
+    elif not compared_robot.enclaves:
         state = State.NONE
     elif restart:
         state = State.RESTART
     else:
-        state = State.NEVER if compared.received is None else State.CURRENT
-    received, confirmed = compared.received, compared.confirmed
+        state = State.NEVER if compared_robot.received is None else State.CURRENT
+    received, confirmed = compared_robot.received, compared_robot.confirmed
     is_later = bool(
-        compared.enclaves
+        compared_robot.enclaves
         and confirmed
-        and known.is_later(compared.robot.name, confirmed.release or 0)
+        and known.is_later(compared_robot.robot.name, confirmed.release or 0)
     )
     if is_later:
         state = max(state, State.LATER, key=_BADNESS.__getitem__)
-    refusal = known.refusals.get(compared.robot.name) if compared.enclaves else None
+    refusal = known.refusals.get(compared_robot.robot.name) if compared_robot.enclaves else None
     if refusal and (received is None or received.time <= refusal.time):
         state = max(state, State.REFUSED, key=_BADNESS.__getitem__)
         text = f"its last message was refused since {iso(refusal.time)}: {refusal.why}"
-        compared = compared._replace(notes=(*compared.notes, text))
+        compared_robot = compared_robot._replace(notes=(*compared_robot.notes, text))
     has_list = (
         known.has_list
-        and bool(compared.enclaves)
+        and bool(compared_robot.enclaves)
         and received is not None
         and state not in (State.REFUSED, State.LATER)
         and set(counts.get("crl", ())) <= {State.CURRENT}
     )
-    validity = known.validity(compared)
+    validity = known.validity(compared_robot)
     certificates = {*counts.get("certificate", ())}
     status = RobotStatus(
-        compared.robot.name,
+        compared_robot.robot.name,
         state,
-        len(compared.enclaves),
+        len(compared_robot.enclaves),
         revoked,
         unrecorded,
         received.time if received else None,
         confirmed.time if confirmed else None,
         bool(received and received.message),
         confirmed.release if confirmed else None,
-        known.published.get(compared.robot.name),
-        stages.of(compared),
+        known.published.get(compared_robot.robot.name),
+        stages.of(compared_robot),
         {kind: counts[kind] for kind in (*_KINDS.values(), _ZENOH) if kind in counts},
         different,
         restart,
-        compared.running(),
-        has_list and restart == () if known.has_list and compared.enclaves else None,
+        compared_robot.running(),
+        has_list and restart == () if known.has_list and compared_robot.enclaves else None,
         {kind: file.window.not_after for kind, file in validity.items()},
         confirmed.dds if confirmed else None,
         confirmed.problems if confirmed else None,
-        compared.notes,
-        has_release=bool(different) and known.has_release(compared),
+        compared_robot.notes,
+        has_release=bool(different) and known.has_release(compared_robot),
         short_lived=known.short_lived(validity),
         has_list=has_list,
         renew_from=min(
             (file.window.expires_soon_from() for file in validity.values()), default=None
         ),
-        lacks_key=known.lacks_key(compared) if different else (),
-        is_locked_out=bool(compared.enclaves) and certificates == {State.REVOKED},
+        lacks_key=known.lacks_key(compared_robot) if different else (),
+        is_locked_out=bool(compared_robot.enclaves) and certificates == {State.REVOKED},
     )
-    if not (different and status.fetches and known.reads_copy(compared, status.heard)):
+    if not (different and status.fetches and known.reads_copy(compared_robot, status.heard)):
         return status
     text = (
         f"It sent a message long after release {status.published} was published, and has release "
@@ -992,11 +996,11 @@ class _Stages:
                 self._new[kind] = new[0] if new else certificates[0]
                 self._of_kind[kind] = certificates, self.of_keystore if new else self.COMPLETE
 
-    def of(self, compared: _ComparedRobot) -> str:
+    def of(self, compared_robot: _ComparedRobot) -> str:
         """Return the stage of the robot's least advanced CA file; "" if it confirmed no CA file."""
         stages = {
             self._stage(kind, certificates)
-            for kind, files in compared.authorities.items()
+            for kind, files in compared_robot.authorities.items()
             for certificates in files
         }
         return min(stages, key=self.ORDER.index, default="")

@@ -172,9 +172,9 @@ class KnownKeys:
         return enclaves_by_key
 
     def refuse_revoked(
-        self, key: PublicKey, whose: str, remedy: str, certificate: x509.Certificate | None = None
+        self, key: PublicKey, holder: str, remedy: str, certificate: x509.Certificate | None = None
     ) -> None:
-        """Raise `KeystoreError` if ``key`` was revoked; ``whose`` names its holder in the error.
+        """Raise `KeystoreError` if ``key`` was revoked; ``holder`` names its holder in the error.
 
         ``certificate`` is the present certificate for the key: a backup may have restored a revoked
         certificate.
@@ -184,7 +184,7 @@ class KnownKeys:
             revoked = _key_and_description(certificate)[1]
         if revoked:
             raise KeystoreError(
-                f"the key of {whose} was revoked", f"It is the key of {revoked}.", remedy
+                f"the key of {holder} was revoked", f"It is the key of {revoked}.", remedy
             )
 
     def refuse_second(self, key: PublicKey, name: str, remedy: str) -> None:

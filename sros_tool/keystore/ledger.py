@@ -197,15 +197,15 @@ _quoted = json.encoder.encode_basestring_ascii
 
 
 def certificate_entry(
-    now: datetime, what: str, certificate: x509.Certificate, enclave: str = "", reason: str = ""
+    now: datetime, label: str, certificate: x509.Certificate, enclave: str = "", reason: str = ""
 ) -> Entry:
-    """Return the entry of an issued certificate; ``what`` is "ca" or "certificate"."""
+    """Return the entry of an issued certificate; ``label`` is "ca" or "certificate"."""
     from sros_tool.pki.certificates import key_digest  # only writing needs it
 
     validity = validity_of(certificate)
     return Entry(
         time=iso(now),
-        what=what,
+        what=label,
         enclave=enclave,
         subject=subject_text(certificate.subject),
         serial=f"{certificate.serial_number:x}",
@@ -219,7 +219,7 @@ def certificate_entry(
 
 def document_entry(
     now: datetime,
-    what: str,
+    label: str,
     message: bytes,
     *,
     enclave: str = "",
@@ -229,10 +229,10 @@ def document_entry(
     nodes: str = "",
     number: int = 0,
 ) -> Entry:
-    """Return the entry of the signed document ``message``; ``what`` is its kind, as in `Entry`."""
+    """Return the entry of the signed document ``message``; ``label`` is its kind, as in `Entry`."""
     return Entry(
         time=iso(now),
-        what=what,
+        what=label,
         enclave=enclave,
         subject=subject,
         sha256=hashlib.sha256(message).hexdigest(),
@@ -299,10 +299,10 @@ class LedgerFile:
         authorities: Callable[[], Sequence[x509.Certificate]],
         *,
         follow_link: bool = True,
-        read: Callable[[Path, str], bytes] = read_bytes,
+        read_content: Callable[[Path, str], bytes] = read_bytes,
     ) -> None:
         self.root = root
-        self._read_first = read
+        self._read_first = read_content
         self._authorities = authorities
         self._follow_link = follow_link
         self._files: _Files | None = None
@@ -427,16 +427,16 @@ class LedgerFile:
         with _open(self.root, self._follow_link) or io.BytesIO() as file:
             yield from iter(lambda: file.read(_BLOCK), b"")
 
-    def _reading(self, having: bytes, terms: _Terms | None = None) -> _Reading:
-        """Return the ledger; chained lines without the text ``having`` are verified, not parsed.
+    def _reading(self, needed_text: bytes, terms: _Terms | None = None) -> _Reading:
+        """Return the ledger; chained lines without ``needed_text`` are verified, not parsed.
 
         ``terms`` are the field values by which the index finds these lines; None if it cannot.
         """
-        if having not in self._readings:
-            self._readings[having] = self._reading_with(having, terms)
-        return self._readings[having]
+        if needed_text not in self._readings:
+            self._readings[needed_text] = self._reading_with(needed_text, terms)
+        return self._readings[needed_text]
 
-    def _reading_with(self, having: bytes, terms: _Terms | None) -> _Reading:
+    def _reading_with(self, needed_text: bytes, terms: _Terms | None) -> _Reading:
         while True:
             known = self._files
             files = known or self._read()
@@ -449,7 +449,7 @@ class LedgerFile:
             if found:
                 self._files = files
                 return self._compared_with_head(files, found)
-            reading = self._compared_with_head(files, self._lines(files, having))
+            reading = self._compared_with_head(files, self._lines(files, needed_text))
             # A transaction of another process may have ended between the reading of the two files.
             kept = known is not None and known.lines is not None
             if kept or not reading.unrecorded or self._is_still(files):
@@ -535,13 +535,13 @@ class LedgerFile:
         numbers = [posting.number for posting in postings]
         return _Lines(entries, numbers, (), head.lines, 0, True, head.last, head.last, ended=True)
 
-    def _read_head(self, read: Callable[[Path, str], bytes]) -> _Head | None:
+    def _read_head(self, read_content: Callable[[Path, str], bytes]) -> _Head | None:
         """Return the head of the ledger; None without one."""
         path = self.root / LEDGER_HEAD
         if not path.exists():
             return None
         try:
-            signed = smime.parse(read(path, "signed head of the ledger"))
+            signed = smime.parse(read_content(path, "signed head of the ledger"))
             if authorities := self._authorities():
                 _verify(signed, authorities)
             stated = _HEAD.fullmatch(signed.text)
@@ -562,14 +562,14 @@ class LedgerFile:
             same = os.path.samestat(state, files.state)
         return same and self._read_head(read_bytes) == files.head
 
-    def _lines(self, files: _Files, having: bytes) -> _Lines:
+    def _lines(self, files: _Files, needed_text: bytes) -> _Lines:
         stated = files.head.lines if files.head else 0
         if files.lines is not None:
-            read = _remembered(files.lines, having, stated, _MOST_LINES, _MOST_BYTES)
+            read = _remembered(files.lines, needed_text, stated, _MOST_LINES, _MOST_BYTES)
         else:
             with _open(self.root, self._follow_link) or io.BytesIO() as file:
                 lines = self._every_line(file)
-                read = _read_lines(lines, having, stated, _MOST_LINES, _MOST_BYTES)
+                read = _read_lines(lines, needed_text, stated, _MOST_LINES, _MOST_BYTES)
         if read is None:
             raise _too_large(self.root / LEDGER)
         return read
@@ -577,14 +577,14 @@ class LedgerFile:
     # ── sealed parts ───────────────────────────────────────────────────────────────────────
 
     def _every_line(
-        self, last: BinaryIO, sealed: Callable[[str], None] = lambda _: None
+        self, last_part: BinaryIO, after_part: Callable[[str], None] = lambda _: None
     ) -> Iterator[bytes]:
-        """Yield the lines of all parts, the last of which is open, and call ``sealed`` after each.
+        """Yield the lines of all parts (the last is open), and call ``after_part`` after each.
 
         Raises:
             KeystoreError: a sealed part is missing, or is not as it was sealed.
         """
-        before = _sealed_before(last)
+        before = _sealed_before(last_part)
         parts = [before] if before else []
         while parts and parts[-1].number > 1:
             with self._part(parts[-1]) as file:
@@ -600,8 +600,8 @@ class LedgerFile:
                     yield line
             if digest.hexdigest() != part.sha256:
                 raise _not_as_sealed(self.root, part)
-            sealed(ledger_part(part.number))
-        yield from _lines_in(last)
+            after_part(ledger_part(part.number))
+        yield from _lines_in(last_part)
 
     def _part(self, sealed: Entry) -> BinaryIO:
         """Return a sealed part, open for reading."""
@@ -614,10 +614,10 @@ class LedgerFile:
             "Copy it back from your archive.",
         )
 
-    def _new_index(self, last: BinaryIO, head: _Head | None) -> tuple[IndexUpdate, bool]:
+    def _new_index(self, last_part: BinaryIO, head: _Head | None) -> tuple[IndexUpdate, bool]:
         """Return the index of all lines, and whether they are the chain that ``head`` signs.
 
-        ``last`` is the last part.  Both are said of the same reading: another process that can
+        ``last_part`` is the last part.  Both are said of the same reading: another process that can
         write to the keystore could exchange a part between two.
 
         Raises:
@@ -628,7 +628,7 @@ class LedgerFile:
         index = IndexUpdate(None)
 
         def indexed() -> Iterator[bytes]:
-            for line in self._every_line(last, index.seal):
+            for line in self._every_line(last_part, index.seal):
                 text = line.removesuffix(b"\n")
                 if entry := _parse(text):
                     index.add(entry, text)
@@ -638,13 +638,13 @@ class LedgerFile:
         read = _read_lines(indexed(), _NONE, stated, _MOST_LINES, _MOST_BYTES)
         if read is None or read.faults or read.unchained:
             return index, False
-        return index, not _head_fault(head, read.lines, read.signed, chained=read.chained)
+        return index, not _head_fault(head, read.lines, read.signed, is_chained=read.chained)
 
     def _compared_with_head(self, files: _Files, read: _Lines) -> _Reading:
         if not read.lines:
-            return _without_lines(self.root, is_there=files.state is not None)
+            return _without_lines(self.root, file_exists=files.state is not None)
         entries, numbers, faults = read.entries, read.numbers, [*read.faults]
-        if fault := _head_fault(files.head, read.lines, read.signed, chained=read.chained):
+        if fault := _head_fault(files.head, read.lines, read.signed, is_chained=read.chained):
             faults.append(fault)
         if files.later:
             text = f"{files.later} is a later part of it, so an earlier ledger was put back"
@@ -714,7 +714,7 @@ def _later_part(root: Path, name: str) -> KeystoreError:
     )
 
 
-def _entry_at(posting: Posting, index: LedgerIndex, last: BinaryIO) -> Entry:
+def _entry_at(posting: Posting, index: LedgerIndex, last_part: BinaryIO) -> Entry:
     """Return the entry to which a posting leads, in the index or the last part of the ledger.
 
     Raises:
@@ -724,7 +724,7 @@ def _entry_at(posting: Posting, index: LedgerIndex, last: BinaryIO) -> Entry:
     if posting.number <= state.sealed:
         line = index.line(posting.number)
     else:
-        line = os.pread(last.fileno(), posting.length, posting.offset - state.sealed_size)
+        line = os.pread(last_part.fileno(), posting.length, posting.offset - state.sealed_size)
     entry = _parse(line)
     if hashlib.sha256(line).digest() != posting.digest or entry is None:
         raise IndexDamagedError(f"line {posting.number} was changed")
@@ -764,11 +764,11 @@ class _Lines(NamedTuple):
 
 
 def _read_lines(
-    lines: Iterable[bytes], having: bytes, stated: int, most: int, most_bytes: int
+    lines: Iterable[bytes], needed_text: bytes, stated: int, maximum: int, most_bytes: int
 ) -> _Lines | None:
-    """Return the lines of a ledger; None if they exceed ``most`` lines or ``most_bytes`` bytes.
+    """Return the lines of a ledger; None if they exceed ``maximum`` lines or ``most_bytes`` bytes.
 
-    ``stated`` is the number of lines that the head states; ``having`` is as in `LedgerFile`.
+    ``stated`` is the number of lines that the head states; ``needed_text`` is as in `LedgerFile`.
     """
     entries: list[Entry] = []
     numbers = array("Q")
@@ -781,7 +781,7 @@ def _read_lines(
     all_before = hashlib.sha256()
     for number, line in enumerate(lines, 1):
         size += len(line)
-        if number > most or size > most_bytes:
+        if number > maximum or size > most_bytes:
             return None
         text = line.removesuffix(b"\n")
         if not chained and number > 1:
@@ -789,7 +789,7 @@ def _read_lines(
         if (
             chained
             and not damaged
-            and having not in text
+            and needed_text not in text
             and text.endswith(b'","previous":"%b"}' % last.encode())
             and _GAP not in text
             and _CA not in text
@@ -829,19 +829,19 @@ def _read_lines(
 
 @lru_cache(maxsize=4)  # a verb asks several times
 def _remembered(
-    data: bytes, having: bytes, stated: int, most: int, most_bytes: int
+    data: bytes, needed_text: bytes, stated: int, maximum: int, most_bytes: int
 ) -> _Lines | None:
-    return _read_lines(_lines_in(io.BytesIO(data)), having, stated, most, most_bytes)
+    return _read_lines(_lines_in(io.BytesIO(data)), needed_text, stated, maximum, most_bytes)
 
 
-def _without_lines(root: Path, *, is_there: bool) -> _Reading:
+def _without_lines(root: Path, *, file_exists: bool) -> _Reading:
     """Return the reading of a ledger file that is missing or has no line.
 
     It is a fault unless the keystore never had a ledger, as a keystore of ros2/sros2.
     """
-    if not is_there and not any((root / file).exists() for file in (SETTINGS, LEDGER_HEAD)):
+    if not file_exists and not any((root / file).exists() for file in (SETTINGS, LEDGER_HEAD)):
         return _Reading(Ledger())
-    missing = _Fault(0, f"{LEDGER} is empty" if is_there else f"there is no {LEDGER}")
+    missing = _Fault(0, f"{LEDGER} is empty" if file_exists else f"there is no {LEDGER}")
     return _Reading(Ledger(gaps=(missing.text,)), [missing])
 
 
@@ -980,14 +980,14 @@ class _Head(NamedTuple):
     index_root: str = ""
 
 
-def _head_fault(head: _Head | None, lines: int, signed: str, *, chained: bool) -> _Fault | None:
+def _head_fault(head: _Head | None, lines: int, signed: str, *, is_chained: bool) -> _Fault | None:
     """Return the fault between a ledger and its signed head; None if they agree.
 
     ``signed`` is the digest of the ledger's line that the head states as the last.
     """
     if not head:
         text = f"{LEDGER_HEAD}, which signs its end, is missing"
-        return _Fault(lines, text) if chained else None
+        return _Fault(lines, text) if is_chained else None
     if head.fault:
         return _Fault(lines, head.fault)
     if head.lines > lines:

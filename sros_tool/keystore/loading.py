@@ -101,9 +101,9 @@ _OF_CA = (Fault.SIGNATURE_HASH, Fault.CA_CHAIN)
 
 
 def vendor_problems(
-    traits: VendorTraits, state: OpenedEnclave, at: datetime
+    traits: VendorTraits, state: OpenedEnclave, moment: datetime
 ) -> tuple[Problem, ...]:
-    """Return the problems for which a vendor refuses to load an enclave at the time ``at``.
+    """Return the problems for which a vendor refuses to load an enclave at the time ``moment``.
 
     They are in the order in which a process meets them.  Only signature and size of governance and
     permissions are checked here; problems in their content are taken from ``state``.
@@ -121,7 +121,7 @@ def vendor_problems(
     }
     faults = [
         fault
-        for fault in sorted(_faults(traits, state, at), key=_when_met)
+        for fault in sorted(_faults(traits, state, moment), key=_when_met)
         if fault.file not in known or fault.fault in CRASHES
     ]
     if not faults:
@@ -188,7 +188,7 @@ def _trust(
     traits: VendorTraits,
     identity_ca: bytes | None,
     permissions_ca: bytes | None,
-    at: datetime,
+    moment: datetime,
 ) -> _Trust:
     read: dict[str, Certificates] = {}
     unreadable = []
@@ -201,7 +201,7 @@ def _trust(
     refused = [
         Problem(file, *fault)
         for file, certificates in read.items()
-        if (fault := _authority_fault(traits, certificates, at))
+        if (fault := _authority_fault(traits, certificates, moment))
     ]
     signers = read.get(PERMISSIONS_CA_FILE, ())
     return _Trust(
@@ -217,10 +217,10 @@ def _unreadable(traits: VendorTraits, data: bytes, file: str, error: PkiError) -
     return Problem(file, f"{error.clause}{cut}", Fault.CERTIFICATE_FILE)
 
 
-def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterator[Problem]:
+def _faults(traits: VendorTraits, state: OpenedEnclave, moment: datetime) -> Iterator[Problem]:
     files = state.files
     shared = (files.get(IDENTITY_CA_FILE), files.get(PERMISSIONS_CA_FILE))
-    trust = _trust(traits, *shared, at)
+    trust = _trust(traits, *shared, moment)
     yield from trust.unreadable
     identity: Certificates = ()
     if CERTIFICATE_FILE in files:
@@ -230,10 +230,10 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
             yield _unreadable(traits, files[CERTIFICATE_FILE], CERTIFICATE_FILE, error)
     yield from trust.refused
     if trust.authorities and identity:
-        yield from _identity_faults(traits, identity[0], state, trust.authorities, at)
-        yield from _list_faults(traits, state, identity[0], trust.authorities, at)
+        yield from _identity_faults(traits, identity[0], state, trust.authorities, moment)
+        yield from _list_faults(traits, state, identity[0], trust.authorities, moment)
     for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
-        yield from _signature_problems(traits, file, state, trust.signers, at)
+        yield from _signature_problems(traits, file, state, trust.signers, moment)
     largest = traits.largest_document
     if largest is not None and state.permissions_bytes > largest:
         text = f"it has {state.permissions_bytes} bytes, and from {largest + 1} on the "
@@ -263,13 +263,13 @@ def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
 
 
 def _signature_problems(
-    traits: VendorTraits, file: str, state: OpenedEnclave, signers: Certificates, at: datetime
+    traits: VendorTraits, file: str, state: OpenedEnclave, signers: Certificates, moment: datetime
 ) -> Iterator[Problem]:
     """Yield the reason for which the vendor refuses the signature of a document, if it does."""
     if file not in state.files or not signers:
         return
     try:
-        text = _signer_fault(traits, state.signed(file), signers, at)
+        text = _signer_fault(traits, state.signed(file), signers, moment)
     except PkiError as error:
         text = str(error)
     if text:
@@ -277,7 +277,7 @@ def _signature_problems(
 
 
 def _authority_fault(
-    traits: VendorTraits, certificates: Certificates, at: datetime
+    traits: VendorTraits, certificates: Certificates, moment: datetime
 ) -> tuple[str, Fault] | None:
     """Return why the vendor refuses a CA file (clause, fault); None if it accepts the file.
 
@@ -291,13 +291,15 @@ def _authority_fault(
         return text, Fault.CA_CRASH
     if traits.verifies_authorities:
         checks = _checks(traits) | Checks.STRICT
-        fault = chain_fault(certificates[0], trusted, at=at, checks=checks)
+        fault = chain_fault(certificates[0], trusted, moment=moment, checks=checks)
         if fault:
             return f"it is refused: {fault}", Fault.CA_CHAIN
     return None
 
 
-def authority_refusals(role: str, certificates: Certificates, at: datetime) -> dict[Vendor, str]:
+def authority_refusals(
+    role: str, certificates: Certificates, moment: datetime
+) -> dict[Vendor, str]:
     """Map each tested vendor that refuses the certificates or documents of a CA to the reason.
 
     ``certificates`` are all certificates of the CA file, the issuing CA first.
@@ -305,19 +307,21 @@ def authority_refusals(role: str, certificates: Certificates, at: datetime) -> d
     refusals = {}
     for vendor in TESTED:
         traits = vendor.traits
-        fault = _authority_fault(traits, certificates, at)
+        fault = _authority_fault(traits, certificates, moment)
         if fault:
             refusals[vendor] = fault[0]
         elif role == IDENTITY:
             trusted = _trusted(traits, certificates)
-            below = chain_fault(certificates[0], trusted, at=at, checks=_checks(traits))
+            below = chain_fault(certificates[0], trusted, moment=moment, checks=_checks(traits))
             first = certificates[0]
             fits = _key_fits(traits, first.public_key(), pss=is_for_pss(first))
             key = "" if fits else "its key algorithm is not supported"
             refusals[vendor] = below or key
         elif traits.signers is Signers.CHAIN:
             trusted = _trusted(traits, certificates)
-            refusals[vendor] = chain_fault(certificates[0], trusted, at=at, checks=Checks.DOCUMENTS)
+            refusals[vendor] = chain_fault(
+                certificates[0], trusted, moment=moment, checks=Checks.DOCUMENTS
+            )
     return {vendor: text for vendor, text in refusals.items() if text}
 
 
@@ -341,7 +345,7 @@ def refusals_text(refusals: Mapping[Vendor, str]) -> str:
 
 
 def _signer_fault(
-    traits: VendorTraits, signed: smime.SignedDocument, certificates: Certificates, at: datetime
+    traits: VendorTraits, signed: smime.SignedDocument, certificates: Certificates, moment: datetime
 ) -> str:
     """Return a clause on why the vendor refuses a document's signature; "" if it accepts it.
 
@@ -366,7 +370,9 @@ def _signer_fault(
             return "the key of its signer is for RSA-PSS only, which signed documents cannot use"
         if listed:
             continue
-        fault = chain_fault(signer, trusted, signed.certificates, at=at, checks=Checks.DOCUMENTS)
+        fault = chain_fault(
+            signer, trusted, signed.certificates, moment=moment, checks=Checks.DOCUMENTS
+        )
         if fault:
             return f"its signer is not accepted: {fault}"
     return ""
@@ -404,7 +410,7 @@ def _identity_faults(
     certificate: x509.Certificate,
     state: OpenedEnclave,
     authorities: Certificates,
-    at: datetime,
+    moment: datetime,
 ) -> Iterator[Problem]:
     """Yield the problems of certificate, key or issuer for which the vendor refuses an identity."""
     if not _hash_fits(traits, certificate):
@@ -426,11 +432,11 @@ def _identity_faults(
     if traits.crashes_on_empty_subject and not certificate.subject.rdns:
         text = "its subject is empty, which crashes the process"
         yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_CRASH)
-    remaining = validity_of(certificate).not_after - at
+    remaining = validity_of(certificate).not_after - moment
     if traits.expiry_overflows and remaining // _LONGEST_TIMER % 2:
         text = "it expires more than 292 years from now, which counts as expired, or crashes"
         yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_LASTS)
-    if fault := chain_fault(certificate, trusted, at=at, checks=_checks(traits)):
+    if fault := chain_fault(certificate, trusted, moment=moment, checks=_checks(traits)):
         yield Problem(CERTIFICATE_FILE, fault, Fault.CERTIFICATE_ISSUER)
 
 
@@ -443,7 +449,7 @@ def _list_faults(
     state: OpenedEnclave,
     certificate: x509.Certificate,
     authorities: Certificates,
-    at: datetime,
+    moment: datetime,
 ) -> Iterator[Problem]:
     """Yield the problems of revocation lists for which the vendor refuses a certificate."""
     lists: list[tuple[x509.CertificateRevocationList, str]] = []
@@ -465,12 +471,12 @@ def _list_faults(
         return
     if not lists:
         return
-    chain, fault = build_chain(certificate, _trusted(traits, authorities), (), at)
+    chain, fault = build_chain(certificate, _trusted(traits, authorities), (), moment)
     # A fault of the chain is reported already.
     refusal = (
         None
         if fault
-        else list_refusal(chain, [revocation_list for revocation_list, _ in lists], at=at)
+        else list_refusal(chain, [revocation_list for revocation_list, _ in lists], moment=moment)
     )
     if refusal is None:
         return

@@ -135,18 +135,22 @@ class LoadedEnclave(NamedTuple):
         )
 
 
-def load_enclave(name: str, folder: Path, *, at: datetime) -> LoadedEnclave:
-    """Return the enclave that DDS would load from a folder at the time ``at``."""
-    return loaded_enclave(name, folder, open_enclave(folder, now=at), at=at)
+def load_enclave(name: str, folder: Path, *, moment: datetime) -> LoadedEnclave:
+    """Return the enclave that DDS would load from a folder at the time ``moment``."""
+    return loaded_enclave(name, folder, open_enclave(folder, now=moment), moment=moment)
 
 
-def load_enclave_of(keystore: Keystore, name: str, *, at: datetime) -> LoadedEnclave:
-    """Return an enclave of a keystore as DDS would load it at the time ``at``."""
-    return loaded_enclave(name, keystore.folder(name), keystore.enclave(name, now=at), at=at)
+def load_enclave_of(keystore: Keystore, name: str, *, moment: datetime) -> LoadedEnclave:
+    """Return an enclave of a keystore as DDS would load it at the time ``moment``."""
+    return loaded_enclave(
+        name, keystore.folder(name), keystore.enclave(name, now=moment), moment=moment
+    )
 
 
-def loaded_enclave(name: str, folder: Path, state: OpenedEnclave, *, at: datetime) -> LoadedEnclave:
-    """Return the enclave that DDS would load from a folder that was opened at the time ``at``."""
+def loaded_enclave(
+    name: str, folder: Path, state: OpenedEnclave, *, moment: datetime
+) -> LoadedEnclave:
+    """Return the enclave that DDS would load from a folder that was opened at ``moment``."""
     governance, permissions = (
         _document(state, file) for file in (GOVERNANCE_FILE, PERMISSIONS_FILE)
     )
@@ -159,7 +163,7 @@ def loaded_enclave(name: str, folder: Path, state: OpenedEnclave, *, at: datetim
         state.files.get(PERMISSIONS_FILE, b""),
         folder,
         state,
-        at,
+        moment,
         key_elsewhere=state.key_on_robot,
         portable=_portable(state.permissions, permissions),
     )
@@ -170,15 +174,15 @@ def _portable(permissions: Permissions | None, document: bytes) -> Permissions |
     return permissions if permissions and canonical_permissions(permissions, document) else None
 
 
-def plan_enclave(policy: Enclave, governance: Governance, *, at: datetime) -> LoadedEnclave:
-    """Return the enclave that DDS would load if the policy were signed at ``at``."""
+def plan_enclave(policy: Enclave, governance: Governance, *, moment: datetime) -> LoadedEnclave:
+    """Return the enclave that DDS would load if the policy were signed at ``moment``."""
     from sros_tool.translate import permissions_for
     from sros_tool.validity import window
 
     subject = f"CN={policy.path}"
     domains = governance.domains().closed()
     permissions = permissions_for(
-        policy, subject=subject, validity=window(at, _PLANNED), domains=domains
+        policy, subject=subject, validity=window(moment, _PLANNED), domains=domains
     )
     # What all vendors read alike is handed on as it is.
     plain = is_plain_permissions(permissions)
@@ -361,7 +365,9 @@ class VendorParticipant:
         if isinstance(permissions, Refusal):
             return permissions.decision()._replace(reason=Fault.PERMISSIONS_MALFORMED.id)
         self.permissions = permissions
-        access = Access(governed, permissions, enclave.subject, at=context.at, zone=context.zone)
+        access = Access(
+            governed, permissions, enclave.subject, moment=context.at, zone=context.zone
+        )
         if late is None:
             return access
         # Its own process may still refuse the documents.
@@ -418,42 +424,47 @@ def evaluated(
     folder: Path,
     state: OpenedEnclave,
     *,
-    at: datetime,
+    moment: datetime,
     domain: int | None = None,
     zone: tzinfo = UTC,
     vendors: Sequence[Vendor] = TESTED,
 ) -> EvaluatedEnclave:
-    """Return an opened enclave as ``vendors`` load it at the time ``at``.
+    """Return an opened enclave as ``vendors`` load it at the time ``moment``.
 
     ``domain`` is the ROS domain to join; None for the first domain of its documents.
     """
     number = domain if domain is not None else next(iter(state.joined_domains() or ()), 0)
-    there, context = loaded_enclave(name, folder, state, at=at), JoinContext(number, at, zone)
+    there, context = (
+        loaded_enclave(name, folder, state, moment=moment),
+        JoinContext(number, moment, zone),
+    )
     participants = tuple(VendorParticipant(vendor, there, context) for vendor in vendors)
     return EvaluatedEnclave(accepted_state(state, participants), participants)
 
 
-def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> OpenedEnclave:
-    """Return an enclave's state without the faults that at least one vendor in ``made`` accepts.
+def accepted_state(
+    state: OpenedEnclave, participants: Sequence[VendorParticipant]
+) -> OpenedEnclave:
+    """Return an enclave's state without the faults that at least one of the vendors accepts.
 
     Documents that a vendor loads count as the enclave's documents if a CA signed them; a document
     that the enclave signed itself stays a fault, whatever vendor accepts it (CVE-2023-24011).
-    ``made`` has at least one participant.
+    ``participants`` has at least one participant.
     """
-    loading = [participant for participant in made if participant.permissions is not None]
+    loading = [participant for participant in participants if participant.permissions is not None]
     if not (state.problems and loading):
         return state
-    sound = not all(participant.causes() for participant in made)
+    sound = not all(participant.causes() for participant in participants)
     problems = tuple(
         problem
         for problem in state.problems
         if (problem.file == KEY_FILE and problem.fault is Fault.FILE_MISSING)
         or (problem.fault in _LEFT_TO_THE_VENDOR and not sound)
-        or all(problem in participant.problems for participant in made)
+        or all(problem in participant.problems for participant in participants)
         or (problem.fault is Fault.SIGNATURE and not _signed_by_ca(state, problem.file))
     )
     if any(problem.fault is Fault.SIGNATURE for problem in problems):
-        named = tuple(_with_acceptance(state, problem, made) for problem in problems)
+        named = tuple(_with_acceptance(state, problem, participants) for problem in problems)
         return replace(state, problems=named)
     return replace(
         state,
@@ -465,11 +476,11 @@ def accepted_state(state: OpenedEnclave, made: Sequence[VendorParticipant]) -> O
 
 
 def _with_acceptance(
-    state: OpenedEnclave, problem: Problem, made: Sequence[VendorParticipant]
+    state: OpenedEnclave, problem: Problem, participants: Sequence[VendorParticipant]
 ) -> Problem:
     """Return a signature's problem, with the vendors that accept it anyway in its text."""
     titles: dict[bool, list[str]] = {True: [], False: []}
-    for participant in made:
+    for participant in participants:
         titles[problem not in participant.problems].append(participant.vendor.title)
     accepting, refusing = (", ".join(together(titles[accepts])) for accepts in (True, False))
     if problem.fault is not Fault.SIGNATURE or not accepting:

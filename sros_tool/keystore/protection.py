@@ -25,18 +25,18 @@ from sros_tool.translate import governance_for, protected_topics
 
 
 def contradictions(
-    stated: Sequence[StatedProtection],
+    stated_protections: Sequence[StatedProtection],
 ) -> Iterator[tuple[StatedProtection, StatedProtection]]:
     """Yield each pair of statements with different levels for some common name, in order."""
     limit = ComparisonLimit()
     signed: dict[str, list[StatedProtection]] = {}
-    for protection in stated:
+    for protection in stated_protections:
         if protection.level is Level.SIGN:
             for topic in protected_topics(protection.kind, protection.name):
                 signed.setdefault(topic, []).append(protection)
     names = Names(signed, limit)
-    place = {protection: number for number, protection in enumerate(stated)}
-    for protection in stated:
+    place = {protection: number for number, protection in enumerate(stated_protections)}
+    for protection in stated_protections:
         if protection.level is Level.SIGN:
             continue
         met = {
@@ -54,7 +54,7 @@ def contradictions(
 
 
 def with_stated(
-    protection: DomainProtection, stated: Sequence[StatedProtection]
+    protection: DomainProtection, stated_protections: Sequence[StatedProtection]
 ) -> DomainProtection:
     """Return ``protection``, raised where policies state a stronger one, and never lowered.
 
@@ -62,7 +62,7 @@ def with_stated(
         PolicyError: statements contradict each other, or a wildcard in the settings matches only a
             part of a statement's names, so that it is unclear which of both decides.
     """
-    for stated_protection, other in contradictions(stated):
+    for stated_protection, other in contradictions(stated_protections):
         raise PolicyError(
             f'{other.source}: {other} has protect="{other.word}", and {stated_protection} has '
             f'protect="{stated_protection.word}" at {stated_protection.source}',
@@ -73,11 +73,11 @@ def with_stated(
     raised = _Raising(protection)
     for stated_protection in {
         (stated_protection.kind, stated_protection.name, stated_protection.level): stated_protection
-        for stated_protection in stated
+        for stated_protection in stated_protections
     }.values():
         raised.state(stated_protection)
     result = raised.result()
-    missing = next(less_protected(governance_for_all(result), stated), None)
+    missing = next(less_protected(governance_for_all(result), stated_protections), None)
     assert missing is None, f"{missing} is not protected as stated"
     return result
 
@@ -108,25 +108,25 @@ class _Raising:
         named = (*self._added, *self._named)
         return replace(self._protection, named=named)
 
-    def state(self, stated: StatedProtection) -> None:
-        topics = protected_topics(stated.kind, stated.name)
-        deciding = {topic: self._deciding_entry(topic, stated) for topic in topics}
+    def state(self, protection: StatedProtection) -> None:
+        topics = protected_topics(protection.kind, protection.name)
+        deciding = {topic: self._deciding_entry(topic, protection) for topic in topics}
         if len({self._value(number) for number in deciding.values()}) > 1:
-            for part in _parts(stated):
+            for part in _parts(protection):
                 self.state(part)
             return
         base = self._value(deciding[topics[0]])
-        needed = self._raised(base, stated.level)
+        needed = self._raised(base, protection.level)
         if needed == base:
             return
         for topic in topics:
-            self._refuse_parted(topic, stated)
+            self._refuse_parted(topic, protection)
         same = set(deciding.values())
         number = same.pop()
         if number is not None and not same and self._means(number, topics):
             self._named[number] = replace(self._named[number], protection=needed)
         else:
-            self._added.append(NamedProtection(stated.kind, stated.name, needed))
+            self._added.append(NamedProtection(protection.kind, protection.name, needed))
 
     def _means(self, number: int, topics: Sequence[str]) -> bool:
         """Return whether an entry of the settings is for exactly these topics."""
@@ -135,7 +135,7 @@ class _Raising:
             any(covers(topic, other) and covers(other, topic) for other in own) for topic in topics
         )
 
-    def _deciding_entry(self, topic: str, stated: StatedProtection) -> int | None:
+    def _deciding_entry(self, topic: str, protection: StatedProtection) -> int | None:
         """Return the number of the settings entry that decides on all names of ``topic``, or None.
 
         Entries for a part of the names are raised to the stated level.
@@ -146,22 +146,22 @@ class _Raising:
             if covers(name, topic):
                 wide.append(name)
             elif covers(topic, name):
-                value = self._raised(self._value(number), stated.level)
+                value = self._raised(self._value(number), protection.level)
                 self._named[number] = replace(self._named[number], protection=value)
-            elif self._raised(self._value(number), stated.level) != self._value(number):
-                raise self._overlap_error(name, stated)
+            elif self._raised(self._value(number), protection.level) != self._value(number):
+                raise self._overlap_error(name, protection)
         return self._owner[min(wide, key=self._rank.__getitem__)] if wide else None
 
-    def _refuse_parted(self, topic: str, stated: StatedProtection) -> None:
+    def _refuse_parted(self, topic: str, protection: StatedProtection) -> None:
         for name in self._topics.meeting(topic):
             if not covers(name, topic) and not covers(topic, name):
-                raise self._overlap_error(name, stated)
+                raise self._overlap_error(name, protection)
 
-    def _overlap_error(self, topic: str, stated: StatedProtection) -> PolicyError:
+    def _overlap_error(self, topic: str, protection: StatedProtection) -> PolicyError:
         other = self._named[self._owner[topic]]
         return PolicyError(
-            f'{stated.source}: {stated} has protect="{stated.word}", but the settings of the '
-            f"keystore have their own protection for {other}",
+            f'{protection.source}: {protection} has protect="{protection.word}", but the '
+            f"settings of the keystore have their own protection for {other}",
             "Some names match both wildcards, and it is unclear which of the two decides.",
             "In the policy, protect names that only one of the wildcards matches, or change the "
             "settings: `sros update_keystore --help` describes --rule and --drop-rule.",
@@ -180,10 +180,10 @@ class _Raising:
         return replace(protection, metadata=Level.SIGN)
 
 
-def _parts(stated: StatedProtection) -> Iterator[StatedProtection]:
+def _parts(protection: StatedProtection) -> Iterator[StatedProtection]:
     """Yield the services and topics of an action."""
     for right, end in ACTION_PARTS["call"]:
-        yield replace(stated, kind=KIND_OF[right], name=stated.name + end)
+        yield replace(protection, kind=KIND_OF[right], name=protection.name + end)
 
 
 def _strength(level: str) -> int:
@@ -195,7 +195,7 @@ def _strength(level: str) -> int:
 
 
 def less_protected(
-    governance: Governance, stated: Iterable[StatedProtection]
+    governance: Governance, stated_protections: Iterable[StatedProtection]
 ) -> Iterator[tuple[StatedProtection, Level]]:
     """Yield the statements that a governance does not fulfil, with the level that it gives.
 
@@ -203,7 +203,7 @@ def less_protected(
     not count: no vendor allows its use.
     """
     domains = [_DomainRules(rule) for rule in governance.domain_access_rules]
-    for protection in stated:
+    for protection in stated_protections:
         found = [
             level
             for topic in protected_topics(protection.kind, protection.name)

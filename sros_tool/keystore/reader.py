@@ -110,7 +110,7 @@ class FilesReadOnce:
         self._errors: dict[tuple[str, str], SrosError] = {}
         self._signed: dict[bytes, smime.SignedDocument | SrosError] = {}
 
-    def read(self, path: Path, what: str, *, most: int = MAX_BYTES) -> bytes:
+    def read(self, path: Path, label: str, *, max_bytes: int = MAX_BYTES) -> bytes:
         """Return the content of a regular file, as `sros_tool.xml.read_bytes` does.
 
         Raises:
@@ -118,14 +118,14 @@ class FilesReadOnce:
         """
         name = os.fspath(path)
         data = self._by_path.get(name)
-        if data is not None and len(data) <= most:
+        if data is not None and len(data) <= max_bytes:
             return data
-        if error := self._errors.get((name, what)):
+        if error := self._errors.get((name, label)):
             raise error.with_traceback(None)
         try:
-            data = self._read(path, what, most)
+            data = self._read(path, label, max_bytes)
         except SrosError as error:
-            self._errors[name, what] = error
+            self._errors[name, label] = error
             raise
         if not self.full:
             self._by_path[name] = data
@@ -136,12 +136,12 @@ class FilesReadOnce:
         """Whether the cache keeps no more files."""
         return self._size > _MOST_KEPT
 
-    def _read(self, path: Path, what: str, most: int) -> bytes:
+    def _read(self, path: Path, label: str, max_bytes: int) -> bytes:
         with suppress(OSError, ValueError):  # what is wrong with a path is said by `read_file`
             data = self._by_file.get(_identity(path.stat()))
-            if data is not None and len(data) <= most:
+            if data is not None and len(data) <= max_bytes:
                 return data
-        state, data = read_file(path, what, most=most)
+        state, data = read_file(path, label, max_bytes=max_bytes)
         if not self.full:
             self._by_file[_identity(state)] = data
             self._size += len(data)
@@ -237,15 +237,15 @@ class Keystore:
             raise part.error.with_traceback(None)
         return part  # type: ignore[return-value]
 
-    def read(self, path: str | Path, what: str) -> bytes:
+    def read(self, path: str | Path, label: str) -> bytes:
         """Return the content of the file at ``path``; a text is relative to the keystore.
 
-        ``what`` describes the file in errors.
+        ``label`` describes the file in errors.
 
         Raises:
             DocumentError: the file does not exist, cannot be read, is too large or not regular.
         """
-        return self.files.read(self._path(path), what)
+        return self.files.read(self._path(path), label)
 
     def _path(self, path: str | Path) -> Path:
         return path if isinstance(path, Path) else self.root / path
@@ -320,7 +320,7 @@ class Keystore:
             self.root,
             lambda: self._trusted,
             follow_link=not self._locked,
-            read=self.files.read,
+            read_content=self.files.read,
         )
 
     @property
@@ -349,7 +349,7 @@ class Keystore:
         """Return the certificate of the issuing identity or permissions CA."""
         return self.certificate(ca_certificate(role), f"{role} CA certificate")
 
-    def certificate(self, path: str | Path, what: str = "certificate") -> x509.Certificate:
+    def certificate(self, path: str | Path, label: str = "certificate") -> x509.Certificate:
         """Return the first certificate of a PEM file; arguments as for `read`.
 
         Raises:
@@ -357,8 +357,8 @@ class Keystore:
         """
         path = self._path(path)
         return self.once(
-            ("certificate", path, what),
-            lambda: load_certificate(self.read(path, what), f"'{path}'"),
+            ("certificate", path, label),
+            lambda: load_certificate(self.read(path, label), f"'{path}'"),
         )
 
     @_Part
@@ -864,9 +864,9 @@ class _EnclaveFiles:
             return None
         return data
 
-    def _content(self, path: Path, what: str) -> bytes | None:
+    def _content(self, path: Path, label: str) -> bytes | None:
         try:
-            return self._files.read(path, what)
+            return self._files.read(path, label)
         except SrosError as error:
             if path.is_file():
                 text = f"it cannot be read: {error.clause}"
@@ -960,7 +960,7 @@ class _EnclaveFiles:
         with suppress(SrosError):
             chain = load_certificates(authorities, "")
             if any(issued_by(certificate, each) for each in chain):
-                return chain_fault(certificate, chain, at=self._now)
+                return chain_fault(certificate, chain, moment=self._now)
         return ""
 
     def _check_chain(self, certificate: x509.Certificate, authorities: bytes) -> None:
@@ -969,7 +969,7 @@ class _EnclaveFiles:
         except SrosError as error:  # in a certificate after the first one
             self._add(IDENTITY_CA_FILE, error.clause, Fault.CERTIFICATE_MALFORMED)
             return
-        if refusal := chain_fault(certificate, chain, at=self._now):
+        if refusal := chain_fault(certificate, chain, moment=self._now):
             self._add(CERTIFICATE_FILE, f"it is refused: {refusal}", Fault.CERTIFICATE_ISSUER)
 
     def _check_revocation(
@@ -1033,11 +1033,11 @@ class _EnclaveFiles:
         self,
         name: str,
         document: bytes,
-        read: Callable[[bytes, str], _Parsed],
+        parse: Callable[[bytes, str], _Parsed],
         malformed: Fault,
     ) -> _Parsed | None:
         try:
-            return read(document, name)
+            return parse(document, name)
         except SrosError as error:
             kind = kind_of(document)
             what = f"its signed content is {kind}, not XML in UTF-8"

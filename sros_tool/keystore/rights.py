@@ -118,20 +118,20 @@ def load_rights(
     fleet: Fleet | None = None,
     *,
     hidden: bool = False,
-    only: Sequence[str] | None = None,
+    only_enclaves: Sequence[str] | None = None,
 ) -> RightsSource:
     """Return the rights that ``path`` gives; a policy with placeholders is expanded for ``fleet``.
 
     ``path`` is a policy file, ``permissions.p7s`` or ``permissions.xml``, an enclave folder, a
     keystore, or a Zenoh configuration such as ``router.json5``.  With ``hidden``, the enclaves of a
-    keystore in folders whose names begin with a dot are included.  ``only`` are the enclaves of a
-    keystore that are read; None for all.
+    keystore in folders whose names begin with a dot are included.  ``only_enclaves`` are the
+    enclaves of a keystore that are read; None for all.
 
     Raises:
         DocumentError: ``path`` is anything else, or malformed.
     """
     if isinstance(path, Keystore):
-        return _keystore_rights(path, hidden=hidden, only=only)
+        return _keystore_rights(path, hidden=hidden, only_enclaves=only_enclaves)
     if path.is_dir():
         if is_keystore(path):
             return _keystore_rights(Keystore(path), hidden=hidden)
@@ -400,11 +400,11 @@ def _document_rights(path: Path, kind: str, file: Path) -> RightsSource:
 
 
 def _keystore_rights(
-    keystore: Keystore, *, hidden: bool, only: Sequence[str] | None = None
+    keystore: Keystore, *, hidden: bool, only_enclaves: Sequence[str] | None = None
 ) -> RightsSource:
     root, reader = keystore.root, _Reader(keystore.files)
     rights: set[Right] = set()
-    for name in enclave_names(root, hidden=hidden) if only is None else only:
+    for name in enclave_names(root, hidden=hidden) if only_enclaves is None else only_enclaves:
         file = enclave_path(root, name) / PERMISSIONS_FILE
         try:
             found, scope = reader.permissions(file, name)
@@ -442,7 +442,7 @@ class _Reader:
     notes: list[Note] = field(default_factory=list)
     documents: dict[str, Permissions] = field(default_factory=dict)
 
-    def permissions(self, file: Path, what: str) -> tuple[frozenset[Right], tuple[str, ...]]:
+    def permissions(self, file: Path, label: str) -> tuple[frozenset[Right], tuple[str, ...]]:
         """Return the rights in a permissions document and the enclaves that it is for."""
         data = self.files.read(file, "permissions document")
         if b"multipart/signed" in data[:1000].lower():
@@ -450,32 +450,32 @@ class _Reader:
                 signed = self.files.signed(data)
             except SrosError as error:
                 raise DocumentError(f"'{file}' cannot be read: {error.what}", error.why) from error
-            self._verify(signed, file, what)
+            self._verify(signed, file, label)
             data = signed.document
         else:
-            text = f"{what}: the file is not signed; DDS loads {PERMISSIONS_FILE} instead."
+            text = f"{label}: the file is not signed; DDS loads {PERMISSIONS_FILE} instead."
             self.unverified.append(Note("rights.unsigned", text))
         permissions = parse_permissions(data, f"'{file}'")
         self.notes += [
-            Note(note.id, f"{what}: {note.text}") for note in _left_out(permissions.grants)
+            Note(note.id, f"{label}: {note.text}") for note in _left_out(permissions.grants)
         ]
         grants = _first_of_each(permissions)
         self.documents.update(dict.fromkeys(grants, permissions))
         rights = (right for name, grant in grants.items() for right in grant_rights(name, grant))
         return frozenset(rights), tuple(grants)
 
-    def _verify(self, signed: smime.SignedDocument, file: Path, what: str) -> None:
+    def _verify(self, signed: smime.SignedDocument, file: Path, label: str) -> None:
         try:
             authority = self._authority_for(file)
             if authority is None:
-                text = f"{what}: the signature was not verified, because there is no "
+                text = f"{label}: the signature was not verified, because there is no "
                 text += f"{PERMISSIONS_CA_FILE} next to the file."
                 self.unverified.append(Note("rights.not-verified", text))
                 return
             signed.verify(authority)
         except SrosError as error:
             self.sound = False
-            text = f"{what}: THE SIGNATURE DOES NOT VERIFY, and DDS refuses it: {error}"
+            text = f"{label}: THE SIGNATURE DOES NOT VERIFY, and DDS refuses it: {error}"
             self.notes.append(Note("rights.bad-signature", text.rstrip(".") + "."))
 
     def _authority_for(self, file: Path) -> x509.Certificate | None:
@@ -602,7 +602,7 @@ class SourcesDifference(NamedTuple):
 
 
 def compare_sources(
-    first: RightsSource, second: RightsSource, *, governance: bool = False
+    first_source: RightsSource, second_source: RightsSource, *, governance: bool = False
 ) -> SourcesDifference:
     """Return the difference between two sources of rights.
 
@@ -610,21 +610,26 @@ def compare_sources(
     is left out, because only its keystore and export have it.  With ``governance``, the governance
     documents of two keystores are compared, too.
     """
-    first, second = _without_observer(first, second), _without_observer(second, first)
+    first_source, second_source = (
+        _without_observer(first_source, second_source),
+        _without_observer(second_source, first_source),
+    )
     scope = None
-    if first.scope is None or second.scope is None:
-        scope = second.scope if first.scope is None else first.scope
-    difference = compare(first.rights, second.rights, scope)
-    unanswered = _unanswered(first.rights, second.rights, difference) if scope is None else ()
-    protections = _protection_differences(first, second)
-    domains = _domain_differences(first, second, scope)
-    governed = governance and _governance_differs(first, second)
+    if first_source.scope is None or second_source.scope is None:
+        scope = second_source.scope if first_source.scope is None else first_source.scope
+    difference = compare(first_source.rights, second_source.rights, scope)
+    unanswered = (
+        _unanswered(first_source.rights, second_source.rights, difference) if scope is None else ()
+    )
+    protections = _protection_differences(first_source, second_source)
+    domains = _domain_differences(first_source, second_source, scope)
+    governed = governance and _governance_differs(first_source, second_source)
     return SourcesDifference(scope, difference, protections, unanswered, domains, governed)
 
 
-def _governance_differs(first: RightsSource, second: RightsSource) -> bool:
+def _governance_differs(first_source: RightsSource, second_source: RightsSource) -> bool:
     """Return whether the governance of two keystores differs, or cannot be read."""
-    keystores = [Keystore(s.path) for s in (first, second) if s.kind == "keystore"]
+    keystores = [Keystore(s.path) for s in (first_source, second_source) if s.kind == "keystore"]
     if len(keystores) < 2 or not all(keystore.has(GOVERNANCE_P7S) for keystore in keystores):
         return False  # an export has the governance in the folders of its enclaves
     try:
@@ -643,10 +648,10 @@ def _without_observer(source: RightsSource, other: RightsSource) -> RightsSource
 
 
 def _domain_differences(
-    first: RightsSource, second: RightsSource, scope: Collection[str] | None
+    first_source: RightsSource, second_source: RightsSource, scope: Collection[str] | None
 ) -> list[DifferentDomains]:
     """Return the enclaves of both sources that have rights in different ROS domains."""
-    before, after = _stated_domains(first), _stated_domains(second)
+    before, after = _stated_domains(first_source), _stated_domains(second_source)
     return [
         DifferentDomains(enclave, before[enclave], after[enclave])
         for enclave in sorted(before.keys() & after.keys())
@@ -670,9 +675,9 @@ def _stated_domains(source: RightsSource) -> dict[str, str]:
 
 
 def _unanswered(
-    first: Collection[Right], second: Collection[Right], difference: RightsDifference
+    first_rights: Collection[Right], second_rights: Collection[Right], difference: RightsDifference
 ) -> list[Right]:
-    """Return the rights of ``second`` to use a name that enclaves offer only in ``first``.
+    """Return the ``second_rights`` to use a name that enclaves offer only in ``first_rights``.
 
     For example, a right to subscribe to a topic that no enclave may publish any more, because the
     right to publish it is gone or denied.  Names with wildcards are left out.
@@ -685,7 +690,7 @@ def _unanswered(
     touched = {word: Names(sorted(names)) for word, names in names_of.items()}
     asked = [
         right
-        for right in second
+        for right in second_rights
         if (offering := OFFERING_SIDE.get(right.right)) in touched
         and right.qualifier is not DENY
         and not is_expression(right.name)
@@ -694,7 +699,7 @@ def _unanswered(
     if not asked:
         return []
     names = {(OFFERING_SIDE[right.right], right.name) for right in asked}
-    before, after = _allowed_pairs(first, names), _allowed_pairs(second, names)
+    before, after = _allowed_pairs(first_rights, names), _allowed_pairs(second_rights, names)
     lost = before - after
     return sorted(right for right in asked if (OFFERING_SIDE[right.right], right.name) in lost)
 
@@ -712,15 +717,19 @@ def _allowed_pairs(
 
 
 def _protection_differences(
-    first: RightsSource, second: RightsSource
+    first_source: RightsSource, second_source: RightsSource
 ) -> list[tuple[str, StatedProtection]]:
     """Return the protections that only one of two policies states, with "-" or "+"."""
-    if first.protections is None or second.protections is None:
+    if first_source.protections is None or second_source.protections is None:
         return []
-    protections, other = set(first.protections), set(second.protections)
-    differences = [("-", protection) for protection in first.protections if protection not in other]
+    protections, other = set(first_source.protections), set(second_source.protections)
+    differences = [
+        ("-", protection) for protection in first_source.protections if protection not in other
+    ]
     differences += [
-        ("+", protection) for protection in second.protections if protection not in protections
+        ("+", protection)
+        for protection in second_source.protections
+        if protection not in protections
     ]
     return sorted(differences, key=lambda line: (line[1].enclave, line[1].name, line[0] == "+"))
 
@@ -729,21 +738,21 @@ _SIDES = {"-": "a", "+": "b"}
 
 
 def policy_difference(
-    first: RightsSource, second: RightsSource, compared: SourcesDifference
+    first_source: RightsSource, second_source: RightsSource, difference: SourcesDifference
 ) -> PolicyDifference:
     """Return the value that ``--json`` prints for a comparison."""
     return PolicyDifference(
-        not compared,
-        first,
-        second,
+        not difference,
+        first_source,
+        second_source,
         [
-            DifferentRight(_SIDES[sign], right, compared.rights.covered.get(right, ()))
-            for sign, right in compared.rights.lines()
+            DifferentRight(_SIDES[sign], right, difference.rights.covered.get(right, ()))
+            for sign, right in difference.rights.lines()
         ],
-        [DifferentProtection(_SIDES[sign], stated) for sign, stated in compared.protections],
-        compared.unanswered,
-        compared.domains,
-        compared.governance_differs,
+        [DifferentProtection(_SIDES[sign], stated) for sign, stated in difference.protections],
+        difference.unanswered,
+        difference.domains,
+        difference.governance_differs,
     )
 
 

@@ -216,9 +216,9 @@ _WHOLE_ALIKE = 0.9
 
 
 def no_such_enclave(
-    keystore: Keystore, name: str, there: Collection[str], *, may_create: bool = True
+    keystore: Keystore, name: str, existing_enclaves: Collection[str], *, may_create: bool = True
 ) -> SrosError:
-    """Return the error for the missing enclave ``name``; ``there`` are the existing enclaves.
+    """Return the error for the missing enclave ``name``, with similar ``existing_enclaves``.
 
     Without ``may_create`` it does not advise to create the enclave.
     """
@@ -226,7 +226,7 @@ def no_such_enclave(
     if revocation := revocation_of(keystore, name):
         return _was_revoked(root, revocation)
     what = f"enclave {name} does not exist in keystore '{root}'"
-    names = sorted(there)
+    names = sorted(existing_enclaves)
     if below := [each for each in names if name and each.startswith(f"{name}/")]:
         return KeystoreError(
             what,
@@ -239,7 +239,7 @@ def no_such_enclave(
             f"{name} is a node of {first_few(of_node, _SHOWN)}.",
             f"Name the enclave: {of_node[0]}.",
         )
-    meant = likely_names(name, there)
+    meant = likely_names(name, existing_enclaves)
     if meant:
         return KeystoreError(what, "", f"Perhaps you mean {' or '.join(meant)}.")
     try:
@@ -295,7 +295,7 @@ def _was_revoked(root: Path, entry: Entry) -> SrosError:
     )
 
 
-def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
+def likely_names(name: str, existing_enclaves: Collection[str]) -> tuple[str, ...]:
     """Return at most three enclaves that a mistyped ``name`` may mean.
 
     These are the enclaves whose names end with ``name``, because people leave out the namespace; if
@@ -305,8 +305,8 @@ def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
     end = "/" + name.strip("/").lower()
     if end == "/":
         return ()
-    lower = {enclave: enclave.lower() for enclave in there}
-    found = [enclave for enclave in there if lower[enclave].endswith(end)]
+    lower = {enclave: enclave.lower() for enclave in existing_enclaves}
+    found = [enclave for enclave in existing_enclaves if lower[enclave].endswith(end)]
     if not found:
         last = {enclave: text.rpartition("/")[2] for enclave, text in lower.items()}
         found = _similar_enclaves(end.rpartition("/")[2], last, _ALIKE)

@@ -570,11 +570,11 @@ class _Table:
             raise _TemplateError(f"{self._at(key)} is not a list of names")
         return list(values)
 
-    def numbers(self, key: str, most: int) -> list[int]:
-        """Return a list of numbers from 0 to ``most``; empty if the key is missing."""
+    def numbers(self, key: str, maximum: int) -> list[int]:
+        """Return a list of numbers from 0 to ``maximum``; empty if the key is missing."""
         values = self._take(key, list, [])
-        if not all(type(value) is int and 0 <= value <= most for value in values):
-            raise _TemplateError(f"{self._at(key)} is not a list of numbers from 0 to {most}")
+        if not all(type(value) is int and 0 <= value <= maximum for value in values):
+            raise _TemplateError(f"{self._at(key)} is not a list of numbers from 0 to {maximum}")
         return list(values)
 
     def flag(self, key: str, default: bool) -> bool:

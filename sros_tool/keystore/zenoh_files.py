@@ -345,14 +345,14 @@ class Drifted:
 
 def drifted(
     keystore: Keystore,
-    wanted: ZenohDocuments,
+    wanted_documents: ZenohDocuments,
     authority: x509.Certificate,
-    gone: Collection[str] = (),
+    gone_enclaves: Collection[str] = (),
     reader: RenderedReader | None = None,
 ) -> tuple[Drifted, ...]:
-    """Return the configurations that are not as ``wanted`` or not signed by ``authority``.
+    """Return the configurations that differ from ``wanted_documents``, or lack a valid signature.
 
-    Configurations of enclaves in ``gone`` do not count, nor do rules for unread enclaves.
+    Configurations of enclaves in ``gone_enclaves`` do not count, nor do rules for unread enclaves.
     ``reader`` may have read the files already.
     """
     reader = reader or RenderedReader()
@@ -360,21 +360,21 @@ def drifted(
     def compare(paths: Sequence[str]) -> list[Drifted]:
         differing = []
         for path in paths:
-            document, present = wanted.files[path], _present_file(keystore, path)
+            document, present = wanted_documents.files[path], _present_file(keystore, path)
             kind = None
             if present is None:
                 kind = Drift.MISSING
-            elif _without_rules_for(present, wanted.unread, reader) != document:
+            elif _without_rules_for(present, wanted_documents.unread, reader) != document:
                 kind = Drift.DIFFERS
             elif not is_signed(keystore.root / path, present, authority, keystore.files):
                 kind = Drift.UNSIGNED
             if kind:
-                differing.append(Drifted(wanted.enclaves[path], path, kind))
+                differing.append(Drifted(wanted_documents.enclaves[path], path, kind))
         return differing
 
-    files = [file for _, part in map_slices(list(wanted.files), compare) for file in part]
-    stale = stale_files(keystore.root, wanted.files, wanted.existing)
-    files += (file for file in stale if file.enclave not in gone)
+    files = [file for _, part in map_slices(list(wanted_documents.files), compare) for file in part]
+    stale = stale_files(keystore.root, wanted_documents.files, wanted_documents.existing)
+    files += (file for file in stale if file.enclave not in gone_enclaves)
     return tuple(files)
 
 
@@ -415,20 +415,22 @@ def zenoh_drift(
     authority: x509.Certificate,
     now: datetime | None,
     *,
-    only: Collection[str] = (),
+    only_enclaves: Collection[str] = (),
     among: Collection[str] = (),
     reader: RenderedReader | None = None,
 ) -> ZenohDrift:
     """Return the configurations that are not as they should be, and the enclaves without one.
 
-    Without ``now``, permissions that have expired count, too.  ``only`` are the enclaves whose
-    files are examined, ``among`` the enclaves whose rights are compared in these files; empty for
-    all.  ``reader`` may have read the files already.
+    Without ``now``, permissions that have expired count, too.  ``only_enclaves`` are the enclaves
+    whose files are examined, ``among`` the enclaves whose rights are compared in these files; empty
+    for all.  ``reader`` may have read the files already.
 
     Raises:
         SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.
     """
-    wanted = zenoh_documents(keystore, network, domains, authority, now, only=only, among=among)
+    wanted = zenoh_documents(
+        keystore, network, domains, authority, now, only_enclaves=only_enclaves, among=among
+    )
     files = drifted(keystore, wanted, authority, reader=reader)
     return ZenohDrift(files, wanted.left_out, wanted.nodes)
 
@@ -442,7 +444,7 @@ def zenoh_documents(
     change: ZenohChange = NO_CHANGE,
     *,
     existing: tuple[str, ...] | None = None,
-    only: Collection[str] = (),
+    only_enclaves: Collection[str] = (),
     among: Collection[str] = (),
 ) -> ZenohDocuments:
     """Return the configurations that the enclaves of a keystore need.
@@ -455,7 +457,8 @@ def zenoh_documents(
         now: the current time; with None, permissions that have expired count, too.
         change: what a transaction changes.
         existing: the enclaves of the keystore; None searches for them.
-        only: the enclaves whose configurations are made, and that count as existing; () for all.
+        only_enclaves: the enclaves whose configurations are made, and that count as existing; ()
+            for all.
         among: the enclaves whose rights these configurations have; () for all.
     """
     root = keystore.root
@@ -481,7 +484,7 @@ def zenoh_documents(
         names.remove(router)
     unread = frozenset(names).difference(among) if among else frozenset[str]()
     names = [name for name in names if name not in unread]
-    reader = _RightsReader(keystore, authority, of_network, network, now, change, only)
+    reader = _RightsReader(keystore, authority, of_network, network, now, change, only_enclaves)
     read: dict[str, _RulesOfEnclave | str] = {}
     for _, of_enclaves in map_slices(names, reader.read):
         read |= of_enclaves
@@ -523,7 +526,7 @@ def zenoh_documents(
         return {_session_path(name): session(name) for name in some}
 
     size = 0
-    chosen = [name for name in rules if not only or name in only]
+    chosen = [name for name in rules if not only_enclaves or name in only_enclaves]
     for _, part in map_slices(chosen, sessions):
         size += sum(map(len, part.values()))
         files |= part
@@ -535,8 +538,8 @@ def zenoh_documents(
         )
     enclaves = {_router_path(name): name for name in network.router_names()}
     enclaves |= {_session_path(name): name for name in chosen}
-    if only:
-        existing = tuple(name for name in existing if name in only)
+    if only_enclaves:
+        existing = tuple(name for name in existing if name in only_enclaves)
     nodes = {name: of_enclave.nodes for name, of_enclave in rules.items()}
     return ZenohDocuments(files, enclaves, left_out, nodes, existing, reader.ledger, unread)
 
@@ -707,7 +710,7 @@ class _RightsReader:
         network: ZenohNetwork,
         now: datetime | None,
         change: ZenohChange,
-        only: Collection[str],
+        only_enclaves: Collection[str],
     ) -> None:
         self._keystore = keystore
         self._authority = authority
@@ -715,7 +718,7 @@ class _RightsReader:
         self._network = network
         self._now = now
         self._change = change
-        self._only = only
+        self._only = only_enclaves
         self.ledger = keystore.ledger
         self._recorded = RecordedRights(keystore, self.ledger)
         self._revoked = {
@@ -826,12 +829,14 @@ class _RightsReader:
         issued = self._change.issued.get(name)
         return issued.nodes if issued else self._recorded.nodes(name)
 
-    def _remote(self, name: str, stated: Mapping[int, Sequence[StatedRight]]) -> RemoteRights:
+    def _remote(
+        self, name: str, stated_rights: Mapping[int, Sequence[StatedRight]]
+    ) -> RemoteRights:
         try:
-            return remote_of(name, stated, nodes_from_text(self._nodes(name)))
+            return remote_of(name, stated_rights, nodes_from_text(self._nodes(name)))
         except PolicyError:
             if policy := self._change.stated.get(name):
-                remote_rights(policy, min(stated))  # names the line of the policy
+                remote_rights(policy, min(stated_rights))  # names the line of the policy
             raise
 
 
@@ -847,7 +852,9 @@ _ANNOUNCED = {"NN": "", "MP": "publish", "MS": "subscribe", "SC": "request", "SS
 _TOKEN = re.compile(r"@ros2_lv/([0-9]+)/\*/\*/\*/(..)/([^/]+)/[^/]+/[^/]+(?:/([^/]+)/\*\*)?")
 
 
-def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[StatedRight]]) -> None:
+def _prove(
+    enclave: str, remote: RemoteRights, stated_rights: Mapping[int, Sequence[StatedRight]]
+) -> None:
     """Raise `PkiError` if rules and rights decide differently on a name in the rights.
 
     For a name with wildcards, examples are tried.
@@ -858,8 +865,8 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
     announced = _announced(tokens, enclave)
     foreign = announced is None
     check_meaning(foreign, False, f"that {enclave} announces nodes of another enclave")
-    if _are_exactly(passing, stated):
-        more = announced != _to_announce(stated)
+    if _are_exactly(passing, stated_rights):
+        more = announced != _to_announce(stated_rights)
         check_meaning(more, False, f"that {enclave} announces names that it has no right to")
         return
     nodes = _some_nodes(enclave, control)
@@ -877,7 +884,7 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
         announcing = (enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN)
         return any(control.allows(*announcing, token) for token in tokens)
 
-    for domain, rights in stated.items():
+    for domain, rights in stated_rights.items():
         rules = Rules([stated_right.right for stated_right in rights])
         names = {(e.right.kind, name) for e in rights for name in _examples(e.right.name)}
         for kind, name in names:
@@ -890,14 +897,14 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
 
 
 def _are_exactly(
-    passing: Mapping[str, KeyExpressions], stated: Mapping[int, Sequence[StatedRight]]
+    passing: Mapping[str, KeyExpressions], stated_rights: Mapping[int, Sequence[StatedRight]]
 ) -> bool:
     """Return whether the rights have no wildcards, and the rules have exactly their keys.
 
     A key below a topic with history is not the key of a name.
     """
     keys: dict[str, set[str]] = {right: set() for right in _PROOF}
-    for domain, rights in stated.items():
+    for domain, rights in stated_rights.items():
         if is_expression("".join([stated_right.right.name for stated_right in rights])):
             return False
         for (_, qualifier, right, name), _ in rights:
@@ -930,11 +937,11 @@ def _announced(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str, str]
     return announced
 
 
-def _to_announce(stated: Mapping[int, Sequence[StatedRight]]) -> set[tuple[str, str, str]]:
+def _to_announce(stated_rights: Mapping[int, Sequence[StatedRight]]) -> set[tuple[str, str, str]]:
     """Return what an enclave may announce by its rights without wildcards, as `_announced` does."""
-    return {(str(domain), "", "") for domain in stated} | {
+    return {(str(domain), "", "") for domain in stated_rights} | {
         (str(domain), right, name)
-        for domain, rights in stated.items()
+        for domain, rights in stated_rights.items()
         for (_, _, right, name), _ in rights
     }
 
@@ -978,14 +985,16 @@ def _present_file(keystore: Keystore, path: str) -> bytes | None:
         return None
 
 
-def stale_files(root: Path, wanted: Collection[str], names: Iterable[str]) -> Iterable[Drifted]:
+def stale_files(
+    root: Path, wanted_paths: Collection[str], names: Iterable[str]
+) -> Iterable[Drifted]:
     """Yield the configurations in enclaves ``names`` that should not be there.
 
     A file without a signed document is left out, because it may be the user's own file.
     """
     for name in names:
         for path in (_router_path(name), _session_path(name)):
-            if path not in wanted and (root / signed_path(path)).is_file():
+            if path not in wanted_paths and (root / signed_path(path)).is_file():
                 yield Drifted(name, path, Drift.STALE)
 
 

@@ -72,12 +72,12 @@ def grant_for_all(document: bytes, name: str, subject: str) -> Grant | None:
 
 
 def _grant_for(
-    vendor: Vendor, permissions: Permissions | Refusal, subject: str, at: datetime
+    vendor: Vendor, permissions: Permissions | Refusal, subject: str, moment: datetime
 ) -> Grant | Refusal:
     """Return the grant that a vendor applies at a time, or why it applies none."""
     if isinstance(permissions, Refusal):
         return permissions
-    index = choose_grant(vendor.traits, permissions, subject, at=at, zone=UTC)
+    index = choose_grant(vendor.traits, permissions, subject, moment=moment, zone=UTC)
     return index if isinstance(index, Refusal) else permissions.grants[index]
 
 

@@ -268,11 +268,11 @@ _RESTORE = "Restore it from a backup, or issue it again."
 _UNREADABLE = "It is not a PEM certificate, it is damaged, or its key algorithm is unknown."
 
 
-def _blocks(data: bytes, what: str) -> Iterator[pem_file.Block]:
+def _blocks(data: bytes, label: str) -> Iterator[pem_file.Block]:
     blocks, damage = _known_blocks(data)
     yield from blocks
     if damage:
-        raise PkiError(what, _sentence(damage), _RESTORE)
+        raise PkiError(label, _sentence(damage), _RESTORE)
 
 
 @lru_cache(maxsize=8)  # several readers ask for the certificate of an enclave, or for all of them
@@ -300,13 +300,13 @@ def _certificate_in(
     raise PkiError(what, why, "Write it with the label CERTIFICATE.")
 
 
-def _permits(rest: bytes, settings: Settings) -> bool:
+def _permits(trust_settings: bytes, settings: Settings) -> bool:
     """Return whether the trust settings after a certificate allow its use (OpenSSL, obj_trust).
 
     Raises:
         PkiError, ValueError: they are no settings (X509_AUX).
     """
-    (value,) = der.children(der.normalized(rest))
+    (value,) = der.children(der.normalized(trust_settings))
     if value.tag != der.SEQUENCE:
         raise ValueError("not settings of a certificate")
     parts = {part.tag: _purposes(part) for part in der.children(value.content)}
@@ -773,8 +773,8 @@ def make_request(key: PrivateKey, subject: str | x509.Name) -> bytes:
     return builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
 
 
-def load_request(data: bytes, what: str) -> SigningRequest:
-    """Read a PEM request and verify its signature; ``what`` names the request in errors.
+def load_request(data: bytes, label: str) -> SigningRequest:
+    """Read a PEM request and verify its signature; ``label`` names the request in errors.
 
     Only keys that every DDS vendor accepts are allowed: EC prime256v1 and RSA 2048, and no RSA key
     that is easy to break.  Extensions in
@@ -785,7 +785,7 @@ def load_request(data: bytes, what: str) -> SigningRequest:
             another kind, or its subject is not exactly one common name.
     """
     with reading(
-        f"the request {what} cannot be read",
+        f"the request {label} cannot be read",
         "It is not a PEM certificate request, or it is damaged.",
         "Create it with `sros create_request` on the robot, and send its request.pem.",
     ):
@@ -802,26 +802,26 @@ def load_request(data: bytes, what: str) -> SigningRequest:
         isinstance(public, ec.EllipticCurvePublicKey) and public.curve.name == "secp256r1"
     ) and (not (isinstance(public, rsa.RSAPublicKey) and public.key_size == 2048)):
         raise PkiError(
-            f"the request {what} is for a key of {algorithm(public)}",
+            f"the request {label} is for a key of {algorithm(public)}",
             "Only EC prime256v1 and RSA 2048 are accepted by every DDS vendor.",
             "Create the key with `sros create_request`.",
         )
     if problem := key_problem(public):
         raise PkiError(
-            f"the key of the request {what} is weak",
+            f"the key of the request {label} is weak",
             f"A certificate for this key would prove nothing: {problem}.",
             "Create another key with `sros create_request`, in another folder or on another token.",
         )
     if not isinstance(digest, _DIGESTS) or not _has_valid_signature(request):
         raise PkiError(
-            f"the signature of the request {what} is not valid",
+            f"the signature of the request {label} is not valid",
             "The sender did not prove possession of the key, or the request was changed "
             "in transit.",
             "Ask the sender to send it again.",
         )
     if len(list(subject)) != 1 or not common_name_of(subject):
         raise PkiError(
-            f"the request {what} is for {said or 'an empty subject'}",
+            f"the request {label} is for {said or 'an empty subject'}",
             "The subject of a request has to be one common name, the name of the enclave, and "
             "nothing else.",
             "Create it with `sros create_request`.",

@@ -95,26 +95,29 @@ class Checks(Flag):
 def chain_fault(
     start: x509.Certificate,
     authorities: Sequence[x509.Certificate],
-    others: Iterable[x509.Certificate] = (),
+    other_certificates: Iterable[x509.Certificate] = (),
     *,
-    at: datetime,
+    moment: datetime,
     checks: Checks = Checks.NONE,
 ) -> str:
     """Return why ``start`` has no valid chain to a self-signed CA of ``authorities``, or "".
 
-    ``others`` are possible intermediate certificates; validities are checked at the time ``at``.
+    ``other_certificates`` are possible intermediate certificates; validities are checked at the
+    time ``moment``.
     """
-    chain = _chain_of(start, tuple(dict.fromkeys(authorities)), tuple(others), at)
+    chain = _chain_of(start, tuple(dict.fromkeys(authorities)), tuple(other_certificates), moment)
     return chain.missing or chain.fault(checks)
 
 
 class _Chain:
     """A certificate chain from `build_chain`, which can be verified with different checks."""
 
-    def __init__(self, certificates: list[x509.Certificate], missing: str, at: datetime) -> None:
+    def __init__(
+        self, certificates: list[x509.Certificate], missing: str, moment: datetime
+    ) -> None:
         self.missing = missing
         self._certificates = certificates
-        self._at = at
+        self._at = moment
         self._known: dict[Checks, str] = {}
 
     def fault(self, checks: Checks) -> str:
@@ -151,23 +154,23 @@ class _Chain:
 def _chain_of(
     start: x509.Certificate,
     authorities: tuple[x509.Certificate, ...],
-    others: tuple[x509.Certificate, ...],
-    at: datetime,
+    other_certificates: tuple[x509.Certificate, ...],
+    moment: datetime,
 ) -> _Chain:
-    certificates, missing = build_chain(start, authorities, others, at)
+    certificates, missing = build_chain(start, authorities, other_certificates, moment)
     if missing:
         unread = (
             fault for certificate in (start, *authorities) for fault in _unread_faults(certificate)
         )
         missing = next(unread, missing)
-    return _Chain(certificates, missing, at)
+    return _Chain(certificates, missing, moment)
 
 
 def build_chain(
     start: x509.Certificate,
     authorities: Sequence[x509.Certificate],
-    others: Sequence[x509.Certificate],
-    at: datetime,
+    other_certificates: Sequence[x509.Certificate],
+    moment: datetime,
 ) -> tuple[list[x509.Certificate], str]:
     """Return the chain from ``start`` to a trusted CA, or why there is none.
 
@@ -180,7 +183,7 @@ def build_chain(
     while len(chain) <= _DEEPEST:
         last = chain[-1]
         complete = _is_self_signed(last)
-        issuer = _issuer(last, authorities, at)
+        issuer = _issuer(last, authorities, moment)
         if issuer is not None and not complete:
             chain.append(issuer)
         elif issuer is not None and len(chain) == only_others:
@@ -193,7 +196,9 @@ def build_chain(
             if any(map(_is_self_signed, chain[only_others:])):
                 return chain, ""
             continue
-        below = None if complete or not ask_others else _issuer(last, others, at, chain)
+        below = (
+            None if complete or not ask_others else _issuer(last, other_certificates, moment, chain)
+        )
         if below is None:
             kind = "self-signed" if complete else "issuer"
             name = subject_text(last.subject if complete else last.issuer)
@@ -209,15 +214,15 @@ def _is_self_signed(certificate: x509.Certificate) -> bool:
 
 def _issuer(
     certificate: x509.Certificate,
-    among: Sequence[x509.Certificate],
-    at: datetime,
+    candidates: Sequence[x509.Certificate],
+    moment: datetime,
     chain: Sequence[x509.Certificate] = (),
 ) -> x509.Certificate | None:
-    """Return the first issuer valid at ``at``, else the issuer that expires last, or None."""
+    """Return the first issuer valid at ``moment``, else the issuer that expires last, or None."""
     certificates = [
-        each for each in among if likely_issued(certificate, each) and each not in chain
+        each for each in candidates if likely_issued(certificate, each) and each not in chain
     ]
-    valid = (issuer for issuer in certificates if validity_of(issuer).contains(at))
+    valid = (issuer for issuer in certificates if validity_of(issuer).contains(moment))
     return next(
         valid,
         max(certificates, key=lambda issuer: validity_of(issuer).not_after, default=None),
@@ -422,15 +427,15 @@ def _critical(certificate: x509.Certificate) -> set[ObjectIdentifier]:
     return {each.oid for each in certificate.extensions if each.critical}
 
 
-def _time_faults(chain: Sequence[x509.Certificate], at: datetime) -> Iterator[str]:
+def _time_faults(chain: Sequence[x509.Certificate], moment: datetime) -> Iterator[str]:
     for certificate in chain:
         name = subject_text(certificate.subject)
         if date := tolerant.unread_date(certificate):
             yield f"the {date} of {name} cannot be read"
         validity = validity_of(certificate)
-        if at > validity.not_after:
+        if moment > validity.not_after:
             yield f"{name} expired at {iso(validity.not_after)}"
-        elif at < validity.not_before:
+        elif moment < validity.not_before:
             yield f"{name} is not valid before {iso(validity.not_before)}"
 
 
@@ -504,7 +509,7 @@ def _name_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
             constraints = extension(authority, x509.NameConstraints)
             if constraints is None:
                 continue
-            for name in _names(certificate, leaf=not place):
+            for name in _names(certificate, is_leaf=not place):
                 if not _is_allowed(name, constraints):
                     yield (
                         f"the nameConstraints of {subject_text(authority.subject)} do not allow "
@@ -512,7 +517,7 @@ def _name_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
                     )
 
 
-def _names(certificate: x509.Certificate, *, leaf: bool) -> Iterator[x509.GeneralName | None]:
+def _names(certificate: x509.Certificate, *, is_leaf: bool) -> Iterator[x509.GeneralName | None]:
     """Yield a certificate's names that constraints apply to; None for a name that is unreadable."""
     subject = certificate.subject
     if subject.rdns:
@@ -522,7 +527,7 @@ def _names(certificate: x509.Certificate, *, leaf: bool) -> Iterator[x509.Genera
         yield x509.RFC822Name(str(text.value)) if readable else None
     names = tuple(extension(certificate, x509.SubjectAlternativeName) or ())
     yield from (None if isinstance(name, UnreadableName) else name for name in names)
-    if leaf and not any(isinstance(name, x509.DNSName) for name in names):
+    if is_leaf and not any(isinstance(name, x509.DNSName) for name in names):
         for common in subject.get_attributes_for_oid(NameOID.COMMON_NAME):
             host = str(common.value).rstrip("\0")
             if _HOST.fullmatch(host):

@@ -361,14 +361,14 @@ class _Score(NamedTuple):
 
 
 def list_refusal(
-    chain: Sequence[x509.Certificate], lists: Lists, *, at: datetime
+    chain: Sequence[x509.Certificate], lists: Lists, *, moment: datetime
 ) -> ListRefusal | None:
-    """Return why OpenSSL refuses ``chain[0]`` with these lists at the time ``at``, or None.
+    """Return why OpenSSL refuses ``chain[0]`` with these lists at the time ``moment``, or None.
 
     ``chain`` leads to a self-signed CA, and is valid without lists.
     """
     certificate = chain[0]
-    found = _best(chain, lists, at)
+    found = _best(chain, lists, moment)
     if found is None:
         name = subject_text(certificate.issuer)
         text = f"the revocation list of {name} is missing, and OpenSSL has another CA's list"
@@ -380,10 +380,10 @@ def list_refusal(
         return ListRefusal(Obstacle.USAGE, crl, text)
     if not score.in_scope:
         return ListRefusal(Obstacle.SCOPE, crl, "it is not for all certificates of its CA")
-    if last_update(crl) > at:
+    if last_update(crl) > moment:
         text = f"it is not valid before {iso(last_update(crl))}"
         return ListRefusal(Obstacle.NOT_YET_VALID, crl, text)
-    if _has_expired(crl, at):
+    if _has_expired(crl, moment):
         expiry = next_update(crl)
         assert expiry
         return ListRefusal(Obstacle.EXPIRED, crl, f"it expired at {iso(expiry)}")
@@ -420,7 +420,7 @@ def _revokes(crl: x509.CertificateRevocationList, certificate: x509.Certificate)
 
 
 def _best(
-    chain: Sequence[x509.Certificate], lists: Lists, at: datetime
+    chain: Sequence[x509.Certificate], lists: Lists, moment: datetime
 ) -> tuple[x509.CertificateRevocationList, x509.Certificate, _Score] | None:
     """Return the list that OpenSSL uses for ``chain[0]``, with its issuer and score, or None.
 
@@ -437,7 +437,7 @@ def _best(
         score = _Score(
             not _entries(_Content(crl)).has_unknown,
             _is_in_scope(chain[0], crl, point),
-            last_update(crl) <= at and not _has_expired(crl, at),
+            last_update(crl) <= moment and not _has_expired(crl, moment),
             issuer is chain[min(1, len(chain) - 1)],
         )
         if best is None or (score, last_update(crl)) > (best[2], last_update(best[0])):
@@ -571,9 +571,9 @@ def _all_reasons(certificate: x509.Certificate, crl: x509.CertificateRevocationL
     return True
 
 
-def _has_expired(crl: x509.CertificateRevocationList, at: datetime) -> bool:
+def _has_expired(crl: x509.CertificateRevocationList, moment: datetime) -> bool:
     expiry = next_update(crl)
-    return expiry is not None and expiry <= at
+    return expiry is not None and expiry <= moment
 
 
 def _value(crl: x509.CertificateRevocationList, kind: type[Extension]) -> Extension | None:

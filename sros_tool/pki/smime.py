@@ -513,9 +513,9 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     )
 
 
-def _octets(wrapped: der.Value) -> bytes:
-    (octets,) = _parts(wrapped, der.OCTET_STRING)
-    if wrapped.tag != der.CONTEXT_0:
+def _octets(octet_string: der.Value) -> bytes:
+    (octets,) = _parts(octet_string, der.OCTET_STRING)
+    if octet_string.tag != der.CONTEXT_0:
         raise ValueError("no content")
     return octets.content
 

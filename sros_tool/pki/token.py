@@ -527,7 +527,7 @@ def pin_file_problem(place: TokenUri) -> str:
         return ""
     path = Path(place.pin_source)
     try:
-        read_bytes(path, "file with the PIN", most=_LONGEST_PIN)
+        read_bytes(path, "file with the PIN", max_bytes=_LONGEST_PIN)
         mode = stat.S_IMODE(path.stat().st_mode)
     except (DocumentError, OSError) as error:
         return str(error).rstrip(".")
@@ -542,7 +542,7 @@ def pin_file_problem(place: TokenUri) -> str:
 def pin_line_break(place: TokenUri) -> str:
     """Return a clause on the effect of a line break after the PIN; "" if there is no line break."""
     try:
-        pin = read_bytes(Path(place.pin_source), "file with the PIN", most=_LONGEST_PIN)
+        pin = read_bytes(Path(place.pin_source), "file with the PIN", max_bytes=_LONGEST_PIN)
     except DocumentError:
         return ""
     if not pin.endswith((b"\n", b"\r")):

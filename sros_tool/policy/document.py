@@ -382,7 +382,7 @@ def read_policy(
     content: bytes | None = None,
     *,
     placeholders: bool = False,
-    read: PolicyFiles | None = None,
+    policy_files: PolicyFiles | None = None,
 ) -> Policy:
     """Read a policy file with its includes, which must be in its folder or below.
 
@@ -391,13 +391,13 @@ def read_policy(
         content: the content of the file, which then need not exist.
         placeholders: accept the placeholders of `sros_tool.policy.placeholders` in names; they are
             not filled in, so only `sros_tool.fleet.expansion` can use the policy.
-        read: returns the content of included files that are not in the file system.
+        policy_files: returns the content of included files that are not in the file system.
 
     Raises:
         PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
             a name is not a valid ROS name, or an enclave is defined twice.
     """
-    return _Reader(path, content, placeholders=placeholders, read=read).policy()
+    return _Reader(path, content, placeholders=placeholders, policy_files=policy_files).policy()
 
 
 def refuse_fallbacks(policy: Policy) -> None:
@@ -420,17 +420,17 @@ class _Reader:
         content: bytes | None,
         *,
         placeholders: bool = False,
-        read: PolicyFiles | None = None,
+        policy_files: PolicyFiles | None = None,
     ) -> None:
         self._shown = path
         self._placeholders = placeholders
         self._owner: Parts = ()
         """The path of the current enclave if it contains placeholders."""
         self._file = Path(os.path.realpath(path))
-        self._includer = Includer(self._file.parent, read)
+        self._includer = Includer(self._file.parent, policy_files)
         if content is not None:
             self._includer.use_content(self._file, content)
-        elif read is None and not os.path.exists(self._file):  # noqa: PTH110 - False for a name that is too long
+        elif policy_files is None and not os.path.exists(self._file):  # noqa: PTH110 - False for a name that is too long
             raise PolicyError(f"the policy file '{path}' does not exist")
 
     def policy(self) -> Policy:
@@ -525,22 +525,22 @@ class _Reader:
         self,
         error: InvalidNameError,
         written: str,
-        what: str,
+        label: str,
         element: etree._Element,
         place: IncludedFile,
     ) -> PolicyError:
         """Return the error for a name, as written, that is not valid with any placeholder's value.
 
-        ``what`` is "enclave name" or "namespace".
+        ``label`` is "enclave name" or "namespace".
         """
         where = self._where(element, place)
         if not has_placeholder(written):
             return PolicyError(f"{where}: {error.what}", error.why, error.remedy)
         remedy = ""
         if written.startswith("{robot"):
-            own = [written.replace("{robot", "{namespace", 1)] if what == "namespace" else []
+            own = [written.replace("{robot", "{namespace", 1)] if label == "namespace" else []
             remedy = f"Write {' or '.join(map(_short, (*own, f'/{written}')))}."
-        return PolicyError(f"{where}: {_short(written)} is not a valid {what}", error.why, remedy)
+        return PolicyError(f"{where}: {_short(written)} is not a valid {label}", error.why, remedy)
 
     def _profiles(self, element: etree._Element, place: IncludedFile) -> Profiles:
         self._attributes(element, place, optional=("type",))
@@ -1087,14 +1087,14 @@ def write_policy(policy: Policy) -> bytes:
 
 
 def checked_text(
-    policy: Policy, output: Path | None, what: str, *, placeholders: bool = False
+    policy: Policy, output: Path | None, label: str, *, placeholders: bool = False
 ) -> bytes:
     """Return the policy as XML, after a check that it reads back as an equal policy.
 
     Args:
         policy: the policy.
         output: the file that will be written, or None.
-        what: how the policy was made, such as "narrowed", for errors.
+        label: how the policy was made, such as "narrowed", for errors.
         placeholders: whether names may have placeholders of a fleet.
 
     Raises:
@@ -1103,7 +1103,7 @@ def checked_text(
     document = write_policy(policy)
     if output and read_policy(output, document, placeholders=placeholders) != policy:
         raise PolicyError(
-            f"the {what} policy changes when it is written and read again",
+            f"the {label} policy changes when it is written and read again",
             "Nothing was written.",
             "This is a defect of sros: please report it with the policy.",
         )

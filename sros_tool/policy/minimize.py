@@ -255,19 +255,19 @@ class _Narrowing:
         replacements = {wildcard.rule: wildcard.replacement for wildcard in wide}
         return _narrowed_enclave(self._enclave, kept, replacements), self._use_of(kept, wide)
 
-    def _use_of(self, kept: set[Right], wide: Sequence[WideRule]) -> EnclaveUse:
+    def _use_of(self, kept_rights: set[Right], wide: Sequence[WideRule]) -> EnclaveUse:
         seen = bool(self._observed)
         unused = [right for right in self._stated if not self._is_observed(right)]
         rewritten = {wildcard.rule for wildcard in wide}
-        remaining = [*kept, *(right for wildcard in wide for right in wildcard.replacement)]
+        remaining = [*kept_rights, *(right for wildcard in wide for right in wildcard.replacement)]
         in_use = self._pairs(self._in_use)
         return EnclaveUse(
             enclave=self._enclave.path,
             observed_at_all=seen,
             never_observed=tuple(
-                r for r in unused if not seen or (r not in kept and r not in rewritten)
+                r for r in unused if not seen or (r not in kept_rights and r not in rewritten)
             ),
-            kept_for_every_node=tuple(r for r in unused if seen and r in kept),
+            kept_for_every_node=tuple(r for r in unused if seen and r in kept_rights),
             wildcards=tuple(wide),
             not_allowed=tuple(sorted(self._refused, key=order)),
             allowed=len(self._pairs(self._stated) | in_use),
@@ -290,9 +290,11 @@ class _Narrowing:
             for seen in self._use.meeting(part)
         )
 
-    def _narrowed(self, kept: set[Right]) -> tuple[WideRule, ...]:
+    def _narrowed(self, kept_rights: set[Right]) -> tuple[WideRule, ...]:
         """Map each wildcard to replace to the rights that replace the wildcard."""
-        wide = [rule for rule in self._stated if is_expression(rule.name) and rule not in kept]
+        wide = [
+            rule for rule in self._stated if is_expression(rule.name) and rule not in kept_rights
+        ]
         owners: dict[Right, list[Right]] = defaultdict(list)
         for rule in wide:
             for part in parts(rule):
@@ -307,7 +309,7 @@ class _Narrowing:
         for right in folded(self._in_use):
             for rule in homes(right):
                 used[rule].append(right)
-        others = Rules(kept)
+        others = Rules(kept_rights)
         needed = unfolded((*self._in_use, *self._common))
         replacement: dict[Right, list[Right]] = defaultdict(list)
         for right in folded(p for p in needed if self._is_allowed(p) and not others.cover(p)):
@@ -322,10 +324,10 @@ class _Narrowing:
             if rule in used or rule in replacement
         )
 
-    def _prove(self, remaining: Sequence[Right]) -> None:
+    def _prove(self, remaining_rights: Sequence[Right]) -> None:
         """Raise unless the narrowed enclave adds no right and keeps every observed right."""
-        after = Rules(remaining)
-        more = [right for right in remaining if not self._rules.cover(right)]
+        after = Rules(remaining_rights)
+        more = [right for right in remaining_rights if not self._rules.cover(right)]
         lost = [p for p in self._in_use if self._is_allowed(p) and not after.cover(p)]
         if more or lost:
             raise PolicyError(
@@ -384,19 +386,21 @@ def _for_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterator[Right]:
 
 
 def _narrowed_enclave(
-    enclave: Enclave, kept: Set[Right], replacements: Mapping[Right, Sequence[Right]]
+    enclave: Enclave, kept_rights: Set[Right], replacements: Mapping[Right, Sequence[Right]]
 ) -> Enclave:
-    """Return ``enclave`` with its denials, the rights in ``kept``, and exact names for wildcards.
+    """Return ``enclave`` with its denials, ``kept_rights``, and exact names for wildcards.
 
     The names that replace a wildcard are written once, where it occurs first, and in its form:
     relative, private or absolute.  Profiles without a rule stay.
     """
     pending = dict(replacements)
-    return enclave.with_profiles(lambda profile: _profile(enclave.path, profile, kept, pending))
+    return enclave.with_profiles(
+        lambda profile: _profile(enclave.path, profile, kept_rights, pending)
+    )
 
 
 def _profile(
-    path: str, profile: Profile, kept: Set[Right], pending: dict[Right, Sequence[Right]]
+    path: str, profile: Profile, kept_rights: Set[Right], pending: dict[Right, Sequence[Right]]
 ) -> Profile:
     """Return the narrowed profile, and remove the replacements that it states from ``pending``."""
     said: dict[tuple[str, str, Level | None], dict[tuple[str, Qualifier], None]] = {}
@@ -406,7 +410,7 @@ def _profile(
             fqn = expand(name, profile.ns, profile.node)
             for right, qualifier in group.rights:
                 whole = Right(path, qualifier, right, fqn)
-                if qualifier is DENY or whole in kept:
+                if qualifier is DENY or whole in kept_rights:
                     said.setdefault((group.kind, name, level), {})[right, qualifier] = None
                 for each in pending.pop(whole, ()):
                     written = _name_written_like(each.name, name, profile)
@@ -457,20 +461,20 @@ class WildcardProposal(NamedTuple):
 def propose_wildcards(
     enclave: str,
     rights: Iterable[Right],
-    known: Iterable[Right],
+    known_rights: Iterable[Right],
     *,
     needed: int,
     size: Callable[[Right], int],
 ) -> tuple[WildcardProposal, ...]:
     """Propose wildcards that make an enclave's document ``needed`` bytes smaller.
 
-    ``rights`` are the rights of this enclave, ``known`` the rights of all enclaves; ``size``
+    ``rights`` are the rights of this enclave, ``known_rights`` the rights of all enclaves; ``size``
     returns the size of a right in bytes.  The largest savings come first; wildcards that newly
     allow a known name are used only if the safe ones do not suffice.
     """
     own = [right for right in rights if right.enclave == enclave and right.qualifier is ALLOW]
     rules = Rules(own)
-    foreign = _names_without_right(enclave, rules, known)
+    foreign = _names_without_right(enclave, rules, known_rights)
     present = Rules(right for right in own if is_expression(right.name))
     # A large document does not list the names that its wildcards match, so these save nothing.
     listed = (right for right in own if not present.cover(right))
@@ -524,17 +528,19 @@ def _wider(name: str) -> Iterator[str]:
         yield _DIGITS.sub("*", name)
 
 
-def _names_without_right(enclave: str, own: Rules, known: Iterable[Right]) -> dict[str, list[str]]:
+def _names_without_right(
+    enclave: str, own_rules: Rules, known_rights: Iterable[Right]
+) -> dict[str, list[str]]:
     """Map rights to the known names for which the enclave lacks the right; actions are split."""
     by_service: dict[bool, set[str]] = {True: set(), False: set()}
-    for part in unfolded(known):
+    for part in unfolded(known_rights):
         if not is_expression(part.name):
             by_service[part.right in ("request", "reply")].add(part.name)
     return {
         right: sorted(
             name
             for name in by_service[right in ("request", "reply")]
-            if not own.cover(Right(enclave, ALLOW, right, name))
+            if not own_rules.cover(Right(enclave, ALLOW, right, name))
         )
         for right in ("publish", "subscribe", "request", "reply")
     }

@@ -136,10 +136,10 @@ class _Form:
             return len(self.pieces) == len(other.pieces) and _pieces_meet(self.pieces, other.pieces)
         return self._meets(other) if self.starred else other._meets(self)
 
-    def _meets(self, fixed: _Form) -> bool:
-        """Return whether a name of the pieces of ``fixed``, without ``*``, matches."""
+    def _meets(self, fixed_form: _Form) -> bool:
+        """Return whether a name of the pieces of ``fixed_form``, without ``*``, matches."""
         reached = self._begin()
-        for piece in fixed.pieces:
+        for piece in fixed_form.pieces:
             kept = reached & self.stars | (reached & self._meets_at(piece)) << 1
             reached = kept | (kept & self.stars) << 1
             if not reached:
@@ -218,9 +218,9 @@ def _members(text: str) -> frozenset[str]:
 class ComparisonLimit:
     """A limit on comparisons, so that a question about many expressions ends in time."""
 
-    def __init__(self, most: int = 60_000_000) -> None:
-        """Set the limit to ``most`` characters; the default takes about ten seconds."""
-        self._left = most
+    def __init__(self, maximum: int = 60_000_000) -> None:
+        """Set the limit to ``maximum`` characters; the default takes about ten seconds."""
+        self._left = maximum
 
     def spend(self, characters: int) -> None:
         """Count a comparison without result against the limit, by the length of the expressions.
@@ -429,9 +429,9 @@ def _as_letters(piece: frozenset[str]) -> Letters:
 
 
 def common_name(
-    wanted: Iterable[str], unwanted: Iterable[str] = (), *, absolute: bool = True
+    wanted_names: Iterable[str], unwanted_names: Iterable[str] = (), *, absolute: bool = True
 ) -> str | None:
-    """Return the shortest absolute ROS name that matches all ``wanted`` and no ``unwanted``.
+    """Return the shortest name that matches all ``wanted_names`` and no ``unwanted_names``.
 
     Without ``absolute``, the name has no leading "/", like DDS topics.  Returns None if there is no
     such name.
@@ -439,7 +439,7 @@ def common_name(
     Raises:
         DocumentError: there are too many ``?`` after ``*`` to decide it.
     """
-    inner, outer = tuple(dict.fromkeys(wanted)), tuple(dict.fromkeys(unwanted))
+    inner, outer = tuple(dict.fromkeys(wanted_names)), tuple(dict.fromkeys(unwanted_names))
     for name in inner:
         if not is_expression(name):
             others = (expression for expression in inner if expression != name)
@@ -453,11 +453,11 @@ def common_name(
 
 
 @lru_cache(maxsize=4096)
-def _search(wanted: tuple[str, ...], unwanted: tuple[str, ...], absolute: bool) -> str | None:
+def _search(wanted: tuple[str, ...], unwanted_names: tuple[str, ...], absolute: bool) -> str | None:
     from sros_tool.automata import NameSet
 
     both = reduce(and_, map(_names_of, wanted), _ros_names(absolute))
-    return (both - NameSet.union(map(_names_of, unwanted))).example()
+    return (both - NameSet.union(map(_names_of, unwanted_names))).example()
 
 
 # ── what characters stand for ──────────────────────────────────────────────────────────────
@@ -467,18 +467,18 @@ class TooManyNames(Exception):  # noqa: N818 - the caller makes an error of it
     """An expression stands for too many names to list."""
 
 
-def listed(expression: str, most: int) -> list[str]:
+def listed(expression: str, maximum: int) -> list[str]:
     """Return expressions whose only wildcard is ``*`` and that match the same ROS names.
 
     A ``?`` is any character of ROS names.
 
     Raises:
-        TooManyNames: there are more than ``most``.
+        TooManyNames: there are more than ``maximum``.
     """
     if "?" not in expression and "[" not in expression:
         return [_STARS.sub("*", expression)]
     pieces = [_choices(*match.groups()) for match in _CHOICE.finditer(expression)]
-    if prod(map(len, pieces)) > most:
+    if prod(map(len, pieces)) > maximum:
         raise TooManyNames
     names = ("".join(choice) for choice in product(*pieces))
     # "/" next to another one or at the end is in no name.

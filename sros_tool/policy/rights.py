@@ -272,12 +272,14 @@ class RightsDifference:
         return RightsDifference(one, other, self.covered)
 
 
-def renamed_enclaves(first: Iterable[Right], second: Iterable[Right]) -> dict[str, str]:
-    """Map enclaves that only ``first`` has to enclaves that only ``second`` has, by equal rights.
+def renamed_enclaves(
+    first_rights: Iterable[Right], second_rights: Iterable[Right]
+) -> dict[str, str]:
+    """Map enclaves that only the first rights have to enclaves with equal rights among the second.
 
     An enclave is left out where several others have the same rights.
     """
-    before, after = (_rights_by_enclave(side) for side in (first, second))
+    before, after = (_rights_by_enclave(side) for side in (first_rights, second_rights))
     gone: dict[frozenset[Right], list[str]] = defaultdict(list)
     new: dict[frozenset[Right], list[str]] = defaultdict(list)
     for enclave in before.keys() - after.keys():
@@ -300,7 +302,9 @@ def _rights_by_enclave(rights: Iterable[Right]) -> dict[str, set[Right]]:
 
 
 def compare(
-    first: Iterable[Right], second: Iterable[Right], scope: frozenset[str] | None = None
+    first_rights: Iterable[Right],
+    second_rights: Iterable[Right],
+    scope: frozenset[str] | None = None,
 ) -> RightsDifference:
     """Compare two sets of rights of the enclaves in ``scope`` (None: all enclaves).
 
@@ -309,7 +313,7 @@ def compare(
     """
     one, other = (
         folded(each for each in side if scope is None or each.enclave in scope)
-        for side in (first, second)
+        for side in (first_rights, second_rights)
     )
     both = Rules(unfolded(one) & unfolded(other) if one != other else ())
     only_first, only_second = (

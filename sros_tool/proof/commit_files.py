@@ -65,7 +65,7 @@ class Revision:
         below = f"{self.path}/" if self.path else ""
         files = [
             (Revision(self.repository, self.name, self.commit, below + name), tree_entry)
-            for name, tree_entry in walk(self.repository, entry.id, most=_MOST_POLICY_ENTRIES)
+            for name, tree_entry in walk(self.repository, entry.id, maximum=_MOST_POLICY_ENTRIES)
         ]
         for file, tree_entry in files:
             if tree_entry.mode not in FILES:
@@ -245,7 +245,7 @@ class CommitFiles:
             raise self._no_file(path, entry)
         links: dict[str, TreeEntry] = {}
         plain: dict[str, TreeEntry] = {}
-        for name, tree_entry in walk(self.repository, entry.id, most=_MOST_ENTRIES):
+        for name, tree_entry in walk(self.repository, entry.id, maximum=_MOST_ENTRIES):
             where = f"{path}/{name}"
             if tree_entry.mode not in (*FILES, LINK):
                 raise self._no_file(where, tree_entry)
@@ -325,7 +325,7 @@ class CommitFiles:
             return content
 
         with suppress(SrosError):  # whoever reads the files finds it, too
-            read_policy(place, placeholders=placeholders, read=read)
+            read_policy(place, placeholders=placeholders, policy_files=read)
         return self.folder / path
 
     def _nowhere(self, path: str) -> Path:

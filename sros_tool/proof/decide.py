@@ -285,10 +285,10 @@ def _not_alone(requirement: Only | Nobody, world: World, limit: SearchLimit) -> 
 
 
 def _uses_of_rights(
-    rights: RightNames, world: World, limit: SearchLimit, without: Sequence[str] = ()
+    rights: RightNames, world: World, limit: SearchLimit, excluded: Sequence[str] = ()
 ) -> Mapping[str, Sequence[Use]]:
-    """Map enclaves with some of the rights to a use of each; leave out ``without``."""
-    left_out = _matching_enclaves(without, world.enclaves)
+    """Map enclaves with some of the rights to a use of each; leave out ``excluded``."""
+    left_out = _matching_enclaves(excluded, world.enclaves)
     uses: defaultdict[str, list[Use]] = defaultdict(list)
     for right, part, topics in _topics_of_rights(rights):
         for met in world.side(part.writes).meeting(topics, limit):
@@ -416,7 +416,7 @@ def _uses_of(
 
 def _shared_by(
     world: World,
-    holders: Collection[Sequence[tuple[_Part, TopicUser]]],
+    holders_by_part: Collection[Sequence[tuple[_Part, TopicUser]]],
     count: int,
     expression: str,
     limit: SearchLimit,
@@ -429,7 +429,7 @@ def _shared_by(
     stated: set[str] = set()
     wild: list[NameSet] = []
     longest = world.longest
-    for parts in holders:
+    for parts in holders_by_part:
         names = {part.topics(expression).ros_name(t) for part, met in parts for t in met.stated}
         stated |= names
         longest = min(longest, *(world.longest - part.longer for part, _ in parts))
@@ -650,9 +650,9 @@ def _named_right(right: str, name: str) -> str:
     return f"{KIND_OF[right].removesuffix('s')} {name}"
 
 
-def _anybody(world: World, parts: Iterable[_Part], name: str, limit: SearchLimit) -> bool:
+def _anybody(world: World, right_parts: Iterable[_Part], name: str, limit: SearchLimit) -> bool:
     """Return whether some enclave may use one of the DDS topics of a name."""
-    for part in parts:
+    for part in right_parts:
         met = world.side(part.writes).meeting(part.topics(name), limit)
         if any(meeting.stated for meeting in met) or any(
             world.use(meeting, part.topics(name), limit) for meeting in met
@@ -690,12 +690,12 @@ def _shortest_chain(
     world: World,
     sources: Iterable[str],
     targets: Container[str],
-    without: Container[str],
+    excluded: Container[str],
     limit: SearchLimit,
 ) -> _Chain:
     """Return a shortest chain of hops from a source to one of ``targets``, or ().
 
-    It does not pass through the enclaves ``without``.  An enclave with rights in several ROS
+    It does not pass through the enclaves ``excluded``.  An enclave with rights in several ROS
     domains passes on what it learns in one of them to the others.
     """
     starts = list(sources)
@@ -710,7 +710,7 @@ def _shortest_chain(
 
         def is_new(enclave: str, origin: str = origin) -> bool:
             there = origins.get(enclave, ())
-            return enclave not in without and origin not in there and len(there) < most
+            return enclave not in excluded and origin not in there and len(there) < most
 
         def is_unused(
             number: int, topic: str, origin: str = origin, router: str = world.router_of(here)

@@ -319,8 +319,8 @@ def _assumption_finding(requirement: Requirement, name: str) -> Finding:
     return ASSUMED.found(own.file, text, own.file, own.line)
 
 
-def _not_crossing(requirement: Requirement, kept: KeptUse) -> Finding:
-    own, use, others = requirement.source, kept.use, _listed_names(kept.others)
+def _not_crossing(requirement: Requirement, kept_use: KeptUse) -> Finding:
+    own, use, others = requirement.source, kept_use.use, _listed_names(kept_use.others)
     ends = f"from {use.enclave} to {others}" if use.writes else f"from {others} to {use.enclave}"
     text = f"{use.name} does not pass between routers {ends}: {demand(requirement)}"
     return NOT_CROSSING.found(own.file, text, own.file, own.line)

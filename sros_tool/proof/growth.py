@@ -478,7 +478,7 @@ def _access_on_vendor(vendor: Vendor, fitting_others: _FittingOthers) -> _Access
         granted = (grant.subject for grant in side.permissions[name].grants[:1])
         subject = subject if _permissions_fit(vendor, side, name, subject) else next(granted, "")
         governed = GovernedDomain(vendor, governance, at)
-        access = Access(governed, side.permissions[name], subject, at=AT)
+        access = Access(governed, side.permissions[name], subject, moment=AT)
         if access.join().reason in ("no-grant", "malformed") or access.join().outcome == "crashes":
             raise DocumentError(
                 f"the permissions of {name} in '{side.shown}' cannot be compared",
@@ -648,7 +648,7 @@ def _each_gain(
 
 
 def _more(
-    stated: _Stated,
+    stated_rights: _Stated,
     enclave: str,
     topics: Mapping[AccessVerb, NameSet],
     sides: tuple[_Access, _Access],
@@ -662,7 +662,7 @@ def _more(
         more = topics[verb]
         if not before.joins:
             more -= NameSet((ROS_DISCOVERY_TOPIC,))  # every participant has it
-        for gain in stated.gains(enclave, verb, more, world, domain, limit):
+        for gain in stated_rights.gains(enclave, verb, more, world, domain, limit):
             if not after.decide(verb, gain.topic) or before.decide(verb, gain.topic):
                 raise AssertionError(f"{gain} is not what {world.title} decides")
             yield gain
@@ -719,12 +719,12 @@ class AccessByVendors:
         yield from _more(self._stated, enclave, topics, sides, world, domain, SearchLimit())
 
 
-def _joined_access(usable: Sequence[Access]) -> _Access:
+def _joined_access(accesses: Sequence[Access]) -> _Access:
     """Return what several permissions, which an enclave can all use, give together."""
     return _Access(
-        {verb: NameSet.union([access.topics(verb) for access in usable]) for verb in _VERBS},
-        lambda verb, topic: any(access.decide(verb, topic).outcome.ok for access in usable),
-        any(access.join().outcome.ok for access in usable),
+        {verb: NameSet.union([access.topics(verb) for access in accesses]) for verb in _VERBS},
+        lambda verb, topic: any(access.decide(verb, topic).outcome.ok for access in accesses),
+        any(access.join().outcome.ok for access in accesses),
     )
 
 
@@ -792,12 +792,12 @@ class _Stated:
         self,
         enclave: str,
         verb: AccessVerb,
-        more: NameSet,
+        added_names: NameSet,
         world: _World,
         domain: int,
         limit: SearchLimit,
     ) -> Iterator[Gain]:
-        """Yield the access that an enclave gains to the topics ``more``.
+        """Yield the access that an enclave gains to the topics ``added_names``.
 
         That is one `Gain` for each right of the policy that covers some of these topics, and one
         for the topics that no right covers.
@@ -807,12 +807,14 @@ class _Stated:
             enclave,
             fitting_others,
             verb,
-            more,
+            added_names,
             world.style,
             world.longest,
         )  # often in several domains
         if key not in self._found:
-            self._found[key] = list(self._searched(enclave, verb, more, world, domain, limit))
+            self._found[key] = list(
+                self._searched(enclave, verb, added_names, world, domain, limit)
+            )
         for gain in self._found[key]:
             yield replace(gain, worlds=(world.title,), domains=(domain,))
 
@@ -820,7 +822,7 @@ class _Stated:
         self,
         enclave: str,
         verb: AccessVerb,
-        more: NameSet,
+        added_names: NameSet,
         world: _World,
         domain: int,
         limit: SearchLimit,
@@ -833,7 +835,7 @@ class _Stated:
         denied = self._denials(enclave, verb, world.style)
         for right, topics in allowed:
             for expression in topics:
-                own = more & names_of(world.style, (expression,))
+                own = added_names & names_of(world.style, (expression,))
                 topic = self._example(own, (enclave, verb, expression), world, limit)
                 if topic is None:
                     continue
@@ -848,7 +850,7 @@ class _Stated:
                         yield self._gain(enclave, verb, right, expression, topic, world, domain)
                 break
         stated = names_of(world.style, (each for _, topics in allowed for each in topics))
-        topic = self._example(more - stated, (enclave, verb, "*"), world, limit)
+        topic = self._example(added_names - stated, (enclave, verb, "*"), world, limit)
         if topic is not None:
             yield self._gain(enclave, verb, None, topic, topic, world, domain)
 
@@ -1018,7 +1020,7 @@ def _edges(side: AccessSource, fitting_pairs: Iterable[tuple[str, str]]) -> _Edg
         usable[domains] = some.union(more)
     network = Network(
         usable,
-        without=OF_EVERY_NODE,
+        excluded=OF_EVERY_NODE,
         questions=QUESTIONS,
         unguarded=unguarded(side.governance) if side.governance else (),
         everybody=sorted(side.permissions),
@@ -1140,11 +1142,11 @@ def _certified_domains(side: AccessSource) -> DomainSet:
     ).closed()
 
 
-def _controlling(governance: Governance | None, more: DomainSet) -> Governance | None:
-    """Return a governance that controls all access, also in the domains ``more``."""
+def _controlling(governance: Governance | None, more_domains: DomainSet) -> Governance | None:
+    """Return a governance that controls all access, also in the domains ``more_domains``."""
     if governance is None:
         return None
-    strict = governance_for(strict_protection(), more).domain_access_rules[0]
+    strict = governance_for(strict_protection(), more_domains).domain_access_rules[0]
 
     def controlling(rule: DomainRule) -> DomainRule:
         topics = tuple(
@@ -1161,7 +1163,7 @@ def _controlling(governance: Governance | None, more: DomainSet) -> Governance |
         )
 
     rules = tuple(map(controlling, governance.domain_access_rules))
-    missing = [domain for domain in more if domain not in governance.domains().closed()]
+    missing = [domain for domain in more_domains if domain not in governance.domains().closed()]
     if missing:
         rules += (replace(strict, domains=DomainSet.of(*((domain, domain) for domain in missing))),)
     return Governance(rules)

@@ -49,7 +49,9 @@ def strict_protection() -> DomainProtection:
     return replace(load_template("production").protection, rtps=Level.SIGN)
 
 
-def _demanded_governance(stated: Sequence[StatedProtection], domains: DomainSet) -> Governance:
+def _demanded_governance(
+    stated_protections: Sequence[StatedProtection], domains: DomainSet
+) -> Governance:
     """Return the weakest governance that a policy allows: strict, except where it states a level.
 
     If it states both levels for a name, the stronger level counts.
@@ -65,7 +67,7 @@ def _demanded_governance(stated: Sequence[StatedProtection], domains: DomainSet)
             data_protection_kind=kinds[right.level],
         )
         for level in (Level.ENCRYPT, Level.SIGN)
-        for right in stated
+        for right in stated_protections
         if right.level is level
         for topic in protected_topics(right.kind, right.name)
     }
@@ -304,8 +306,8 @@ def _no_longer_stated(
             )
 
 
-def _signed(stated: Iterable[StatedProtection], kind: str) -> list[str]:
-    return [right.name for right in stated if right.kind == kind]
+def _signed(stated_protections: Iterable[StatedProtection], kind: str) -> list[str]:
+    return [right.name for right in stated_protections if right.kind == kind]
 
 
 def _set_of_names(names: Iterable[str]) -> NameSet:

@@ -325,17 +325,17 @@ class Repository:
             gone.append(part)
         return entry
 
-    def contents_in_parts(self, ids: Iterable[str], most: int) -> Iterator[dict[str, bytes]]:
+    def contents_in_parts(self, ids: Iterable[str], maximum: int) -> Iterator[dict[str, bytes]]:
         """Yield the contents of files by id, in batches that fit into memory.
 
         Raises:
             DocumentError: a file is missing, damaged or too large, or all files together have more
-                than ``most`` bytes.
+                than ``maximum`` bytes.
         """
         known = self.sizes(wanted := dict.fromkeys(ids))
         sizes = {each: known.get(each, 0) for each in wanted}  # what is missing is an error below
-        if sum(sizes.values()) > most:
-            raise DocumentError(f"the files of the commit have more than {most} bytes")
+        if sum(sizes.values()) > maximum:
+            raise DocumentError(f"the files of the commit have more than {maximum} bytes")
         part: list[str] = []
         room = _AT_ONCE
         for each, size in sizes.items():
@@ -550,7 +550,7 @@ def _contents_of_kind(
 
 
 def walk(
-    repository: Repository, tree: str, *, most: int, other: str = ""
+    repository: Repository, tree: str, *, maximum: int, other: str = ""
 ) -> Iterator[tuple[str, TreeEntry]]:
     """Yield path and entry of all files, links and submodules below a folder, level by level.
 
@@ -558,8 +558,8 @@ def walk(
     path with the same content.
 
     Raises:
-        DocumentError: there are more than ``most`` entries (a few objects can stand for millions),
-            or too many levels of folders (git has to be asked again for each level).
+        DocumentError: there are more than ``maximum`` entries (a few objects can stand for
+            millions), or too many levels of folders (git has to be asked again for each level).
     """
     level = [("", tree, other)]
     count = depth = 0
@@ -574,8 +574,8 @@ def walk(
             before = folders[there] if there else {}
             for name, entry in folders[here].items():
                 count += 1
-                if count > most:
-                    raise DocumentError(f"there are more than {most} files in the commit")
+                if count > maximum:
+                    raise DocumentError(f"there are more than {maximum} files in the commit")
                 old = before.get(name)
                 if old == entry:
                     continue

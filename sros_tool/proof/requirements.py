@@ -277,7 +277,7 @@ def read_requirements(path: Path, fleet: FleetSource = _no_fleet) -> tuple[Requi
             line.
         SrosError: as ``fleet`` raises it.
     """
-    data = read_bytes(path, "requirements file", most=1024 * 1024)
+    data = read_bytes(path, "requirements file", max_bytes=1024 * 1024)
     return parse_requirements(data, str(path), fleet)
 
 
@@ -582,11 +582,11 @@ def _placeholders(table: _Table) -> dict[Placeholder, str]:
 
 
 def _group_members(
-    table: _Table, used: Mapping[Placeholder, str], fleet: Fleet | None
+    table: _Table, used_placeholders: Mapping[Placeholder, str], fleet: Fleet | None
 ) -> dict[str, tuple[Robot, ...]]:
     """Map the groups of placeholders to their robots; "" stands for the whole fleet."""
     members: dict[str, tuple[Robot, ...]] = {}
-    for placeholder, key in used.items():
+    for placeholder, key in used_placeholders.items():
         if fleet is None:
             raise table.error(
                 key,
@@ -660,14 +660,15 @@ def _plural_names(
             )
 
 
-def _filled_words(text: object, used: Iterable[Placeholder], robot: Robot) -> object:
+def _filled_words(text: object, used_placeholders: Iterable[Placeholder], robot: Robot) -> object:
     """Return the name or reason of a requirement with the values of a robot.
 
-    ``used`` are the placeholders in the names of the requirement, which tell the group.
+    ``used_placeholders`` are the placeholders in the names of the requirement, which tell the
+    group.
     """
     if not isinstance(text, str):
         return text
-    groups = {"", *(placeholder.group for placeholder in used)}
+    groups = {"", *(placeholder.group for placeholder in used_placeholders)}
     for (value, own), group in product(
         (("robot", robot.name), ("namespace", robot.namespace)), groups
     ):

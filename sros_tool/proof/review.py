@@ -329,7 +329,7 @@ class _Review:
         findings = partial(self._findings, of_head, head_fleet)
         if head_fleet:
             self.robots[named] = fleet_with_enclaves(head_fleet, of_head)
-        yield from self._step_result("policy", named, findings, if_any=bool(of_head))
+        yield from self._step_result("policy", named, findings, only_with_result=bool(of_head))
         keystores = yield from self._keystores(self.head)
         for path, keystore in keystores.items():
             with suppress(SrosError):  # what is wrong with it is a finding
@@ -342,10 +342,13 @@ class _Review:
                 "new-access",
                 named,
                 lambda: self._access(of_base, base_fleet, before, after),
-                if_any=bool(asked.policies),
+                only_with_result=bool(asked.policies),
             )
             yield from self._step_result(
-                "rights", named, partial(self._rights, before, after), if_any=bool(of_base)
+                "rights",
+                named,
+                partial(self._rights, before, after),
+                only_with_result=bool(of_base),
             )
         for path, keystore in keystores.items():
             yield from self._keystore(path, keystore)
@@ -365,10 +368,10 @@ class _Review:
         subject: str,
         decide: Callable[[], tuple[int, Content] | None],
         *,
-        if_any: bool = True,
+        only_with_result: bool = True,
     ) -> Iterator[ReviewStep]:
         """Run ``decide`` and yield a step with its result or its error."""
-        if not if_any:
+        if not only_with_result:
             return
         try:
             decided = decide()
@@ -457,7 +460,7 @@ class _Review:
         """Yield path and entry of files of a commit that are missing or different in the other."""
         tree = side.repository.tree(side.commit)
         before = other.repository.tree(other.commit) if other else ""
-        return walk(side.repository, tree, most=_MOST_ENTRIES, other=before)
+        return walk(side.repository, tree, maximum=_MOST_ENTRIES, other=before)
 
     def _delivery_step(
         self, base: tuple[list[Path], Fleet | None], head: tuple[list[Path], Fleet]
@@ -694,13 +697,13 @@ class _Review:
 
     def _access(
         self,
-        of_base: Sequence[Path],
+        base_paths: Sequence[Path],
         base_fleet: Fleet | None,
         before: Callable[[], AccessSource],
         after: Callable[[], AccessSource],
     ) -> tuple[int, Content]:
         head = after()
-        if not of_base:
+        if not base_paths:
             assert self.base
             for path in self.request.policies:  # raises the reason why it was not read
                 self.base.policies(path, placeholders=base_fleet is not None)
@@ -755,12 +758,12 @@ class _Review:
             base_files = yield from self._requirement_files(self.base)
         at, zone = self.request.at, self.request.zone
         systems: dict[str, Callable[[], System]] = {
-            path: partial(load_system, folder, at=at, zone=zone)
+            path: partial(load_system, folder, moment=at, zone=zone)
             for path, folder in keystores.items()
         }
         if self.request.policies:
             named = " ".join(self.request.policies)
-            systems[named] = lambda: load_system(policies, at=at, fleet=fleet)
+            systems[named] = lambda: load_system(policies, moment=at, fleet=fleet)
         if not systems:
             yield from _read(files, lambda: fleet)
         for subject, load in systems.items():
@@ -786,10 +789,18 @@ class _Review:
         return read_fleet(file) if file else None
 
     def _dropped(
-        self, earlier: Sequence[Requirement], wanted: Sequence[Requirement], system: System
+        self,
+        earlier: Sequence[Requirement],
+        wanted_requirements: Sequence[Requirement],
+        system: System,
     ) -> tuple[int, Content]:
-        dropped = [requirement.requirement for requirement in dropped_requirements(earlier, wanted)]
-        findings = dropped_findings(earlier, wanted, " ".join(self.request.requirements))
+        dropped = [
+            requirement.requirement
+            for requirement in dropped_requirements(earlier, wanted_requirements)
+        ]
+        findings = dropped_findings(
+            earlier, wanted_requirements, " ".join(self.request.requirements)
+        )
         broken = requirement_findings(dropped, system)
         chosen = FindingFilter(exclude=(VACUOUS.id,)).choose([*findings, *broken])
         return _FOUND, DroppedRequirements(len(dropped), chosen)
@@ -827,8 +838,8 @@ class _Review:
             yield from self._step_result("new-access", path, access)
         yield from self._step_result("expiry", path, lambda: self._expiry(before or folder, folder))
 
-    def _expiry(self, settings_of: Path, folder: Path) -> tuple[int, Content]:
-        settings = Keystore(settings_of).template
+    def _expiry(self, settings_folder: Path, folder: Path) -> tuple[int, Content]:
+        settings = Keystore(settings_folder).template
         found = due_enclaves(Keystore(folder), self.request.renew_within, self.request.at, settings)
         return _UNDECIDED if found.unreadable else _FOUND if found.due else _OK, found
 
@@ -873,8 +884,8 @@ def _made_absolute(before: Iterable[Enclave], after: Iterable[Enclave]) -> tuple
     return tuple(placed for right, placed in absolute.items() if right in relative)
 
 
-def _status(chosen: ChosenFindings) -> int:
-    return _FOUND if chosen.fails(WARNING) else _OK
+def _status(chosen_findings: ChosenFindings) -> int:
+    return _FOUND if chosen_findings.fails(WARNING) else _OK
 
 
 def _decided_requirements(

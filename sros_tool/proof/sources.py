@@ -459,11 +459,11 @@ def _access_at_revision(revision: Revision, fleet: Fleet | None) -> AccessSource
 _Read = tuple[Policy, Fleet | None]
 
 
-def _read(path: Path, fleet: Fleet | None, read: PolicyFiles | None = None) -> _Read:
+def _read(path: Path, fleet: Fleet | None, policy_files: PolicyFiles | None = None) -> _Read:
     """Return the policy in a file, and the fleet with the enclaves that the policy has."""
     if fleet is None:
-        return read_policy(path, read=read), None
-    expanded = FleetPolicy(read_policy(path, placeholders=True, read=read), fleet)
+        return read_policy(path, policy_files=policy_files), None
+    expanded = FleetPolicy(read_policy(path, placeholders=True, policy_files=policy_files), fleet)
     return expanded.policy(), fleet.with_enclaves(expanded.patterns)
 
 

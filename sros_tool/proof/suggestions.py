@@ -95,45 +95,45 @@ class _Stated:
         return sorted(name for of, name in self.users if of == right)
 
 
-def _candidates(stated: _Stated, worlds: Sequence[World]) -> Iterator[Requirement]:
+def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Requirement]:
     for right in ("publish", "call", "request"):
-        yield from _sole_holders(stated, right)
-    yield from _unused_services(stated)
-    yield from _limits(stated)
+        yield from _sole_holders(stated_rights, right)
+    yield from _unused_services(stated_rights)
+    yield from _limits(stated_rights)
     yield from _gates(worlds[0])
     for kind, pair in RIGHTS.items():
-        if any(stated.wild[right] or stated.names(right) for right in pair):
+        if any(stated_rights.wild[right] or stated_rights.names(right) for right in pair):
             yield Protected(source=_NOWHERE, names=((kind, "/*"),), level=Level.ENCRYPT)
     for right in ("publish", "request", "call"):
-        wild = tuple(sorted(stated.wild[right]))
+        wild = tuple(sorted(stated_rights.wild[right]))
         yield Widest(source=_NOWHERE, rights=((right, wild),), enclaves=("*",))
 
 
-def _sole_holders(stated: _Stated, right: str) -> Iterator[Only]:
+def _sole_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
     """Yield a requirement for each enclave that is the only one with a right to a received name."""
     other = OTHER_SIDE[right]
     names: dict[str, list[str]] = defaultdict(list)
-    for name in stated.names(right):
-        users = stated.users[right, name]
-        if len(users) == 1 and name not in _OF_EVERY_NODE and (other, name) in stated.users:
+    for name in stated_rights.names(right):
+        users = stated_rights.users[right, name]
+        if len(users) == 1 and name not in _OF_EVERY_NODE and (other, name) in stated_rights.users:
             names[next(iter(users))].append(name)
     for enclave, found in sorted(names.items()):
         yield Only(source=_NOWHERE, rights=((right, tuple(found)),), enclaves=(enclave,))
 
 
-def _unused_services(stated: _Stated) -> Iterator[Nobody]:
+def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
     """Yield requirements that nobody calls services that change a node and that no enclave uses."""
-    last = {name.rpartition("/")[2] for name in stated.names("reply") if name.count("/") > 1}
+    last = {name.rpartition("/")[2] for name in stated_rights.names("reply") if name.count("/") > 1}
     for each in sorted(last.difference(READING_SERVICES)):
         yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{each}",)),))
 
 
-def _limits(stated: _Stated) -> Iterator[AtMost]:
+def _limits(stated_rights: _Stated) -> Iterator[AtMost]:
     """Yield limits for names that only few enclaves publish."""
     names: dict[int, list[str]] = defaultdict(list)
-    for name in stated.names("publish"):
-        if name not in _OF_EVERY_NODE and ("subscribe", name) in stated.users:
-            names[len(stated.users["publish", name])].append(name)
+    for name in stated_rights.names("publish"):
+        if name not in _OF_EVERY_NODE and ("subscribe", name) in stated_rights.users:
+            names[len(stated_rights.users["publish", name])].append(name)
     for count in range(2, _FEW + 1):
         if names[count]:
             yield AtMost(source=_NOWHERE, rights=(("publish", tuple(names[count])),), most=count)

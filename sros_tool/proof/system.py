@@ -107,26 +107,26 @@ class System:
 def load_system(
     path: Path | Sequence[Path],
     *,
-    at: datetime,
+    moment: datetime,
     zone: tzinfo = UTC,
     domain: int | None = None,
     fleet: Fleet | None = None,
-    only: Collection[str] = (),
+    only_enclaves: Collection[str] = (),
     template: Template | None = None,
-    opened: Keystore | None = None,
+    keystore: Keystore | None = None,
 ) -> System:
     """Return the worlds of policies, or of a keystore with its signed documents.
 
     Args:
         path: the keystore; or policies and folders of policies, which count as one policy.
-        at: the time for which rights are decided.
+        moment: the time for which rights are decided.
         zone: the time zone of robots, in which some vendors read dates.
         domain: the ROS domain; for a keystore, None stands for all domains.
         fleet: the robots that fill in placeholders of a policy.
-        only: the names of the wanted worlds, from `WORLDS`; () stands for all. A keystore without
-            Zenoh configurations has no Zenoh world.
+        only_enclaves: the names of the wanted worlds, from `WORLDS`; () stands for all. A keystore
+            without Zenoh configurations has no Zenoh world.
         template: the template of the keystore for which a policy is meant.
-        opened: the keystore, if it is open already.
+        keystore: the keystore, if it is open already.
 
     Raises:
         DocumentError: a file cannot be read, there is no policy, two policies state the same
@@ -142,14 +142,16 @@ def load_system(
                 "A template is for a policy that is not signed yet.",
                 "Leave --template out, or check the policy.",
             )
-        return _keystore_system(opened or Keystore(paths[0]), at, zone, domain, only)
+        return _keystore_system(keystore or Keystore(paths[0]), moment, zone, domain, only_enclaves)
     files = [file for each in paths for file in policy_files(each)]
     if not files:
         raise PolicyError(
             "requirements need a policy, and there is no policy", "", "Name a policy."
         )
     policy = join_policies([read_policy_for(file, fleet) for file in files])
-    system = policy_system(policy, at=at, domain=domain or 0, only=only, template=template)
+    system = policy_system(
+        policy, moment=moment, domain=domain or 0, only_enclaves=only_enclaves, template=template
+    )
     return replace(system, fleet=lambda: fleet)
 
 
@@ -159,12 +161,12 @@ def load_system(
 def policy_system(
     policy: Policy,
     *,
-    at: datetime,
+    moment: datetime,
     domain: int = 0,
-    only: Collection[str] = (),
+    only_enclaves: Collection[str] = (),
     template: Template | None = None,
 ) -> System:
-    """Return the worlds of a policy as if it were signed at ``at``.
+    """Return the worlds of a policy as if it were signed at ``moment``.
 
     The governance is the template's, with the protection that the policy states added.  Without a
     template, a name has exactly the protection that the policy states for it, and all other names
@@ -188,17 +190,17 @@ def policy_system(
         enclave.path: permissions_for(
             enclave,
             subject=subjects[enclave.path],
-            validity=window(at, _PLANNED),
+            validity=window(moment, _PLANNED),
             domains=domains,
         )
         for enclave in policy.enclaves
     }
     worlds = []
     for vendor in TESTED:
-        if not only or vendor.value in only:
+        if not only_enclaves or vendor.value in only_enclaves:
             governed = GovernedDomain(vendor, governance, domain)
             access = {
-                name: (Access(governed, permissions, subjects[name], at=at),)
+                name: (Access(governed, permissions, subjects[name], moment=moment),)
                 for name, permissions in signed.items()
             }
             granted = {} if unique else {name: (subject,) for name, subject in subjects.items()}
@@ -207,19 +209,19 @@ def policy_system(
                 _dds_world(vendor, access, stated, demanded=demanded, fitting_others=fitting_others)
             )
     left_out = None
-    if not only or _ZENOH in only:
+    if not only_enclaves or _ZENOH in only_enclaves:
         try:
             remotes = tuple(remote_rights(enclave, domain) for enclave in policy.enclaves)
             worlds.append(_planned_zenoh(policy, AccessControl(remotes), domain, stated))
         except SrosError as error:
-            if only:
+            if only_enclaves:
                 raise
             left_out = error
     return System(policy.file, tuple(worlds), Places.of_policy(policy), rights, left_out)
 
 
 def _planned_zenoh(
-    policy: Policy, control: AccessControl, domain: int, stated: Mapping[str, TopicAccess]
+    policy: Policy, control: AccessControl, domain: int, stated_access: Mapping[str, TopicAccess]
 ) -> World:
     """Return the Zenoh world with the rules that sros would write for a policy.
 
@@ -233,13 +235,13 @@ def _planned_zenoh(
         return own is not None and bool(messages) and all(own.allows(enclave, *e) for e in messages)
 
     access = {each.path: ros_access(stated_rights(each)) for each in policy.enclaves}
-    return World("Zenoh", access, confirm=confirm, stated=stated)
+    return World("Zenoh", access, confirm=confirm, stated_access=stated_access)
 
 
 def _dds_world(
     vendor: Vendor,
     access: Mapping[str, Sequence[Access]],
-    stated: Mapping[str, TopicAccess],
+    stated_access: Mapping[str, TopicAccess],
     *,
     title: str = "",
     idle: Collection[str] = (),
@@ -251,7 +253,7 @@ def _dds_world(
     Args:
         vendor: the vendor.
         access: for each enclave, its possible documents; it may do what any of them permits.
-        stated: the topics that rights name without wildcards, by enclave.
+        stated_access: the topics that rights name without wildcards, by enclave.
         title: the title of the world; "" for the vendor's.
         idle: the enclaves without valid permissions.
         demanded: for each level, the topics for which a policy states it; None for a keystore.
@@ -276,7 +278,7 @@ def _dds_world(
         title or vendor.title,
         {name: topics(accesses) for name, accesses in access.items()},
         confirm=confirm,
-        stated=stated,
+        stated_access=stated_access,
         weak=weak,
         demanded=None if demanded is None else NameSet.union(demanded.values()),
         needed=_OF_EVERY_NODE,
@@ -348,7 +350,11 @@ _MOST_GOVERNANCES = 4
 
 
 def _keystore_system(
-    keystore: Keystore, at: datetime, zone: tzinfo, domain: int | None, only: Collection[str]
+    keystore: Keystore,
+    at: datetime,
+    zone: tzinfo,
+    domain: int | None,
+    only_enclaves: Collection[str],
 ) -> System:
     """Return the worlds of a keystore.
 
@@ -370,7 +376,7 @@ def _keystore_system(
     public = not any(
         os.path.lexists(folder / key) for folder in folders.values() for key in _KEY_FILES
     )
-    loaded = {name: load_enclave_of(keystore, name, at=at) for name in names}
+    loaded = {name: load_enclave_of(keystore, name, moment=at) for name in names}
     if public:
         loaded = {name: enclave._replace(key_elsewhere=True) for name, enclave in loaded.items()}
     for name, enclave in loaded.items():
@@ -416,7 +422,7 @@ def _keystore_system(
     moments = {name: (at, *_later(name, grants.get(name, ()), at)) for name in names}
     worlds = []
     for vendor, number in product(TESTED, domains):
-        if only and vendor.value not in only:
+        if only_enclaves and vendor.value not in only_enclaves:
             continue
         title = vendor.title if len(domains) == 1 else f"{vendor.title} in domain {number}"
         access: dict[str, tuple[Access, ...]] = {}
@@ -445,7 +451,7 @@ def _keystore_system(
         )
     for first in range(0, len(worlds), len(domains)):
         _link_domains(worlds[first : first + len(domains)])  # those of one vendor
-    if _ZENOH in only or (not only and has_zenoh_files(root, hidden=True)):
+    if _ZENOH in only_enclaves or (not only_enclaves and has_zenoh_files(root, hidden=True)):
         on_zenoh = list(_zenoh_worlds(keystore, domain, stated))
         _link_domains(on_zenoh)
         worlds += on_zenoh
@@ -476,7 +482,7 @@ def _without_faults(
 _MOST_MOMENTS = 10
 
 
-def _later(name: str, grants: Iterable[Grant], at: datetime) -> tuple[datetime, ...]:
+def _later(name: str, grants: Iterable[Grant], moment: datetime) -> tuple[datetime, ...]:
     """Return a moment inside the validity of each grant that becomes valid later.
 
     Raises:
@@ -486,7 +492,7 @@ def _later(name: str, grants: Iterable[Grant], at: datetime) -> tuple[datetime, 
     for grant in grants:
         with suppress(UsageError):  # it ends before it begins
             validities.append(grant.validity)
-    later = (validity for validity in validities if at < validity.not_before)
+    later = (validity for validity in validities if moment < validity.not_before)
     moments = {each.not_before + (each.not_after - each.not_before) / 2 for each in later}
     if len(moments) > _MOST_MOMENTS:
         raise KeystoreError(
@@ -499,7 +505,7 @@ def _later(name: str, grants: Iterable[Grant], at: datetime) -> tuple[datetime, 
 
 
 def _zenoh_worlds(
-    keystore: Keystore, domain: int | None, stated: Mapping[str, TopicAccess]
+    keystore: Keystore, domain: int | None, stated_access: Mapping[str, TopicAccess]
 ) -> Iterator[World]:
     """Yield the worlds of Zenoh, one for each domain.
 
@@ -526,8 +532,8 @@ def _zenoh_worlds(
     for each in domains:
         title = "Zenoh" if len(domains) == 1 else f"Zenoh in domain {each}"
         crossing = Crossing(source.links.router_of, rules, each) if source.links else None
-        enclaves = {*stated}.difference(source.routers)
-        yield _enforced(title, enforcers, enclaves, each, stated, crossing)
+        enclaves = {*stated_access}.difference(source.routers)
+        yield _enforced(title, enforcers, enclaves, each, stated_access, crossing)
 
 
 def _enforced(
@@ -535,7 +541,7 @@ def _enforced(
     enforcers: Sequence[Enforcement],
     enclaves: Iterable[str],
     domain: int,
-    stated: Mapping[str, TopicAccess],
+    stated_access: Mapping[str, TopicAccess],
     crossing: Crossing | None,
 ) -> World:
     """Return the Zenoh world of a domain, with all enclaves and with other names in the rules."""
@@ -549,7 +555,7 @@ def _enforced(
         title,
         {name: enforced_access(enforcers, name, domain) for name in names},
         confirm=confirm,
-        stated={name: stated.get(name, nothing) for name in names},
+        stated_access={name: stated_access.get(name, nothing) for name in names},
         crossing=crossing,
     )
 

@@ -145,7 +145,7 @@ class DecidedFiles:
 
 
 def signed_files(
-    keystore: Keystore, *, at: datetime, zone: tzinfo = UTC, domain: int | None = None
+    keystore: Keystore, *, moment: datetime, zone: tzinfo = UTC, domain: int | None = None
 ) -> DecidedFiles:
     """Return the enclaves of a keystore with their signed files.
 
@@ -160,26 +160,27 @@ def signed_files(
     public = not any(
         os.path.lexists(keystore.folder(name) / key) for name in names for key in _KEY_FILES
     )
-    enclaves = {name: load_enclave_of(keystore, name, at=at) for name in names}
+    enclaves = {name: load_enclave_of(keystore, name, moment=moment) for name in names}
     if public:
         enclaves = {name: each._replace(key_elsewhere=True) for name, each in enclaves.items()}
     side = AccessSource(str(keystore.root), "keystore", source.rights, source.documents)
-    return DecidedFiles(str(keystore.root), enclaves, side, at, zone, domain, keystore)
+    return DecidedFiles(str(keystore.root), enclaves, side, moment, zone, domain, keystore)
 
 
-def _planned_files(policy: Policy, *, at: datetime, domain: int | None = None) -> DecidedFiles:
+def _planned_files(policy: Policy, *, moment: datetime, domain: int | None = None) -> DecidedFiles:
     """Return the enclaves of a policy as they would be signed, with the default template."""
     template = load_template(DEFAULT_TEMPLATE)
     domains = DomainSet.of((domain or 0, domain or 0))
     protection = with_stated(template.protection, stated_protections(policy.enclaves))
     governance = governance_for(protection, domains)
     enclaves = {
-        enclave.path: plan_enclave(enclave, governance, at=at) for enclave in policy.enclaves
+        enclave.path: plan_enclave(enclave, governance, moment=moment)
+        for enclave in policy.enclaves
     }
     permissions = {name: each.portable for name, each in enclaves.items() if each.portable}
     side = AccessSource(policy.file, "policy", policy_rights(policy), permissions)
     return DecidedFiles(
-        *(policy.file, enclaves, side, at),
+        *(policy.file, enclaves, side, moment),
         domain=domain,
         unique_subjects=template.unique_subject,
     )
@@ -203,7 +204,7 @@ class UpgradeFindings(NamedTuple):
 def check_upgrade(
     path: Path,
     later: Distribution,
-    at: Circumstances,
+    circumstances: Circumstances,
     *,
     present: Distribution | None = None,
     here: Distribution | None = None,
@@ -214,7 +215,7 @@ def check_upgrade(
     Args:
         path: the policy or keystore.
         later: the distribution after the update.
-        at: the moment, the ROS domain, and other conditions.
+        circumstances: the moment, the ROS domain, and other conditions.
         present: the distribution before it; by default those that the keystore says.
         here: the distribution that is sourced, where the keystore says none.
         vendor: the only DDS vendor that is used, of any release, or ``zenoh``; "" for all.
@@ -224,16 +225,25 @@ def check_upgrade(
         DocumentError: a file cannot be read, or there are too many wildcards to decide.
     """
     if is_keystore(path):
-        files = signed_files(at.keystore(path), at=at.now, zone=at.zone, domain=at.domain)
+        files = signed_files(
+            circumstances.keystore(path),
+            moment=circumstances.now,
+            zone=circumstances.zone,
+            domain=circumstances.domain,
+        )
     else:
-        files = _planned_files(read_policy_for(path, at.fleet), at=at.now, domain=at.domain)
+        files = _planned_files(
+            read_policy_for(path, circumstances.fleet),
+            moment=circumstances.now,
+            domain=circumstances.domain,
+        )
     findings: list[Finding] = []
     by_distribution = _present_distributions(files, present, here, later)
     for before, enclaves in by_distribution.items():
         findings += _upgrade(files.only(enclaves), before, later, vendor)
-        findings += _vulnerabilities(before, later, vendor, at.advisories)
+        findings += _vulnerabilities(before, later, vendor, circumstances.advisories)
         if not files.keystore:
-            findings += _rights_needed_after(path, at, before, later)
+            findings += _rights_needed_after(path, circumstances, before, later)
     compared = {name for enclaves in by_distribution.values() for name in enclaves}
     found = joined(list(dict.fromkeys(findings)))
     return UpgradeFindings(found, len(compared), len(files.enclaves))
@@ -317,18 +327,18 @@ def _vulnerabilities(
 
 
 def _rights_needed_after(
-    path: Path, at: Circumstances, before: Distribution, after: Distribution
+    path: Path, circumstances: Circumstances, before: Distribution, after: Distribution
 ) -> Iterator[Finding]:
     """Yield rights that a policy denies and that nodes need only after the update."""
     now, then = (
-        policy_findings([path], replace(at, distribution=distribution.named))
+        policy_findings([path], replace(circumstances, distribution=distribution.named))
         for distribution in (before, after)
     )
     yield from (finding for finding in then if finding not in now)
 
 
 def check_distributions(
-    keystore: Keystore, *, at: datetime, zone: tzinfo = UTC, domain: int | None = None
+    keystore: Keystore, *, moment: datetime, zone: tzinfo = UTC, domain: int | None = None
 ) -> list[Finding]:
     """Return findings on enclaves whose distributions decide differently.
 
@@ -337,7 +347,7 @@ def check_distributions(
     """
     if not (of_several := of_several_distributions(keystore)):
         return []
-    files = signed_files(keystore, at=at, zone=zone, domain=domain)
+    files = signed_files(keystore, moment=moment, zone=zone, domain=domain)
     findings = []
     for names, enclaves in of_several.items():
         for before, after in _pairs([find_distribution(name) for name in names]):

@@ -183,16 +183,16 @@ class Side:
             )
         return self._found[expression]
 
-    def _accepted_topics(self, own: Automaton, limit: SearchLimit) -> Iterator[str]:
+    def _accepted_topics(self, automaton: Automaton, limit: SearchLimit) -> Iterator[str]:
         """Yield the exact topics that an automaton accepts."""
-        forwards = _starting(self._topics, own.prefix)
-        backwards = _starting(self._backwards, own.suffix[::-1])
+        forwards = _starting(self._topics, automaton.prefix)
+        backwards = _starting(self._backwards, automaton.suffix[::-1])
         limit.spend(min(len(forwards), len(backwards)))
         if len(forwards) <= len(backwards):
             topics: Iterator[str] = (self._topics[i] for i in forwards)
         else:
             topics = (self._backwards[i][::-1] for i in backwards)
-        return filter(own.matches, topics)
+        return filter(automaton.matches, topics)
 
     def perhaps_meeting(
         self, automata: Collection[Automaton] | None, limit: SearchLimit
@@ -290,7 +290,7 @@ class World:
         access: Mapping[str, TopicAccess],
         *,
         confirm: Confirm,
-        stated: Mapping[str, TopicAccess],
+        stated_access: Mapping[str, TopicAccess],
         weak: Mapping[Level, NameSet] = MappingProxyType({}),
         demanded: NameSet | None = None,
         needed: Sequence[tuple[bool, str]] = (),
@@ -301,8 +301,8 @@ class World:
     ) -> None:
         """Create a world from the access of each enclave by its own permissions.
 
-        ``confirm`` decides on one topic without these sets, and ``stated`` has the topics that the
-        rights of an enclave name without wildcards.
+        ``confirm`` decides on one topic without these sets, and ``stated_access`` has the topics
+        that the rights of an enclave name without wildcards.
 
         ``weak`` are the topics that are protected less than a level demands; without a level, there
         are none.  ``demanded`` are the topics whose protection a policy demands, while the
@@ -317,7 +317,7 @@ class World:
         self.confirm_own = confirm
         self.fitting_others = fitting_others
         self.own = access
-        self.stated = {name: self._with_fitting(name, stated) for name in stated}
+        self.stated = {name: self._with_fitting(name, stated_access) for name in stated_access}
         self.longest = longest
         self.enclaves = tuple(sorted(access))
         self._access = {name: self._with_fitting(name, access) for name in access}
@@ -416,12 +416,14 @@ class World:
         )
         return next(filter(None, (*stated, *examples)), None)
 
-    def use(self, met: TopicUser, topics: Topics, limit: SearchLimit) -> str | None:
+    def use(self, topic_user: TopicUser, topics: Topics, limit: SearchLimit) -> str | None:
         """Return the best example of ``topics`` that an enclave may use, or None."""
-        if met.wild:
-            return self.example(met.names, topics, limit)
+        if topic_user.wild:
+            return self.example(topic_user.names, topics, limit)
         valid = valid_topics(topics.begin, topics.end)
-        return shortest(right for right in met.stated if right in valid) or shortest(met.stated)
+        return shortest(right for right in topic_user.stated if right in valid) or shortest(
+            topic_user.stated
+        )
 
     def readers_of(self, topic: str) -> list[str]:
         """Return the enclaves that may read a topic."""
@@ -437,10 +439,10 @@ class World:
         """Return the router that an enclave connects to; "" if there are not several routers."""
         return self.crossing.router_of.get(enclave, "") if self.crossing else ""
 
-    def written_by(self, enclave: str, without: NameSet) -> Written:
-        """Return the topics that an enclave may write, except ``without``, always the same."""
+    def written_by(self, enclave: str, excluded_names: NameSet) -> Written:
+        """Return what an enclave may write, except ``excluded_names`` (equal in all calls)."""
         if enclave not in self._written:
-            names = self.side(True).of[enclave] - without
+            names = self.side(True).of[enclave] - excluded_names
             around = names.around()
             exact = tuple(topic for topic in around.exact if topic in names) if around else ()
             self._written[enclave] = Written(names, around, exact)
@@ -504,10 +506,10 @@ def dds_access(access: Access) -> TopicAccess:
     return TopicAccess(access.topics(AccessVerb.PUBLISH), access.topics(AccessVerb.SUBSCRIBE))
 
 
-def ros_access(stated: Iterable[StatedRight]) -> TopicAccess:
+def ros_access(stated_rights: Iterable[StatedRight]) -> TopicAccess:
     """Return the topics of the ROS names that rights allow, and denials do not take away."""
     names: dict[tuple[bool, str, bool], list[NameSet]] = defaultdict(list)
-    for right in (right.right for right in stated):
+    for right in (right.right for right in stated_rights):
         for writes, topic in topics_of(right):
             names[writes, topic[:2], right.qualifier is ALLOW].append(named(topic))
 

@@ -113,22 +113,25 @@ class Context:
 _NO_CONTEXT = Context()
 
 
-def compose(first: PictureSource, context: Context = _NO_CONTEXT) -> Picture:
+def compose(first_source: PictureSource, context: Context = _NO_CONTEXT) -> Picture:
     """Return the picture of one source."""
-    known = Known(first.rights)
-    edges = _edges_of(first.rights, known, context.common)
-    stated = dict.fromkeys(folded(first.rights), OverlaySide.BOTH)
-    return _picture((first,), edges, stated, known, context)
+    known = Known(first_source.rights)
+    edges = _edges_of(first_source.rights, known, context.common)
+    stated = dict.fromkeys(folded(first_source.rights), OverlaySide.BOTH)
+    return _picture((first_source,), edges, stated, known, context)
 
 
 def overlay(
-    first: PictureSource, second: PictureSource, kind: str, context: Context = _NO_CONTEXT
+    first_source: PictureSource,
+    second_source: PictureSource,
+    kind: str,
+    context: Context = _NO_CONTEXT,
 ) -> Picture:
     """Return a picture that compares two sources; ``kind`` is a key of `_OVERLAYS`."""
-    scope = first.scope if second.scope is None else second.scope
+    scope = first_source.scope if second_source.scope is None else second_source.scope
     rights = [
         frozenset(right for right in side.rights if scope is None or right.enclave in scope)
-        for side in (first, second)
+        for side in (first_source, second_source)
     ]
     known = Known(rights[0] | rights[1])
     sides = [_edges_of(own, known, context.common) for own in rights]
@@ -145,7 +148,7 @@ def overlay(
         unseen = frozenset(right.enclave for right in rights[0] - rights[1])
         unseen -= {right.enclave for right in rights[1]}
         edges = [_neutral(edge, unseen) for edge in edges]
-    picture = _picture((first, second), edges, stated, known, context)
+    picture = _picture((first_source, second_source), edges, stated, known, context)
     return replace(
         picture,
         overlay=_OVERLAYS[kind],
@@ -210,8 +213,8 @@ def union(sources: Sequence[PictureSource]) -> PictureSource:
 def _picture(
     sources: Sequence[PictureSource],
     edges: Iterable[Edge],
-    stated: Mapping[Right, OverlaySide],
-    known: Known,
+    stated_rights: Mapping[Right, OverlaySide],
+    known_names: Known,
     context: Context,
 ) -> Picture:
     edges = tuple(sorted(edges, key=edge_order))
@@ -225,7 +228,7 @@ def _picture(
     return Picture(
         title=" and ".join(source.origin.title for source in sources),
         origins=tuple(source.origin for source in sources),
-        enclaves=_enclaves(sources, stated, known, context),
+        enclaves=_enclaves(sources, stated_rights, known_names, context),
         names=tuple(
             Name(
                 kind,
@@ -277,16 +280,18 @@ def edge_order(edge: Edge) -> tuple[str, int, str, str, tuple[str, ...], str]:
 
 def _enclaves(
     sources: Sequence[PictureSource],
-    stated: Mapping[Right, OverlaySide],
-    known: Known,
+    stated_rights: Mapping[Right, OverlaySide],
+    known_names: Known,
     context: Context,
 ) -> tuple[PicturedEnclave, ...]:
     described = {enclave.path: enclave for source in sources for enclave in source.enclaves}
     statements: dict[str, list[Statement]] = defaultdict(list)
-    for right in sorted(stated, key=order):
-        reaches = len(known.reached(right.kind, right.name))
+    for right in sorted(stated_rights, key=order):
+        reaches = len(known_names.reached(right.kind, right.name))
         statements[right.enclave].append(
-            Statement(right.qualifier, right.right, right.kind, right.name, reaches, stated[right])
+            Statement(
+                right.qualifier, right.right, right.kind, right.name, reaches, stated_rights[right]
+            )
         )
     nodes: dict[str, set[str]] = defaultdict(set)
     for source in sources:
@@ -377,9 +382,9 @@ def _identity(edge: Edge) -> tuple[object, ...]:
 
 
 def _overlay_differences(
-    first: frozenset[Right], second: frozenset[Right]
+    first_rights: frozenset[Right], second_rights: frozenset[Right]
 ) -> tuple[OverlayDifference, ...]:
-    difference = compare(first, second)
+    difference = compare(first_rights, second_rights)
     return tuple(
         OverlayDifference(
             OverlaySide.FIRST if sign == "-" else OverlaySide.SECOND,
@@ -506,7 +511,9 @@ _WHOLE: dict[str, frozenset[tuple[str, str]]] = {
 _Found = dict[Qualifier, set[str]]
 
 
-def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = ()) -> list[Edge]:
+def _edges_of(
+    rights: Iterable[Right], known_names: Known, common: Sequence[Right] = ()
+) -> list[Edge]:
     """Return one edge for each right or denial and each name that it matches, unsorted.
 
     A wildcard that matches no known name is drawn as a name.  ``common`` are the rights that every
@@ -519,7 +526,7 @@ def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = (
     topics: dict[tuple[str, str, str, str], _Found] = defaultdict(lambda: defaultdict(set))
     for stated in unfolded(rights):
         by = stated.name if is_expression(stated.name) else ""
-        for reached in known.drawn(stated):
+        for reached in known_names.drawn(stated):
             # A wildcard drawn as a name is treated like an exact name.
             said = "" if reached == by else by
             topics[stated.enclave, stated.kind, stated.right, reached][stated.qualifier].add(said)
@@ -528,7 +535,7 @@ def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = (
     for (enclave, kind, right, name), by_qualifier in topics.items():
         qualifier = DENY if DENY in by_qualifier else ALLOW
         action, inside, part = name.rpartition(ACTION_SEPARATOR)
-        if inside and (action in known.actions or is_expression(action)):
+        if inside and (action in known_names.actions or is_expression(action)):
             whole[enclave, action, qualifier][right, part] = by_qualifier[qualifier]
             continue
         edges.append(
@@ -623,9 +630,9 @@ _ORDER = list(WireLevel)
 class _Demanded:
     """The protection that a policy demands for names; used if there is no governance."""
 
-    def __init__(self, stated: Iterable[StatedProtection]) -> None:
+    def __init__(self, stated_protections: Iterable[StatedProtection]) -> None:
         topics_of: dict[WireLevel, list[str]] = defaultdict(list)
-        for protection in stated:
+        for protection in stated_protections:
             topics = protected_topics(protection.kind, protection.name)
             topics_of[WireLevel(protection.word)] += topics
         self._names = {level: Names(topics) for level, topics in topics_of.items()}

@@ -241,7 +241,7 @@ class _System:
         self._direct = Network(in_domains, unguarded=opened, everybody=everybody)
         self._network = Network(
             in_domains,
-            without=OF_EVERY_NODE,
+            excluded=OF_EVERY_NODE,
             questions=QUESTIONS,
             unguarded=opened,
             everybody=everybody,
@@ -429,14 +429,14 @@ _ROOM = {"names": 66, "enclave": 24, "group": 24}
 """Width on a card that its text does not use, in pixels."""
 
 
-def flow_scene(picture: Picture, hops: int = HOPS, *, placed: bool = True) -> Scene:
+def flow_scene(picture: Picture, hops: int = HOPS, *, with_places: bool = True) -> Scene:
     """Return the scene of a picture with a focus.
 
     Args:
         picture: a picture with a focus.
         hops: how many hops to the left and to the right are drawn, at least 1.
-        placed: whether cards get a y and groups get frames; formats that place cards themselves
-            need neither.
+        with_places: whether cards get a y and groups get frames; formats that place cards
+            themselves need neither.
     """
     draft = _Draft(picture, FocusFlow.of(picture), hops)
     cards = draft.in_columns()
@@ -454,7 +454,7 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, placed: bool = True) -> Sc
         heads=tuple(draft.heads(cards)),
         shown=len(names),
     )
-    if not placed:
+    if not with_places:
         return scene
     cards = stacked(
         cards.values(), sorted({(link.source, link.target) for link in links}), draft.columns
@@ -493,9 +493,9 @@ class _Draft:
         self._nodes = self._folded()
         self._stages = [self._stage(stage) for stage in range(1 - self._right, self._left)]
 
-    def _column_of(self, before: bool, hop: int) -> int:
+    def _column_of(self, is_before_focus: bool, hop: int) -> int:
         middle = self._first + 2 * self._left - 1
-        return middle + (1 - 2 * hop if before else 2 * hop - 1)
+        return middle + (1 - 2 * hop if is_before_focus else 2 * hop - 1)
 
     def _folded(self) -> Mapping[tuple[bool, str], str]:
         """Map side of the focus and enclave to the id of the card that stands for the enclave."""
@@ -671,12 +671,12 @@ class _Draft:
                     ends = ("s:", card.id) if before else (card.id, "l:")
                     yield Link(*ends, 0, 0, ("influence",), ALLOW, WireLevel.UNKNOWN, False, _BOTH)
 
-    def _side(self, before: bool) -> Mapping[str, int]:
-        return self._flow.before if before else self._flow.after
+    def _side(self, is_before_focus: bool) -> Mapping[str, int]:
+        return self._flow.before if is_before_focus else self._flow.after
 
-    def _next_to(self, before: bool) -> set[str]:
+    def _next_to(self, is_before_focus: bool) -> set[str]:
         """Return the enclaves at the last drawn hop that share a name with further enclaves."""
-        stage = self._hops if before else -self._hops
+        stage = self._hops if is_before_focus else -self._hops
         return {e.enclave for e in self._picture.edges if any(self._flow.ends(e, stage))}
 
     def heads(self, cards: Mapping[str, Card]) -> Iterator[Head]:

@@ -76,16 +76,16 @@ class Folding(NamedTuple):
         """
         return _Draft(picture, robots or {}).folding()
 
-    def scenes(self, *, placed: bool = True, hops: int = 0) -> tuple[Scene, ...]:
+    def scenes(self, *, with_places: bool = True, hops: int = 0) -> tuple[Scene, ...]:
         """Return the scenes, whose cards list the real enclaves and names.
 
         Args:
-            placed: for formats that place cards themselves, False: without y and frames.
+            with_places: for formats that place cards themselves, False: without y and frames.
             hops: with a focus, how far enclaves are drawn; 0 for the default.
         """
-        scenes = scenes_of(self.picture, placed=placed, drawn_as=self.names)
+        scenes = scenes_of(self.picture, with_places=with_places, drawn_as=self.names)
         if self.picture.focus:
-            scenes = (flow_scene(self.picture, hops or HOPS, placed=placed), *scenes)
+            scenes = (flow_scene(self.picture, hops or HOPS, with_places=with_places), *scenes)
         return tuple(map(self._scene, scenes))
 
     def _scene(self, scene: Scene) -> Scene:

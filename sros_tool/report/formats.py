@@ -588,7 +588,7 @@ def render(
     if form == "markdown":
         return _render_markdown(folding.picture, everything=everything)
     placed = form in ("html", "svg") and not graphviz
-    scenes = folding.scenes(placed=placed, hops=hops or 0)
+    scenes = folding.scenes(with_places=placed, hops=hops or 0)
     if form == "html":
         return render_page(picture, scenes, moment, folding.picture)
     scene = next((scene for scene in scenes if everything and scene.id == "all"), scenes[0])

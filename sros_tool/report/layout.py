@@ -184,7 +184,7 @@ DrawnAs = Mapping[tuple[str, str], Sequence[str]]
 
 
 def scenes_of(
-    picture: Picture, *, placed: bool = True, drawn_as: DrawnAs | None = None
+    picture: Picture, *, with_places: bool = True, drawn_as: DrawnAs | None = None
 ) -> tuple[Scene, ...]:
     """Return the scenes of a picture, the overview first.
 
@@ -194,26 +194,32 @@ def scenes_of(
 
     Args:
         picture: the picture.
-        placed: whether cards get a y and groups get frames; formats that place cards themselves
-            need neither.
+        with_places: whether cards get a y and groups get frames; formats that place cards
+            themselves need neither.
         drawn_as: the real names behind drawn names, which are counted instead.
     """
     groups = {enclave.path: enclave.group for enclave in picture.enclaves}
     titles = sorted(set(groups.values()))
     essential = [edge for edge in picture.edges if not edge.common]
     if len(groups) <= _MOST_ENCLAVES or len(titles) < 2 or len(titles) > len(groups) // 2:
-        scenes = [_scene(picture, "essential", "Overview", essential, str, drawn_as, placed=placed)]
+        scenes = [
+            _scene(
+                picture, "essential", "Overview", essential, str, drawn_as, with_places=with_places
+            )
+        ]
         if len(essential) < len(picture.edges):
             title = "With what every node needs"
             scenes.append(
-                _scene(picture, "all", title, picture.edges, str, drawn_as, placed=placed)
+                _scene(picture, "all", title, picture.edges, str, drawn_as, with_places=with_places)
             )
         return tuple(scenes)
     # Group ids begin with a colon; enclave names never do.
     outside = {path: f":{group}" for path, group in groups.items()}
     overview = outside.__getitem__
     scenes = [
-        _scene(picture, "essential", "Overview", essential, overview, drawn_as, placed=placed)
+        _scene(
+            picture, "essential", "Overview", essential, overview, drawn_as, with_places=with_places
+        )
     ]
     for title in titles:
 
@@ -223,7 +229,9 @@ def scenes_of(
         touched = {(e.kind, e.name) for e in essential if groups[e.enclave] == title}
         edges = [edge for edge in essential if (edge.kind, edge.name) in touched]
         scenes.append(
-            _scene(picture, f"group {title}", title, edges, owner, drawn_as, placed=placed)
+            _scene(
+                picture, f"group {title}", title, edges, owner, drawn_as, with_places=with_places
+            )
         )
     return tuple(scenes)
 
@@ -236,7 +244,7 @@ def _scene(
     owner: Callable[[str], str],
     drawn_as: DrawnAs | None,
     *,
-    placed: bool,
+    with_places: bool,
 ) -> Scene:
     members: dict[str, list[str]] = defaultdict(list)
     for enclave in picture.enclaves:
@@ -245,7 +253,7 @@ def _scene(
     for edge in picture.edges:
         everybody[edge.kind, edge.name].add(owner(edge.enclave))
     draft = _Draft(picture, edges, owner, members, everybody)
-    scene = draft.placed(name, title) if placed else draft.scene(name, title)
+    scene = draft.placed(name, title) if with_places else draft.scene(name, title)
     shown = _count_real_names({(edge.kind, edge.name) for edge in edges}, drawn_as or {})
     hidden = (
         _count_real_names({(name.kind, name.name) for name in picture.names}, drawn_as or {})
@@ -364,14 +372,14 @@ class _Draft:
         sides |= {f"s{node}" for node in idle}
         for side in sorted(sides):
             first = side[0] == "s" or f"s{side[1:]}" not in sides
-            yield self._side_card(side, first=first)
+            yield self._side_card(side, is_first=first)
         for number, bundle in enumerate(self._bundles):
             yield self._names_card(number, bundle)
 
-    def _side_card(self, side: str, *, first: bool) -> Card:
+    def _side_card(self, side: str, *, is_first: bool) -> Card:
         """Return the card of a sender or receiver.
 
-        The ``first`` card of an enclave also counts the names that no other enclave uses.
+        The ``is_first`` card of an enclave also counts the names that no other enclave uses.
         """
         node, sends = side[1:], side[0] == "s"
         members = tuple(self._members[node])
@@ -382,7 +390,7 @@ class _Draft:
         else:
             group = self._groups[node].rstrip("/") + "/"
             label = node.removeprefix(group) or node
-        if first and (own := self._own.get(node)):
+        if is_first and (own := self._own.get(node)):
             notes += _own_text(own)
         notes += self._notes.get(node, ())
         notes += [
@@ -465,10 +473,10 @@ def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
 # ── text on cards ───────────────────────────────────────────────────────────────────────
 
 
-def _own_text(own: Iterable[Bundle]) -> list[str]:
+def _own_text(own_bundles: Iterable[Bundle]) -> list[str]:
     """Return lines like ``own: 3 topics, 2 services`` for names that only one enclave uses."""
     kinds, lacks = Counter[str](), Counter[Lack]()
-    for bundle in own:
+    for bundle in own_bundles:
         kinds[bundle.kind] += len(bundle.names)
         lacks[bundle.lacks] += len(bundle.names)
     counts = [counted(number, KIND_NAMES[kind]) for kind, number in kinds.items()]
@@ -743,12 +751,12 @@ def _inversions(ends: Sequence[int], size: int) -> int:
 
 def place_column(
     column: Sequence[ColumnItem],
-    wanted: Mapping[str, float],
+    wanted_positions: Mapping[str, float],
     gap: float,
     top: float,
     lead: float = 0,
 ) -> dict[str, float]:
-    """Map items to y positions near their ``wanted`` y, without overlaps.
+    """Map items to y positions near their ``wanted_positions`` y, without overlaps.
 
     Items keep their order, with ``gap`` between them, and none is above ``top``.  The first item of
     each group has ``lead`` more space above it.  All lengths are in pixels.
@@ -762,7 +770,7 @@ def place_column(
     # Without the offsets, it is isotonic regression: least squares with increasing values.
     blocks: list[list[float]] = []
     for item, offset in zip(column, offsets, strict=True):
-        target = wanted.get(item.id, 0.0) - item.height / 2 - offset
+        target = wanted_positions.get(item.id, 0.0) - item.height / 2 - offset
         blocks.append([max(target, top), 1])
         while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
             mean, count = blocks.pop()

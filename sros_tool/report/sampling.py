@@ -51,14 +51,14 @@ class SampledKeystore(NamedTuple):
 
 
 def sample_of(
-    keystore: Keystore, robots: Mapping[str, Robot], wanted: Collection[str] = ()
+    keystore: Keystore, robots: Mapping[str, Robot], wanted_names: Collection[str] = ()
 ) -> SampledKeystore:
     """Return the enclaves of a keystore to read in full: all of them, or a sample of equal units.
 
     Args:
         keystore: the keystore.
         robots: the robots of its fleet, by enclave.
-        wanted: names of units that are read in any case.
+        wanted_names: names of units that are read in any case.
 
     Units that use names of other units are all read.  So is everything where names of units cannot
     be told apart, or where too much is not alike.
@@ -89,7 +89,7 @@ def sample_of(
     if len(others) > _LARGE:
         return everything
     named: dict[int, set[Right]] = defaultdict(set)
-    for right in load_rights(keystore, only=others).rights:
+    for right in load_rights(keystore, only_enclaves=others).rights:
         of_right = {*names.text(right.name).units}
         for n in of_right & few.keys():
             if len(of_right) > 1:
@@ -100,7 +100,7 @@ def sample_of(
         equal[number, frozenset(named[n])].append(n)
     unread, left_out = [], set()
     for first, *more in equal.values():
-        if rest := [n for n in more[:-1] if units[n].name not in wanted]:
+        if rest := [n for n in more[:-1] if units[n].name not in wanted_names]:
             members = tuple(units[n].name for n in rest)
             number = sum(len(enclaves[n]) for n in rest)
             unread.append(UnreadUnits(units[first].what, members, number, units[first].name))

@@ -179,25 +179,27 @@ def _routers(keystore: Keystore | None) -> int:
     return sum((keystore.folder(name) / ROUTER_FILE).exists() for name in keystore.names)
 
 
-def _compared_picture(read: Sequence[PictureSource], context: Context, *, use: bool) -> Picture:
+def _compared_picture(
+    sources_read: Sequence[PictureSource], context: Context, *, use: bool
+) -> Picture:
     """Return the picture of one source, or the comparison of two sources.
 
     The comparison is "use" if the second source was observed, "change" for two sources of the same
     kind, "worlds" if one is for Zenoh, and else "drift" (of a keystore from its policy).
     """
-    if len(read) == 1:
-        return compose(read[0], context)
-    first, second = read
-    kinds = [source.origin.kind for source in read]
+    if len(sources_read) == 1:
+        return compose(sources_read[0], context)
+    first, second = sources_read
+    kinds = [source.origin.kind for source in sources_read]
     if use or kinds[1] == "observation":
         return overlay(first, second, "use", context)
     if kinds[0] == kinds[1]:
         return overlay(first, second, "change", context)
     if "zenoh" in kinds:
-        first, second = sorted(read, key=lambda source: source.origin.kind == "zenoh")
+        first, second = sorted(sources_read, key=lambda source: source.origin.kind == "zenoh")
         return overlay(first, second, "worlds", context)
     # Drift is shown from the side of the policy, whichever was named first.
-    first, second = sorted(read, key=lambda source: source.origin.kind != "policy")
+    first, second = sorted(sources_read, key=lambda source: source.origin.kind != "policy")
     return overlay(first, second, "drift", context)
 
 
@@ -258,8 +260,8 @@ def _sample(path: Path, drawing: Drawing) -> SampledKeystore | None:
 
 
 def drawn_difference(
-    first: RightsSource,
-    second: RightsSource,
+    first_source: RightsSource,
+    second_source: RightsSource,
     difference: RightsDifference,
     *,
     letters: int,
@@ -268,8 +270,8 @@ def drawn_difference(
     """Return a Mermaid diagram of added and removed rights, and of other rights to the same names.
 
     Args:
-        first: the rights before.
-        second: the rights after.
+        first_source: the rights before.
+        second_source: the rights after.
         difference: the rights that only one of both has.
         letters: the maximum length of the diagram, in characters.
         arrows: the maximum number of arrows.
@@ -277,7 +279,7 @@ def drawn_difference(
     Returns None if the diagram is too large, and "" if nothing differs or both are of different
     kinds.
     """
-    if first.kind != second.kind or not difference:
+    if first_source.kind != second_source.kind or not difference:
         return ""
     changed: dict[str, set[str]] = {}
     for right in (*difference.only_first, *difference.only_second):
@@ -293,16 +295,16 @@ def drawn_difference(
         return PictureSource(SourceTitle(title, source.kind), used, scope=source.scope)
 
     context = Context(common_rights())
-    picture = overlay(side("before", first), side("after", second), "change", context)
-    scenes = scenes_of(picture, placed=False)
+    picture = overlay(side("before", first_source), side("after", second_source), "change", context)
+    scenes = scenes_of(picture, with_places=False)
     scene = next((scene for scene in scenes if scene.id == "all"), scenes[0])
     text = render_mermaid(picture, scene)
     return None if len(text) > letters or len(scene.links) > arrows else text
 
 
-def _check_no_governance(sources: Sequence[Path], read: Sequence[PictureSource]) -> None:
+def _check_no_governance(sources: Sequence[Path], sources_read: Sequence[PictureSource]) -> None:
     """Raise `UsageError` if --template is used with a source that has a governance of its own."""
-    for path, source in zip(sources, read, strict=True):
+    for path, source in zip(sources, sources_read, strict=True):
         kind = source.origin.kind
         if kind in ("keystore", "enclave"):
             raise UsageError(
@@ -352,7 +354,7 @@ def _robots_of(fleet: Fleet, enclaves: Iterable[str]) -> dict[str, Robot]:
 
 
 def _with_requirements(
-    picture: Picture, file: Path, drawing: Drawing, opened: Keystore | None
+    picture: Picture, file: Path, drawing: Drawing, keystore: Keystore | None
 ) -> Picture:
     """Return the picture with the rights that break requirements, as ``sros check`` decides.
 
@@ -368,11 +370,11 @@ def _with_requirements(
         raise UsageError("--requirements takes one policy or keystore", "", "Name only one SOURCE.")
     system = load_system(
         drawing.sources[0],
-        at=drawing.now,
+        moment=drawing.now,
         zone=drawing.zone,
         fleet=drawing.fleets[0],
         template=load_template(drawing.template) if drawing.template else None,
-        opened=opened,
+        keystore=keystore,
     )
     wanted = read_requirements(file, system.fleet)
     decided = decide_all(wanted, system)
@@ -407,10 +409,10 @@ def _pictured(finding: Finding, enclaves: Container[str]) -> PicturedFinding:
     return PicturedFinding(finding.id, finding.severity.word, text, finding.remedy, enclave)
 
 
-def _finding_text(finding: Finding, about: str = "") -> str:
-    """Return a finding as one text: file name, line, subject (``about``) and text."""
+def _finding_text(finding: Finding, subject: str = "") -> str:
+    """Return a finding as one text: file name, line, subject (``subject``) and text."""
     place = f"{Path(finding.file).name}:{finding.line}" if finding.line else ""
-    return ": ".join(filter(None, (place, about, finding.text)))
+    return ": ".join(filter(None, (place, subject, finding.text)))
 
 
 # ── one source ─────────────────────────────────────────────────────────────────────────────
@@ -435,7 +437,7 @@ def read_source(
         keystore = Keystore(path)
         sample = SampledKeystore(keystore, keystore.names)
     if sample:
-        read = load_rights(sample.keystore, only=sample.enclaves)
+        read = load_rights(sample.keystore, only_enclaves=sample.enclaves)
         read = replace(read, rights=sample.rights(read.rights))
     else:
         read = load_rights(path, fleet)
@@ -498,16 +500,19 @@ def common_rights() -> tuple[Right, ...]:
     return tuple(sorted(policy_rights(policy)))
 
 
-def _template_governance(choice: str, stated: Sequence[StatedProtection] = ()) -> Governance:
+def _template_governance(
+    choice: str, stated_protections: Sequence[StatedProtection] = ()
+) -> Governance:
     """Return the governance that a keystore with this template would have.
 
     Args:
         choice: the name or path of the template.
-        stated: the protection of names that a policy states; it is added to the template's.
+        stated_protections: the protection of names that a policy states; it is added to the
+            template's.
     """
     from sros_tool.dds.domains import DomainSet
 
-    protection = with_stated(load_template(choice).protection, stated)
+    protection = with_stated(load_template(choice).protection, stated_protections)
     return governance_for(protection, DomainSet.of((0, 0)))
 
 
@@ -544,7 +549,7 @@ def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime
     enclaves, validities = [], set()
     for name in sample.enclaves:
         opened = keystore.enclave(name, now=now)
-        evaluation = evaluated(name, keystore.folder(name), opened, at=now)
+        evaluation = evaluated(name, keystore.folder(name), opened, moment=now)
         enclaves.append(_pictured_enclave(name, evaluation.state, evaluation.problems))
         validities |= set(_validities_of(name, evaluation.state))
     try:
@@ -564,7 +569,7 @@ def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime
 
 def _with_enclave(source: PictureSource, folder: Path, now: datetime) -> PictureSource:
     name = next(iter(sorted(source.scope or ())), _base_name(folder))
-    evaluation = evaluated(name, folder, open_enclave(folder, now=now), at=now)
+    evaluation = evaluated(name, folder, open_enclave(folder, now=now), moment=now)
     state = evaluation.state
     return replace(
         source,

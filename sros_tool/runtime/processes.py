@@ -633,11 +633,11 @@ def _words(folder: int, name: str) -> list[str]:
     return [os.fsdecode(word) for word in text.split(b"\0")] if text else []
 
 
-def _read(folder: int, name: str, most: int) -> bytes:
+def _read(folder: int, name: str, max_bytes: int) -> bytes:
     """Return a file of /proc/PID.
 
     Raises:
-        OSError: It cannot be read, or is longer than ``most``.
+        OSError: It cannot be read, or is longer than ``max_bytes``.
     """
     handle = os.open(name, os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
     try:
@@ -645,8 +645,8 @@ def _read(folder: int, name: str, most: int) -> bytes:
         while part := os.read(handle, 1024 * 1024):
             parts.append(part)
             length += len(part)
-            if length > most:
-                raise _TooLongError(0, f"its {name} is longer than {most // 1024**2} MiB")
+            if length > max_bytes:
+                raise _TooLongError(0, f"its {name} is longer than {max_bytes // 1024**2} MiB")
         return b"".join(parts)
     finally:
         os.close(handle)

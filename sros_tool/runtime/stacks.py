@@ -243,7 +243,7 @@ class ProbeRun(NamedTuple):
     status: int | None
 
 
-def _run_probe(kind: str, probe: ProbeEnclave, extra: Mapping[str, str]) -> ProbeRun:
+def _run_probe(kind: str, probe: ProbeEnclave, extra_variables: Mapping[str, str]) -> ProbeRun:
     with TemporaryDirectory(prefix="sros-probe-") as folder:
         report, log = Path(folder, "report.jsonl"), Path(folder, "log.txt")
         environment = {
@@ -251,7 +251,7 @@ def _run_probe(kind: str, probe: ProbeEnclave, extra: Mapping[str, str]) -> Prob
             for name, value in os.environ.items()
             if not name.startswith("ROS_SECURITY_")
         }
-        environment |= {**probe.environment, **extra, "ROS_LOG_DIR": folder}
+        environment |= {**probe.environment, **extra_variables, "ROS_LOG_DIR": folder}
         # -P: never import modules from the current folder.
         command = [sys.executable, "-P", "-m", "sros_tool.runtime.stacks", kind, str(report)]
         with log.open("wb") as output:
@@ -475,7 +475,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _report_failure(events: EventWriter, error: Exception, stage: ProcessStage, asked: str) -> None:
+def _report_failure(
+    events: EventWriter, error: Exception, stage: ProcessStage, asked_endpoint: str
+) -> None:
     refused = isinstance(error, SecurityRefusedError)
     reason = f"{type(error).__name__}: {error}"
     if isinstance(error, SrosError):
@@ -483,7 +485,7 @@ def _report_failure(events: EventWriter, error: Exception, stage: ProcessStage, 
         reason = str(SrosError(error.what, error.why)).rstrip(".")
     if stage is not ProcessStage.ENDPOINT:
         time.sleep(_LOG_FLUSH_SECONDS)
-    text = f"{asked}\n{reason}" if asked else reason
+    text = f"{asked_endpoint}\n{reason}" if asked_endpoint else reason
     events.report(EventKind.REFUSED if refused else EventKind.FAILED, text, stage=stage)
 
 

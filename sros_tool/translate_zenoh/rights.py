@@ -146,20 +146,20 @@ def remote_rights(enclave: Enclave, domain: int) -> RemoteRights:
 
 def remote_of(
     enclave: str,
-    stated: Mapping[int, Sequence[StatedRight]],
+    stated_rights: Mapping[int, Sequence[StatedRight]],
     nodes: Collection[NodeName] = (),
 ) -> RemoteRights:
     """Return the rights that every process gives to processes of an enclave.
 
-    ``stated`` maps ROS domains to the enclave's rights.  The result includes the graph tokens,
-    which every node needs; `graph_rules` says which ``nodes`` the enclave may announce.
+    ``stated_rights`` maps ROS domains to the enclave's rights.  The result includes the graph
+    tokens, which every node needs; `graph_rules` says which ``nodes`` the enclave may announce.
 
     Raises:
         PolicyError: Zenoh rules cannot express a right; the text names the place.
     """
     rules: list[AccessRule] = []
     made_of: dict[tuple[Flow, tuple[Message, ...]], list[Difference]] = {}
-    for domain, rights in stated.items():
+    for domain, rights in stated_rights.items():
         of_names = [named.right for named in rights]
         rules += graph_rules(enclave, domain, of_names, nodes)
         for right, keys, difference in _allowed_keys(domain, rights):
@@ -220,13 +220,13 @@ def untyped(key: str) -> str:
     return key
 
 
-def as_router(router: str, own: RemoteRights) -> RemoteRights:
-    """Return the rights that a process with the rights ``own`` gives to its router.
+def as_router(router: str, own_rights: RemoteRights) -> RemoteRights:
+    """Return the rights that a process with the rights ``own_rights`` gives to its router.
 
     A router passes on messages, so it may send what the process may receive, and receive what the
     process may send.
     """
-    return own.mirrored(router)
+    return own_rights.mirrored(router)
 
 
 def crossing_rules(names: Iterable[str], domains: Iterable[int]) -> tuple[AccessRule, ...]:
@@ -251,7 +251,7 @@ _NO_KEY = re.compile(r"[#$]|//|/\Z")
 
 
 def _allowed_keys(
-    domain: int, stated: Iterable[StatedRight]
+    domain: int, stated_rights: Iterable[StatedRight]
 ) -> Iterator[tuple[str, tuple[str, ...], Difference | None]]:
     """Yield each right with its allowed key expressions, and their `Difference`.
 
@@ -262,7 +262,7 @@ def _allowed_keys(
     """
     allowed: dict[str, dict[str, Source]] = {}
     denied: dict[str, dict[str, Source]] = {}
-    for (_, qualifier, right, name), source in stated:
+    for (_, qualifier, right, name), source in stated_rights:
         side = allowed if qualifier is ALLOW else denied
         side.setdefault(right, {}).setdefault(name, source)
     for right, places in sorted(allowed.items()):

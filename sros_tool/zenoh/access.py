@@ -219,14 +219,16 @@ _NO_SUBJECT = "no subject matches, and the default is DENY"
 _NO_RULE_AT_ALL = "no rule is in force, and the default is DENY"
 
 
-def _decided(applying: Sequence[tuple[bool, str]], subjects: tuple[str, ...]) -> AccessDecision:
+def _decided(
+    applicable_rules: Sequence[tuple[bool, str]], subjects: tuple[str, ...]
+) -> AccessDecision:
     """Return the decision of the rules that apply to a message: if any rule denies, it is denied.
 
-    ``applying`` has, for each rule, whether it allows, and its id.
+    ``applicable_rules`` has, for each rule, whether it allows, and its id.
     """
-    if denied := tuple(rule for allows, rule in applying if not allows):
+    if denied := tuple(rule for allows, rule in applicable_rules if not allows):
         return AccessDecision(False, denied, subjects, f"rule {denied[0]} denies it")
-    allowed = tuple(rule for _, rule in applying)
+    allowed = tuple(rule for _, rule in applicable_rules)
     why = f"rule {allowed[0]} allows it" if allowed else _NO_RULE
     return AccessDecision(bool(allowed), allowed, subjects, why)
 
@@ -394,15 +396,15 @@ def narrowed(rights: RemoteRights, most: Iterable[AccessRule], kept: str) -> Rem
     return RemoteRights(rights.common_name, in_order((*graph, *both.rules)))
 
 
-def is_within(remote: RemoteRights, own: RemoteRights) -> bool:
-    """Return whether rights of a remote process allow nothing beyond the rights ``own``."""
-    mine, theirs = AccessControl((own,)), AccessControl((remote,))
+def is_within(remote: RemoteRights, own_rights: RemoteRights) -> bool:
+    """Return whether rights of a remote process allow nothing beyond the rights ``own_rights``."""
+    mine, theirs = AccessControl((own_rights,)), AccessControl((remote,))
     return all(
-        mine.allows(own.common_name, rule.flow.opposite(), message, key)
+        mine.allows(own_rights.common_name, rule.flow.opposite(), message, key)
         or not theirs.allows(remote.common_name, rule.flow, message, key)
         or any(
-            message in answering.messages and own.keys_of(answering).include(key)
-            for answering in own.rules
+            message in answering.messages and own_rights.keys_of(answering).include(key)
+            for answering in own_rights.rules
             if answering.flow is rule.flow.opposite()
         )
         for rule in remote.rules

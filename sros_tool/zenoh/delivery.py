@@ -107,54 +107,54 @@ def route(
     return source, router, target
 
 
-def publication(way: Route, key: str, subscribed: str = "") -> Delivery:
-    """Return the delivery of a published sample along the route ``way``.
+def publication(route: Route, key: str, subscribed_key: str = "") -> Delivery:
+    """Return the delivery of a published sample along the route ``route``.
 
-    ``key`` is the key of the sample, perhaps with wildcards; ``subscribed`` is the key of the
+    ``key`` is the key of the sample, perhaps with wildcards; ``subscribed_key`` is the key of the
     subscription ("": the same key).
     """
-    back = way[::-1]
+    back = route[::-1]
     # Nothing is sent that nobody wants to hear, but what has wildcards goes to the router anyway.
-    wanted = back[:-1] if "*" in key and way[1].mode is Mode.ROUTER else back
+    wanted = back[:-1] if "*" in key and route[1].mode is Mode.ROUTER else back
     return Delivery(
         (
-            *_checks_on_route(wanted, Message.DECLARE_SUBSCRIBER, subscribed or key),
-            *_checks_on_route(way, Message.PUT, key),
+            *_checks_on_route(wanted, Message.DECLARE_SUBSCRIBER, subscribed_key or key),
+            *_checks_on_route(route, Message.PUT, key),
         )
     )
 
 
-def call(way: Route, key: str, served: str = "", replied: str = "") -> Delivery:
-    """Return the delivery of a query along the route ``way``, and of the reply.
+def call(route: Route, key: str, served_key: str = "", reply_key: str = "") -> Delivery:
+    """Return the delivery of a query along the route ``route``, and of the reply.
 
-    ``key`` is the key of the query; ``served`` is the key of the queryable, and ``replied`` the key
-    of the reply ("": the same key).
+    ``key`` is the key of the query; ``served_key`` is the key of the queryable, and ``reply_key``
+    the key of the reply ("": the same key).
     """
-    back = way[::-1]
+    back = route[::-1]
     # Queries go to the router in any case, and to another peer only if it offers to reply.
-    offered = back[:-1] if way[1].mode is Mode.ROUTER else back
+    offered = back[:-1] if route[1].mode is Mode.ROUTER else back
     return Delivery(
         (
-            *_checks_on_route(offered, Message.DECLARE_QUERYABLE, served or key),
-            *_checks_on_route(way, Message.QUERY, key),
+            *_checks_on_route(offered, Message.DECLARE_QUERYABLE, served_key or key),
+            *_checks_on_route(route, Message.QUERY, key),
         ),
-        tuple(_checks_on_route(back, Message.REPLY, replied or key)),
+        tuple(_checks_on_route(back, Message.REPLY, reply_key or key)),
     )
 
 
 def token(
-    way: Route, key: str, asked: str, message: Message = Message.DECLARE_LIVELINESS_SUBSCRIBER
+    route: Route, key: str, asked_key: str, message: Message = Message.DECLARE_LIVELINESS_SUBSCRIBER
 ) -> Delivery:
-    """Return the delivery of a liveliness token along the route ``way``, to a watching process.
+    """Return the delivery of a liveliness token along the route ``route``, to a watching process.
 
-    ``asked`` is the key that this process asks for, by a ``message``.  A router answers it; peers
-    send each other all tokens without being asked.
+    ``asked_key`` is the key that this process asks for, by a ``message``.  A router answers it;
+    peers send each other all tokens without being asked.
     """
-    asking = way[:-3:-1] if way[-2].mode is Mode.ROUTER else ()
+    asking = route[:-3:-1] if route[-2].mode is Mode.ROUTER else ()
     return Delivery(
         (
-            *_checks_on_route(asking, message, asked),
-            *_checks_on_route(way, Message.LIVELINESS_TOKEN, key),
+            *_checks_on_route(asking, message, asked_key),
+            *_checks_on_route(route, Message.LIVELINESS_TOKEN, key),
         )
     )
 

@@ -124,12 +124,12 @@ def _is_deep(value: Any) -> bool:
     return any(isinstance(each, dict | list) for each in level)
 
 
-def _tokens(text: str, most: int) -> Iterator[_Token]:
+def _tokens(text: str, maximum: int) -> Iterator[_Token]:
     at, line, count = 0, 1, 0
     while at < len(text):
         count += 1
-        if count > 2 * most:  # every other one may be space
-            raise Json5Error(f"more than {most} tokens", line)
+        if count > 2 * maximum:  # every other one may be space
+            raise Json5Error(f"more than {maximum} tokens", line)
         found = _TOKEN.match(text, at)
         if found is None:
             raise Json5Error(f"unexpected {text[at : at + 10]!r}", line)
@@ -146,8 +146,8 @@ def _tokens(text: str, most: int) -> Iterator[_Token]:
 class _Reader:
     """A reader of JSON5 values; ``_now`` is the next token."""
 
-    def __init__(self, text: str, most: int) -> None:
-        self._tokens = _tokens(text, most)
+    def __init__(self, text: str, maximum: int) -> None:
+        self._tokens = _tokens(text, maximum)
         self._now = next(self._tokens)
 
     def whole(self) -> Any:
@@ -225,10 +225,10 @@ def _name_of(token: _Token) -> str:
 
 
 def _unescaped(text: str, line: int) -> str:
-    def character(found: re.Match[str]) -> str:
-        if code := found[1] or found[2]:
+    def character(match: re.Match[str]) -> str:
+        if code := match[1] or match[2]:
             return chr(int(code, 16))
-        return "" if found[3] in _CONTINUED else _ESCAPED.get(found[3], found[3])
+        return "" if match[3] in _CONTINUED else _ESCAPED.get(match[3], match[3])
 
     if "\\" not in text:
         return text

@@ -196,10 +196,10 @@ def sequence_includes(wide: Sequence[str], narrow: Sequence[str]) -> bool:
     return len(wide) in reached
 
 
-def _onward(reached: set[int], wide: Sequence[str]) -> set[int]:
+def _onward(positions: set[int], wide: Sequence[str]) -> set[int]:
     """Return positions in ``wide``, with the ones after each ``**``: it may stand for nothing."""
-    places = set(reached)
-    for at in sorted(reached):
+    places = set(positions)
+    for at in sorted(positions):
         while at < len(wide) and wide[at] == ANY_CHUNKS:
             at += 1
             places.add(at)

@@ -125,8 +125,8 @@ _MOST_KINDS = 1024
 match."""
 
 
-def _check_number(number: int, most: int = _MOST_STEPS) -> None:
-    if number > most:
+def _check_number(number: int, maximum: int = _MOST_STEPS) -> None:
+    if number > maximum:
         raise CannotSubtract
 
 
@@ -297,9 +297,9 @@ def _kinds(first: str, some: tuple[str, ...]) -> Mapping[frozenset[str], Chunks]
     return kinds
 
 
-def _matches_any(chunk: str, wild: Iterable[str], without: frozenset[str]) -> bool:
-    """Return whether a chunk of ``wild`` that is not in ``without`` includes ``chunk``."""
-    return any(_matches(wide, chunk) for wide in wild if wide not in without)
+def _matches_any(chunk: str, wild: Iterable[str], excluded: frozenset[str]) -> bool:
+    """Return whether a chunk of ``wild`` that is not in ``excluded`` includes ``chunk``."""
+    return any(_matches(wide, chunk) for wide in wild if wide not in excluded)
 
 
 @lru_cache(maxsize=_MANY)
@@ -616,18 +616,18 @@ class RuleKeys:
     says that there are only plain keys.
     """
 
-    def __init__(self, expressions: frozenset[str], made_of: tuple[Difference, ...]) -> None:
+    def __init__(self, expressions: frozenset[str], differences: tuple[Difference, ...]) -> None:
         """Sort the key expressions by kind.
 
-        ``made_of`` are the set differences that the expressions write out; () if unknown.
+        ``differences`` are the set differences that the expressions write out; () if unknown.
         """
         wide = [expression for expression in expressions if "*" in _ENDS.sub("", expression)]
         self.plain = expressions.difference(wide)
         self.tokens = KeyExpressions(
             expression for expression in wide if expression.startswith("@")
         )
-        self.differences = made_of or _differences(wide)
-        self.is_plain = not wide and not made_of
+        self.differences = differences or _differences(wide)
+        self.is_plain = not wide and not differences
         self._has_plain_tokens = any(expression.startswith("@") for expression in self.plain)
 
     def include(self, key: str) -> bool:
@@ -667,9 +667,9 @@ def _in_order(expressions: frozenset[str]) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=_MANY)
-def keys_of(expressions: frozenset[str], made_of: tuple[Difference, ...] = ()) -> RuleKeys:
+def keys_of(expressions: frozenset[str], differences: tuple[Difference, ...] = ()) -> RuleKeys:
     """Return the keys that expressions include; equal arguments give the same object (a cache)."""
-    return RuleKeys(expressions, made_of)
+    return RuleKeys(expressions, differences)
 
 
 _TYPE = "/$*::$*/*"

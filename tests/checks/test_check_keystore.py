@@ -202,7 +202,7 @@ def test_local_time_is_standard_time_in_summer_too(
             GovernedDomain(vendor, state.governance, 0),
             state.permissions,
             subject,
-            at=at,
+            moment=at,
             zone=zone,
         )
         for vendor in (Vendor.FAST, Vendor.CYCLONE)

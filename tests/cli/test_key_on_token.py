@@ -220,7 +220,7 @@ def test_no_process_of_another_rmw_starts(rmw: str, root: Path) -> None:
 
 
 def test_each_vendor_is_asked_whether_it_uses_the_key(root: Path) -> None:
-    enclave = load_enclave("/arm", root / "enclaves/arm", at=datetime.now(UTC))
+    enclave = load_enclave("/arm", root / "enclaves/arm", moment=datetime.now(UTC))
     refusing = {each for each in TESTED if enclave.problems(each.traits)}
     assert refusing == {*CYCLONE_DDS}
     explained = sros("explain", root, "/arm", "join", "--all-vendors")

@@ -118,4 +118,4 @@ def access_of(
     if isinstance(permissions_read, Refusal):
         return permissions_read
     governed = GovernedDomain(vendor, read, domain)
-    return Access(governed, permissions_read, subject, at=at, zone=zone)
+    return Access(governed, permissions_read, subject, moment=at, zone=zone)

@@ -82,7 +82,9 @@ def test_an_allow_rule_at_the_end_takes_no_right_away(
     governed = GovernedDomain(vendor, governance, case.domain)
     for question in case.questions:
         before, after = (
-            Access(governed, each, case.subject, at=NOW, zone=ZoneInfo(case.zone)).decide(*question)
+            Access(governed, each, case.subject, moment=NOW, zone=ZoneInfo(case.zone)).decide(
+                *question
+            )
             for each in (permissions, more)
         )
         assert after.outcome.ok or not before.outcome.ok

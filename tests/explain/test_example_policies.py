@@ -58,7 +58,7 @@ def enclaves() -> Iterator[tuple[Path, Enclave]]:
 
 
 def planned(enclave: Enclave) -> LoadedEnclave:
-    return plan_enclave(enclave, GOVERNANCE, at=NOW)._replace(policy=enclave)
+    return plan_enclave(enclave, GOVERNANCE, moment=NOW)._replace(policy=enclave)
 
 
 def question(right: str, name: str) -> Question:
@@ -124,7 +124,7 @@ def test_every_denied_twin(file: Path, enclave: Enclave, vendor: Vendor) -> None
         assert found.change is not None and found.change.lift == ()
         assert found.change.add == (Right(enclave.path, ALLOW, right.right, name),)
         changed = plan_enclave(
-            policy_of(enclave.path, rights.union(found.change.add)), GOVERNANCE, at=NOW
+            policy_of(enclave.path, rights.union(found.change.add)), GOVERNANCE, moment=NOW
         )
         assert Evaluator(vendor, changed, CONTEXT).answer(asked).allowed
         still = question(OPPOSITE[right.right], name)
@@ -153,7 +153,7 @@ def test_every_denial(enclave: Enclave, right: Right, vendor: Vendor) -> None:
     rights = {
         r for each in FILES for r in policy_rights(policy(each)) if r.enclave == right.enclave
     }
-    lifted = plan_enclave(policy_of(enclave.path, rights - {right}), GOVERNANCE, at=NOW)
+    lifted = plan_enclave(policy_of(enclave.path, rights - {right}), GOVERNANCE, moment=NOW)
     assert Evaluator(vendor, lifted, CONTEXT).answer(question(right.right, name)).allowed
 
 

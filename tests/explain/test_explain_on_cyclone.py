@@ -67,7 +67,7 @@ def test_cyclone_does_as_told(policy: str, tmp_path: Path) -> None:
             assert found.status == (0 if expected else 1), (found, allowed)
             seen.add(expected)
         context = JoinContext(0, now())
-        evaluator = Evaluator(Vendor.CYCLONE, load_enclave(enclave, folder, at=now()), context)
+        evaluator = Evaluator(Vendor.CYCLONE, load_enclave(enclave, folder, moment=now()), context)
         for question in questions:
             for part, decision in evaluator.answer(question).parts:
                 assert decision.outcome.ok == allowed[_key(part)], part

@@ -150,7 +150,7 @@ def test_who_may(made: Path, mode: str) -> None:
 
 def test_who_may_says_what_each_enclave_is_told(made: Path) -> None:
     """What the router drops is decided without the enclave's own files, with the same answer."""
-    evaluator = ZenohEvaluator(Keystore(made / "client"), at=now(), domain=0)
+    evaluator = ZenohEvaluator(Keystore(made / "client"), moment=now(), domain=0)
     outcomes = set()
     for enclave, words in product(evaluator.names, ("publish /chatter", "call /add", "join")):
         question = ask(*words.split())
@@ -374,7 +374,7 @@ def test_random_policies_are_answered_as_their_permissions_say(
     sros("generate_artifacts", "-k", root, "-p", policy).ok()
     sros("zenoh", root, "--mode", mode).ok()
     rules = Rules(unfolded(policy_rights(read_policy(policy))))
-    evaluator = ZenohEvaluator(Keystore(root), at=now(), domain=0)
+    evaluator = ZenohEvaluator(Keystore(root), moment=now(), domain=0)
     enclaves = [each for each in evaluator.names if each != "/router"]
     allowed = denied = 0
     for enclave, (right, other), name in product(enclaves, OTHER_END.items(), NAMES):
@@ -392,7 +392,7 @@ def test_random_policies_are_answered_as_their_permissions_say(
 
 def asked_in(root: Path) -> dict[tuple[str, str, str], tuple[tuple[Any, ...], Any]]:
     """Return the answer to each question in a keystore, and the files that are out of date."""
-    evaluator = ZenohEvaluator(Keystore(root), at=now(), domain=0)
+    evaluator = ZenohEvaluator(Keystore(root), moment=now(), domain=0)
     found = {}
     for enclave, right, name in product(evaluator.names, OTHER_END, NAMES[: None if LONG else 2]):
         answer = evaluator.answer(enclave, ask(WORD[right], name))

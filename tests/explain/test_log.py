@@ -885,7 +885,7 @@ def test_how_often_files_are_read_is_not_for_the_log_to_choose(
 
     def opened(opening: Keystore, name: str, *, at: datetime) -> LoadedEnclave:
         read.append(name)
-        return load_enclave_of(opening, name, at=at)
+        return load_enclave_of(opening, name, moment=at)
 
     def refuse(_file: LedgerFile, *_asked: str) -> Ledger:
         raise AssertionError("the ledger was read")

@@ -104,7 +104,7 @@ NEVER = [
 def evaluator(step: str, vendor: Vendor) -> Evaluator:
     (enclave,) = read_policy(policies_dir() / f"operator_{step}.xml").enclaves
     assert enclave.path == f"/operator/{step}"
-    loaded = plan_enclave(enclave, GOVERNANCE, at=CONTEXT.at)
+    loaded = plan_enclave(enclave, GOVERNANCE, moment=CONTEXT.at)
     return Evaluator(vendor, loaded, CONTEXT)
 
 

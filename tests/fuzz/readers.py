@@ -128,8 +128,8 @@ def _certificate(data: bytes, place: Place) -> None:
         _ = subject_text(each.subject), common_name_of(each.issuer), digest(each), pem(each)
         certificate_entry(NOW, "certificate", each)
     for checks in (Checks.NONE, ~Checks.NONE):
-        chain_fault(first, chain, [authority], at=NOW, checks=checks)
-        chain_fault(first, [authority], chain, at=NOW, checks=checks)
+        chain_fault(first, chain, [authority], moment=NOW, checks=checks)
+        chain_fault(first, [authority], chain, moment=NOW, checks=checks)
     describe(place.put("cert.pem", data), now=NOW)
     key = place.corpus.key
     Issuer(first, key).issue(common_name("x"), key.public_key(), WINDOW)

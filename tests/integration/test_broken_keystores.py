@@ -162,7 +162,7 @@ AT_PEERS_OF_ONE = {
 @pytest.mark.parametrize("each", ALL, ids=lambda each: each.name)
 def test_explain_says_what_each_vendor_does(each: Breakage, broken: dict[str, Bench]) -> None:
     bench = broken[each.name]
-    material = load_enclave("/base", bench.path("enclaves/base"), at=bench.now)
+    material = load_enclave("/base", bench.path("enclaves/base"), moment=bench.now)
     setting = JoinContext(0, bench.now, ZoneInfo(each.zone))
     does = {
         **{vendor: each.on_fast(vendor)[0] for vendor in FAST_DDS},

@@ -127,7 +127,7 @@ def test_drawn_lists() -> None:
         start, *trusted = (each.public_bytes(Encoding.DER) for each in chain)
         written = [each.public_bytes(Encoding.PEM) for each in lists]
         error = openssl.fault(start, trusted, flags=CRL_CHECK, lists=written)
-        refusal = list_refusal(chain, lists, at=NOW)
+        refusal = list_refusal(chain, lists, moment=NOW)
         found = refusal.obstacle if refusal else None
         theirs = KNOWN.get(error, error) if error else None
         count[theirs] += 1

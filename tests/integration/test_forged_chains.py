@@ -141,7 +141,7 @@ def our_fault(start: bytes, trusted: list[bytes], others: list[bytes], checks: C
     except PkiError:
         return UNREADABLE
     split = len(trusted)
-    return chain_fault(first, rest[:split], rest[split:], at=NOW, checks=checks)
+    return chain_fault(first, rest[:split], rest[split:], moment=NOW, checks=checks)
 
 
 @pytest.fixture

@@ -333,7 +333,7 @@ def test_sites_with_one_identity_ca_are_apart_by_their_permissions_cas(
             domains=DomainSet.of((DOMAIN, DOMAIN)),
             now=now,
             keyring=Keyring(places=places),
-            imported=imported,
+            imported_cas=imported,
         )
         create_enclaves(root, [f"/{root.name}/talker", f"/{root.name}/listener"], now=now)
     # Whoever gets a certificate of the office for any name can show that robot's permissions.

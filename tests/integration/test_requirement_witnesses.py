@@ -61,7 +61,9 @@ def witnesses(world: str, domain: int = DOMAIN) -> Iterator[tuple[Policy, Use, b
         number += 1
         policy = draw_policy(draw)
         try:
-            system = policy_system(policy, at=datetime.now(UTC), domain=domain, only=(world,))
+            system = policy_system(
+                policy, moment=datetime.now(UTC), domain=domain, only_enclaves=(world,)
+            )
         except PolicyError:
             continue  # Zenoh cannot carry it out
         for requirement in (draw_requirement(draw) for _ in range(10)):

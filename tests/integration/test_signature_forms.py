@@ -104,7 +104,7 @@ def test_what_the_vendors_take(vendor: str, workshop: Workshop, enclaves: dict[s
 
 @pytest.mark.parametrize("name", FORMS)
 def test_sros_explains_what_the_vendors_do(name: str, enclaves: dict[str, Path]) -> None:
-    material = load_enclave("/t", enclaves[name], at=datetime.now(UTC))
+    material = load_enclave("/t", enclaves[name], moment=datetime.now(UTC))
     taken = {vendor: takes(vendor, name) for vendor in TESTED}
     found = {vendor: not material.problems(vendor.traits) for vendor in taken}
     assert found == taken

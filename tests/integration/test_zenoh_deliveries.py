@@ -74,7 +74,7 @@ def test_what_explain_answers_is_what_happens(tmp_path: Path, mode: str, seed: i
     """Each enclave of a random policy tries every name in every direction, also with no rules."""
     policy = drawn_policy(random.Random(f"live {seed}"))
     keystore = make_keystore(tmp_path, policy, mode)
-    evaluator = ZenohEvaluator(Keystore(keystore), at=now(), domain=0)
+    evaluator = ZenohEvaluator(Keystore(keystore), moment=now(), domain=0)
     answers = {
         enclave: {
             right: [

@@ -163,7 +163,7 @@ def predicted(
             "ask the graph" if case.asks else "watch": token(
                 back, case.announced, case.watched, asking_with(case)
             ).arrives,
-            "history": call(back, f"{case.kept}/@adv/**", replied=case.kept).answered,
+            "history": call(back, f"{case.kept}/@adv/**", reply_key=case.kept).answered,
         }
         for kind, arrives in told.items():
             if arrives:

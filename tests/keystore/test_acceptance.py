@@ -37,7 +37,7 @@ OUTCOMES = {
 def test_each_vendor(row: Row, tmp_path: Path) -> None:
     granted = permissions(grant(allow(publish("*"), subscribe("*"))))
     write_enclave(row, tmp_path / "t", "CN=/t", governance(), granted)
-    material = load_enclave("/t", tmp_path / "t", at=NOW)
+    material = load_enclave("/t", tmp_path / "t", moment=NOW)
     for vendor in TESTED:
         answer = row.answer(vendor)
         problems = [str(each) for each in material.problems(vendor.traits)]
@@ -53,7 +53,7 @@ def test_an_empty_subject_crashes_fast_dds_before_it_reads_a_document(
     document = permissions(grant(allow(publish("*"), subscribe("*")), subject=granted))
     made = Row("", Made(), "", "", "")
     write_enclave(made, tmp_path / "t", x509.Name([]), governance(), document)
-    material = load_enclave("/t", tmp_path / "t", at=NOW)
+    material = load_enclave("/t", tmp_path / "t", moment=NOW)
     for vendor in (Vendor.FAST, Vendor.FAST_2_9):
         said = Evaluator(vendor, material, JoinContext(42, NOW)).answer(ask("join"))
         assert said.outcome is Outcome.CRASHES, said

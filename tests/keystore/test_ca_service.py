@@ -100,7 +100,7 @@ def made_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         installs(folder, patched)(office(folder))
         root = folder / "site"
         create_keystore(
-            root, template=TEMPLATE, now=now(), keyring=SERVICE, imported={"identity": pem(CA)}
+            root, template=TEMPLATE, now=now(), keyring=SERVICE, imported_cas={"identity": pem(CA)}
         )
         create_enclaves(root, ["/talker", "/listener"], now=now())
     return folder
@@ -356,7 +356,11 @@ def test_what_a_service_cannot_do_is_refused(site: Path, tmp_path: Path) -> None
     ):
         with pytest.raises(SrosError, match=words):
             create_keystore(
-                tmp_path / "new", template=template, now=now(), keyring=SERVICE, imported=imported
+                tmp_path / "new",
+                template=template,
+                now=now(),
+                keyring=SERVICE,
+                imported_cas=imported,
             )
     with pytest.raises(UsageError, match="not the name of a CA service"):
         Keyring(places={"identity": "issuer:../evil"})
@@ -374,7 +378,7 @@ def test_a_later_list_of_the_service_that_a_robot_sends_stops_no_renewal(
     install(office(tmp_path))
     root, then = tmp_path / "site", now() + 20 * DAY
     create_keystore(
-        root, template=TEMPLATE, now=now(), keyring=SERVICE, imported={"identity": pem(CA)}
+        root, template=TEMPLATE, now=now(), keyring=SERVICE, imported_cas={"identity": pem(CA)}
     )
     (tmp_path / "fleet.toml").write_text(
         '[groups.some]\nrenewal = "allowed"\n[robots]\n'

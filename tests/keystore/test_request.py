@@ -282,9 +282,9 @@ def test_a_revoked_enclave_comes_back_only_if_it_is_named(
             attempt(home, request, now=NOW)
         assert f"--enclave {NAME}" in str(caught.value)
     with pytest.raises(KeystoreError, match="should be for /base"):
-        sign_request(home, request, now=NOW, only=["/base"])
+        sign_request(home, request, now=NOW, only_enclaves=["/base"])
     assert snapshot(home) == before
-    signed = sign_request(home, request, now=NOW, only=[NAME])
+    signed = sign_request(home, request, now=NOW, only_enclaves=[NAME])
     assert "keystore.revoked-before" in {each.id for each in signed.notes}
 
 

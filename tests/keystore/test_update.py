@@ -666,7 +666,7 @@ def test_settings_that_changed_meanwhile(root: Path) -> None:
     change(root, ("protection.rtps", "ENCRYPT"))
     state = snapshot(root)
     with pytest.raises(KeystoreError, match="have just changed"):
-        update_keystore(root, seen.settings, now=LATER, seen=seen, allow_looser=True)
+        update_keystore(root, seen.settings, now=LATER, seen_settings=seen, allow_looser=True)
     assert snapshot(root) == state
 
 

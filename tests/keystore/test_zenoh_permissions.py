@@ -186,7 +186,7 @@ def on_dds(vendor: Vendor, document: Permissions, domain: int) -> dict[tuple[str
             governed(vendor, verb, domain),
             document,
             "CN=/t",
-            at=datetime(2027, 1, 1, tzinfo=UTC),
+            moment=datetime(2027, 1, 1, tzinfo=UTC),
         )
         for verb in (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
     }

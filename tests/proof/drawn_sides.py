@@ -484,7 +484,7 @@ class Side:
             )
             governance = self.own.governance or _STRICT
             governed = GovernedDomain(vendor, governance, domain)
-            self._access[key] = Access(governed, permissions, f"CN={enclave}", at=AT)
+            self._access[key] = Access(governed, permissions, f"CN={enclave}", moment=AT)
         return self._access[key].decide(verb, topic).outcome.ok
 
     def on_zenoh(self, enclave: str, domain: int, verb: AccessVerb, topic: str) -> bool:

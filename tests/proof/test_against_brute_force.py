@@ -171,7 +171,7 @@ def test_every_decision_is_that_of_brute_force() -> None:
     different: list[str] = []
     implied = 0
     for number, policy, requirements in cases():
-        system, protected = policy_system(policy, at=NOW), levels(policy)
+        system, protected = policy_system(policy, moment=NOW), levels(policy)
         for world in system.worlds:
             # The links of Zenoh are always encrypted.
             level = (lambda _: 2) if world.title == "Zenoh" else protected

@@ -163,7 +163,7 @@ def test_proposals_for_a_fleet_demand_what_those_for_its_robots_demand(folder: P
     from sros_tool.fleet.fleet_file import read_fleet
 
     fleet = read_fleet(folder / "fleet.toml")
-    system = load_system(folder / "robot.xml", at=datetime(2027, 1, 1, tzinfo=UTC), fleet=fleet)
+    system = load_system(folder / "robot.xml", moment=datetime(2027, 1, 1, tzinfo=UTC), fleet=fleet)
     each, folded = (suggest(system.rights, system.worlds, of) for of in (None, fleet))
     text = render_requirements(folded, "robot.xml")
     assert "# only /{robot}/mux may publish {namespace}/cmd_vel\n" in text

@@ -206,7 +206,7 @@ def test_proposals_have_no_name_that_the_file_could_not_have() -> None:
         "/e": TopicAccess(names_of(Style.FNMATCH, ("rt/ok", "rt/fine*")), NameSet()),
         "/f": TopicAccess(NameSet(), names_of(Style.FNMATCH, ("rt/ok", "rt/fine*"))),
     }
-    world = World("a world", sides, confirm=lambda *_: True, stated=sides)
+    world = World("a world", sides, confirm=lambda *_: True, stated_access=sides)
     text = render_requirements(suggest(rights, [world]), 'a "file"\n')
     found = parse_requirements(text.encode(), "r.toml")
     assert [demand(each) for each in found][:1] == ["only /e may publish /ok"]

@@ -27,7 +27,7 @@ def requirements() -> tuple[Requirement, ...]:
 
 
 def test_they_hold_and_could_fail(requirements: tuple[Requirement, ...]) -> None:
-    decided = decide_all(requirements, load_system(policies_dir() / "mobile_robot.xml", at=NOW))
+    decided = decide_all(requirements, load_system(policies_dir() / "mobile_robot.xml", moment=NOW))
     assert decided.violations == ()
     assert decided.vacuous == ()
     assert len(requirements) >= 15
@@ -133,7 +133,7 @@ def test_a_change_breaks_what_it_should(
     assert after != before
     file.write_text(after)
     asked = [each for each in requirements if LONG or shown(each) == mutation.breaks]
-    decided = decide_all(asked, load_system(folder / "mobile_robot.xml", at=NOW))
+    decided = decide_all(asked, load_system(folder / "mobile_robot.xml", moment=NOW))
     (violation,) = decided.violations
     assert decided.vacuous == ()
     assert shown(violation.requirement) == mutation.breaks

@@ -245,7 +245,7 @@ def test_an_update_changes_nothing_of_shipped_policies(tmp_path: Path) -> None:
     first, *others = (
         Shipped(vendor.traits.product, vendor.release, vendor, SUPPORTED[0]) for vendor in TESTED
     )
-    files = signed_files(keystore, at=now())
+    files = signed_files(keystore, moment=now())
     # Many wildcards take long, unless both vendors have the same style of them.
     few = files.only(name for name in keystore.names if not name.startswith("/operator"))
     for other in some(others, 2):
@@ -320,7 +320,7 @@ def test_nodes_of_a_later_distribution_need_more(bench: Bench) -> None:
 def test_a_keystore_says_for_which_distributions_it_is(bench: Bench) -> None:
     secret = {"SROS_CA_PASSPHRASE": SECRET}
     denied_status(bench, "base")
-    checked = partial(check_distributions, at=bench.now)
+    checked = partial(check_distributions, moment=bench.now)
     assert checked(Keystore(bench.root)) == []
     words = ("update_keystore", bench.root, "--set", "distributions=lyrical,jazzy")
     sros(*words, env=secret).ok()
@@ -340,9 +340,9 @@ def test_a_keystore_says_for_which_distributions_it_is(bench: Bench) -> None:
 def test_an_enclave_that_one_distribution_refuses(bench: Bench) -> None:
     words = ("update_keystore", bench.root, "--set", "distributions=jazzy,lyrical")
     sros(*words, env={"SROS_CA_PASSPHRASE": SECRET}).ok()
-    assert check_distributions(Keystore(bench.root), at=bench.now) == []
+    assert check_distributions(Keystore(bench.root), moment=bench.now) == []
     expired_authority(bench)
-    (found,) = check_distributions(Keystore(bench.root), at=bench.now)
+    (found,) = check_distributions(Keystore(bench.root), moment=bench.now)
     assert found.id == "distribution.refused"
     assert found.text.startswith("Jazzy with Cyclone DDS 0.10 refuses it (permissions_ca.cert.pem")
 

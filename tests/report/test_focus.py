@@ -190,7 +190,7 @@ def test_every_enclave_of_an_answer_is_drawn_and_linked(
         return
     picture = focused(picture, [source], [word])
     flow = FocusFlow.of(picture)
-    network = Network(rights, without=OF_EVERY_NODE, questions=QUESTIONS)
+    network = Network(rights, excluded=OF_EVERY_NODE, questions=QUESTIONS)
     for each in picture.focus:
         starts = {each.name} if each.kind == "enclave" else set(each.senders)
         far = {path: len(hops) + 1 for path, hops in network.influencing(starts).items()}
@@ -218,7 +218,7 @@ def test_what_is_not_there_is_refused_with_a_likely_name() -> None:
 
 def test_every_format_has_the_answer(tmp_path: Path) -> None:
     picture = seen(tmp_path, CHAIN, "/cmd_vel")
-    scene = flow_scene(picture, placed=False)
+    scene = flow_scene(picture, with_places=False)
     assert "/mux alone may publish /cmd_vel" in render_dot(picture, scene)
     assert "/mux alone may publish /cmd_vel" in render_mermaid(picture, scene)
     ended = sros("view", MOBILE_ROBOT, "--focus", "/cmd_vel", "--format", "svg").ok()

@@ -225,13 +225,13 @@ def test_the_flow_agrees_with_the_one_that_explain_follows(
     open_to_all: str,
 ) -> None:
     by_permissions = Network(
-        policy_rights(read_policy(MOBILE_ROBOT)), without=OF_EVERY_NODE, questions=QUESTIONS
+        policy_rights(read_policy(MOBILE_ROBOT)), excluded=OF_EVERY_NODE, questions=QUESTIONS
     )
     network, path = by_permissions, robot_page
     if root := open_keystores.get(open_to_all):
         network = Network(
             load_rights(root).rights,
-            without=OF_EVERY_NODE,
+            excluded=OF_EVERY_NODE,
             questions=QUESTIONS,
             unguarded=unguarded(Keystore(root).governance),
             everybody=enclave_names(root),

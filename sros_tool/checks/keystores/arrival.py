@@ -151,7 +151,7 @@ def verify_arrival(
     now: datetime,
     domain: int | None = None,
     zone: tzinfo = UTC,
-    only: Sequence[str] | None = None,
+    only_enclaves: Sequence[str] | None = None,
     secrets: Secrets | None = None,
 ) -> Arrival:
     """Check the enclaves in a folder on a robot, or one enclave.
@@ -164,7 +164,7 @@ def verify_arrival(
         now: the moment to check for.
         domain: the ROS domain that the enclaves have to join.
         zone: the time zone of the robot.
-        only: the enclaves to check; None for all of them and the folder itself.
+        only_enclaves: the enclaves to check; None for all of them and the folder itself.
         secrets: called for the PINs of tokens, which are then opened to prove that they have the
             keys; None opens no token.
 
@@ -173,11 +173,11 @@ def verify_arrival(
     """
     if is_keystore(path):
         root, kind = path, "keystore"
-        names = search_enclaves(path)[0] if only is None else tuple(only)
+        names = search_enclaves(path)[0] if only_enclaves is None else tuple(only_enclaves)
     elif path.is_dir() and is_enclave(path):
         root, name = locate_enclave(path)
         names, kind = (name,), "enclave"
-        only = names
+        only_enclaves = names
     else:
         refuse_earlier(path)
         raise DocumentError(
@@ -198,7 +198,7 @@ def verify_arrival(
     findings = [
         finding
         for finding in keystore_findings(
-            keystore, now=now, zone=zone, domain=domain, only=only, on_robot=True
+            keystore, now=now, zone=zone, domain=domain, only_enclaves=only_enclaves, on_robot=True
         )
         if not (finding.file in elsewhere and finding.id == _FILE_MISSING)
     ]
@@ -261,7 +261,7 @@ def _enclave(
         return ArrivedEnclave(name, False, "", None)
     state = keystore.enclave(name, now=now, domain=domain)
     domains = state.joined_domains()
-    evaluation = evaluated(name, folder, state, at=now, domain=domain, zone=zone)
+    evaluation = evaluated(name, folder, state, moment=now, domain=domain, zone=zone)
     state = evaluation.state
     loadable = not (state.problems or evaluation.stopped())
     # On the robot, where there is no ledger, a key that is missing is lost.

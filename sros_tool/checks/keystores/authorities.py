@@ -122,14 +122,14 @@ WEAK = FindingKind(
 
 
 def _authority_findings(
-    role: str, chain: tuple[x509.Certificate, ...], at: datetime, subject: str, file: str
+    role: str, chain: tuple[x509.Certificate, ...], moment: datetime, subject: str, file: str
 ) -> Iterator[Finding]:
     """Yield findings about a CA that a vendor refuses; ``chain`` is the content of its file."""
     certificate = chain[0]
     name = authority_text(certificate)
     if certificate.issuer != certificate.subject:
         issuer = subject_text(certificate.issuer)
-        refused = refusals_text(authority_refusals(role, chain, at))
+        refused = refusals_text(authority_refusals(role, chain, moment))
         yield INTERMEDIATE.found(subject, f"{name} is issued by {issuer}. {refused}", file)
     elif role == PERMISSIONS and (fault := next(purpose_faults(chain[:1]), "")):
         yield CA_PURPOSE.found(subject, fault, file)

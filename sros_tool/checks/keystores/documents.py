@@ -611,12 +611,12 @@ _NONE = (ProtectionKind.NONE,)
 
 
 def check_governance(
-    enclave: CheckedEnclave, common: bytes, asked: Sequence[Vendor]
+    enclave: CheckedEnclave, common: bytes, vendors: Sequence[Vendor]
 ) -> Iterator[Finding]:
     """Yield findings if an enclave has another governance than the document ``common``.
 
     ``common`` is the signed governance of the keystore, or of the first enclave of an export.
-    ``asked`` are the vendors that the enclave's nodes may use.
+    ``vendors`` are the vendors that the enclave's nodes may use.
     """
     governance = enclave.state.governance
     if governance is None:
@@ -626,7 +626,7 @@ def check_governance(
         file = enclave.file(GOVERNANCE_FILE)
         source = "the keystore" if enclave.keystore.governance else "other enclaves"
         yield DIFFERS.found(enclave.name, f"'{file}' differs from the governance of {source}", file)
-        yield from governance_findings(enclave.keystore, governance, file, asked)
+        yield from governance_findings(enclave.keystore, governance, file, vendors)
 
 
 @dataclass(frozen=True, slots=True)
@@ -646,27 +646,29 @@ class _Chosen:
         )
 
 
-def _rule_findings(rule: DomainRule, asked: Sequence[Vendor]) -> Iterator[tuple[FindingKind, str]]:
-    yield from _domain_rule(rule, asked)
+def _rule_findings(
+    rule: DomainRule, vendors: Sequence[Vendor]
+) -> Iterator[tuple[FindingKind, str]]:
+    yield from _domain_rule(rule, vendors)
     yield from _topic_rules(rule)
 
 
 def governance_findings(
-    keystore: CheckedKeystore, governance: Governance, file: str, asked: Sequence[Vendor]
+    keystore: CheckedKeystore, governance: Governance, file: str, vendors: Sequence[Vendor]
 ) -> Iterator[Finding]:
     """Yield findings about topics and discovery that a governance document leaves unprotected.
 
-    ``file`` is the document's path, ``asked`` are the vendors that nodes may use.
+    ``file`` is the document's path, ``vendors`` are the vendors that nodes may use.
     """
     domains = governance.domains().closed()
 
     for rule in governance.domain_access_rules:
         subject = f"domain {rule.domains}"
-        for kind, text in _rule_findings(rule, asked):
+        for kind, text in _rule_findings(rule, vendors):
             # A template may choose open topics; no template chooses to lose messages, or a rule
             # that does nothing.
             own = kind in (SIGNED_PAYLOAD, UNREACHABLE_TOPIC_RULE)
-            by = "" if own else keystore.accepts(kind, _Chosen(kind, text, domains, asked))
+            by = "" if own else keystore.accepts(kind, _Chosen(kind, text, domains, vendors))
             yield kind.found(subject, text, file, accepted=by)
         for part in rule.domains.ranges:
             kind = GOVERNANCE_DOMAIN_RANGE if part.last is not None else GOVERNANCE_OPEN_RANGE
@@ -674,11 +676,11 @@ def governance_findings(
                 yield kind.found(subject, f"the range {problem}", file)
 
 
-def _unauthenticated(rule: DomainRule, asked: Sequence[Vendor]) -> tuple[FindingKind, str]:
+def _unauthenticated(rule: DomainRule, vendors: Sequence[Vendor]) -> tuple[FindingKind, str]:
     """Return the kind and the text of the finding about participants without a certificate."""
     kind = UNAUTHENTICATED_KEPT_OUT
     clauses: dict[str, list[str]] = {}
-    for vendor in asked or TESTED:
+    for vendor in vendors or TESTED:
         if vendor.traits.ignores_unauthenticated:
             clause = "they are refused all the same"
         elif rule.rtps_protection_kind is ProtectionKind.NONE:
@@ -720,11 +722,11 @@ def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:
     return f"anybody can read and write {some_names(opened)}"
 
 
-def _domain_rule(rule: DomainRule, asked: Sequence[Vendor]) -> Iterator[tuple[FindingKind, str]]:
+def _domain_rule(rule: DomainRule, vendors: Sequence[Vendor]) -> Iterator[tuple[FindingKind, str]]:
     for attribute, text in _open_attributes(rule):
         kind = _OPEN[attribute]
         if kind is UNAUTHENTICATED:
-            kind, reach = _unauthenticated(rule, asked)
+            kind, reach = _unauthenticated(rule, vendors)
             text = f"{text}: {reach}"
         yield kind, text
 

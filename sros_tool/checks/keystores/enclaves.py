@@ -395,9 +395,9 @@ def _denied_before_everything(grant: Grant) -> list[str]:
     return []
 
 
-def _lasts_at_least(chosen: Span, length: timedelta) -> bool:
+def _lasts_at_least(chosen_validity: Span, length: timedelta) -> bool:
     """Return whether a chosen validity is at least ``length``; a fixed date of expiry always is."""
-    return not isinstance(chosen, timedelta) or length <= chosen + BACKDATE
+    return not isinstance(chosen_validity, timedelta) or length <= chosen_validity + BACKDATE
 
 
 def _copies(enclave: CheckedEnclave) -> Iterator[Finding]:

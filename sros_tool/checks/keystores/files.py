@@ -291,12 +291,12 @@ def _below(
     start: str,
     keystore: CheckedKeystore,
     links: _Links,
-    trusted: frozenset[int],
-    kept: list[str],
+    trusted_users: frozenset[int],
+    kept_names: list[str],
 ) -> Iterator[Finding]:
     """Yield findings about the files and folders below ``start``.
 
-    Keys that belong only in the original keystore are added to ``kept``.
+    Keys that belong only in the original keystore are added to ``kept_names``.
     """
     root = os.fspath(keystore.root)
     keys = {os.path.join(root, ENCLAVES, name[1:], KEY_FILE) for name in keystore.names}
@@ -315,7 +315,7 @@ def _below(
             if stat.S_ISLNK(info.st_mode):
                 yield from links.check(path)
                 continue
-            yield from _writers(path, info, trusted)
+            yield from _writers(path, info, trusted_users)
             yield from _open_folder(path, root, info.st_mode, original)
         if parent == root and AGENT in folders:
             folders.remove(AGENT)  # of `sros agent`, closed to others
@@ -326,7 +326,7 @@ def _below(
             if stat.S_ISLNK(info.st_mode):
                 yield from links.check(path)
                 continue
-            yield from _writers(path, info, trusted)
+            yield from _writers(path, info, trusted_users)
             if path in keys:
                 yield from key_mode_findings(path, info.st_mode)
             elif name in _KNOWN and inside.startswith(ENCLAVES) and name != KEY_FILE:
@@ -335,7 +335,7 @@ def _below(
                         if _holds_key(keystore, path, info):
                             yield from _other(keystore, path, info, original)
             elif keystore.looks_like_original and _is_kept(keystore, path, info):
-                kept.append(os.path.relpath(path, root))
+                kept_names.append(os.path.relpath(path, root))
                 yield from key_mode_findings(path, info.st_mode)
             else:
                 yield from _other(keystore, path, info, original)
@@ -390,12 +390,12 @@ def _open_folder(path: str, root: str, mode: int, original: bool) -> Iterator[Fi
         yield FOLDER_OPEN.found(path, text, path, remedy=remedy)
 
 
-def _writers(path: str, info: os.stat_result, trusted: frozenset[int]) -> Iterator[Finding]:
+def _writers(path: str, info: os.stat_result, trusted_users: frozenset[int]) -> Iterator[Finding]:
     if info.st_mode & stat.S_IWOTH:
         text = f"its mode is {stat.S_IMODE(info.st_mode):04o}"
         remedy = f"Run `chmod o-w {quote(path)}`."
         yield WORLD_WRITABLE.found(path, text, path, remedy=remedy)
-    elif why := other_writers(info, trusted):
+    elif why := other_writers(info, trusted_users):
         yield OTHERS_WRITE.found(path, why, path)
 
 

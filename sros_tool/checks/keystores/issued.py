@@ -385,12 +385,14 @@ def _ledger(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> I
 _SIGN_FOR_THE_FLEET = "Run `sros generate_artifacts -k KEYSTORE -p POLICY_FILE --fleet FLEET_FILE`."
 
 
-def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -> Iterator[Finding]:
+def check_policy(
+    enclave: CheckedEnclave, wanted_rights: dict[str, frozenset[Right]]
+) -> Iterator[Finding]:
     """Yield a finding if the rights of an enclave differ from the rights in the policies."""
-    if not wanted:
+    if not wanted_rights:
         return
     name, grant = enclave.name, grant_of(enclave)
-    if name not in wanted:
+    if name not in wanted_rights:
         if _is_plain_router(enclave, grant):
             return
         yield NOT_IN_POLICY.found(name, "none of the given policies names it", str(enclave.folder))
@@ -405,7 +407,7 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
             yield STALE.found(
                 name, text, enclave.file("permissions.p7s"), remedy=_SIGN_FOR_THE_FLEET
             )
-    difference = compare(grant_rights(name, grant), wanted[name])
+    difference = compare(grant_rights(name, grant), wanted_rights[name])
     if difference:
         shown = [
             f"{sign} {right.qualifier} {right.describe()}" for sign, right in difference.lines()

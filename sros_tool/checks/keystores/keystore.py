@@ -97,7 +97,7 @@ def keystore_findings(
     domain: int | None = None,
     policies: tuple[Policy, ...] = (),
     fleet: Fleet | None = None,
-    only: Sequence[str] | None = None,
+    only_enclaves: Sequence[str] | None = None,
     sample: Sequence[str] | None = None,
     on_robot: bool = False,
     distribution: str = "",
@@ -112,8 +112,9 @@ def keystore_findings(
         domain: the ROS domain that its enclaves have to join.
         policies: policies with which its permissions are compared.
         fleet: the robots that the policies are for, whose domains are compared, too.
-        only: the enclaves to check; None for all of them and the keystore itself.
-        sample: without ``only``, the enclaves to check with the keystore itself; None for all.
+        only_enclaves: the enclaves to check; None for all of them and the keystore itself.
+        sample: without ``only_enclaves``, the enclaves to check with the keystore itself; None for
+            all.
         on_robot: whether the keystore is on a robot, where it must not have a CA key.
         distribution: the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
         vendors: the DDS vendors of its nodes, or ``zenoh``; () if they may use any.
@@ -133,7 +134,7 @@ def keystore_findings(
         distribution=distribution,
         on_zenoh=ZENOH in vendors,
     )
-    checked = sample if only is None else only
+    checked = sample if only_enclaves is None else only_enclaves
     names = keystore.names if checked is None else tuple(checked)
     wanted = wanted_rights(keystore)
     asked = asked_vendors(vendors)
@@ -178,7 +179,7 @@ def keystore_findings(
 
     outcomes = [outcome for _, outcome in map_slices(names, work)]
     found = [*about_governance, *(finding for findings, *_ in outcomes for finding in findings)]
-    if only is None:
+    if only_enclaves is None:
         issued = [summary for _, share, _ in outcomes for summary in share]
         of_keystore = [*check_files(keystore), *about_authorities]
         found = [*of_keystore, *check_issued(keystore, issued), *found]
@@ -186,13 +187,16 @@ def keystore_findings(
         found = [*check_files(keystore, names), *found]
     topics = {name: names for *_, share in outcomes for name, names in share.items()}
     found += check_capitals(topics)
-    found += zenoh_files.check_network(keystore, only)
+    found += zenoh_files.check_network(keystore, only_enclaves)
     if policies:
         from sros_tool.checks.policies import findings_in
 
         parts = [
-            replace(policy, enclaves=tuple(each for each in policy.enclaves if each.path in only))
-            if only is not None
+            replace(
+                policy,
+                enclaves=tuple(each for each in policy.enclaves if each.path in only_enclaves),
+            )
+            if only_enclaves is not None
             else policy
             for policy in policies
         ]
@@ -225,7 +229,7 @@ def _vendors_of(distributions: Sequence[Distribution]) -> tuple[Vendor, ...]:
 
 def _enclave_findings(
     enclave: CheckedEnclave,
-    wanted: dict[str, frozenset[Right]],
+    wanted_rights: dict[str, frozenset[Right]],
     governance: bytes,
     vendors: Sequence[Vendor],
 ) -> Iterator[Finding]:
@@ -236,7 +240,7 @@ def _enclave_findings(
     yield from check_enclave(enclave)
     yield from check_documents(enclave)
     yield from check_governance(enclave, governance, vendors)
-    yield from check_policy(enclave, wanted)
+    yield from check_policy(enclave, wanted_rights)
     yield from zenoh_files.check_own_zenoh(enclave)
 
 

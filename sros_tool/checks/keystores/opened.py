@@ -182,12 +182,12 @@ class CheckedKeystore:
             (self.root / folder).exists() for folder in (PUBLIC, SETTINGS)
         )
 
-    def accepts(self, kind: FindingKind, chosen: Callable[[Template], bool]) -> str:
+    def accepts(self, kind: FindingKind, accepts_weakness: Callable[[Template], bool]) -> str:
         """Return text naming the template or keystore that accepts a weakness; "" if none does.
 
-        ``chosen`` returns whether settings choose the weakness.  It is called with the template
-        as sros ships it, so a changed setting of this keystore accepts nothing.  Without settings
-        (keystores of ros2/sros2) no weakness is accepted.
+        ``accepts_weakness`` returns whether settings choose the weakness.  It is called with the
+        template as sros ships it, so a changed setting of this keystore accepts nothing.  Without
+        settings (keystores of ros2/sros2) no weakness is accepted.
 
         An export has no settings, so it is compared with all templates.  A weakness that no
         template chooses counts as accepted by the original keystore, but an error never does.
@@ -195,11 +195,11 @@ class CheckedKeystore:
         if self.settings:
             name = self.settings.name
             template = _shipped(name) or self.settings
-            return f"template {name}" if chosen(template) else ""
+            return f"template {name}" if accepts_weakness(template) else ""
         if self.is_original:
             return ""
         for name in template_names():
-            if chosen(_load_shipped(name)):
+            if accepts_weakness(_load_shipped(name)):
                 return f"template {name}"
         return "" if kind.severity is ERROR else "keystore whose CA signed it"
 

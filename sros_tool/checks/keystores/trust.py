@@ -44,9 +44,9 @@ permissions."""
 class _Party:
     """What an enclave trusts, and what it presents, of the identity and the permissions CA."""
 
-    def __init__(self, certificate: x509.Certificate, trusted: tuple[bytes, bytes]) -> None:
+    def __init__(self, certificate: x509.Certificate, trusted_cas: tuple[bytes, bytes]) -> None:
         self.certificate = certificate
-        self.trusted = tuple(map(_certificates, trusted))
+        self.trusted = tuple(map(_certificates, trusted_cas))
         self.signer: x509.Certificate | None = None
 
     def accepts(self, other: _Party, role: int) -> bool:

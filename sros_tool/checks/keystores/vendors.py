@@ -168,7 +168,7 @@ def evaluate(
         distributions: the ROS 2 distributions that it is for, which findings name.
     """
     keystore = enclave.keystore
-    there = loaded_enclave(enclave.name, enclave.folder, enclave.state, at=keystore.now)
+    there = loaded_enclave(enclave.name, enclave.folder, enclave.state, moment=keystore.now)
     numbers = (domain,) if domain is not None else example_domains(enclave.state)
     by_domain = {
         number: {
@@ -185,19 +185,21 @@ def evaluate(
     return EnclaveEvaluation(checked, by_domain, there.portable is not None, distributions)
 
 
-def check_vendors(evaluation: EnclaveEvaluation, known: Collection[Finding]) -> Iterator[Finding]:
+def check_vendors(
+    evaluation: EnclaveEvaluation, known_findings: Collection[Finding]
+) -> Iterator[Finding]:
     """Yield findings about refusals by vendors, and about decisions in which vendors differ.
 
-    ``known`` are the other findings about the enclave and its CAs.
+    ``known_findings`` are the other findings about the enclave and its CAs.
     """
     for domain, made in evaluation.by_domain.items():
-        if findings := list(_refusals(evaluation, made, known)):
+        if findings := list(_refusals(evaluation, made, known_findings)):
             yield from findings
             return
         # Vendors decide alike on usual names in a document as sros writes it, and each topic costs.
-        if evaluation.portable and not any(_is_about_rules(finding) for finding in known):
+        if evaluation.portable and not any(_is_about_rules(finding) for finding in known_findings):
             continue
-        ids = {finding.id for finding in known}
+        ids = {finding.id for finding in known_findings}
         if findings := list(_different_rights(evaluation, made, domain, ids)):
             yield from findings
             return
@@ -225,16 +227,16 @@ _MOST_DOMAINS = 8
 
 def _refusals(
     evaluation: EnclaveEvaluation,
-    made: Mapping[Vendor, VendorParticipant],
-    known: Collection[Finding],
+    participants: Mapping[Vendor, VendorParticipant],
+    known_findings: Collection[Finding],
 ) -> Iterator[Finding]:
     """Yield an error if all vendors refuse the enclave, or else the refusals by some vendors.
 
-    Yields nothing if errors in ``known`` name a cause for every vendor.  A refusal by only some
-    vendors is left out if a finding in ``known`` names its cause.
+    Yields nothing if errors in ``known_findings`` name a cause for every vendor.  A refusal by only
+    some vendors is left out if a finding in ``known_findings`` names its cause.
     """
     enclave = evaluation.enclave
-    causes = {vendor: participant.causes() for vendor, participant in made.items()}
+    causes = {vendor: participant.causes() for vendor, participant in participants.items()}
     by_cause: dict[RefusalCause, list[Vendor]] = {}
     for vendor, cause in causes.items():
         for refusal_cause in cause:
@@ -243,7 +245,9 @@ def _refusals(
         return
     all_refuse = all(causes.values())
     if all_refuse:
-        errors = [finding for finding in known if finding.kind.severity is ERROR]  # also accepted
+        errors = [
+            finding for finding in known_findings if finding.kind.severity is ERROR
+        ]  # also accepted
         if all(
             any(_is_named(refusal_cause, errors) for refusal_cause in cause)
             for cause in causes.values()
@@ -251,7 +255,9 @@ def _refusals(
             return
     else:
         by_cause = {
-            cause: vendors for cause, vendors in by_cause.items() if not _is_named(cause, known)
+            cause: vendors
+            for cause, vendors in by_cause.items()
+            if not _is_named(cause, known_findings)
         }
         if not by_cause:
             return
@@ -273,13 +279,13 @@ def _refusals(
     )
 
 
-def _is_named(cause: RefusalCause, known: Iterable[Finding]) -> bool:
+def _is_named(cause: RefusalCause, known_findings: Iterable[Finding]) -> bool:
     """Return whether a known finding already names the cause of a refusal."""
     wanted = _NAMED_BY.get(cause.reason, frozenset())
     own = f"enclave.{cause.reason}"
     return any(
         finding.id in wanted or (finding.id == own and _file(finding) == cause.file)
-        for finding in known
+        for finding in known_findings
     )
 
 
@@ -310,7 +316,7 @@ _SHOWN = 3
 
 def _different_rights(
     evaluation: EnclaveEvaluation,
-    made: Mapping[Vendor, VendorParticipant],
+    participants: Mapping[Vendor, VendorParticipant],
     domain: int,
     known: Collection[str],
 ) -> Iterator[Finding]:
@@ -321,7 +327,7 @@ def _different_rights(
     enclave = evaluation.enclave
     answers = {
         vendor: participant.access
-        for vendor, participant in made.items()
+        for vendor, participant in participants.items()
         if participant.access and not participant.causes()
     }
     differing = list(_differences(evaluation, answers, _topics_to_ask(enclave, known)))
@@ -432,11 +438,13 @@ class _Denial(NamedTuple):
         return finding.kind is PARTITIONS and bool(self.partition)
 
 
-def check_starting(evaluation: EnclaveEvaluation, known: Sequence[Finding]) -> list[Finding]:
+def check_starting(
+    evaluation: EnclaveEvaluation, known_findings: Sequence[Finding]
+) -> list[Finding]:
     """Return the findings, plus an error if no vendor lets an ordinary node start in the enclave.
 
-    Vendors that refuse the enclave do not count.  ``known`` findings with the same cause are left
-    out.
+    Vendors that refuse the enclave do not count.  ``known_findings`` findings with the same cause
+    are left out.
 
     An enclave with only a part of the rights that every node needs is for a tool such as the
     observer of `sros generate_policy`, which has no log and no services; it gets no error.
@@ -444,10 +452,10 @@ def check_starting(evaluation: EnclaveEvaluation, known: Sequence[Finding]) -> l
     enclave = evaluation.enclave
     grant = grant_of(enclave)
     if grant is None or not is_for_ros(grant):
-        return [*known]
+        return [*known_findings]
     described = has_type_descriptions(enclave.keystore.distribution)
     if evaluation.portable and _states_all(grant):
-        return [*known]
+        return [*known_findings]
     has_denials = any(not rule.allow for rule in grant.rules)
     for domain, made in evaluation.by_domain.items():
         running = [participant for participant in made.values() if not participant.causes()]
@@ -462,8 +470,8 @@ def check_starting(evaluation: EnclaveEvaluation, known: Sequence[Finding]) -> l
             titles = evaluation.titles([participant.vendor for participant in running])
             where += f"on {' and '.join(titles)} "
         finding = NO_NODE.found(enclave.name, f"{where}{worst}", enclave.file(PERMISSIONS_FILE))
-        return [*(each for each in known if not worst.explains(each)), finding]
-    return [*known]
+        return [*(each for each in known_findings if not worst.explains(each)), finding]
+    return [*known_findings]
 
 
 def _states_all(grant: Grant) -> bool:

@@ -127,8 +127,10 @@ def check_own_zenoh(enclave: CheckedEnclave) -> Iterator[Finding]:
     )
 
 
-def _configuration_findings(enclave: CheckedEnclave, opened: OpenedZenoh) -> Iterator[Finding]:
-    for problem in opened.problems:
+def _configuration_findings(
+    enclave: CheckedEnclave, opened_zenoh: OpenedZenoh
+) -> Iterator[Finding]:
+    for problem in opened_zenoh.problems:
         if kind := _KINDS.get(problem.fault.value):
             text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
             yield _found(kind, enclave, text, problem.file)
@@ -143,7 +145,7 @@ def _found(kind: FindingKind, enclave: CheckedEnclave, text: str, file: str) -> 
 
 
 def check_network(
-    keystore: CheckedKeystore, only: Collection[str] | None = None
+    keystore: CheckedKeystore, only_enclaves: Collection[str] | None = None
 ) -> Iterator[Finding]:
     """Yield findings about a keystore's Zenoh network, or only about the files of some enclaves."""
     network = keystore.settings.zenoh if keystore.settings else None
@@ -163,14 +165,16 @@ def check_network(
         yield CANNOT_BE_MADE.found("zenoh", str(error), keystore.shown(SETTINGS))
         return
     for file in drift.files:
-        if only is None or file.enclave in only:
+        if only_enclaves is None or file.enclave in only_enclaves:
             yield from _drift_findings(keystore, file)
     for shared in shared_nodes(drift.nodes):
-        if only is None or not {*shared.enclaves, *shared.others}.isdisjoint(only):
+        if only_enclaves is None or not {*shared.enclaves, *shared.others}.isdisjoint(
+            only_enclaves
+        ):
             first = shared.enclaves[0]
             yield SHARED_NODE.found(first, str(shared), str(keystore.opened.folder(first)))
     for name, why in drift.left_out.items():
-        if only is None or name in only:
+        if only_enclaves is None or name in only_enclaves:
             faults = {e.fault for e in keystore.enclave(name).problems_in_keystore}
             remedy = _RENEW if faults and faults <= _EXPIRED else ""
             yield LEFT_OUT.found(
@@ -178,19 +182,21 @@ def check_network(
             )
 
 
-def _drift_findings(keystore: CheckedKeystore, drift: Drifted) -> Iterator[Finding]:
+def _drift_findings(keystore: CheckedKeystore, drifted: Drifted) -> Iterator[Finding]:
     """Yield a finding for each difference between a configuration and the keystore."""
     from sros_tool.keystore.zenoh_files import Drift, open_zenoh
 
-    file = keystore.shown(drift.path)
-    if drift.kind is Drift.STALE:
-        yield LEFT_OVER.found(drift.enclave, "the keystore has none for it", file)
+    file = keystore.shown(drifted.path)
+    if drifted.kind is Drift.STALE:
+        yield LEFT_OVER.found(drifted.enclave, "the keystore has none for it", file)
         return
-    if drift.kind is Drift.MISSING:
-        yield MISSING.found(drift.enclave, "it is missing, or cannot be read", file)
+    if drifted.kind is Drift.MISSING:
+        yield MISSING.found(drifted.enclave, "it is missing, or cannot be read", file)
         return
-    state = keystore.enclave(drift.enclave)
-    enclave = CheckedEnclave(keystore, drift.enclave, state)
-    found = list(_configuration_findings(enclave, open_zenoh(enclave.folder, drift.enclave, state)))
+    state = keystore.enclave(drifted.enclave)
+    enclave = CheckedEnclave(keystore, drifted.enclave, state)
+    found = list(
+        _configuration_findings(enclave, open_zenoh(enclave.folder, drifted.enclave, state))
+    )
     text = "the settings and the permissions of the keystore give another configuration"
-    yield from found or [OUT_OF_DATE.found(drift.enclave, text, file)]
+    yield from found or [OUT_OF_DATE.found(drifted.enclave, text, file)]

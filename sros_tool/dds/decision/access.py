@@ -137,13 +137,13 @@ class Refusal(NamedTuple):
 
 
 def choose_grant(
-    traits: VendorTraits, permissions: Permissions, subject: str, *, at: datetime, zone: tzinfo
+    traits: VendorTraits, permissions: Permissions, subject: str, *, moment: datetime, zone: tzinfo
 ) -> int | Refusal:
     """Return the index of the grant that decides for ``subject``, or why there is none."""
     if not subject and traits.crashes_on_empty_subject:
         text = f"{traits.title} ends with an error at a certificate with an empty subject."
         return Refusal("empty-subject", text, Outcome.CRASHES)
-    now = at.timestamp()
+    now = moment.timestamp()
     outdated: Refusal | None = None
     certified = certified_text(traits, subject)
     states = [
@@ -505,8 +505,10 @@ class GovernedDomain:
         )
 
 
-def _verdict_text(verdict: RuleVerdict, asked: str, domain: int, *, by_peers: bool = False) -> str:
-    """Return ``verdict`` on ``asked``, such as ``publish rt/a``, as a clause.
+def _verdict_text(
+    verdict: RuleVerdict, asked_access: str, domain: int, *, by_peers: bool = False
+) -> str:
+    """Return ``verdict`` on ``asked_access``, such as ``publish rt/a``, as a clause.
 
     ``by_peers``: the participant itself allows the access, and its peers deny it.
     """
@@ -514,14 +516,15 @@ def _verdict_text(verdict: RuleVerdict, asked: str, domain: int, *, by_peers: bo
     peers = f" for domain {domain}, and peers enforce that" if by_peers else ""
     match verdict.reason:
         case "allow-rule":
-            return f"{rule} allows {asked} by {verdict.expression}"
+            return f"{rule} allows {asked_access} by {verdict.expression}"
         case "deny-rule":
-            return f"{rule} denies {asked} by {verdict.expression}{peers}"
+            return f"{rule} denies {asked_access} by {verdict.expression}{peers}"
         case "partition":
-            return f"{rule} names {verdict.expression}, but not the partitions of {asked}{peers}"
+            names = f"{rule} names {verdict.expression}"
+            return f"{names}, but not the partitions of {asked_access}{peers}"
         case "default":
             word = "ALLOW" if verdict.allowed else "DENY"
-            return f"no rule names {asked}, and the grant's default is {word}"
+            return f"no rule names {asked_access}, and the grant's default is {word}"
         case "open-range":
             return f"{rule} has domains without <min>, which crashes the process"
         case "empty-topic":
@@ -529,7 +532,7 @@ def _verdict_text(verdict: RuleVerdict, asked: str, domain: int, *, by_peers: bo
         case "empty-default":
             return "the grant's <default> is empty, which crashes the process"
         case _:
-            return f"no rule allows {asked}{peers}"
+            return f"no rule allows {asked_access}{peers}"
 
 
 class _Joining(NamedTuple):
@@ -695,17 +698,17 @@ class Access:
         permissions: Permissions,
         subject: str,
         *,
-        at: datetime,
+        moment: datetime,
         zone: tzinfo = UTC,
     ) -> None:
-        """Prepare the decisions on ``subject`` (RFC 4514) in a domain at the aware moment ``at``.
+        """Prepare the decisions on ``subject`` (RFC 4514) in a domain at ``moment`` (aware).
 
         ``zone`` is the host's time zone.  Nothing is raised: the decisions report every fault.
         """
         self._traits = governed.vendor.traits
         self._governed = governed
         self._grant: int | None = None
-        chosen = choose_grant(self._traits, permissions, subject, at=at, zone=zone)
+        chosen = choose_grant(self._traits, permissions, subject, moment=moment, zone=zone)
         if isinstance(chosen, Refusal):
             self._join = chosen.decision()
             return
@@ -931,9 +934,14 @@ class Access:
         return self._answer(Outcome.PEER_DENIES, "peer-refuses-participant", text, topic_rule=rule)
 
     def _verdict(
-        self, verdict: RuleVerdict, asked: str, topic_rule: TopicRule, *, by_peers: bool = False
+        self,
+        verdict: RuleVerdict,
+        asked_access: str,
+        topic_rule: TopicRule,
+        *,
+        by_peers: bool = False,
     ) -> Decision:
-        text = _verdict_text(verdict, asked, self._governed.domain, by_peers=by_peers)
+        text = _verdict_text(verdict, asked_access, self._governed.domain, by_peers=by_peers)
         outcome = Outcome.PEER_DENIES if by_peers else verdict.outcome
         return self._answer(outcome, verdict.reason, text, verdict, topic_rule)
 

@@ -180,8 +180,8 @@ class _Reader:
     def _unescaped(self, text: str) -> str:
         return _REFERENCE.sub(self._referred, text) if "&" in text else text
 
-    def _referred(self, found: re.Match[str]) -> str:
-        word = (found[1] or "").removesuffix(";")
+    def _referred(self, match: re.Match[str]) -> str:
+        word = (match[1] or "").removesuffix(";")
         if word in _ENTITIES:
             return _ENTITIES[word]
         number = _NUMBER.fullmatch(word)

@@ -53,14 +53,14 @@ def read_permissions_as(vendor: Vendor, xml: bytes) -> Permissions | Refusal:
 
 
 def _read(
-    vendor: Vendor, what: str, read: Callable[[bytes], _Document], xml: bytes
+    vendor: Vendor, label: str, parse: Callable[[bytes], _Document], xml: bytes
 ) -> _Document | Refusal:
     from sros_tool.dds.decision.elements import UnreadableError
 
     try:
-        return read(xml)
+        return parse(xml)
     except UnreadableError as error:
-        return error.refusal(vendor.traits, what)
+        return error.refusal(vendor.traits, label)
     except DocumentError as error:
         return Refusal("malformed", f"{vendor.title}: {error}")
 

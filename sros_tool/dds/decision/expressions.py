@@ -99,7 +99,7 @@ class _FnmatchSets:
         index = start
         negated = text[index : index + 1] in ("!", "^")
         index += negated
-        closed, plain = self._end_of(index, first=True)
+        closed, plain = self._end_of(index, is_first=True)
         if not closed:
             return (_OPENING if plain else _NOTHING), start
         members: list[Letters] = []
@@ -114,7 +114,7 @@ class _FnmatchSets:
             return _NOTHING, index + 1
         return _set_of(members, negated), index + 1
 
-    def _end_of(self, index: int, *, first: bool) -> tuple[bool, bool]:
+    def _end_of(self, index: int, *, is_first: bool) -> tuple[bool, bool]:
         """Return whether a set is closed after ``index``; if not, whether its ``[`` is literal.
 
         Results are cached, because many sets that are not closed would take quadratic time.
@@ -123,10 +123,10 @@ class _FnmatchSets:
         path: list[tuple[int, bool | None]] = []
         closed, plain = False, True
         while index < len(text):
-            if not first and text[index] == "]":
+            if not is_first and text[index] == "]":
                 closed = True
                 break
-            if not first and index in self._known:
+            if not is_first and index in self._known:
                 closed, plain = self._known[index]
                 break
             letters, a_range, after = _token(text, index)
@@ -136,7 +136,7 @@ class _FnmatchSets:
             elif letters == _OPENING and not a_range:
                 decided = True
             path.append((index, decided))
-            index, first = after, False
+            index, is_first = after, False
         for place, decided in reversed(path):
             plain = plain if decided is None else decided
             if text[place] != "]":  # the first member of a set may be one; later it closes the set

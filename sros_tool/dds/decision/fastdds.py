@@ -165,13 +165,13 @@ def _plain(text: str) -> str:
     return _decoded("".join(written[:place]).partition("\0")[0])
 
 
-def _referred(found: re.Match[str]) -> str | None:
+def _referred(match: re.Match[str]) -> str | None:
     """Return the bytes of a character reference such as ``&amp;``, or None if it is malformed."""
-    if found[2]:
-        return _ENTITIES[found[2]]
+    if match[2]:
+        return _ENTITIES[match[2]]
     # TinyXML-2 reads the digits backwards, from the last one to the mark before them.
-    base, mark = (16, "x") if found[0][2] == "x" else (10, "#")
-    digits = found[1].rpartition(mark)[2]
+    base, mark = (16, "x") if match[0][2] == "x" else (10, "#")
+    digits = match[1].rpartition(mark)[2]
     if not re.fullmatch("[0-9a-fA-F]*" if base == 16 else "[0-9]*", digits):
         return None
     return _utf8(int(digits.lstrip("0")[:30] or "0", base))  # the longer ones are as far too large
@@ -308,13 +308,13 @@ def _number(element: XmlElement) -> int:
     return _integer(match) % 2**32
 
 
-def _integer(found: re.Match[str]) -> int:
+def _integer(match: re.Match[str]) -> int:
     """Return a number as sscanf reads it: above 64 bits, it is the largest 64-bit number."""
-    if found[1]:
-        return min(int(found[1], 16), 2**64 - 1)
-    digits = found[2].lstrip("+-").lstrip("0")
+    if match[1]:
+        return min(int(match[1], 16), 2**64 - 1)
+    digits = match[2].lstrip("+-").lstrip("0")
     number = int(digits or "0") if len(digits) <= 20 else 2**64
-    return min(number, 2**64 - 1) if found[2][0] != "-" or number >= 2**64 else -number
+    return min(number, 2**64 - 1) if match[2][0] != "-" or number >= 2**64 else -number
 
 
 def _flag(element: XmlElement) -> bool:
@@ -388,12 +388,12 @@ def _topic_rule(element: XmlElement) -> TopicRule:
     return rule
 
 
-def _values(take: _Sequence, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
+def _values(sequence: _Sequence, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for attribute in attributes(rule):
-        left_out = attribute.default is not None and not take.is_next(attribute.name)
+        left_out = attribute.default is not None and not sequence.is_next(attribute.name)
         values[attribute.name] = (
-            attribute.default if left_out else _value(take.next(attribute.name), attribute)
+            attribute.default if left_out else _value(sequence.next(attribute.name), attribute)
         )
     return values
 

@@ -24,13 +24,13 @@ class ComparisonCrash(Exception):  # noqa: N818
     """The comparison of these two subjects crashes the vendor's process."""
 
 
-def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
-    """Return whether a grant for ``granted`` applies to the certificate subject ``certified``.
+def same_subject(rule: Subjects, granted_subject: str, certified_subject: str) -> bool:
+    """Return whether a grant for ``granted_subject`` applies to a certificate with another subject.
 
     Raises:
         ComparisonCrash: the comparison crashes the vendor's process.
     """
-    return _COMPARE[rule](granted, certified)
+    return _COMPARE[rule](granted_subject, certified_subject)
 
 
 def also_fitting(
@@ -78,18 +78,18 @@ def certified_text(traits: VendorTraits, subject: str) -> str:
     return subject.encode()[: traits.longest_subject].decode(errors="surrogateescape")
 
 
-def _exact(granted: str, certified: str) -> bool:
-    return _attributes(granted) == _attributes(certified)
+def _exact(granted_subject: str, certified_subject: str) -> bool:
+    return _attributes(granted_subject) == _attributes(certified_subject)
 
 
-def _whole_attributes(granted: str, certified: str) -> bool:
+def _whole_attributes(granted_subject: str, certified_subject: str) -> bool:
     """Return whether subjects are equal, split at commas and without blanks around parts.
 
     Escaped commas split as well.  A part of less than three bytes keeps some of its blanks, and
     what stands behind an empty part is ignored.  Source: Fast DDS 2.9.1, Permissions.cpp
     (rfc2253_string_compare).
     """
-    ours, theirs = granted.encode(), certified.encode(errors="surrogateescape")
+    ours, theirs = granted_subject.encode(), certified_subject.encode(errors="surrogateescape")
     our_start = their_start = 0
     our_end, their_end = _part_end(ours, 0), _part_end(theirs, 0)
     while our_start < our_end and their_start < their_end:
@@ -132,8 +132,8 @@ _BEFORE = {
 """Maps a character to a pattern for the text before it, outside of escapes and quotes."""
 
 
-def _any_order(granted: str, certified: str) -> bool:
-    ours, theirs = _types_and_values(granted), _types_and_values(certified)
+def _any_order(granted_subject: str, certified_subject: str) -> bool:
+    ours, theirs = _types_and_values(granted_subject), _types_and_values(certified_subject)
     first_values: dict[str, str] = {}
     for kind, value in theirs:
         first_values.setdefault(kind, value)
@@ -195,19 +195,21 @@ def _plain_subject(text: str) -> str:
 _SEPARATORS = re.compile(r"[,/|]")
 
 
-def _subset(granted: str, certified: str, *, plain: Callable[[str], str] = str) -> bool:
-    parts = [plain(part) for part in _SEPARATORS.split(granted) if part]
+def _subset(
+    granted_subject: str, certified_subject: str, *, normalize: Callable[[str], str] = str
+) -> bool:
+    parts = [normalize(part) for part in _SEPARATORS.split(granted_subject) if part]
     if len(parts) > _MOST_PARTS:
         return False
     values: dict[str, str] = {}
     for part in parts:
         kind, _, value = part.partition("=")
         values.setdefault(kind, value)
-    wanted = _SEPARATORS.split(certified)
+    wanted = _SEPARATORS.split(certified_subject)
     if wanted and not wanted[-1]:  # no empty part after a last separator
         wanted.pop()
     for part in wanted:
-        kind, _, value = plain(part).partition("=")
+        kind, _, value = normalize(part).partition("=")
         if not part or values.get(kind) != value:
             return False
     return True
@@ -229,7 +231,7 @@ _COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
     Subjects.WHOLE_ATTRIBUTES: _whole_attributes,
     Subjects.ANY_ORDER: _any_order,
     Subjects.SUBSET: _subset,
-    Subjects.TRIMMED_SUBSET: partial(_subset, plain=_without_blanks),
+    Subjects.TRIMMED_SUBSET: partial(_subset, normalize=_without_blanks),
 }
 
 

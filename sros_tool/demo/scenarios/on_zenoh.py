@@ -144,14 +144,14 @@ def _action_pair() -> tuple[Party, ...]:
 # ── who hears, who calls, and who serves ───────────────────────────────────────────────────
 
 
-def _topic_rows(how: str, keystore: KeystoreChoice, world: str) -> tuple[Row, ...]:
+def _topic_rows(link_mode: str, keystore: KeystoreChoice, world: str) -> tuple[Row, ...]:
     """Return the rows for sessions that connect in peer mode, or in client mode."""
     pair = _topic_pair(keystore)
     talker = _attacker("talker without permission", Role.TALKER, keystore, lawless=False)
     listener = _attacker("listener without permission", Role.LISTENER, keystore, lawless=False)
     rows = [
         _attempt(
-            f"talker to listener, {how}",
+            f"talker to listener, {link_mode}",
             RowStatus.HEARD,
             "the rules allow the topic to both, by the names in their certificates",
             hears("listener", "talker"),
@@ -165,7 +165,7 @@ def _topic_rows(how: str, keystore: KeystoreChoice, world: str) -> tuple[Row, ..
     ):
         rows.append(
             _attempt(
-                f"{party.name}, {how}",
+                f"{party.name}, {link_mode}",
                 RowStatus.NOT_HEARD,
                 "no rule allows it, and what no rule allows is dropped",
                 claim,
@@ -453,30 +453,30 @@ _CONNECTION_ROWS = (
 )
 
 
-def _expiring(name: str, keystore: KeystoreChoice, *, cut: bool) -> Row:
+def _expiring(name: str, keystore: KeystoreChoice, *, link_is_cut: bool) -> Row:
     steady = _rightful("steady talker", Role.TALKER, keystore, "admin")
     return Row(
         name,
-        RowStatus.CUT_OFF if cut else RowStatus.STILL_HEARD,
+        RowStatus.CUT_OFF if link_is_cut else RowStatus.STILL_HEARD,
         "router and sessions close a link when its certificate expires"
-        if cut
+        if link_is_cut
         else "Zenoh looks at the dates of a certificate only when a link is opened",
         (*_topic_pair(keystore), steady),
-        (Claim(Relation.HEARS_EXPIRED, "listener", "talker", holds=not cut),),
+        (Claim(Relation.HEARS_EXPIRED, "listener", "talker", holds=not link_is_cut),),
         (hears("listener", steady.name),),
         brief=True,
         short_lived=True,
-        defence_removed="" if cut else "close_link_on_expiration",
+        defence_removed="" if link_is_cut else "close_link_on_expiration",
     )
 
 
 _EXPIRY_ROWS = tries(
     "certificate that expires during a link",
-    _expiring("certificate that expires during a link", zenoh_forger.short_lived, cut=True),
+    _expiring("certificate that expires during a link", zenoh_forger.short_lived, link_is_cut=True),
     _expiring(
         "certificate that expires, the link stays",
         zenoh_forger.links_that_outlive_certificates,
-        cut=False,
+        link_is_cut=False,
     ),
 )
 
@@ -621,7 +621,7 @@ def _rogue(
     keystore: KeystoreChoice,
     world: str,
     *,
-    reads: bool,
+    router_reads: bool,
     defence_removed: str = "",
     part: str = "guest",
 ) -> Row:
@@ -637,7 +637,7 @@ def _rogue(
         "sessions trust this router"
         if succeeds
         else "a session accepts data from the router only if the certificate has the router's name",
-        hears(rogue.name, "talker") if reads else hears("listener", rogue.name),
+        hears(rogue.name, "talker") if router_reads else hears("listener", rogue.name),
         (rogue, *_topic_pair(keystore)[1:]),
         () if part == "router" else _CHATTER,
         world=world,
@@ -662,7 +662,13 @@ _ROUTER_ROWS = tuple(
     )
     for row in tries(
         attack,
-        _rogue(f"{attack}{suffix}", keystore, world, reads=reads, defence_removed=defence_removed),
+        _rogue(
+            f"{attack}{suffix}",
+            keystore,
+            world,
+            router_reads=reads,
+            defence_removed=defence_removed,
+        ),
     )
 )
 
@@ -855,7 +861,7 @@ def _announcing(
     token: _FalseToken,
     keystore: KeystoreChoice,
     world: str,
-    how: str = "",
+    name_suffix: str = "",
     defence_removed: str = "",
 ) -> Row:
     """Return a row in which an enclave announces a publisher to an observer of the graph."""
@@ -866,7 +872,7 @@ def _announcing(
     observer = _rightful("observer", Role.OBSERVER, keystore, "client")
     wide, talker, _ = _topic_pair(keystore)
     return _attempt(
-        f"{token.attack}{how}",
+        f"{token.attack}{name_suffix}",
         RowStatus.VISIBLE if defence_removed else RowStatus.NOT_VISIBLE,
         "nobody compares the names in a token with a policy"
         if defence_removed
@@ -903,13 +909,15 @@ _SERVICE_TOKEN = _TOKENS[-1]
 _ERASING = "another enclave erases a node"
 
 
-def _erasing(how: str, keystore: KeystoreChoice, world: str, defence_removed: str = "") -> Row:
+def _erasing(
+    name_suffix: str, keystore: KeystoreChoice, world: str, defence_removed: str = ""
+) -> Row:
     """Return a row in which the guest takes the talker out of the graph of an observer."""
     wide, talker, _ = _topic_pair(keystore)
     eraser = _attacker("eraser", Role.ERASER, keystore)
     observer = _rightful("observer", Role.OBSERVER, keystore, "client")
     return _attempt(
-        f"{_ERASING}{how}",
+        f"{_ERASING}{name_suffix}",
         RowStatus.ERASED if defence_removed else RowStatus.NOT_ERASED,
         "when a token ends, the graph compares its session and name, but not the enclave"
         if defence_removed
@@ -1066,7 +1074,7 @@ _OPEN_ROWS = (
                 f"the router itself {'reads' if reads else 'injects'}",
                 zenoh_forger.talkative_router,
                 "believed",
-                reads=reads,
+                router_reads=reads,
                 part="router",
             ),
             "TLS ends at the router, and sessions trust what the router passes on",

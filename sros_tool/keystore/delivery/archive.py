@@ -116,15 +116,15 @@ def _unzip(data: bytes, limits: ArchiveLimits) -> bytes:
     return plain
 
 
-def _members(tar: tarfile.TarFile, most: int) -> Iterator[tuple[str, bytes]]:
+def _members(tar: tarfile.TarFile, maximum: int) -> Iterator[tuple[str, bytes]]:
     seen: set[str] = set()
     for entry in tar:
         name = entry.name
-        if name in seen or len(seen) >= most:
+        if name in seen or len(seen) >= maximum:
             raise DocumentError(
                 f"it contains {name!r} twice"
                 if name in seen
-                else f"it contains more than {most} entries"
+                else f"it contains more than {maximum} entries"
             )
         seen.add(name)
         if entry.isdir():

@@ -257,11 +257,11 @@ def collect(
 
 
 def _refusals(
-    before: Mapping[str, RefusedMessage], taken: Sequence[_ReceivedMessage]
+    before: Mapping[str, RefusedMessage], messages: Sequence[_ReceivedMessage]
 ) -> dict[str, str]:
     """Map robots to why their last messages were refused; a missing message changes nothing."""
     refused = {}
-    for message in taken:
+    for message in messages:
         name = message.robot.name
         if message.outcome == "refused":
             refused[name] = message.why
@@ -366,12 +366,12 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Rec
             yield taken
 
 
-def _add_signed_by_others(taken: _ReceivedMessage, message: bytes) -> None:
+def _add_signed_by_others(received: _ReceivedMessage, message: bytes) -> None:
     """Add what CAs signed in a message that does not count: revocation list and certificate."""
     with suppress(SrosError):
         signed = smime.parse_new(message)
-        taken.stranger = signed.signer()
-        taken.crl = parse_confirmation(signed.text, "it").crl
+        received.stranger = signed.signer()
+        received.crl = parse_confirmation(signed.text, "it").crl
 
 
 def _read_message(inbox: Folder, robot: str) -> _File | None:
@@ -385,7 +385,7 @@ def _read_message(inbox: Folder, robot: str) -> _File | None:
         state = inbox.state(path)
         if state is None:
             return None
-        data = inbox.read(path, most=MAX_BYTES)
+        data = inbox.read(path, max_bytes=MAX_BYTES)
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -524,7 +524,7 @@ class _Verifier:
         """
         validity = validity_of(signer)
         moment = min(max(self._now, validity.not_before), validity.not_after)
-        if fault := chain_fault(signer, self._authorities, at=moment):
+        if fault := chain_fault(signer, self._authorities, moment=moment):
             raise _RefusedError(f"no identity CA of the keystore issued its certificate: {fault}")
         if signer.serial_number in self._revoked:
             raise _RefusedError(f"its certificate, {signer.serial_number:x}, was revoked")
@@ -714,9 +714,9 @@ class _Renewals:
 
 def _revoke_again(
     root: Path,
-    forgotten: Forgotten,
+    forgotten_lists: Forgotten,
     robots_with_lists: Sequence[str],
-    taken: Sequence[_ReceivedMessage],
+    messages: Sequence[_ReceivedMessage],
     *,
     now: datetime,
     keyring: Keyring,
@@ -728,10 +728,10 @@ def _revoke_again(
     signed; but if they are lists of a CA service, which alone can sign another one and knows its
     certificates, there is only a note.  Return the same as `_sign`.
     """
-    if not (forgotten.lists or forgotten.unknown(Keystore(root))):
+    if not (forgotten_lists.lists or forgotten_lists.unknown(Keystore(root))):
         return "", [], []
-    again = {entry.serial for crl in forgotten.lists for entry in crl.revoked}
-    requests = [request for message in taken for request in message.requests if request.request]
+    again = {entry.serial for crl in forgotten_lists.lists for entry in crl.revoked}
+    requests = [request for message in messages for request in message.requests if request.request]
     for request in requests:
         if again & {*request.vouching}:
             request.done("refused", "its certificate was revoked")
@@ -746,7 +746,9 @@ def _revoke_again(
         )
         return "", [Note("fleet.later-list", text)] if robots_with_lists else [], []
     try:
-        restored = restore_revocations(root, forgotten, now=now, keyring=keyring, dry_run=dry_run)
+        restored = restore_revocations(
+            root, forgotten_lists, now=now, keyring=keyring, dry_run=dry_run
+        )
     except SrosError as error:
         if not robots_with_lists:
             text = f"a certificate that the ledger lacks cannot be recorded: {error.what}"
@@ -765,7 +767,7 @@ def _revoke_again(
 
 def _sign(
     root: Path,
-    taken: Sequence[_ReceivedMessage],
+    messages: Sequence[_ReceivedMessage],
     *,
     now: datetime,
     allow_refusal: Sequence[Vendor],
@@ -778,7 +780,9 @@ def _sign(
     slows down the others.
     Return why the CAs cannot sign ("" if they can), the notes, and the files that changed.
     """
-    by_robot = [[request for request in message.requests if request.request] for message in taken]
+    by_robot = [
+        [request for request in message.requests if request.request] for message in messages
+    ]
     by_robot = [requests for requests in by_robot if requests]
     notes: list[Note] = []
     changes: list[FileChange] = []
@@ -791,7 +795,7 @@ def _sign(
                 root,
                 b"".join(request.pem for request in requests),
                 now=now,
-                only=[request.name for request in requests],
+                only_enclaves=[request.name for request in requests],
                 renew=True,
                 replace_keys=True,
                 allow_refusal=allow_refusal,

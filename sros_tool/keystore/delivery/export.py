@@ -304,7 +304,7 @@ _OF_TIME = frozenset(
 
 def _evaluated(root: Path, name: str, now: datetime) -> EvaluatedEnclave:
     folder = enclave_path(root, name)
-    return evaluated(name, folder, open_enclave(folder, now=now), at=now)
+    return evaluated(name, folder, open_enclave(folder, now=now), moment=now)
 
 
 def _not_running(root: Path, name: str, problems: Sequence[str]) -> KeystoreError:
@@ -331,15 +331,15 @@ def _files_of(root: Path, name: str, evaluation: EvaluatedEnclave) -> dict[str, 
 _FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES)
 
 
-def _read_files(root: Path, name: str, wanted: Iterable[str]) -> dict[str, bytes]:
-    """Map the paths of the ``wanted`` files of an enclave to their content; skip missing files.
+def _read_files(root: Path, name: str, wanted_files: Iterable[str]) -> dict[str, bytes]:
+    """Map the paths of an enclave's ``wanted_files`` to their content; skip missing files.
 
     Raises:
         KeystoreError: a file other than that of the key has a private key.
     """
     files: dict[str, bytes] = {}
     with Folder(root) as opened:
-        for file in wanted:
+        for file in wanted_files:
             path = f"{enclave_folder(name)}/{file}"
             with suppress(FileNotFoundError):
                 files[path] = opened.read_inside(path)

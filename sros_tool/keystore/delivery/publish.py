@@ -332,7 +332,9 @@ class _Keys:
             self.signers[role] = self._online(role, new=first or role in rotate)
         left = expiry.root if first else self.roots.last.expires - now
         if first or rotate or left < expiry.root / 3:
-            self._sign_root(now + expiry.root, new=first or "root" in rotate, must=bool(rotate))
+            self._sign_root(
+                now + expiry.root, new=first or "root" in rotate, is_required=bool(rotate)
+            )
         if left < expiry.root / 3 and not self.has_new_root:
             end = iso(self.roots.last.expires)
             text = (
@@ -368,7 +370,7 @@ class _Keys:
             signers.append(load_signer(read_bytes(before, "key"), f"'{before}'"))
         return signers
 
-    def _sign_root(self, expires: datetime, *, new: bool, must: bool) -> None:
+    def _sign_root(self, expires: datetime, *, new: bool, is_required: bool) -> None:
         """Add a version of the root, if its key is here; ``new`` makes another root key."""
         from sros_tool.keystore.delivery.repository import load_signer, new_key
 
@@ -379,7 +381,7 @@ class _Keys:
             if self.roots.versions:
                 self.roots.check_signer("root", keys[0], path)
         elif self.roots.versions:
-            if must or self._elsewhere:
+            if is_required or self._elsewhere:
                 raise KeystoreError(
                     f"the root key '{path}' does not exist",
                     "This key signs the list of the keys that robots trust.",
@@ -692,23 +694,23 @@ class _Run:
             )
         return forgotten
 
-    def _restore(self, forgotten: Forgotten | None, keyring: Keyring) -> None:
-        """Record that the keystore was restored, and revoke again what is ``forgotten``.
+    def _restore(self, forgotten_lists: Forgotten | None, keyring: Keyring) -> None:
+        """Record that the keystore was restored, and revoke again what is ``forgotten_lists``.
 
         Certificates in releases that the keystore sealed are recorded, so that `revoke` knows them.
         """
-        forgotten = forgotten or Forgotten(self.keystore, self._now)
+        forgotten_lists = forgotten_lists or Forgotten(self.keystore, self._now)
         for certificate in self._sealed_certificates():
-            forgotten.add_certificate(certificate)
+            forgotten_lists.add_certificate(certificate)
         revocation = restore_revocations(
             self.keystore.root,
-            forgotten,
+            forgotten_lists,
             now=self._now,
             keyring=keyring,
             dry_run=self._dry_run,
         )
         self.keystore = Keystore(self.keystore.root)
-        if forgotten.lists:
+        if forgotten_lists.lists:
             whence = f"the last release in '{self._folder}' has"
             self._notes.append(restored_note(revocation, whence))
         self._notes += revocation.notes
@@ -720,7 +722,7 @@ class _Run:
             if not path.startswith(f"{_ARCHIVES}/"):
                 continue
             with suppress(SrosError):
-                data = read_bytes(self._folder / path, "archive", most=OF_ONE_ROBOT.packed)
+                data = read_bytes(self._folder / path, "archive", max_bytes=OF_ONE_ROBOT.packed)
                 release = read_release(data)
                 if seal_problem(release, authorities):
                     continue
@@ -775,7 +777,9 @@ class _Run:
     def _read(self, robot: str, release: PublishedRelease) -> bytes:
         """Return the archive of a release; empty if it is missing or damaged."""
         try:
-            data = read_bytes(self._folder / release.path(robot), "archive", most=release.length)
+            data = read_bytes(
+                self._folder / release.path(robot), "archive", max_bytes=release.length
+            )
         except SrosError:
             return b""
         return data if hashlib.sha256(data).hexdigest() == release.sha256 else b""

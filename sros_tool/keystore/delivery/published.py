@@ -58,9 +58,9 @@ class PublishedRelease(NamedTuple):
         return self
 
 
-def check_count(value: object, most: int = MOST_NUMBER) -> int:
+def check_count(value: object, maximum: int = MOST_NUMBER) -> int:
     """Return a number of a release or a version; raise `ValueError` if it is none."""
-    if type(value) is not int or not 1 <= value <= most:
+    if type(value) is not int or not 1 <= value <= maximum:
         raise ValueError("a number or version is not a number, or is too high")
     return value
 
@@ -141,7 +141,7 @@ def read_published(keystore: Keystore) -> Published:
         return Published()
     try:
         path, what = keystore.root / PUBLISHED, "list of what is published"
-        value = parse_json(read_bytes(path, what, most=_MOST_BYTES))
+        value = parse_json(read_bytes(path, what, max_bytes=_MOST_BYTES))
         return Published(
             {name: _robot(each) for name, each in value["robots"].items()},
             {name: check_count(version) for name, version in value["versions"].items()},
@@ -166,7 +166,9 @@ def may_be_later(keystore: Keystore) -> bool:
         known = read_published(keystore)
         if known.folder:
             path = Path(known.folder) / "metadata" / "timestamp.json"
-            version = parse_json(read_bytes(path, "timestamp", most=_SMALL))["signed"]["version"]
+            version = parse_json(read_bytes(path, "timestamp", max_bytes=_SMALL))["signed"][
+                "version"
+            ]
             return bool(version > known.versions.get("timestamp", 0))
     return False
 

@@ -69,14 +69,14 @@ def new_key() -> bytes:
     )
 
 
-def load_signer(data: bytes, what: str) -> CryptoSigner:
-    """Return the signer with an Ed25519 key (PEM); ``what`` names its file in errors."""
+def load_signer(data: bytes, label: str) -> CryptoSigner:
+    """Return the signer with an Ed25519 key (PEM); ``label`` names its file in errors."""
     try:
         key = serialization.load_pem_private_key(data, None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise PkiError(f"{what} is not a private key without passphrase") from error
+        raise PkiError(f"{label} is not a private key without passphrase") from error
     if not isinstance(key, Ed25519PrivateKey):
-        raise PkiError(f"{what} is not an Ed25519 key", "", "Name the key that sros made.")
+        raise PkiError(f"{label} is not an Ed25519 key", "", "Name the key that sros made.")
     return CryptoSigner(key)
 
 
@@ -277,7 +277,7 @@ def _read_present(folder: Folder, roots: Roots) -> Present:
     roots.verify(_TIMESTAMP, timestamp)
     described = timestamp.signed.snapshot_meta
     snapshot = _read(folder, Snapshot, _SNAPSHOT, described.version)
-    file = folder.read(f"{_METADATA}/{described.version}.{_SNAPSHOT}.json", most=_MOST_BYTES)
+    file = folder.read(f"{_METADATA}/{described.version}.{_SNAPSHOT}.json", max_bytes=_MOST_BYTES)
     described.verify_length_and_hashes(file)
     roots.verify(_SNAPSHOT, snapshot)
     meta = snapshot.signed.meta
@@ -299,7 +299,7 @@ def _read(
     folder: Folder, kind: type[_Content], role: str, version: int | None = None
 ) -> Metadata[_Content]:
     name = f"{role}.json" if version is None else f"{version}.{role}.json"
-    data = folder.read(f"{_METADATA}/{name}", most=_MOST_BYTES)
+    data = folder.read(f"{_METADATA}/{name}", max_bytes=_MOST_BYTES)
     metadata = Metadata[_Content].from_bytes(data)
     if not isinstance(metadata.signed, kind):
         raise RepositoryError(f"{name} is metadata of another kind")

@@ -389,7 +389,7 @@ def evaluate_delivered(
         for file, data in files.items():
             write_new_file(Path(folder, file), data)
         opened = replace(open_enclave(Path(folder), now=now), key_on_robot=True)
-        evaluation = evaluated(name, Path(folder), opened, at=now)
+        evaluation = evaluated(name, Path(folder), opened, moment=now)
         state = evaluation.state
         zenoh = open_zenoh(Path(folder), name, state)
     problems = list(evaluation.problems)
@@ -658,12 +658,16 @@ class MadeRequest(NamedTuple):
     notes: Notes
 
 
-def shown_request(folder: Path, made: Requested, *, again: bool, dry_run: bool) -> MadeRequest:
+def shown_request(folder: Path, requested: Requested, *, again: bool, dry_run: bool) -> MadeRequest:
     """Return the value that ``--json`` prints for a new signing request."""
-    key = made.key if again or not dry_run else None  # a dry run does not keep the key it makes
+    key = (
+        requested.key if again or not dry_run else None
+    )  # a dry run does not keep the key it makes
     outcome = "requested_again" if again else "requested"
-    enclave = RequestedEnclave(made.name, outcome, made.file.parent, made.file, key)
-    return MadeRequest(folder, dry_run, (enclave,), changes_below(folder, made.changes), made.notes)
+    enclave = RequestedEnclave(requested.name, outcome, requested.file.parent, requested.file, key)
+    return MadeRequest(
+        folder, dry_run, (enclave,), changes_below(folder, requested.changes), requested.notes
+    )
 
 
 class ImportedAnswer(NamedTuple):
@@ -692,15 +696,17 @@ class ImportedAnswer(NamedTuple):
     notes: Notes
 
 
-def shown_import(imported: ImportedEnclave, *, pinned: bool) -> ImportedAnswer:
+def shown_import(imported_enclave: ImportedEnclave, *, pinned: bool) -> ImportedAnswer:
     """Return the value that ``--json`` prints for an installed answer.
 
     ``pinned`` says whether ``--ca`` was given.
     """
     return shown(
-        imported,
+        imported_enclave,
         ImportedAnswer,
-        authorities=trusted_authorities(imported.identity_ca, imported.permissions_ca),
-        authorities_verified=pinned or not imported.first,
-        restart_zenoh=imported.restart,
+        authorities=trusted_authorities(
+            imported_enclave.identity_ca, imported_enclave.permissions_ca
+        ),
+        authorities_verified=pinned or not imported_enclave.first,
+        restart_zenoh=imported_enclave.restart,
     )

@@ -113,7 +113,7 @@ def sign_request(
     *,
     now: datetime,
     policy: Policy | FleetPolicy | None = None,
-    only: Sequence[str] = (),
+    only_enclaves: Sequence[str] = (),
     refuse_revoked: bool = False,
     renew: bool = False,
     answer: Path | None = None,
@@ -133,9 +133,9 @@ def sign_request(
     Args:
         root: the keystore.
         data: the request (PEM).
-        only: the name of the enclave that the request has to be for; empty for any.  A robot can
-            write any name into its request.
-        refuse_revoked: refuse a revoked enclave also if ``only`` names it.
+        only_enclaves: the name of the enclave that the request has to be for; empty for any.  A
+            robot can write any name into its request.
+        refuse_revoked: refuse a revoked enclave also if ``only_enclaves`` names it.
         renew: the enclave has to exist; it gets a new certificate.
         answer: the path for the answer, which is written after the keystore has changed.
         force: replace ``answer`` if it exists.
@@ -145,14 +145,14 @@ def sign_request(
     Raises:
         PkiError: the request is not valid.
         KeystoreError: the enclave exists (without ``renew``) or does not exist (with ``renew``);
-            the enclave was revoked and ``only`` does not name it; the request is for another
-            enclave than ``only``; the key was revoked or belongs to another enclave; ``answer``
-            exists; the keystore cannot issue; no vendor would accept the enclave, or a vendor that
-            accepts it today would no longer do so.
+            the enclave was revoked and ``only_enclaves`` does not name it; the request is for
+            another enclave than ``only_enclaves``; the key was revoked or belongs to another
+            enclave; ``answer`` exists; the keystore cannot issue; no vendor would accept the
+            enclave, or a vendor that accepts it today would no longer do so.
     """
     request = load_request(data, "that was given")
-    if only:
-        _check_requested_enclaves([request], only)
+    if only_enclaves:
+        _check_requested_enclaves([request], only_enclaves)
     name = check_enclave_name(request.name)
     stated = _stated(policy, [name])
     if answer is not None:
@@ -162,7 +162,9 @@ def sign_request(
     )
     with change:
         signer = _Signer(change, domain, stated)
-        issued = signer.certify(request, renew=renew, named=bool(only) and not refuse_revoked)
+        issued = signer.certify(
+            request, renew=renew, named=bool(only_enclaves) and not refuse_revoked
+        )
         signer.keep_zenoh()
         files = _answer_files(root, issued, change.zenoh)
         number = change.keystore.ledger_file.next_number()
@@ -215,7 +217,7 @@ def certify_requests(
     *,
     now: datetime,
     policy: Policy | FleetPolicy | None = None,
-    only: Sequence[str] = (),
+    only_enclaves: Sequence[str] = (),
     refuse_revoked: bool = False,
     renew: bool = False,
     replace_keys: bool = False,
@@ -228,9 +230,9 @@ def certify_requests(
 
     As `sign_request`, but no answers are made: an export without keys brings the enclaves to their
     robots.  Unless ``renew`` is set, an enclave whose key is certified already stays as it is.
-    ``only`` has the names of the enclaves that the requests have to be for; empty for any.  With
-    ``replace_keys``, the private key of an enclave in the keystore is removed if the request has
-    another key: the enclave's key is on its robot from then on.
+    ``only_enclaves`` has the names of the enclaves that the requests have to be for; empty for any.
+    With ``replace_keys``, the private key of an enclave in the keystore is removed if the request
+    has another key: the enclave's key is on its robot from then on.
 
     Raises:
         PkiError: a request is not valid.
@@ -244,8 +246,8 @@ def certify_requests(
         raise DocumentError(
             "the input has no signing request", "", "Give the request.pem files of enclaves."
         )
-    if only:
-        _check_requested_enclaves(requests, only)
+    if only_enclaves:
+        _check_requested_enclaves(requests, only_enclaves)
     _check_distinct(requests)
     stated = _stated(policy, [check_enclave_name(request.name) for request in requests])
     change = KeystoreChange(
@@ -260,7 +262,9 @@ def certify_requests(
         signer = _Signer(change, domain, stated, replace_keys=replace_keys)
         for request in requests:
             if request.name not in kept:
-                signer.certify(request, renew=renew, named=bool(only) and not refuse_revoked)
+                signer.certify(
+                    request, renew=renew, named=bool(only_enclaves) and not refuse_revoked
+                )
         if len(kept) < len(requests):
             signer.keep_zenoh()
             change.record()
@@ -282,19 +286,21 @@ def _split_requests(data: bytes) -> list[bytes]:
     return [part + _END + b"\n" for part in parts] + ([rest] if rest.strip() else [])
 
 
-def _check_requested_enclaves(requests: Sequence[SigningRequest], only: Sequence[str]) -> None:
-    """Raise `KeystoreError` unless the requests are for the enclaves ``only``, in any order."""
-    if len(requests) != len(only):
+def _check_requested_enclaves(
+    requests: Sequence[SigningRequest], only_enclaves: Sequence[str]
+) -> None:
+    """Raise `KeystoreError` unless the requests are for exactly ``only_enclaves``, in any order."""
+    if len(requests) != len(only_enclaves):
         raise KeystoreError(
-            f"there are {len(requests)} requests for {len(only)} enclaves",
+            f"there are {len(requests)} requests for {len(only_enclaves)} enclaves",
             "",
             "Name the enclaves with --enclave, one for each request.",
         )
     for number, request in enumerate(requests, 1):
-        if request.name not in only:
+        if request.name not in only_enclaves:
             raise KeystoreError(
                 f"request number {number} is for enclave {request.name}, and should be for "
-                f"{first_few(only, 3)}",
+                f"{first_few(only_enclaves, 3)}",
                 "The request asks for the identity of another enclave. Nothing was signed.",
                 "Examine the robot that the request comes from.",
             )
@@ -497,14 +503,14 @@ def _check_free(answer: Path, force: bool) -> None:
         )
 
 
-def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
-    if exists and not renew:
+def _check_name(root: Path, name: str, renew: bool, has_enclave_already: bool) -> None:
+    if has_enclave_already and not renew:
         raise KeystoreError(
             f"enclave {name} already exists in keystore '{root}'",
             "The sender of the request would get the rights of this enclave.",
             "If that is intended, add --renew; otherwise create the request for another name.",
         )
-    if renew and not exists:
+    if renew and not has_enclave_already:
         raise KeystoreError(
             f"enclave {name} does not exist in keystore '{root}'",
             "Only an existing enclave can be renewed.",
@@ -512,20 +518,26 @@ def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
         )
 
 
-def _check_key(request: SigningRequest, known: KnownKeys, present: x509.Certificate | None) -> None:
+def _check_key(
+    request: SigningRequest, known_keys: KnownKeys, present_certificate: x509.Certificate | None
+) -> None:
     """Raise `KeystoreError` if the key of a request was revoked, or is that of another enclave.
 
     An enclave that already shares its key with another enclave is renewed, with a note.
     """
     remedy = "Create a new key on the robot, with `sros create_request` in another folder."
-    same = present if present and present.public_key() == request.public_key else None
-    known.refuse_revoked(request.public_key, f"the request for {request.name}", remedy, same)
+    same = (
+        present_certificate
+        if present_certificate and present_certificate.public_key() == request.public_key
+        else None
+    )
+    known_keys.refuse_revoked(request.public_key, f"the request for {request.name}", remedy, same)
     if not same:
-        known.refuse_second(request.public_key, request.name, remedy)
+        known_keys.refuse_second(request.public_key, request.name, remedy)
 
 
 def _check_same_key(
-    keystore: Keystore, request: SigningRequest, present: x509.Certificate | None
+    keystore: Keystore, request: SigningRequest, present_certificate: x509.Certificate | None
 ) -> None:
     """Raise `KeystoreError` if the keystore has another key for the enclave of a request."""
     root, folder = keystore.root, keystore.folder(request.name)
@@ -534,7 +546,7 @@ def _check_same_key(
         key = load_key(keystore.read(path, "private key"), f"'{path}'")
         fits = key.public_key() == request.public_key
     elif (path := folder / KEY_URI_FILE).exists():
-        fits = bool(present and present.public_key() == request.public_key)
+        fits = bool(present_certificate and present_certificate.public_key() == request.public_key)
     if not fits:
         raise KeystoreError(
             f"enclave {request.name} has another key in keystore '{root}'",
@@ -569,10 +581,12 @@ def _new_key_note(old: x509.Certificate, request: SigningRequest) -> list[Note]:
     ]
 
 
-def _lost_rights(change: KeystoreChange, earlier: EarlierPermissions, issued: Issued) -> list[Note]:
+def _lost_rights(
+    change: KeystoreChange, earlier_permissions: EarlierPermissions, issued: Issued
+) -> list[Note]:
     """Return a note on the rights that the enclave loses, and how long its old files work."""
     (grant,) = issued.permissions.grants
-    replaced = replaced_rights(issued.issuance.name, earlier, grant, change.now)
+    replaced = replaced_rights(issued.issuance.name, earlier_permissions, grant, change.now)
     (replaced,) = with_ledger(change.keystore, (replaced,), change.now)
     text = lasting_text(change.root, (replaced,))
     if not text:
@@ -582,9 +596,11 @@ def _lost_rights(change: KeystoreChange, earlier: EarlierPermissions, issued: Is
     return [Note("request.rights-lost", f"{lost} {text} {again}")]
 
 
-def _earlier_rights(change: KeystoreChange, name: str, present: x509.Certificate) -> SignedRights:
+def _earlier_rights(
+    change: KeystoreChange, name: str, present_certificate: x509.Certificate
+) -> SignedRights:
     """Return the rights in an enclave's present permissions, after verifying their signature."""
-    subject = text_of(present.subject)
+    subject = text_of(present_certificate.subject)
     old = change.keystore.signed_grant(name, subject)
     old.signed.verify(change.permissions.certificate)
     if old.grant is None:

@@ -212,7 +212,7 @@ def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
         if KEY_URI_FILE not in files:
             # As where the key is on its robot.
             write_new_file(Path(folder, REQUEST), b"\n", flush=False)
-        enclave = load_enclave(name, Path(folder), at=now)
+        enclave = load_enclave(name, Path(folder), moment=now)
     domains = enclave.joined_domains
     domain = next(iter(domains), 0) if domains else 0
     reasons = {}
@@ -281,13 +281,13 @@ def _would_be_shut_out(
     )
 
 
-def _clauses(refused: Mapping[Vendor, str], what: str) -> str:
-    """Return a clause for each reason, such as "A and B refuse ``what`` (reason)"."""
+def _clauses(refused: Mapping[Vendor, str], label: str) -> str:
+    """Return a clause for each reason, such as "A and B refuse ``label`` (reason)"."""
     by_reason: dict[str, list[str]] = {}
     for vendor, reason in refused.items():
         by_reason.setdefault(reason, []).append(vendor.title)
     return "; ".join(
-        f"{enumerated(titles)} {'refuses' if len(titles) == 1 else 'refuse'} {what} ({reason})"
+        f"{enumerated(titles)} {'refuses' if len(titles) == 1 else 'refuse'} {label} ({reason})"
         for reason, titles in ((reason, together(named)) for reason, named in by_reason.items())
     )
 
@@ -534,12 +534,14 @@ def _complete(files: Mapping[str, bytes | None]) -> Files:
     return complete if all(file in complete for file in _NEEDED) else {}
 
 
-def _certificate_kind(data: bytes, listed: frozenset[int], now: datetime) -> tuple[object, ...]:
+def _certificate_kind(
+    data: bytes, listed_serials: frozenset[int], now: datetime
+) -> tuple[object, ...]:
     """Return all that vendors could treat differently in a certificate, except name and key."""
     form = read_form(data)
     if form is None:
         return (data,)
-    return (form.common, holds_at(form, now), form.serial in listed)
+    return (form.common, holds_at(form, now), form.serial in listed_serials)
 
 
 def _listed_serials(crl: bytes) -> frozenset[int]:

@@ -92,18 +92,18 @@ class Authority:
         """Return an `Issuer` that signs certificates with this CA."""
         return Issuer(self.certificate, self.key)
 
-    def sign(self, document: bytes, what: str) -> bytes:
+    def sign(self, document: bytes, label: str) -> bytes:
         """Return ``document`` as a signed S/MIME message (``.p7s``).
 
-        The message is parsed again, to check its digest and its content.  ``what`` names the
+        The message is parsed again, to check its digest and its content.  ``label`` names the
         document in the error.
 
         Raises:
             PkiError: the message does not contain ``document`` with a correct digest.
         """
-        return self.sign_all((document,), what)[0]
+        return self.sign_all((document,), label)[0]
 
-    def sign_all(self, documents: Sequence[bytes], what: str) -> list[bytes]:
+    def sign_all(self, documents: Sequence[bytes], label: str) -> list[bytes]:
         """Return ``documents`` as signed S/MIME messages, in order, as by `sign`.
 
         For small documents this is faster than `sign`, because each step is done for several
@@ -115,7 +115,7 @@ class Authority:
             parsed = [smime.parse_new(message) for message in signed]
             for document, message in zip(batch, parsed, strict=True):
                 text = document.replace(b"\r\n", b"\n")
-                check_meaning((message.digest_matches(), message.text), (True, text), what)
+                check_meaning((message.digest_matches(), message.text), (True, text), label)
             messages += signed
         return messages
 
@@ -148,12 +148,12 @@ def create_authorities(
     template: Template,
     keyring: Keyring,
     now: datetime,
-    imported: Mapping[str, bytes],
+    imported_cas: Mapping[str, bytes],
 ) -> Authorities:
     """Stage the CAs of a new keystore and return them, ready to sign.
 
-    ``imported`` maps roles ("identity", "permissions") to the PEM of an existing CA, which is then
-    used instead of a new one.
+    ``imported_cas`` maps roles ("identity", "permissions") to the PEM of an existing CA, which is
+    then used instead of a new one.
 
     Raises:
         KeystoreError: the places of the CA keys do not fit the template.
@@ -161,7 +161,7 @@ def create_authorities(
         PkiError: an imported CA cannot be used.
     """
     check_places(keyring, template)
-    check_imported_keys(imported, keyring, template)
+    check_imported_keys(imported_cas, keyring, template)
     validity = window(now, template.authority_validity)
     # Separate CAs get unique names, so that messages and diagrams distinguish keystores.
     serial = secrets.token_hex(4)
@@ -171,20 +171,20 @@ def create_authorities(
         path = f"{PRIVATE}/{file}.key.pem"
         service = keyring.ca_service(transaction.root, role, template)
         if service:
-            if role not in imported:
+            if role not in imported_cas:
                 raise UsageError(
                     f"the certificate of the CA service '{service.place}' is missing",
                     "",
                     "Run `sros create_keystore` with --identity-ca FILE, a file with this "
                     "certificate and the certificates of its issuers.",
                 )
-            existing = check_imported(role, imported[role], None, now)
+            existing = check_imported(role, imported_cas[role], None, now)
             transaction.write(f"{PUBLIC}/{file}.cert.pem", existing.bundle)
             notes.extend(existing.notes)
             return Authority(existing.certificate, None, service)
-        key = keyring.make(transaction, path, role, template, compared=role in imported)
-        if role in imported:
-            existing = check_imported(role, imported[role], key, now)
+        key = keyring.make(transaction, path, role, template, compared=role in imported_cas)
+        if role in imported_cas:
+            existing = check_imported(role, imported_cas[role], key, now)
             certificate, bundle = existing.certificate, existing.bundle
             notes.extend(existing.notes)
         else:

@@ -105,22 +105,22 @@ class CaService:
         return f"sros-issuer-{self.place.removeprefix(_SCHEME)}"
 
     def issue(
-        self, asked: CertificateRequest, authority: x509.Certificate, now: datetime
+        self, request: CertificateRequest, authority: x509.Certificate, now: datetime
     ) -> x509.Certificate:
         """Return the certificate that the service issues; ``authority`` is the identity CA.
 
         Raises:
             CaServiceError: the program fails, or the certificate is not what was asked for.
         """
-        answer = self._answer(asked)
+        answer = self._answer(request)
         try:
             certificate = load_certificate(answer, f"of {self.program}")
-            fault = _fault(certificate, asked, authority, now)
+            fault = _fault(certificate, request, authority, now)
         except PkiError as error:
             fault = error.clause
         if fault:
-            raise self._error(asked, f"The certificate of `{self.program}` is refused: {fault}")
-        _LOG.info("%s issued a certificate for %s", self.program, asked.enclave)
+            raise self._error(request, f"The certificate of `{self.program}` is refused: {fault}")
+        _LOG.info("%s issued a certificate for %s", self.program, request.enclave)
         return certificate
 
     def _answer(self, asked: CertificateRequest) -> bytes:
@@ -160,9 +160,9 @@ class CaService:
             raise self._error(asked, f"{why}: {said}" if said else why)
         return answer
 
-    def _error(self, asked: CertificateRequest, why: str) -> CaServiceError:
+    def _error(self, request: CertificateRequest, why: str) -> CaServiceError:
         return CaServiceError(
-            f"the CA service did not issue a certificate for enclave {asked.enclave}",
+            f"the CA service did not issue a certificate for enclave {request.enclave}",
             f"{why}. Nothing was changed.",
         )
 
@@ -205,7 +205,7 @@ def _seconds_left(end: float) -> float:
 
 def _fault(
     certificate: x509.Certificate,
-    asked: CertificateRequest,
+    request: CertificateRequest,
     authority: x509.Certificate,
     now: datetime,
 ) -> str:
@@ -216,15 +216,15 @@ def _fault(
     if tolerant.is_tolerated(certificate):
         return "it breaks rules of X.509 (RFC 5280)"
     key, validity = certificate.public_key(), validity_of(certificate)
-    if key != asked.public_key:
+    if key != request.public_key:
         return f"it is for another key ({algorithm(key)}) than the request"
     if not issued_by(certificate, authority):
         issuer = other_issuer(certificate, authority)
         return f"its issuer is {issuer}, not the identity CA of the keystore"
     subject = {(part.oid, part.value) for part in certificate.subject}
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
-    if len(names) > 1 or not subject.issuperset((part.oid, part.value) for part in asked.subject):
-        has, wanted = subject_text(certificate.subject), subject_text(asked.subject)
+    if len(names) > 1 or not subject.issuperset((part.oid, part.value) for part in request.subject):
+        has, wanted = subject_text(certificate.subject), subject_text(request.subject)
         return (
             f"its subject is {has}; it should be {wanted}, perhaps with more parts. Let the "
             "service take the subject from $SROS_SUBJECT. If the service takes it from the request "
@@ -235,10 +235,10 @@ def _fault(
         return "it is a CA certificate, or does not state that it is not one"
     if not (validity.contains(now) or validity.contains(now + _AHEAD)):
         return f"it is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, not now"
-    if validity.not_after > asked.validity.not_after:
+    if validity.not_after > request.validity.not_after:
         return (
             f"it expires at {iso(validity.not_after)}, later than the requested "
-            f"{iso(asked.validity.not_after)}"
+            f"{iso(request.validity.not_after)}"
         )
     if not 0 < certificate.serial_number.bit_length() <= _MOST_SERIAL_BITS:
         return "no revocation list can have its serial number"

@@ -267,10 +267,14 @@ class EnclaveWriter:
         permissions = _permissions(rights, subject_text(certificate.subject), validity)
         return render_permissions(permissions) == text
 
-    def _validity(self, name: str, usual: Window) -> Window:
-        """Return the default validity ``usual``, shortened if the enclave is short-lived."""
+    def _validity(self, name: str, default_validity: Window) -> Window:
+        """Return ``default_validity``, shortened if the enclave is short-lived."""
         longest = self._template.longest_validity(name)
-        return usual if longest is None else usual.within(window(self._now, longest))
+        return (
+            default_validity
+            if longest is None
+            else default_validity.within(window(self._now, longest))
+        )
 
     def _validity_of_permissions(self, name: str, certificate: x509.Certificate) -> Window:
         """Return the validity of an enclave's permissions, which expire with their certificate.
@@ -408,16 +412,18 @@ def _permissions(
 
 
 def _early_expiry(
-    what: str, wanted: Window, authority: x509.Certificate, root: Path
+    label: str, wanted_validity: Window, authority: x509.Certificate, root: Path
 ) -> Note | None:
     """Return a note if the CA's expiry shortens the chosen validity by more than 1 %."""
     end = validity_of(authority).not_after
-    lost = wanted.not_after - end
-    if lost <= max((wanted.not_after - wanted.not_before) * _NOTED_LOSS, timedelta(0)):
+    lost = wanted_validity.not_after - end
+    if lost <= max(
+        (wanted_validity.not_after - wanted_validity.not_before) * _NOTED_LOSS, timedelta(0)
+    ):
         return None
     return Note(
         "keystore.ends-with-ca",
-        f"New {what} expire with their CA at {iso(end)}, {lost.days} days earlier than the "
+        f"New {label} expire with their CA at {iso(end)}, {lost.days} days earlier than the "
         f"keystore's settings choose. Rotate the CA with `sros rotate_ca {quote(str(root))} "
         "--next`.",
     )

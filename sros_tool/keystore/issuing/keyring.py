@@ -39,10 +39,10 @@ Secrets = Callable[[str], str]
 """Function that returns a secret, such as a passphrase or PIN, for a description of it."""
 
 
-def no_secrets(what: str) -> str:
+def no_secrets(label: str) -> str:
     """Raise `PkiError`: without another function, a keyring cannot ask the user for secrets."""
     raise PkiError(
-        f"{what} is needed",
+        f"{label} is needed",
         "The keyring has no secrets handler to ask for it.",
         "Pass a handler, as in `Keyring(secrets=...)`.",
     )

@@ -165,11 +165,11 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
         )
 
 
-def _matched_anyway(left_out: set[str], present: set[str]) -> bool:
-    """Return whether each name in ``left_out`` (no wildcards) matches a wildcard in ``present``."""
+def _matched_anyway(left_out: set[str], expressions: set[str]) -> bool:
+    """Return whether each name in ``left_out`` (no wildcards) matches one of ``expressions``."""
     if not left_out:
         return True
-    wildcards = list(filter(is_expression, present))
+    wildcards = list(filter(is_expression, expressions))
     index = ExpressionIndex(Style.FNMATCH, wildcards)
     return all(
         not is_expression(name)
@@ -303,9 +303,9 @@ def _only_match(expression: str, known: list[str]) -> str | None:
     return None
 
 
-def _member(found: re.Match[str]) -> str:
+def _member(match: re.Match[str]) -> str:
     """Return a character that a set such as ``[a-c]`` matches."""
-    return next((c for c in _CHARACTERS if matches(found[0], c)), "")
+    return next((c for c in _CHARACTERS if matches(match[0], c)), "")
 
 
 def _range_ends(domains: DomainSet) -> tuple[int, ...]:
@@ -324,7 +324,7 @@ def _access(vendor: Vendor, permissions: Permissions, domain: int) -> Access:
     middle = window.not_before + (window.not_after - window.not_before) / 2
     at = datetime.fromtimestamp(int(middle.timestamp()), UTC) + timedelta(seconds=1)
     governed = GovernedDomain(vendor, _everything_controlled(domain), domain)
-    return Access(governed, permissions, grant.subject, at=at)
+    return Access(governed, permissions, grant.subject, moment=at)
 
 
 def _everything_controlled(domain: int) -> Governance:

@@ -380,18 +380,20 @@ class KeystoreChange:
             template=self.template,
             keyring=self.keyring,
             now=self.now,
-            given=self.crl,
+            given_list=self.crl,
         )
 
-    def revoke(self, replaced: Sequence[Superseded], *, names: Sequence[str] | None = None) -> None:
-        """Revoke all earlier certificates of the enclaves whose certificates are ``replaced``.
+    def revoke(
+        self, superseded: Sequence[Superseded], *, names: Sequence[str] | None = None
+    ) -> None:
+        """Revoke all earlier certificates of the enclaves whose certificates are ``superseded``.
 
         The enclaves ``names`` (default: all) get the revocation list, and have to be restarted.
         """
-        if not replaced:
+        if not superseded:
             return
         lists = self.revocation_lists()
-        revocations = lists.superseded(replaced)
+        revocations = lists.superseded(superseded)
         if names is None:
             names = lists.recipients()
         self.restart = self.names if names is None else tuple(names)
@@ -403,7 +405,7 @@ class KeystoreChange:
         self,
         issued: Mapping[str, SignedRights],
         *,
-        gone: frozenset[str] = frozenset(),
+        gone_enclaves: frozenset[str] = frozenset(),
         replaced: Sequence[str] = (),
         stated: Mapping[str, Enclave | None] | None = None,
         created: Sequence[str] = (),
@@ -412,7 +414,7 @@ class KeystoreChange:
 
         Args:
             issued: the new permissions of enclaves.
-            gone: the enclaves that are revoked.
+            gone_enclaves: the enclaves that are revoked.
             replaced: the enclaves whose earlier certificates are revoked.
             stated: the policies of enclaves, whose lines errors name.
             created: new enclaves, which have no running process yet.
@@ -430,7 +432,11 @@ class KeystoreChange:
             signer=lambda: self.permissions,
             now=self.now,
             change=ZenohChange(
-                issued, gone=gone, replaced=replaced, stated=stated or {}, recorded=self.entries
+                issued,
+                gone=gone_enclaves,
+                replaced=replaced,
+                stated=stated or {},
+                recorded=self.entries,
             ),
         ).without(created)
         self.notes += self.zenoh.notes
@@ -510,10 +516,11 @@ class KeystoreChange:
             )
             self.notes.append(Note("service.expires-early", text))
 
-    def finish(self, *, aim: str = "") -> None:
+    def finish(self, *, command: str = "") -> None:
         """Commit the change, unless vendors would refuse enclaves that they accept today.
 
-        ``aim`` says for error messages why the change needs a revocation list, such as ``revoke``.
+        ``command`` says for error messages why the change needs a revocation list, such as
+        ``revoke``.
 
         Raises:
             KeystoreError: nodes of a vendor would stop working.
@@ -530,14 +537,14 @@ class KeystoreChange:
                 self.moment,
                 keystore=self.keystore,
                 allowed=self._allowed,
-                remedy=lambda: self._another_ca(aim) if aim else "",
+                remedy=lambda: self._another_ca(command) if command else "",
             )
         self.transaction.commit()
 
-    def _another_ca(self, aim: str) -> str:
+    def _another_ca(self, command: str) -> str:
         from sros_tool.keystore.lifecycle.revocation_list import another_ca
 
-        return another_ca(self.keystore, aim)
+        return another_ca(self.keystore, command)
 
     def result(self, kind: Callable[..., Result], **more: Any) -> Result:
         """Return the result, of class ``kind``, with the fields ``more`` of the verb."""

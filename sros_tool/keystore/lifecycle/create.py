@@ -155,13 +155,13 @@ def create_keystore(
     domains: DomainSet | None = None,
     now: datetime,
     keyring: Keyring = IN_KEYSTORE,
-    imported: Mapping[str, bytes] = _NONE_IMPORTED,
+    imported_cas: Mapping[str, bytes] = _NONE_IMPORTED,
     dry_run: bool = False,
 ) -> Creation:
     """Create a keystore for ``domains`` (default: 0) from ``template``.
 
-    ``imported`` maps roles ("identity", "permissions") to PEM certificates of existing CAs, whose
-    keys the ``keyring`` opens.
+    ``imported_cas`` maps roles ("identity", "permissions") to PEM certificates of existing CAs,
+    whose keys the ``keyring`` opens.
 
     Raises:
         KeystoreError: ``root`` has a keystore or parts of one: enclaves of an older CA would not
@@ -172,14 +172,14 @@ def create_keystore(
     _check_free(root)
     with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run, fresh=True) as change:
         domains = domains or DomainSet.of((0, 0))
-        _write_keystore(change, template, domains, imported)
+        _write_keystore(change, template, domains, imported_cas)
         change.record()
         change.notes += change.authorities.notes
-        if imported and not change.identity.service:  # which would issue for the example
+        if imported_cas and not change.identity.service:  # which would issue for the example
             change.notes += imported_notes(
                 change.transaction, template, change.authorities, domains, now
             )
-            if IDENTITY in imported:
+            if IDENTITY in imported_cas:
                 change.notes.append(_OWN_LIST)
         change.transaction.commit()
     change.notes += _place_notes(root)
@@ -385,7 +385,7 @@ def _domains_of(fleet: Fleet | None, domain: int | None) -> DomainSet:
 
 
 def _revoked_before(
-    change: KeystoreChange, wanted: Iterable[str], named: Collection[str], fleet: Fleet | None
+    change: KeystoreChange, wanted_names: Iterable[str], named: Collection[str], fleet: Fleet | None
 ) -> list[Note]:
     """Return a note for each revoked enclave that is created again because it is ``named``.
 
@@ -393,7 +393,7 @@ def _revoked_before(
         KeystoreError: a revoked enclave is only in a policy, from which nobody removed it.
     """
     existing, known, root = frozenset(change.names), change.known, change.root
-    missing = [name for name in wanted if name not in existing]
+    missing = [name for name in wanted_names if name not in existing]
     revoked = known.revoked_before(missing) if missing else ()
     again = [name for name in missing if name in revoked]
     if unasked := [name for name in again if name not in named]:
@@ -507,7 +507,10 @@ def _begin(
 
 
 def _write_keystore(
-    change: KeystoreChange, template: Template, domains: DomainSet, imported: Mapping[str, bytes]
+    change: KeystoreChange,
+    template: Template,
+    domains: DomainSet,
+    imported_cas: Mapping[str, bytes],
 ) -> None:
     """Stage a new keystore: its CAs, its governance and its settings."""
 
@@ -518,7 +521,7 @@ def _write_keystore(
         window(change.now, span)  # raises if the CAs could not issue anything
     change.template, change.domains, change.fleet = template, domains, None
     authorities = create_authorities(
-        change.transaction, template, change.keyring, change.now, imported
+        change.transaction, template, change.keyring, change.now, imported_cas
     )
     change.authorities = authorities
     change.identity, change.permissions = authorities.identity, authorities.permissions
@@ -614,10 +617,12 @@ def write_governance(
     change.entries.append(document_entry(change.now, "governance", message))
 
 
-def _raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection]) -> None:
+def _raise_protection(
+    change: KeystoreChange, stated_protections: Sequence[StatedProtection]
+) -> None:
     """Stage a governance and settings with more protection, if policies demand more.
 
-    ``stated`` are the statements of policies about the protection of names.
+    ``stated_protections`` are the statements of policies about the protection of names.
 
     Raises:
         PolicyError: the statements contradict each other, or the settings.
@@ -625,8 +630,8 @@ def _raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection]
             hand.
     """
     root, template, governance = change.root, change.template, change.governance
-    protection = with_stated(template.protection, stated)
-    less = [demanded for demanded, _ in less_protected(governance, stated)]
+    protection = with_stated(template.protection, stated_protections)
+    less = [demanded for demanded, _ in less_protected(governance, stated_protections)]
     if not less:
         return
     demand = f"{less[0].source} demands that {less[0]} has protect={less[0].word!r}"
@@ -671,13 +676,13 @@ def _raise_protection(change: KeystoreChange, stated: Sequence[StatedProtection]
 
 
 def refuse_less_protected(
-    root: Path, governance: Governance, stated: Sequence[StatedProtection]
+    root: Path, governance: Governance, stated_protections: Sequence[StatedProtection]
 ) -> None:
     """Raise `KeystoreError` if a policy demands more protection than the governance gives.
 
     Used when requests are signed, because all robots would need a changed governance.
     """
-    for name, level in less_protected(governance, stated):
+    for name, level in less_protected(governance, stated_protections):
         kinds = "data=ENCRYPT" if name.level is Level.ENCRYPT else "metadata=SIGN"
         raise KeystoreError(
             f"{name.source} demands that {name} has protect={name.word!r}, and keystore '{root}' "
@@ -699,22 +704,22 @@ def _zenoh_notes(template: Template) -> tuple[Note, ...]:
     return (Note("keystore.protection-on-zenoh", text),)
 
 
-def restart_note(disturbed: Mismatch, *, revoked: bool = False) -> Note:
+def restart_note(mismatch: Mismatch, *, revoked: bool = False) -> Note:
     """Return a note on the processes to restart and their order; vendors agree (tested)."""
-    return Note("keystore.restart", _restart_text(disturbed, revoked=revoked))
+    return Note("keystore.restart", _restart_text(mismatch, revoked=revoked))
 
 
-def _restart_text(disturbed: Mismatch, *, revoked: bool) -> str:
-    if revoked and not disturbed.everything:
+def _restart_text(mismatch: Mismatch, *, revoked: bool) -> str:
+    if revoked and not mismatch.everything:
         return (
             "All vendors: restart all processes together; restarted processes refuse the revoked "
             "certificates of other processes. Until then, running processes communicate as before."
         )
-    if disturbed:
+    if mismatch:
         which, what = "all processes", "do not communicate"
-        if not disturbed.everything:
+        if not mismatch.everything:
             which = "the processes that use these names"
-            what += f" on {', '.join(disturbed.names)}, but do on everything else"
+            what += f" on {', '.join(mismatch.names)}, but do on everything else"
         return (
             f"Cyclone DDS and Fast DDS: restart {which} together; processes before and after the "
             f"restart {what}. Until then, running processes communicate as before."
@@ -748,7 +753,7 @@ _OF_KEY = {*KEY_FILES, REQUEST}
 
 def write_enclaves(
     change: KeystoreChange,
-    wanted: Mapping[str, Enclave | None],
+    wanted_enclaves: Mapping[str, Enclave | None],
     *,
     revoke_old: bool = False,
     keep_same: bool = False,
@@ -761,7 +766,7 @@ def write_enclaves(
 
     Args:
         change: the change of the keystore.
-        wanted: maps enclaves to their policies, or None.
+        wanted_enclaves: maps enclaves to their policies, or None.
         revoke_old: also replace and revoke the certificates of enclaves that get other permissions.
         keep_same: keep permissions that already state the rights of a policy.
         places: maps enclaves to the places of new keys on tokens; other new keys are in files.
@@ -772,12 +777,14 @@ def write_enclaves(
     """
     network = change.template.zenoh
     if routers := set(network.router_names() if network else ()).difference(change.names):
-        wanted = ChainMap(dict.fromkeys(sorted(routers)), wanted)  # type: ignore[arg-type]
+        wanted_enclaves = ChainMap(dict.fromkeys(sorted(routers)), wanted_enclaves)  # type: ignore[arg-type]
     writer = change.writer(keys_on_token=bool(places), revoke_old=revoke_old)
     maker = _EnclaveMaker(
-        change, writer, places, wanted, revoke_old=revoke_old, keep_same=keep_same
+        change, writer, places, wanted_enclaves, revoke_old=revoke_old, keep_same=keep_same
     )
-    done = writer.for_each(list(wanted), lambda name: maker.make(name, wanted[name]), progress)
+    done = writer.for_each(
+        list(wanted_enclaves), lambda name: maker.make(name, wanted_enclaves[name]), progress
+    )
     created = tuple(name for name, made in done.items() if made.outcome == "created")
     change.outcomes = {
         name: outcome
@@ -795,13 +802,16 @@ def write_enclaves(
     superseded = [made.superseded for made in done.values() if made.superseded]
     change.revoke(superseded)
     change.keep_zenoh(
-        writer.signed, replaced=[old.name for old in superseded], stated=wanted, created=created
+        writer.signed,
+        replaced=[old.name for old in superseded],
+        stated=wanted_enclaves,
+        created=created,
     )
     change.record()
     replaced = [made.replaced for made in done.values() if made.replaced]
     if not revoke_old:
         replaced = [*with_ledger(change.keystore, replaced, change.now)]
-    change.finish(aim="replace the permissions" if superseded else "")
+    change.finish(command="replace the permissions" if superseded else "")
     return tuple(replaced)
 
 
@@ -923,14 +933,14 @@ class _EnclaveMaker:
                 permissions.append(entry.subject)
         return working
 
-    def _lost_rights(self, default: Enclave, present: set[str]) -> Iterator[Note]:
+    def _lost_rights(self, default: Enclave, existing_files: set[str]) -> Iterator[Note]:
         """Yield a note if an enclave had other rights than the default ones that it gets.
 
         The unsigned copy of lost permissions shows that an enclave had some which the ledger does
         not record.
         """
         name, last = default.path, self._change.recorded.last(default.path)
-        if last.policy == default.digest if last else "permissions.xml" not in present:
+        if last.policy == default.digest if last else "permissions.xml" not in existing_files:
             return
         text = (
             f"enclave {name} had lost its {PERMISSIONS_FILE}: it now has the default permissions "
@@ -970,7 +980,7 @@ class _EnclaveMaker:
         )
 
     def _identity(
-        self, name: str, present: set[str], *, replaced: bool
+        self, name: str, existing_files: set[str], *, replaced: bool
     ) -> NewIdentity | x509.Certificate:
         """Return the certificate of an enclave, or the subject and key for a new certificate.
 
@@ -983,10 +993,10 @@ class _EnclaveMaker:
         """
         change, root = self._change, self._root
         folder = enclave_path(root, name)
-        if name in self._tokens.places and not present.isdisjoint(_OF_KEY):
+        if name in self._tokens.places and not existing_files.isdisjoint(_OF_KEY):
             self._tokens.check_present(name, root)
-        if CERTIFICATE_FILE in present:
-            if not present & _OF_KEY:
+        if CERTIFICATE_FILE in existing_files:
+            if not existing_files & _OF_KEY:
                 raise KeystoreError(
                     f"enclave {name} has a certificate but no key",
                     f"Its {KEY_FILE} is missing, and the certificate does not work with a new key.",
@@ -995,12 +1005,12 @@ class _EnclaveMaker:
                 )
             return self._usable_certificate(name)
         subject = enclave_subject(name, unique=change.template.unique_subject)
-        if PERMISSIONS_FILE in present and not replaced:
+        if PERMISSIONS_FILE in existing_files and not replaced:
             subject = self._subject_of_permissions(name, subject)
-        if present.isdisjoint(KEY_FILES):
+        if existing_files.isdisjoint(KEY_FILES):
             new_key = self._tokens.key(name) if name in self._tokens.places else generate_key()
             return NewIdentity(subject, new_key.public_key(), new_key)
-        path = folder / next(file for file in KEY_FILES if file in present)
+        path = folder / next(file for file in KEY_FILES if file in existing_files)
         public = (
             load_key(read_bytes(path, "private key"), f"'{path}'")
             if path.name == KEY_FILE
@@ -1011,15 +1021,15 @@ class _EnclaveMaker:
         change.known.refuse_second(public, name, remedy)
         return NewIdentity(subject, public)
 
-    def _subject_of_permissions(self, name: str, own: x509.Name) -> x509.Name:
-        """Return the subject in an enclave's signed permissions, or else ``own``."""
+    def _subject_of_permissions(self, name: str, own_subject: x509.Name) -> x509.Name:
+        """Return the subject in an enclave's signed permissions, or else ``own_subject``."""
         path = enclave_path(self._root, name) / PERMISSIONS_FILE
         for subject in _permissions_subjects(path, self._change.permissions.certificate):
-            if common_name_of(subject) == common_name_of(own):
+            if common_name_of(subject) == common_name_of(own_subject):
                 message = self._change.keystore.read(path, "permissions document")
                 self._change.recorded.policy(name, hashlib.sha256(message).hexdigest())
                 return subject
-        return own
+        return own_subject
 
     def _usable_certificate(self, name: str) -> x509.Certificate:
         """Return the certificate of an enclave, after checking its issuer and validity.

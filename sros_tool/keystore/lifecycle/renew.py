@@ -125,7 +125,7 @@ def renew(
             change.keep_zenoh(writer.signed, replaced=renewed if change.revoked else ())
         change.record()
         issued = None if change.revoked else IssuedEarlier(change.keystore, renewed)
-        change.finish(aim="renew with --revoke-old" if revoke_old else "")
+        change.finish(command="renew with --revoke-old" if revoke_old else "")
     ends = [issued.until(old.name, old.not_after, "certificate") for old in replaced if issued]
     return change.result(
         Changed,

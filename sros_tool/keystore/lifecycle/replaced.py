@@ -107,23 +107,24 @@ def earlier_permissions(
 
 
 def replaced_rights(
-    name: str, earlier: EarlierPermissions, grant: Grant, now: datetime
+    name: str, earlier_permissions: EarlierPermissions, grant: Grant, now: datetime
 ) -> ReplacedRights:
-    """Return the rights gained and lost when ``grant`` replaces ``earlier`` permissions.
+    """Return the rights gained and lost when ``grant`` replaces ``earlier_permissions``.
 
-    `with_ledger` says whether other permissions of the enclave work longer than ``earlier``.
+    `with_ledger` says whether other permissions of the enclave work longer than
+    ``earlier_permissions``.
     """
-    difference = compare(grant_rights(name, earlier.grant), grant_rights(name, grant))
+    difference = compare(grant_rights(name, earlier_permissions.grant), grant_rights(name, grant))
     lost: list[Right] = []
     gained: list[Right] = []
     for sign, right in difference.lines():
         if right not in difference.covered:
             taken = (sign == "-") == (right.qualifier is ALLOW)
             (lost if taken else gained).append(right)
-    end = validity_of(earlier.certificate).not_after
+    end = validity_of(earlier_permissions.certificate).not_after
     with suppress(SrosError):  # an expiry before the beginning
-        end = min(end, earlier.grant.validity.not_after)
-    before, after = earlier.grant.domains().closed(), grant.domains().closed()
+        end = min(end, earlier_permissions.grant.validity.not_after)
+    before, after = earlier_permissions.grant.domains().closed(), grant.domains().closed()
     lost_domains, gained_domains = (
         str(DomainSet.of(*((domain, domain) for domain in here if domain not in there)))
         for here, there in ((before, after), (after, before))
@@ -161,23 +162,23 @@ class IssuedEarlier:
 
 
 def with_ledger(
-    keystore: Keystore, replaced: Collection[ReplacedRights], now: datetime
+    keystore: Keystore, replaced_rights: Collection[ReplacedRights], now: datetime
 ) -> tuple[ReplacedRights, ...]:
     """Return the replaced rights, each with the latest expiry that the ledger has for its enclave.
 
     The ledger may have permissions that work longer than those that are replaced: a robot has them
     if the keystore was restored from a backup.
     """
-    if not replaced:
+    if not replaced_rights:
         return ()
-    issued = IssuedEarlier(keystore, {rights.enclave for rights in replaced})
+    issued = IssuedEarlier(keystore, {rights.enclave for rights in replaced_rights})
     return tuple(
         replace(
             rights,
             works_until=until if until >= now else None,
             may_work_longer=issued.lacks_some,
         )
-        for rights in replaced
+        for rights in replaced_rights
         for until in (
             issued.until(
                 rights.enclave,
@@ -225,11 +226,11 @@ def _described_rights(rights: Sequence[Right]) -> list[str]:
     ]
 
 
-def lasting_text(root: Path, replaced: Sequence[ReplacedRights]) -> str:
+def lasting_text(root: Path, replaced_rights: Sequence[ReplacedRights]) -> str:
     """Return sentences on lost rights that still work, and how to end that; "" if none work."""
     lasting = [
         rights
-        for rights in replaced
+        for rights in replaced_rights
         if rights.loses() and (rights.works_until or rights.may_work_longer)
     ]
     if not lasting:

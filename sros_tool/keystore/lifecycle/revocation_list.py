@@ -234,15 +234,15 @@ class RevocationListSigner:
         template: Template,
         keyring: Keyring,
         now: datetime,
-        given: bytes = b"",
+        given_list: bytes = b"",
     ) -> None:
-        if given and not authority.service:
+        if given_list and not authority.service:
             raise UsageError(
                 "the keystore signs its revocation list itself",
                 "--crl is only for a keystore whose identity CA is a CA service.",
                 "Leave --crl out.",
             )
-        self._given = given
+        self._given = given_list
         self._transaction = transaction
         self._keystore = keystore
         self._root = keystore.root
@@ -306,9 +306,9 @@ class RevocationListSigner:
         self._last = last
         return revocations
 
-    def superseded(self, replaced: Iterable[Superseded]) -> list[Entry]:
+    def superseded(self, superseded: Iterable[Superseded]) -> list[Entry]:
         """Return the ledger entries for revoking all earlier certificates of enclaves."""
-        by_name = {certificate.name: certificate for certificate in replaced}
+        by_name = {certificate.name: certificate for certificate in superseded}
         entries = self.revocations(
             {name: certificate.old for name, certificate in by_name.items()},
             SUPERSEDED,
@@ -324,13 +324,13 @@ class RevocationListSigner:
         return entries
 
     def _still_valid(
-        self, names: Iterable[str], present: Mapping[str, Entry], listed: Collection[int]
+        self, names: Iterable[str], present: Mapping[str, Entry], listed_serials: Collection[int]
     ) -> dict[str, dict[int, Entry]]:
         """Map each enclave to its certificates that have not expired, by serial number.
 
         The certificates are read from the ledger, from the folder ``revoked`` (a new list after a
         lost one lacks them), and from ``present``, because the ledger lacks certificates that
-        ros2/sros2 issued.  Serial numbers in ``listed`` are not looked for in the folder.
+        ros2/sros2 issued.  Serial numbers in ``listed_serials`` are not looked for in the folder.
         """
         certificates: dict[str, dict[int, Entry]] = {name: {} for name in names}
         moment = iso(self._now)
@@ -343,7 +343,7 @@ class RevocationListSigner:
                 and not expired
             ):
                 certificates[entry.enclave][int(entry.serial, 16)] = entry
-        for certificate in _moved_away(self._keystore, self._recorded_as_moved(listed)):
+        for certificate in _moved_away(self._keystore, self._recorded_as_moved(listed_serials)):
             name = common_name_of(certificate.subject)
             if name in certificates and validity_of(certificate).not_after >= self._now:
                 entry = certificate_entry(self._now, "certificate", certificate, name)
@@ -352,9 +352,9 @@ class RevocationListSigner:
             certificates[name][int(entry.serial, 16)] = entry
         return certificates
 
-    def _recorded_as_moved(self, listed: Collection[int]) -> Container[str]:
-        """Return ``listed``, and the numbers in ``revoked`` that the ledger certainly has."""
-        known = {f"{serial:x}" for serial in listed}
+    def _recorded_as_moved(self, listed_serials: Collection[int]) -> Container[str]:
+        """Return ``listed_serials``, and numbers in ``revoked`` that the ledger certainly has."""
+        known = {f"{serial:x}" for serial in listed_serials}
         ledger = self._keystore.ledger_file
         if not ledger.is_indexed:
             return known
@@ -594,7 +594,7 @@ class RevocationListSigner:
             return None  # in this case all processes have to be restarted together anyway
         old = self._authentic(self._keystore.embedded_list(file))
         try:
-            authority = self._open(other, replaced, coming=coming)
+            authority = self._open(other, replaced, is_coming=coming)
         except KeystoreError as error:
             # The new CA has issued nothing yet; the next stage of the rotation signs its list.
             if not coming:
@@ -609,9 +609,9 @@ class RevocationListSigner:
         return signed
 
     def _open(
-        self, certificate: x509.Certificate, replaced: Replacement, *, coming: bool
+        self, certificate: x509.Certificate, replaced: Replacement, *, is_coming: bool
     ) -> Authority:
-        place = replaced.key if coming else replaced.old_key_place(certificate)
+        place = replaced.key if is_coming else replaced.old_key_place(certificate)
         # The places in the environment variables are for the key of the issuing CA.
         keyring = replace(self._keyring, places={})
         key = keyring.open(self._keystore, IDENTITY, replace(self._template, identity_key=place))
@@ -676,17 +676,17 @@ def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
         transaction.link_to_first_list(lacking)
 
 
-def another_ca(keystore: Keystore, aim: str) -> str:
+def another_ca(keystore: Keystore, purpose: str) -> str:
     """Return the remedy, as a sentence, if DDS refuses the lists of the identity CA.
 
-    ``aim`` is the command to repeat afterwards, such as ``revoke``.
+    ``purpose`` is the command to repeat afterwards, such as ``revoke``.
     """
     file = keystore.identity_file
     words = ["sros rotate_ca", quote(str(keystore.root))]
     if read_rotation(keystore).stage is not RotationStage.NONE:
         return (
             f"First retire the old CA: `{' '.join(words)} --finish`, restart all processes, and "
-            f"then {aim}."
+            f"then {purpose}."
         )
     if len(keystore.authority_files) > 1:
         words.append("--identity")
@@ -694,5 +694,5 @@ def another_ca(keystore: Keystore, aim: str) -> str:
         words.append("--identity-key URI")
     return (
         f"Replace the identity CA by a CA that may sign revocation lists: `{' '.join(words)} "
-        f"--finish`, restart all processes, and then {aim}."
+        f"--finish`, restart all processes, and then {purpose}."
     )

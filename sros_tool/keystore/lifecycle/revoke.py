@@ -117,9 +117,9 @@ def revoke(
         )
         change.remarks += lists.remarks
         _drop_routers(change, gone)
-        change.keep_zenoh({}, gone=gone)
+        change.keep_zenoh({}, gone_enclaves=gone)
         change.record()
-        change.finish(aim="revoke")
+        change.finish(command="revoke")
     return change.result(
         Revocation,
         outcomes=dict.fromkeys(names, "revoked"),
@@ -130,7 +130,7 @@ def revoke(
 
 def restore_revocations(
     root: Path,
-    forgotten: Forgotten,
+    forgotten_lists: Forgotten,
     *,
     now: datetime,
     keyring: Keyring = IN_KEYSTORE,
@@ -152,12 +152,12 @@ def restore_revocations(
         lists, known = change.revocation_lists(), revoked_serials(change.keystore)
         reasons = {
             f"{entry.serial:x}": entry.reason
-            for crl in forgotten.lists
+            for crl in forgotten_lists.lists
             for entry in crl.revoked
             if entry.serial not in known
         }
         # A CA service knows its certificates, also those of other sites.
-        unknown = {} if change.identity.service else forgotten.unknown(change.keystore)
+        unknown = {} if change.identity.service else forgotten_lists.unknown(change.keystore)
         reasons = _reasons_of_revoked(change, unknown) | reasons
         recorded = change.keystore.ledger_file.with_values("serial", reasons).entries
         issued = {
@@ -200,20 +200,20 @@ def restore_revocations(
         gone = frozenset(again)
         number = max(change.keystore.ledger_file.next_number(), int(now.timestamp()))
         change.entries = [Entry(iso(now), RESTORED, number=number), *unknown.values()]
-        if revocations or forgotten.lists:
+        if revocations or forgotten_lists.lists:
             change.restart = tuple(name for name in change.names if name not in gone)
             _, entries = lists.sign(
                 revocations,
                 change.restart,
                 incomplete=True,
-                least=max((crl.number for crl in forgotten.lists), default=0) + 1,
+                least=max((crl.number for crl in forgotten_lists.lists), default=0) + 1,
             )
             change.entries += entries
         change.remarks += lists.remarks
         _drop_routers(change, gone)
-        change.keep_zenoh({}, gone=gone)
+        change.keep_zenoh({}, gone_enclaves=gone)
         change.record()
-        change.finish(aim="revoke")
+        change.finish(command="revoke")
     if unknown:
         change.notes.append(_unknown_note(change, unknown))
     return change.result(Changed, outcomes=dict.fromkeys(again, "revoked"))
@@ -253,12 +253,12 @@ def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
     return Note("fleet.certificates-restored", f"{text}.")
 
 
-def restored_note(restored: Changed, whence: str) -> Note:
-    """Return a note on lists that `restore_revocations` took from ``whence``."""
+def restored_note(restored: Changed, lists_from: str) -> Note:
+    """Return a note on lists that `restore_revocations` took from ``lists_from``."""
     again = "would be revoked again" if restored.dry_run else "is revoked again"
     text = (
-        f"{whence} a revocation list that the keystore signed but does not know: the keystore was "
-        f"restored from a backup, or is a copy. Everything on the list {again}"
+        f"{lists_from} a revocation list that the keystore signed but does not know: the keystore "
+        f"was restored from a backup, or is a copy. Everything on the list {again}"
     )
     if restored.outcomes:
         text += f", with {first_few(tuple(restored.outcomes), _SHOWN)}"
@@ -289,7 +289,7 @@ def refresh_crl(
         next_update, change.entries = lists.sign((), change.names, incomplete=True)
         change.remarks += lists.remarks
         change.record()
-        change.finish(aim="sign the list")
+        change.finish(command="sign the list")
     return change.result(Revocation, next_update=next_update)
 
 

@@ -241,10 +241,10 @@ def _count(
 # ── remarks ────────────────────────────────────────────────────────────────────────────────
 
 
-def _expiry_remarks(states: Sequence[AuthorityStatus], now: datetime) -> list[str]:
+def _expiry_remarks(authority_states: Sequence[AuthorityStatus], now: datetime) -> list[str]:
     """Return remarks on CAs that expire soon, or have expired."""
     remarks = []
-    for state in states:
+    for state in authority_states:
         if state.state != "issuing" or state.validity.not_after - now > _SOON:
             continue
         name = "CA" if len(state.roles) > 1 else f"{state.roles[0]} CA"

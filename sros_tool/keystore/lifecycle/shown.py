@@ -158,18 +158,20 @@ class NewKeystore(NamedTuple):
 
 
 def shown_keystore(
-    result: Creation, imported: Mapping[str, bytes], notes: Sequence[Note]
+    result: Creation, imported_cas: Mapping[str, bytes], notes: Sequence[Note]
 ) -> NewKeystore:
-    """Return the value for a new keystore; ``imported`` maps roles to existing CAs (PEM)."""
+    """Return the value for a new keystore; ``imported_cas`` maps roles to existing CAs (PEM)."""
     authorities = []
     separate = result.template.separate_authorities
     for roles in [(role,) for role in ROLES] if separate else [ROLES]:
         role, certificate = roles[0], None
         if not result.dry_run:
             certificate = Keystore(result.root).ca_certificate(role)
-        elif role in imported:
-            certificate = load_certificate(imported[role], f"of the {role} CA")
-        authorities.append(KeystoreAuthority(authority_facts(roles, certificate), role in imported))
+        elif role in imported_cas:
+            certificate = load_certificate(imported_cas[role], f"of the {role} CA")
+        authorities.append(
+            KeystoreAuthority(authority_facts(roles, certificate), role in imported_cas)
+        )
     return shown(
         result,
         NewKeystore,
@@ -423,7 +425,7 @@ class KeystoreLists(NamedTuple):
 def shown_lists(
     root: Path,
     lists: Sequence[RevocationList],
-    refreshed: Revocation | None,
+    refreshed_by: Revocation | None,
     enclaves: Mapping[str, str],
     *,
     expires_soon: bool,
@@ -453,9 +455,9 @@ def shown_lists(
             )
             for other in lists[1:]
         ],
-        restart=refreshed.restart if refreshed else (),
-        changes=changes_below(root, refreshed.changes) if refreshed else (),
-        notes=(*refreshed.notes, *refreshed.remarks) if refreshed else (),
+        restart=refreshed_by.restart if refreshed_by else (),
+        changes=changes_below(root, refreshed_by.changes) if refreshed_by else (),
+        notes=(*refreshed_by.notes, *refreshed_by.remarks) if refreshed_by else (),
     )
 
 

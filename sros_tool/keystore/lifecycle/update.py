@@ -148,29 +148,29 @@ class KeystoreUpdate(Changed):
 # ── what is, and what shall be ─────────────────────────────────────────────────────────────
 
 
-def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, DomainSet]:
+def edited_settings(root: Path, present_settings: PresentSettings) -> tuple[Template, DomainSet]:
     """Return the settings and domains that the edited files of a keystore state.
 
     Raises:
         KeystoreError: nothing was edited, both files were edited to different protection, or
             settings cannot state the governance.
     """
-    edits = present.edits
+    edits = present_settings.edits
     if not edits:
         raise KeystoreError(
             f"no file of keystore '{root}' was edited",
             f"{SETTINGS} and {GOVERNANCE_XML} are as sros wrote them.",
             "Edit one of them first, or name what to change with --set or --template.",
         )
-    if present.written is None and not present.without_settings:
+    if present_settings.written is None and not present_settings.without_settings:
         _ = Keystore(root).template  # raises what is wrong with them
         raise KeystoreError(
             f"there is no {SETTINGS} in keystore '{root}', so there is no change to apply",
             "",
             f"Restore the settings with `sros update_keystore {quote(str(root))} --discard-edits`.",
         )
-    written = present.written or present.settings
-    if present.settings.zenoh and not written.zenoh:
+    written = present_settings.written or present_settings.settings
+    if present_settings.settings.zenoh and not written.zenoh:
         raise KeystoreError(
             f"{SETTINGS} of keystore '{root}' has no table [zenoh] any more",
             "The Zenoh files would stay, and no command would update them.",
@@ -179,7 +179,7 @@ def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, Dom
             f"{quote(str(root))} --discard-edits`.",
         )
     if not edits.governance:
-        return written, present.domains
+        return written, present_settings.domains
     path = root / GOVERNANCE_XML
     governance = parse_governance(read_bytes(path, "governance document"), f"'{path}'")
     protection = protection_for(governance)
@@ -191,7 +191,7 @@ def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, Dom
             f"State the protection in {SETTINGS} instead: "
             f"`sros update_keystore {quote(str(root))} --discard-edits` restores the file.",
         )
-    if written.protection not in (present.settings.protection, protection):
+    if written.protection not in (present_settings.settings.protection, protection):
         raise KeystoreError(
             f"{SETTINGS} and {GOVERNANCE_XML} of keystore '{root}' were edited, and differ",
             "Both state the protection of messages.",
@@ -201,14 +201,14 @@ def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, Dom
     return replace(written, protection=protection), governance.domains().closed()
 
 
-def _checked_target(root: Path, present: PresentSettings, target: Template) -> Template:
+def _checked_target(root: Path, present_settings: PresentSettings, target: Template) -> Template:
     """Return ``target`` with the places of the present CA keys.
 
     Raises:
         UsageError: the keystore cannot be changed to ``target``.
     """
     for name in ("identity_key", "permissions_key"):
-        wanted, place = getattr(target, name), getattr(present.settings, name)
+        wanted, place = getattr(target, name), getattr(present_settings.settings, name)
         if wanted and wanted != place:
             raise UsageError(
                 f"the settings name '{wanted}' as the place of a CA key, but it is at "
@@ -225,7 +225,7 @@ def _checked_target(root: Path, present: PresentSettings, target: Template) -> T
             "Add --set authorities.layout=separate to keep separate CAs, or create another "
             "keystore.",
         )
-    known = hidden_protections(present.settings.protection)
+    known = hidden_protections(present_settings.settings.protection)
     for hidden, by in hidden_protections(target.protection):
         if (hidden, by) not in known:
             raise UsageError(
@@ -233,7 +233,7 @@ def _checked_target(root: Path, present: PresentSettings, target: Template) -> T
                 f"The rule for {by} decides on the same names.",
                 "State one rule for these names.",
             )
-    return with_places(with_values(target), present.settings)
+    return with_places(with_values(target), present_settings.settings)
 
 
 # ── the update ─────────────────────────────────────────────────────────────────────────────
@@ -250,7 +250,7 @@ def update_keystore(
     revoke_old: bool = False,
     allow_refusal: Sequence[Vendor] = (),
     replace_edits: bool = False,
-    seen: PresentSettings | None = None,
+    seen_settings: PresentSettings | None = None,
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
     progress: Progress | None = None,
@@ -269,7 +269,7 @@ def update_keystore(
         allow_refusal: vendors whose nodes may stop working.
         replace_edits: accept that ``target`` replaces edits by hand in the settings or the
             governance, because it contains or undoes them.
-        seen: the settings that ``target`` was made from.
+        seen_settings: the settings that ``target`` was made from.
         keyring: opens the keys of the CAs.
         dry_run: report the changes without making them.
         progress: called with the name of each enclave that is done.
@@ -278,15 +278,15 @@ def update_keystore(
         UsageError: more would be allowed without ``allow_looser``, or the keystore cannot be
             changed to ``target``.
         KeystoreError: an enclave cannot be issued again, files were edited by hand, the settings
-            are no longer the ``seen`` settings, or vendors would refuse enclaves that they accept
-            today.
+            are no longer the ``seen_settings`` settings, or vendors would refuse enclaves that they
+            accept today.
     """
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
     )
     with change:
         present = present_settings(change.keystore)
-        if seen is not None and seen != present:
+        if seen_settings is not None and seen_settings != present:
             raise KeystoreError(
                 f"the settings of keystore '{root}' have just changed",
                 "Another command changed them in the meantime.",
@@ -324,7 +324,7 @@ def update_keystore(
                 "Nothing was changed.",
                 "If that is intended, add --allow-looser.",
             )
-        change.finish(aim="update with --revoke-old" if revoke_old else "")
+        change.finish(command="update with --revoke-old" if revoke_old else "")
     return update()
 
 
@@ -340,16 +340,16 @@ class _Goal:
         return governance_for(self.settings.protection, self.domains)
 
 
-def _first_step(present: PresentSettings, goal: _Goal) -> _Goal:
+def _first_step(present_settings: PresentSettings, goal: _Goal) -> _Goal:
     """Return the goal of the stage CREDENTIALS, which keeps protection, domains and name."""
     settings = replace(
         goal.settings,
-        protection=present.settings.protection,
-        name=present.settings.name,
-        description=present.settings.description,
-        distributions=present.settings.distributions,
+        protection=present_settings.settings.protection,
+        name=present_settings.settings.name,
+        description=present_settings.settings.description,
+        distributions=present_settings.settings.distributions,
     )
-    return _Goal(settings, present.domains)
+    return _Goal(settings, present_settings.domains)
 
 
 def _signed_payloads(before: DomainProtection, after: DomainProtection) -> list[Note]:
@@ -379,16 +379,16 @@ _ONLY_STATED = ("name", "description", "distributions")
 """Settings that no file depends on."""
 
 
-def _pending(present: PresentSettings, goal: _Goal) -> tuple[UpdateStage, ...]:
+def _pending(present_settings: PresentSettings, goal: _Goal) -> tuple[UpdateStage, ...]:
     """Return the stages that change something, in order."""
     found = []
-    before, after = present.settings, _first_step(present, goal).settings
+    before, after = present_settings.settings, _first_step(present_settings, goal).settings
     if before != after:
         found.append(UpdateStage.CREDENTIALS)
-    if goal.governance() != present.governance or present.edits.governance:
+    if goal.governance() != present_settings.governance or present_settings.edits.governance:
         found.append(UpdateStage.GOVERNANCE)
     named = any(getattr(before, key) != getattr(goal.settings, key) for key in _ONLY_STATED)
-    if not found and (named or present.edits or present.written is None):
+    if not found and (named or present_settings.edits or present_settings.written is None):
         found.append(UpdateStage.CREDENTIALS)
     return tuple(found)
 
@@ -417,14 +417,19 @@ class _Updater:
     """Writer of one update, within a transaction."""
 
     def __init__(
-        self, change: KeystoreChange, present: PresentSettings, goal: _Goal, *, revoke_old: bool
+        self,
+        change: KeystoreChange,
+        present_settings: PresentSettings,
+        goal: _Goal,
+        *,
+        revoke_old: bool,
     ) -> None:
         self._change = change
         self._root = change.root
-        self._present = present
+        self._present = present_settings
         self._goal = goal
         self._revoke_old = revoke_old
-        before, after = present.settings, goal.settings
+        before, after = present_settings.settings, goal.settings
         self._certificates = revoke_old or (
             (before.certificate_validity, before.unique_subject)
             != (after.certificate_validity, after.unique_subject)
@@ -432,12 +437,12 @@ class _Updater:
         self._permissions = (
             self._certificates
             or before.permissions_validity != after.permissions_validity
-            or present.domains != goal.domains
+            or present_settings.domains != goal.domains
             # Rights that no ledger records would not be signed again once there are settings.
-            or present.without_settings
+            or present_settings.without_settings
         )
         self._kept_open: tuple[str, ...] = ()
-        self._before = EnclaveDomains(present.domains, change.fleet)
+        self._before = EnclaveDomains(present_settings.domains, change.fleet)
         self._after = EnclaveDomains(goal.domains, change.fleet)
         change.template, change.domains = goal.settings, goal.domains
         self._writer = change.writer(revoke_old=revoke_old)
@@ -587,13 +592,13 @@ class _Updater:
         )
         return NewIdentity(enclave_subject(name, unique=unique), public)
 
-    def _has_default_rights(self, state: Credentials, earlier: SignedRights) -> bool:
+    def _has_default_rights(self, state: Credentials, earlier_rights: SignedRights) -> bool:
         """Return whether an enclave has the default rights, and the update changes these."""
         before, after = self._present.settings, self._goal.settings
         if before.default_permissions == after.default_permissions:
             return False
         default = default_rights(before, state.name)
-        if earlier.policy not in ("", default.digest):
+        if earlier_rights.policy not in ("", default.digest):
             return False
         validity, domains = state.lifetime().permissions, self._before.of(state.name)
         (grant,) = permissions_for(

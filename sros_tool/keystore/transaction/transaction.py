@@ -707,10 +707,10 @@ class KeystoreLock:
     anybody who may read the folder could lock the folder itself.
     """
 
-    def __init__(self, folder: Folder, what: str = "keystore") -> None:
-        """Prepare to lock ``folder``, which is ``what`` in errors."""
+    def __init__(self, folder: Folder, label: str = "keystore") -> None:
+        """Prepare to lock ``folder``, which is ``label`` in errors."""
         self._folder = folder
-        self._what = what
+        self._what = label
         self._handle = -1
 
     @property

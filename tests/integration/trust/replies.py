@@ -66,7 +66,7 @@ def engine_says(
 ) -> dict[Vendor, tuple[str, str]]:
     """Return what the engine says of an enclave's folder, in a word and a sentence, by vendor."""
     try:
-        enclave = load_enclave("/t", folder, at=at)
+        enclave = load_enclave("/t", folder, moment=at)
         asked = question("publish", f"/{TOPIC.removeprefix('rt/')}")
         context = JoinContext(DOMAIN, at)
         answers = {each: Evaluator(each, enclave, context).answer(asked) for each in vendors}
