@@ -21,7 +21,12 @@ from pathlib import Path
 
 from benchmarks.floor import make_enclaves, sizes_of
 from benchmarks.inputs import fleet_file, fleet_policy
-from sros_tool.keystore.confirmation import Confirmation, Received, keep, make_confirmation
+from sros_tool.keystore.confirmation import (
+    Confirmation,
+    Received,
+    keep_confirmation,
+    make_confirmation,
+)
 
 PER_ROBOT = 100
 _MADE = 1.5
@@ -105,7 +110,7 @@ def _confirm(root: Path, robots: int) -> None:
         certificates = {
             path: whole.certificates[path] for path in own if path in whole.certificates
         }
-        keep(root, Received(Confirmation(f"r{number}", now, own, certificates), now))
+        keep_confirmation(root, Received(Confirmation(f"r{number}", now, own, certificates), now))
 
 
 def _words(sizes: Sequence[tuple[str, int | str]]) -> list[str]:

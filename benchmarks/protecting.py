@@ -182,7 +182,7 @@ def _run_pair(
     network = RowNetwork(own=own_network)
     processes: list[subprocess.Popen[bytes]] = []
     try:
-        with network.entered(), (folder / "pair.log").open("ab") as log:
+        with network.in_network(), (folder / "pair.log").open("ab") as log:
             for end, variables in ends.items():
                 environment = base_environment(os.environ)
                 environment |= backend.environment(Role.TALKER, wire=True)

@@ -595,7 +595,7 @@ def _enclave_to_ask(
     """Return an enclave of a keystore, or of a policy as if it were signed."""
     from sros_tool.explain.asking import (
         AskedEnclave,
-        not_in_policy,
+        not_in_policy_error,
         planned_enclave,
         signed_enclave,
     )
@@ -607,7 +607,7 @@ def _enclave_to_ask(
         alone = _policy(keystore)
         own = alone.enclave(name)
         if own is None:
-            raise not_in_policy(alone, name, Path(alone.file))
+            raise not_in_policy_error(alone, name, Path(alone.file))
         return AskedEnclave(planned_enclave(own, None, asking)._replace(policy=own), alone)
     opened = OpenedOnce(Path(keystore))
     opened.check()

@@ -258,7 +258,9 @@ class Automaton:
 
     def may_meet(self, other: Automaton) -> bool:
         """Return False if the prefixes or suffixes show that both automata share no name."""
-        return _agree(self.prefix, other.prefix) and _agree(self.suffix[::-1], other.suffix[::-1])
+        return _have_same_value(self.prefix, other.prefix) and _have_same_value(
+            self.suffix[::-1], other.suffix[::-1]
+        )
 
 
 def _only_way(
@@ -275,7 +277,7 @@ def _only_way(
     return found
 
 
-def _agree(one: str, other: str) -> bool:
+def _have_same_value(one: str, other: str) -> bool:
     return one.startswith(other) or other.startswith(one)
 
 
@@ -325,7 +327,7 @@ class _Some:
             for automaton in self._by_prefix.get(name[:length], ())
         )
 
-    def meeting(self, automaton: Automaton) -> Iterator[Automaton]:
+    def possibly_overlapping(self, automaton: Automaton) -> Iterator[Automaton]:
         """Yield the automata that may accept a name that ``automaton`` accepts."""
         begin = automaton.prefix
         for length in self._lengths:
@@ -451,7 +453,7 @@ class SearchLimit:
 
     def __init__(self, maximum: int = 600_000) -> None:
         """Set the limit to ``maximum`` steps; the default takes about ten seconds."""
-        self._left = maximum
+        self._fewest_letters_left = maximum
 
     def spend(self, steps: int) -> None:
         """Subtract ``steps`` from the steps that are left.
@@ -459,12 +461,12 @@ class SearchLimit:
         Raises:
             DocumentError: no steps are left.
         """
-        self._left -= steps
-        if self._left < 0:
-            raise _too_many()
+        self._fewest_letters_left -= steps
+        if self._fewest_letters_left < 0:
+            raise _too_many_error()
 
 
-def _too_many() -> DocumentError:
+def _too_many_error() -> DocumentError:
     return DocumentError(
         "there are too many wildcards to decide which names they match",
         "The sets of names that the wildcards share are too many to compare, such as with many "
@@ -691,7 +693,7 @@ def _leaves(node: _Node) -> Iterator[_Some]:
 # ── searching ──────────────────────────────────────────────────────────────────────────────
 
 
-def _reduced(
+def _simplified(
     node: _Node,
     certain_automata: frozenset[Automaton],
     possible_automata: frozenset[Automaton] | None,
@@ -710,19 +712,19 @@ def _reduced(
             return False
         return _Some(automata=left) if len(left) < len(node.automata) or node.exact else node
     if isinstance(node, _Not):
-        inner = _reduced(node.of, certain_automata, possible_automata)
+        inner = _simplified(node.of, certain_automata, possible_automata)
         return not inner if isinstance(inner, bool) else _Not(inner)
     if isinstance(node, _Intersection):
         kept: list[_Node] = []
         for part in node.of:
-            inner = _reduced(part, certain_automata, possible_automata)
+            inner = _simplified(part, certain_automata, possible_automata)
             if inner is False:
                 return False
             if not isinstance(inner, bool):
                 kept.append(inner)
         return (kept[0] if len(kept) == 1 else _Intersection(tuple(kept))) if kept else True
     if isinstance(node, _AtLeast):
-        parts = [_reduced(part, certain_automata, possible_automata) for part in node.of]
+        parts = [_simplified(part, certain_automata, possible_automata) for part in node.of]
         count = node.count - parts.count(True)
         open_ones = tuple(part for part in parts if not isinstance(part, bool))
         if count <= 0 or len(open_ones) < count:
@@ -731,7 +733,7 @@ def _reduced(
     rules: list[tuple[_Node, bool]] = []
     last = node.last
     for part, says in node.of:
-        inner = _reduced(part, certain_automata, possible_automata)
+        inner = _simplified(part, certain_automata, possible_automata)
         if inner is True:
             last = says
             break
@@ -759,20 +761,22 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
     leaves = tuple(_leaves(node))
     automata = frozenset[Automaton]().union(*(leaf.automata for leaf in leaves))
     if len(automata) > _MOST_AUTOMATA:
-        raise _too_many()
+        raise _too_many_error()
     exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
     everything = frozenset[Automaton]().union(*(leaf.everything for leaf in leaves))
     around = _including_set(node, _fewest_automata_first)
     for own in sorted(automata if around is None else around.automata, key=_automaton_order):
-        met = frozenset(automaton for leaf in leaves for automaton in leaf.meeting(own))
+        met = frozenset(
+            automaton for leaf in leaves for automaton in leaf.possibly_overlapping(own)
+        )
         if others := len(met) // _OF_A_STEP:
             limit.spend(others)
-        left = _reduced(node, everything | {own}, met)
+        left = _simplified(node, everything | {own}, met)
         if left is not False:
             yield _Search(_accepted_names(own, left), frozenset(filter(own.matches, exact)))
     none = frozenset[Automaton]()
-    if around is None and not everything and _reduced(node, none, none):
-        left = _reduced(node, none, None)
+    if around is None and not everything and _simplified(node, none, none):
+        left = _simplified(node, none, None)
         yield _Search(_Not(_Some()) if isinstance(left, bool) else left, exact)
 
 
@@ -787,33 +791,33 @@ def _fewest_automata_first(around: Surroundings) -> tuple[int, int]:
     return len(around.automata) + (not affixes) * _MOST_AUTOMATA, affixes
 
 
-def _needed(node: _Node) -> frozenset[Automaton]:
+def _including_automata(node: _Node) -> frozenset[Automaton]:
     """Return automata that accept every name of a set, which has no exact names."""
     match node:
         case _Some():
             return node.automata if len(node.automata) == 1 else frozenset()
         case _Not():
-            return _excepted(node.of)
+            return _excluding_automata(node.of)
         case _Intersection():
-            return frozenset[Automaton]().union(*map(_needed, node.of))
+            return frozenset[Automaton]().union(*map(_including_automata, node.of))
         case _AtLeast():
-            counts = Counter(need for part in node.of for need in _needed(part))
+            counts = Counter(need for part in node.of for need in _including_automata(part))
             spare = len(node.of) - node.count
             return frozenset(automaton for automaton, number in counts.items() if number > spare)
         case _First(last=False):
-            return _in_all(_needed(part) for part, says in node.of if says)
+            return _in_all(_including_automata(part) for part, says in node.of if says)
     return frozenset()
 
 
-def _excepted(node: _Node) -> frozenset[Automaton]:
+def _excluding_automata(node: _Node) -> frozenset[Automaton]:
     """Return automata that accept every name outside of a set, which has no exact names."""
     match node:
         case _Not():
-            return _needed(node.of)
+            return _including_automata(node.of)
         case _Intersection():
-            return _in_all(map(_excepted, node.of))
+            return _in_all(map(_excluding_automata, node.of))
         case _First(last=True):
-            return _in_all(_needed(part) for part, says in node.of if not says)
+            return _in_all(_including_automata(part) for part, says in node.of if not says)
     return frozenset()
 
 
@@ -844,7 +848,7 @@ class _Search:
         self._node = node
         found = {automaton for leaf in _leaves(node) for automaton in leaf.automata}
         self._machine = _machine(tuple(sorted(found, key=_automaton_order)))
-        self._needed = _needed(node)
+        self._including_automata = _including_automata(node)
         self._taken = _ExcludedNames(name for name in taken if node.truth(_contains_test(name)))
 
     def shortest(self, limit: SearchLimit, longest: int | None) -> str | None:
@@ -853,7 +857,7 @@ class _Search:
         start = machine.start, 0
         costs = {start: 0}
         before: dict[tuple[int, int], tuple[tuple[int, int], str]] = {}
-        left = self._left(machine.start)
+        left = self._fewest_letters_left(machine.start)
         if left is None:
             return None
         number = count()
@@ -864,14 +868,17 @@ class _Search:
             if cost > costs[state]:
                 continue
             reached, place = state
-            if place not in taken.ends and self._node.truth(machine.accepting(reached)):
-                return _spelt(state, before)
-            ways = taken.ways(place, machine.classes)
+            if place not in taken.ends and self._node.truth(machine.acceptance_test(reached)):
+                return _letters_to(state, before)
+            ways = taken.next_letters(place, machine.classes)
             limit.spend(len(ways) * (1 + machine.size // 1024))
             for letter, moves, there in ways:
                 to = _moved_places(reached, moves) & machine.useful
                 new, paid = (to, there), cost + len(letter.encode())
-                if costs.get(new, paid + 1) <= paid or (left := self._left(to)) is None:
+                if (
+                    costs.get(new, paid + 1) <= paid
+                    or (left := self._fewest_letters_left(to)) is None
+                ):
                     continue
                 if longest is None or paid + left <= longest:
                     costs[new] = paid
@@ -879,16 +886,18 @@ class _Search:
                     heapq.heappush(row, (paid + left, -paid, next(number), new))
         return None
 
-    def _left(self, positions: int) -> int | None:
+    def _fewest_letters_left(self, positions: int) -> int | None:
         """Return the fewest letters that complete a name, or None if no name begins in this way."""
         left = 0
-        for need in self._needed:
-            some = self._machine.left(need, positions)
+        for need in self._including_automata:
+            some = self._machine.fewest_letters_left(need, positions)
             if some is None:
                 return None
             left = max(left, some)
         return (
-            None if self._node.truth(self._machine.accepting_longer(positions)) is False else left
+            None
+            if self._node.truth(self._machine.longer_acceptance_test(positions)) is False
+            else left
         )
 
 
@@ -896,7 +905,7 @@ def _contains_test(name: str) -> _Test:
     return lambda some: some.accepts(name)
 
 
-def _spelt(
+def _letters_to(
     state: tuple[int, int], before: Mapping[tuple[int, int], tuple[tuple[int, int], str]]
 ) -> str:
     """Return the letters on the way to a state, which ``before`` leads back to the start."""
@@ -945,11 +954,11 @@ class _Machine:
             for at, letters, to in a.edges
         )
 
-    def accepting(self, positions: int) -> _Test:
+    def acceptance_test(self, positions: int) -> _Test:
         """Return a test whether an automaton of a set accepts the text read so far."""
         return lambda some: any(positions & self._ends[automaton] for automaton in some.automata)
 
-    def accepting_longer(self, positions: int) -> _Test:
+    def longer_acceptance_test(self, positions: int) -> _Test:
         """Return a test whether an automaton of a set may accept a longer text."""
 
         def ask(some: _Some) -> _Truth:
@@ -963,7 +972,7 @@ class _Machine:
 
         return ask
 
-    def left(self, automaton: Automaton, positions: int) -> int | None:
+    def fewest_letters_left(self, automaton: Automaton, positions: int) -> int | None:
         """Return the fewest letters after which an automaton accepts; None if there is no way."""
         for distance, places in self._levels[automaton]:
             if positions & places:
@@ -989,11 +998,13 @@ def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
     for key, ranges in alike.items():
         letters = Letters(tuple(ranges))
         of = (by_letters[kind] for kind, has in zip(kinds, key, strict=True) if has)
-        found.append(_Class(letters, _best(letters), _moves(each for some in of for each in some)))
+        found.append(
+            _Class(letters, _best_letter(letters), _moves(each for some in of for each in some))
+        )
     return tuple(sorted(found, key=lambda each: _letter_rank(each.best)))
 
 
-def _best(letters: Letters, excluded: Container[str] = ()) -> str:
+def _best_letter(letters: Letters, excluded: Container[str] = ()) -> str:
     """Return the best letter for an example, or "" if all of them are excluded."""
     for letter in _PREFERRED:
         if letter in letters and letter not in excluded:
@@ -1027,13 +1038,13 @@ class _ExcludedNames:
             self.ends.add(at)
         self._ways: dict[int, list[tuple[str, _Moves, int]]] = {}
 
-    def ways(self, place: int, classes: Sequence[_Class]) -> list[tuple[str, _Moves, int]]:
+    def next_letters(self, place: int, classes: Sequence[_Class]) -> list[tuple[str, _Moves, int]]:
         """Return the next letters to try at a place, each with its moves and the next place."""
         if place not in self._ways:
             children = self._tree[place] if place >= 0 else {}
             found = []
             for letters, best, moves in classes:
-                other = _best(letters, children) if best in children else best
+                other = _best_letter(letters, children) if best in children else best
                 if other:
                     found.append((other, moves, -1))
                 inner = ((letter, to) for letter, to in children.items() if letter in letters)

@@ -424,14 +424,14 @@ def assign(
     units = Counter(programs.values())
     assigned: list[ClosedProcess] = []
 
-    def give(process: Process, enclave: str, known_by: str) -> None:
+    def assign_enclave(process: Process, enclave: str, known_by: str) -> None:
         origin = origins[process.pid]
         del left[process.pid]
         unit = origin.unit if units[origin.unit] == 1 else ""
         assigned.append(ClosedProcess.of(process, enclave, origin._replace(unit=unit), known_by))
 
     for router in [process for process in left.values() if process.is_router]:
-        give(router, _ROUTER, "program")
+        assign_enclave(router, _ROUTER, "program")
     by_enclave: dict[str, list[ObservedNode]] = {}
     for node in nodes:
         by_enclave.setdefault(node.enclaves[0], []).append(node)
@@ -448,7 +448,7 @@ def assign(
             ]
             if len(processes) <= len({node.participant for node in of_enclave}):
                 for process in processes:
-                    give(process, enclave, known_by)
+                    assign_enclave(process, enclave, known_by)
     of_program: dict[int, set[str]] = {}
     for each in assigned:
         of_program.setdefault(each.pid, set()).add(each.enclave)
@@ -597,7 +597,7 @@ def access_lines(policy: Policy, folder: Path) -> list[str]:
     return [*lines[:_MOST_LINES], *([f"and {counted(more, 'more name')}"] if more > 0 else [])]
 
 
-def forbidding(robot: Path, addition: str, moment: datetime) -> list[Requirement]:
+def requirements_broken_by(robot: Path, addition: str, moment: datetime) -> list[Requirement]:
     """Return the requirements in the folder of a closed robot that more rights would break.
 
     ``addition`` is the policy document with these rights.  None if the folder has no requirements,
@@ -610,12 +610,12 @@ def forbidding(robot: Path, addition: str, moment: datetime) -> list[Requirement
         needed, template = read_requirements(file), load_template(_TEMPLATE)
         merged = merge_into(path, read_policy(path, addition.encode())).document
 
-        def broken(policy: Policy) -> dict[Requirement, None]:
+        def broken_requirements(policy: Policy) -> dict[Requirement, None]:
             decided = decide_all(needed, policy_system(policy, moment=moment, template=template))
             return dict.fromkeys(violation.requirement for violation in decided.violations)
 
-        if after := broken(read_policy(path, merged)):
-            before = broken(read_policy(path))
+        if after := broken_requirements(read_policy(path, merged)):
+            before = broken_requirements(read_policy(path))
             return [requirement for requirement in after if requirement not in before]
     except SrosError:
         pass
@@ -760,7 +760,9 @@ class OpenRobot:
                 self._write_processes(self.observed)
         denied_before: Sequence[str] = ()
         with suppress(SrosError):  # the steps say what is wrong
-            denied_before = self._denied() if self.export.exists() and self.seen.exists() else ()
+            denied_before = (
+                self._denied_access_texts() if self.export.exists() and self.seen.exists() else ()
+            )
         steps, problems, is_stopped = [], [], False
         for step in self.steps(duration):
             state = "kept" if step.made and step.made.exists() else "open"
@@ -775,7 +777,10 @@ class OpenRobot:
                 is_stopped = step.guards and state == "findings"
             steps.append(CloseStep(step.command, state))
             if step.into == self.seen and not dry_run:
-                mixed = [*self._programs(), *(() if partial else self._twins())]
+                mixed = [
+                    *self._shared_program_texts(),
+                    *(() if partial else self._shared_node_texts()),
+                ]
                 problems, is_stopped = [*problems, *mixed], bool(mixed)
         changes = [] if dry_run or is_stopped else self._remove_enclaves()
         closing = self._closing()._replace(steps=steps, dry_run=dry_run)
@@ -784,7 +789,7 @@ class OpenRobot:
         if self.observed and len(closing.observed.processes) > len(self.observed.processes):
             self._write_processes(closing.observed)
         changes = [*self._write_starts(closing), *changes]
-        denied = self._denied()
+        denied = self._denied_access_texts()
         newly = [right for right in denied if right not in denied_before]
         problems += self._problems(closing, partial=partial)
         return closing._replace(
@@ -965,7 +970,7 @@ class OpenRobot:
             f"run `sros close {shlex.quote(str(self.folder))}`; if they are right, add them: {add}"
         )
 
-    def _programs(self) -> Iterator[str]:
+    def _shared_program_texts(self) -> Iterator[str]:
         """Yield which programs start processes of several enclaves, and so would put all in one."""
         observed = (self.observed or ObservedProcesses(self.domain)).within(
             read_policy(self.policy)
@@ -986,7 +991,7 @@ class OpenRobot:
                     f"sros close {shlex.quote(str(self.folder))} --for 1m"
                 )
 
-    def _twins(self) -> Iterator[str]:
+    def _shared_node_texts(self) -> Iterator[str]:
         """Yield which processes share names of nodes, and so would share one enclave."""
         by_enclave: dict[str, list[ClosedProcess]] = {}
         for process in self.observed.processes if self.observed else ():
@@ -1150,7 +1155,7 @@ class OpenRobot:
         """The keystore, or the policy if the keystore was brought to another machine."""
         return self.keystore if self.keystore.exists() else self.policy
 
-    def _denied(self) -> list[str]:
+    def _denied_access_texts(self) -> list[str]:
         """Return, as sentences, what the keystore denies to the observed nodes."""
         return [str(right) for right in self._denied_rights()]
 

@@ -38,12 +38,12 @@ class Shipped(NamedTuple):
     @property
     def release(self) -> str:
         """The product and the release, such as ``Fast DDS 3.6``."""
-        return f"{self.product} {_minor(self.latest)}"
+        return f"{self.product} {_minor_version(self.latest)}"
 
     @property
     def tested(self) -> bool:
         """Whether sros decides by rules that were tested with this release."""
-        return _minor(self.vendor.release) == _minor(self.latest)
+        return _minor_version(self.vendor.release) == _minor_version(self.latest)
 
     def __str__(self) -> str:
         """Return text such as ``Fast DDS 3.6, assumed to decide as Fast DDS 2.14``."""
@@ -191,7 +191,7 @@ def selected_vendors(vendor: str, distributions: Sequence[Distribution]) -> tupl
     return tuple(dict.fromkeys(shipped))
 
 
-def sourced(environment_value: str | None) -> Distribution | None:
+def sourced_distribution(environment_value: str | None) -> Distribution | None:
     """Return the distribution that $ROS_DISTRO names; None if sros does not know it."""
     return find_distribution(environment_value) if environment_value in DISTRIBUTIONS else None
 
@@ -213,12 +213,14 @@ def _decided_as(product: str, version: str) -> Vendor:
         (vendor for vendor in TESTED if vendor.traits.product == product),
         key=lambda vendor: _numbers(vendor.release),
     )
-    release = _numbers(_minor(version))
-    not_later = [vendor for vendor in vendors if _numbers(_minor(vendor.release)) <= release]
+    release = _numbers(_minor_version(version))
+    not_later = [
+        vendor for vendor in vendors if _numbers(_minor_version(vendor.release)) <= release
+    ]
     return not_later[-1] if not_later else vendors[0]
 
 
-def _minor(version: str) -> str:
+def _minor_version(version: str) -> str:
     """Return the first two numbers of a version, by which releases differ."""
     return ".".join(version.split(".")[:2])
 

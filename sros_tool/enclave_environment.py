@@ -93,7 +93,7 @@ def loadable_environment(
     )
     from sros_tool.keystore.participant import JoinContext
     from sros_tool.keystore.reader import Keystore
-    from sros_tool.keystore.selection import no_such_enclave
+    from sros_tool.keystore.selection import missing_enclave_error
     from sros_tool.names import check_enclave_name
     from sros_tool.pki.token import MODULE_VARIABLE
     from sros_tool.runtime.environment import (
@@ -122,7 +122,7 @@ def loadable_environment(
     keystore = Keystore(root)
     keystore.check()
     if not has_enclave(root, name):
-        raise no_such_enclave(keystore, name, keystore.names)
+        raise missing_enclave_error(keystore, name, keystore.names)
     folder = keystore.folder(name)
     state = keystore.enclave(name, now=now)
     domains = state.domains() if wanted is not None else state.joined_domains()
@@ -177,7 +177,7 @@ def loadable_environment(
     module = environment.get(MODULE_VARIABLE)
     if module and not target:
         variables[MODULE_VARIABLE] = module
-    notes += (_token_there(name, state.token),) if target else tuple(pin_notes(state.token))
+    notes += (_missing_token_note(name, state.token),) if target else tuple(pin_notes(state.token))
     return EnclaveEnvironment(variables, notes, needs_pin=not state.token.pin_source)
 
 
@@ -261,7 +261,7 @@ def _check_dates_here(name: str, keystore: Keystore, vendor: Vendor, context: Jo
 # ── keys on tokens ─────────────────────────────────────────────────────────────────────────
 
 
-def _token_there(name: str, place: TokenUri) -> Note:
+def _missing_token_note(name: str, place: TokenUri) -> Note:
     pin = f"its PIN in '{place.pin_source}'" if place.pin_source else "its PIN"
     return Note(
         "token.there",
@@ -390,12 +390,12 @@ def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
         return
     authority = keystore.ca_certificate(PERMISSIONS)
 
-    def drifted(moment: datetime | None) -> bool:
+    def has_drifted(moment: datetime | None) -> bool:
         drift = zenoh_drift(keystore, network, keystore.domains, authority, moment)
         return any(file.enclave == name for file in drift.files)
 
     # The router starts although the permissions of another enclave have expired since.
-    if drifted(now) and drifted(None):
+    if has_drifted(now) and has_drifted(None):
         where = quote(str(keystore.root))
         raise KeystoreError(
             f"the Zenoh configuration of enclave {name} does not match the keystore",

@@ -88,7 +88,7 @@ class Folder:
     def state(self, path: str) -> os.stat_result | None:
         """Return the lstat(2) of ``path`` (a link is not followed); None if nothing is there."""
         try:
-            parent, name = self._at(path)
+            parent, name = self._folder_and_name(path)
             return os.stat(name, dir_fd=parent, follow_symlinks=False)
         except FileNotFoundError:
             return None
@@ -106,13 +106,13 @@ class Folder:
         """
         state = self.state(path)
         if state is not None and not stat.S_ISDIR(state.st_mode):
-            raise self._in_the_way(path, link=stat.S_ISLNK(state.st_mode))
+            raise self._blocked_path_error(path, link=stat.S_ISLNK(state.st_mode))
         return state is not None
 
     def link_target(self, path: str) -> str | None:
         """Return the target text of the link at ``path``; None if there is no link."""
         try:
-            parent, name = self._at(path)
+            parent, name = self._folder_and_name(path)
             return os.readlink(name, dir_fd=parent)
         except OSError as error:
             if error.errno in (errno.EINVAL, errno.ENOENT):
@@ -130,7 +130,7 @@ class Folder:
 
     def read(self, path: str, *, max_bytes: int = _MOST_BYTES) -> bytes:
         """Return the content of the regular file at ``path``, of at most ``max_bytes`` bytes."""
-        with self._naming(path), self.open(path) as file:
+        with self._adding_path_to_errors(path), self.open(path) as file:
             state = os.fstat(file.fileno())
             if not stat.S_ISREG(state.st_mode):
                 raise OSError(errno.EINVAL, "it is not a regular file", str(self.path / path))
@@ -140,8 +140,8 @@ class Folder:
 
     def open(self, path: str) -> BinaryIO:
         """Open ``path`` for reading, whatever its file type; return the file object."""
-        parent, name = self._at(path)
-        with self._naming(path):
+        parent, name = self._folder_and_name(path)
+        with self._adding_path_to_errors(path):
             return open(os.open(name, _OLD_FILE, dir_fd=parent), "rb")
 
     def read_inside(self, path: str) -> bytes:
@@ -177,8 +177,8 @@ class Folder:
         Returns:
             A descriptor for writing, which the caller closes.
         """
-        parent, name = self._at(path)
-        with self._naming(path):
+        parent, name = self._folder_and_name(path)
+        with self._adding_path_to_errors(path):
             handle = os.open(name, _NEW_FILE, mode, dir_fd=parent)
             if self._hand_over:
                 os.fchown(handle, *self._owner)
@@ -193,7 +193,7 @@ class Folder:
         handle = self.create(path, mode)
         try:
             for part in parts:
-                with self._naming(path):
+                with self._adding_path_to_errors(path):
                     write_all(handle, part)
         finally:
             os.close(handle)
@@ -207,14 +207,14 @@ class Folder:
         try:
             return self.create(path, 0o600)
         except FileExistsError:
-            parent, name = self._at(path)
-            with self._naming(path):
+            parent, name = self._folder_and_name(path)
+            with self._adding_path_to_errors(path):
                 return os.open(name, _OLD_FILE, dir_fd=parent)
 
     def symlink(self, target: str, path: str) -> None:
         """Make the symbolic link ``path`` with the text ``target``."""
-        parent, name = self._at(path)
-        with self._naming(path):
+        parent, name = self._folder_and_name(path)
+        with self._adding_path_to_errors(path):
             os.symlink(target, name, dir_fd=parent)
             if self._hand_over:
                 # By a handle: meanwhile, the owner of the folder could put another file there.
@@ -231,8 +231,8 @@ class Folder:
         It stays as it is if it belongs to somebody else than this folder, or has another hard link,
         which may be elsewhere.
         """
-        parent, name = self._at(path)
-        with self._naming(path):
+        parent, name = self._folder_and_name(path)
+        with self._adding_path_to_errors(path):
             handle = os.open(name, _OLD_FILE, dir_fd=parent)
             try:
                 state = os.fstat(handle)
@@ -243,8 +243,8 @@ class Folder:
 
     def mkdir(self, path: str, mode: int) -> None:
         """Make the folder ``path``; its permission bits are ``mode`` whatever the umask is."""
-        parent, name = self._at(path)
-        with self._naming(path):
+        parent, name = self._folder_and_name(path)
+        with self._adding_path_to_errors(path):
             os.mkdir(name, 0o700, dir_fd=parent)
         if mode != 0o700 or self._hand_over:
             handle = self.handle(path)
@@ -254,31 +254,31 @@ class Folder:
 
     def copy(self, source: str, target: str) -> None:
         """Copy the regular file ``source`` with its permission bits and times to a new file."""
-        parent, name = self._at(source)
+        parent, name = self._folder_and_name(source)
         old = os.stat(name, dir_fd=parent, follow_symlinks=False)
         self.write(target, self.read(source), stat.S_IMODE(old.st_mode) & 0o777)
-        parent, name = self._at(target)
+        parent, name = self._folder_and_name(target)
         os.utime(name, ns=(old.st_atime_ns, old.st_mtime_ns), dir_fd=parent, follow_symlinks=False)
 
     # ── moving and removing ────────────────────────────────────────────────────────────────
 
     def replace(self, source: str, target: str) -> None:
         """Rename ``source`` to ``target``; replace an existing file or link."""
-        here, name, there, new = self._pair(source, target)
-        with self._naming(target):
+        here, name, there, new = self._two_places(source, target)
+        with self._adding_path_to_errors(target):
             os.replace(name, new, src_dir_fd=here, dst_dir_fd=there)
 
     def rename(self, source: str, target: str) -> None:
         """Rename the folder ``source`` to ``target``, which is missing or an empty folder."""
-        here, name, there, new = self._pair(source, target)
-        with self._naming(target):
+        here, name, there, new = self._two_places(source, target)
+        with self._adding_path_to_errors(target):
             os.rename(name, new, src_dir_fd=here, dst_dir_fd=there)
         self.forget(source)
 
     def link(self, source: str, target: str) -> None:
         """Make ``target`` a second name (a hard link) of the file ``source``."""
-        here, name, there, new = self._pair(source, target)
-        with self._naming(target):
+        here, name, there, new = self._two_places(source, target)
+        with self._adding_path_to_errors(target):
             os.link(name, new, src_dir_fd=here, dst_dir_fd=there, follow_symlinks=False)
 
     def exchange(self, one: str, other: str) -> bool:
@@ -287,23 +287,23 @@ class Folder:
         Return False, without a change, if the kernel, the C library or the file system does not
         support it.
         """
-        return exchange(*self._pair(one, other))
+        return exchange(*self._two_places(one, other))
 
     def unlink(self, path: str, *, missing_ok: bool = False) -> None:
         """Remove the file or link at ``path``."""
         with contextlib.ExitStack() as stack:
             if missing_ok:
                 stack.enter_context(contextlib.suppress(FileNotFoundError))
-            parent, name = self._at(path)
-            with self._naming(path):
+            parent, name = self._folder_and_name(path)
+            with self._adding_path_to_errors(path):
                 os.unlink(name, dir_fd=parent)
 
     def rmdir(self, path: str) -> None:
         """Remove the empty folder at ``path``."""
         if path in self._handles:
             self.forget()
-        parent, name = self._at(path)
-        with self._naming(path):
+        parent, name = self._folder_and_name(path)
+        with self._adding_path_to_errors(path):
             os.rmdir(name, dir_fd=parent)
 
     def remove_tree(self, path: str) -> None:
@@ -311,7 +311,7 @@ class Folder:
         import shutil
 
         self.forget()
-        parent, name = self._at(path)
+        parent, name = self._folder_and_name(path)
         shutil.rmtree(name, dir_fd=parent)
 
     # ── the disk ───────────────────────────────────────────────────────────────────────────
@@ -337,21 +337,21 @@ class Folder:
         except OSError as error:
             if error.errno in (errno.ELOOP, errno.ENOTDIR):
                 link = self.link_target(path) is not None
-                raise self._in_the_way(path, link=link) from error
+                raise self._blocked_path_error(path, link=link) from error
             error.filename = str(self.path / path)
             raise
         self._handles[path] = handle
         return handle
 
-    def _at(self, path: str) -> tuple[int, str]:
+    def _folder_and_name(self, path: str) -> tuple[int, str]:
         """Return the descriptor of the folder that ``path`` is in, and its last part."""
         if len(self._handles) > _MOST_OPEN:
             self.forget()
         return self._find(path)
 
-    def _pair(self, one: str, other: str) -> tuple[int, str, int, str]:
-        """Return `_at` of two paths; opening the second does not evict the first from the cache."""
-        return (*self._at(one), *self._find(other))
+    def _two_places(self, one: str, other: str) -> tuple[int, str, int, str]:
+        """Return `_folder_and_name` of two paths, whose folders stay open together."""
+        return (*self._folder_and_name(one), *self._find(other))
 
     def _find(self, path: str) -> tuple[int, str]:
         folder, _, name = path.rpartition("/")
@@ -360,7 +360,7 @@ class Folder:
         return self.handle(folder), name
 
     @contextlib.contextmanager
-    def _naming(self, path: str) -> Iterator[None]:
+    def _adding_path_to_errors(self, path: str) -> Iterator[None]:
         """Add the full path to an OSError that the body raises."""
         try:
             yield
@@ -368,7 +368,7 @@ class Folder:
             error.filename, error.filename2 = str(self.path / path), None
             raise
 
-    def _in_the_way(self, path: str, *, link: bool) -> KeystoreError:
+    def _blocked_path_error(self, path: str, *, link: bool) -> KeystoreError:
         whole = self.path / path
         if link:
             return KeystoreError(

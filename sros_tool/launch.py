@@ -95,7 +95,7 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
                 f"secured_nodes cannot be used with {_FILTER}: the processes that it leaves out "
                 "would be in no enclave. Leave the filter out."
             )
-        secured = _of_launch(Path(keystore), Path(policy), enclave)
+        secured = _secured_launch_actions(Path(keystore), Path(policy), enclave)
         if secured:
             from launch_ros.ros_adapters import get_ros_adapter
 
@@ -114,7 +114,9 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
         Executable.prepare = _prepare_labelled  # not where launch only looks for this action
 
 
-def _of_launch(keystore: Path, policy: Path, enclave: str) -> EnclaveEnvironment | None:
+def _secured_launch_actions(
+    keystore: Path, policy: Path, enclave: str
+) -> EnclaveEnvironment | None:
     """Return the environment of the node of launch, or None if it has no enclave.
 
     Raises:

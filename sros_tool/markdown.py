@@ -35,7 +35,7 @@ def fenced(text: str, language: str = "text") -> str:
     return f"{fence}{language}\n{lines}\n{fence}"
 
 
-def bounded(items: Iterable[str], maximum: int, rest: str) -> str:
+def bounded_list(items: Iterable[str], maximum: int, rest: str) -> str:
     """Return ``items`` as a Markdown list of at most ``maximum`` characters.
 
     A last item counts those that do not fit, followed by ``rest``, a clause that says where to

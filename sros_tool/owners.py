@@ -42,7 +42,7 @@ def replaceable_on_the_way(path: Path, trusted_users: frozenset[int]) -> Iterato
     A sticky folder such as ``/tmp``, in which only the owner of a file can rename it, counts only
     if others own the next part of the path in it.
     """
-    for step, state in _way(path):
+    for step, state in _path_states(path):
         kept = state.st_mode & stat.S_ISVTX and state.st_uid in trusted_users
         if not kept and (why := other_writers(state, trusted_users)):
             yield step, why
@@ -55,12 +55,12 @@ def file_of_root(path: Path) -> Path | None:
         state = real.lstat()
     except (OSError, RuntimeError, ValueError):  # a loop of links, or a NUL byte
         return None
-    ways = [state, *(status for _, status in _way(real))]
+    ways = [state, *(status for _, status in _path_states(real))]
     ours = stat.S_ISREG(state.st_mode) and not any(other_writers(status, _ROOT) for status in ways)
     return real if ours else None
 
 
-def _way(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
+def _path_states(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
     """Yield the folders and links on the way to ``path``, each with its lstat(2).
 
     ``path`` itself is included only if it is a link.

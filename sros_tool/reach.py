@@ -173,7 +173,7 @@ class _Direction:
         self._topics = sorted(self._exact)
         self._prefixes = sorted(self._wild)
 
-    def meeting(self, topic: str) -> Iterator[_Access]:
+    def possibly_overlapping(self, topic: str) -> Iterator[_Access]:
         """Yield the accesses whose topics may overlap ``topic``, which can be a wildcard.
 
         Only the text before the first wildcard is compared, so some of them do not overlap.
@@ -258,18 +258,18 @@ class Network:
         ``topic`` can be a wildcard: then they may use some topic that it matches.
         """
         asked = _Access("", topic, ())
-        ends = self._sides[direction].meeting(topic)
-        return frozenset(end.enclave for end in ends if _shared(asked, end))
+        ends = self._sides[direction].possibly_overlapping(topic)
+        return frozenset(end.enclave for end in ends if _shared_topic(asked, end))
 
     def reach(self, enclave: str) -> Reach:
         """Return the enclaves that an enclave can influence and learn from, over several hops."""
-        return Reach(enclave, self.influenced({enclave}), self.influencing({enclave}))
+        return Reach(enclave, self.influenced_by({enclave}), self.influencers_of({enclave}))
 
-    def influenced(self, enclaves: Collection[str]) -> dict[str, HopPath]:
+    def influenced_by(self, enclaves: Collection[str]) -> dict[str, HopPath]:
         """Return all others that these enclaves can influence, each with a shortest path."""
         return self._search(enclaves, True)
 
-    def influencing(self, enclaves: Collection[str]) -> dict[str, HopPath]:
+    def influencers_of(self, enclaves: Collection[str]) -> dict[str, HopPath]:
         """Return all others that can influence these enclaves, each with a shortest path."""
         return self._search(enclaves, False)
 
@@ -300,22 +300,24 @@ class Network:
             if like in used_hops:
                 continue
             used_hops.add(like)
-            for other in others.meeting(end.topic):
+            for other in others.possibly_overlapping(end.topic):
                 if other.enclave in known:
                     continue
                 writer, reader = (end, other) if forward else (other, end)
-                if name := self._carrying(writer, reader):
+                if name := self._carried_topic(writer, reader):
                     yield _hop(writer, reader, name)
 
-    def _carrying(self, writer: _Access, reader: _Access) -> str:
+    def _carried_topic(self, writer: _Access, reader: _Access) -> str:
         """Return a DDS topic that a writer may write and a reader gets, or ""."""
         if not _in_common(writer.domains, reader.domains):
             return ""
         sending, receiving = (self._router_of.get(end.enclave, "") for end in (writer, reader))
         if sending == receiving:
-            return _shared(writer, reader)
-        passing = self._passing[receiving].meeting(writer.topic)
-        names = (_shared(writer, reader, given) for given in passing if given.enclave == sending)
+            return _shared_topic(writer, reader)
+        passing = self._passing[receiving].possibly_overlapping(writer.topic)
+        names = (
+            _shared_topic(writer, reader, given) for given in passing if given.enclave == sending
+        )
         return next(filter(None, names), "")
 
 
@@ -371,14 +373,14 @@ def _accesses(
     for (enclave, direction), topics in sorted(allowed.items()):
         outside = sorted(denied[enclave, direction].union(ignored))
         accesses = []
-        for topic in sorted(topics, key=_plain_first):
+        for topic in sorted(topics, key=_exact_names_first):
             met = tuple(name for name in outside if overlap(name, topic))
             if not any(name == topic or covers(name, topic) for name in met):
                 accesses.append(_Access(enclave, topic, met, domains))
         yield direction, accesses
 
 
-def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
+def _exact_names_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
     """Return a sort key: topics before services, and /rosout last."""
     kind = topic[:3]
     return (
@@ -390,7 +392,7 @@ def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
     )
 
 
-def _shared(*accesses: _Access) -> str:
+def _shared_topic(*accesses: _Access) -> str:
     """Return a DDS topic that all accesses allow, or ""."""
     topics = sorted({access.topic for access in accesses})
     if not all(overlap(one, other) for one, other in combinations(topics, 2)):

@@ -69,7 +69,7 @@ class Window:
         """
         return self.not_after - min(_SOON, (self.not_after - self.not_before) / 3)
 
-    def life(self, made_at: datetime | None = None) -> timedelta:
+    def lifetime(self, made_at: datetime | None = None) -> timedelta:
         """Return how long a document with this validity is valid after it was made.
 
         ``made_at`` is when it was made, or when its file came here; a time long before the validity
@@ -86,11 +86,11 @@ class Window:
             begin = min(max(made_at, self.not_before), latest)
         return self.not_after - begin
 
-    def within(self, outer: Window) -> Window:
+    def intersection(self, outer: Window) -> Window:
         """Return the part of this window that is in ``outer``."""
         return Window(max(self.not_before, outer.not_before), min(self.not_after, outer.not_after))
 
-    def lasts(self, new: Window, now: datetime) -> bool:
+    def can_be_kept(self, new: Window, now: datetime) -> bool:
         """Return whether a document with this validity can be kept instead of a ``new`` one.
 
         It can while more than a third of ``new`` is left, and if it does not expire after ``new``.

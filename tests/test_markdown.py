@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.markdown import bounded, code, fenced, plain
+from sros_tool.markdown import bounded_list, code, fenced, plain
 from tests.support.harness import policy_text, publish, sros
 
 HOSTILE = [
@@ -68,7 +68,7 @@ def test_a_fence_ends_where_it_should(text: str) -> None:
 
 def test_words_are_no_markup_and_a_list_is_bounded() -> None:
     assert plain("a rule for * [x](y) <b> `c` a_b") == r"a rule for \* \[x\](y) \<b\> \`c\` a\_b"
-    listed = bounded(("x" * 90 for _ in range(1000)), 1000, "which are elsewhere")
+    listed = bounded_list(("x" * 90 for _ in range(1000)), 1000, "which are elsewhere")
     assert listed.endswith("\n- and 990 more, which are elsewhere")
     assert len(listed) < 1100
 

@@ -91,10 +91,10 @@ def test_a_window_begins_early_enough_for_every_time_zone(moment: datetime, leng
 @given(moments, st.lists(seconds, min_size=3, max_size=3, unique=True))
 def test_a_window_within_another(moment: datetime, lengths: list[int]) -> None:
     one, two = (Window(moment, moment + timedelta(seconds=each)) for each in lengths[:2])
-    both = one.within(two)
-    assert both == two.within(one)
+    both = one.intersection(two)
+    assert both == two.intersection(one)
     assert both.not_after == min(one.not_after, two.not_after)
     with pytest.raises(UsageError):
         Window(moment, moment)
     with pytest.raises(UsageError):
-        one.within(Window(one.not_after, one.not_after + timedelta(seconds=1)))
+        one.intersection(Window(one.not_after, one.not_after + timedelta(seconds=1)))

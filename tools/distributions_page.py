@@ -8,7 +8,7 @@ from dataclasses import fields
 from enum import Enum
 
 from sros_tool.checks.upgrade import ALL
-from sros_tool.dds.decision.vendors import TESTED, VendorTraits, together
+from sros_tool.dds.decision.vendors import TESTED, VendorTraits, joined_titles
 from sros_tool.distributions import SUPPORTED, Shipped
 from sros_tool.names import has_type_descriptions
 from sros_tool.zenoh.releases import version_text
@@ -86,7 +86,7 @@ def _where(values: Sequence[object]) -> Iterator[str]:
     """Yield the releases that have each of a trait's values, in words."""
     for value in dict.fromkeys(values):
         titles = [vendor.title for vendor, own in zip(TESTED, values, strict=True) if own == value]
-        releases = ", ".join(together(titles))
+        releases = ", ".join(joined_titles(titles))
         if value is True:
             yield releases
         elif isinstance(value, Enum):

@@ -69,7 +69,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, open_enclave, read_certificate
-from sros_tool.keystore.transaction.transaction import tidy
+from sros_tool.keystore.transaction.transaction import recover_keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import make_request, validity_of
 from sros_tool.pki.crl import list_number, load_crl
@@ -171,7 +171,7 @@ class _Round:
 
     def run(self) -> Round:
         now, before = self._machine.now, self._state
-        self._attempt(lambda: tidy(self._folder))
+        self._attempt(lambda: recover_keystore(self._folder))
         boot = self._machine.boot()
         if self._machine.restarted or before.boot != boot:
             # After a start of the machine no process has files of before; what is seen counts.
@@ -811,7 +811,7 @@ def _is_due(file: Path, now: datetime) -> bool:
     """
     validity = validity_of(read_certificate(file))
     here_since = time_of_file(file.stat().st_mtime)
-    return now >= validity.not_after - validity.life(here_since) / 3
+    return now >= validity.not_after - validity.lifetime(here_since) / 3
 
 
 def _enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:

@@ -181,7 +181,7 @@ def fetch_release(
             if not is_here:
                 updater.download_target(target, str(path))
     except (DownloadError, RepositoryError, OSError, ValueError) as error:
-        raise _explained(error, source, now) from error
+        raise _fetch_error(error, source, now) from error
     return _read(path, robot, number)
 
 
@@ -297,7 +297,7 @@ def _read(path: Path, robot: str, number: int) -> Release:
 _CLOCK = "set the clock of this robot, if it is wrong"
 
 
-def _explained(error: Exception, source: str, now: datetime) -> FetchError:
+def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
     """Return what an error of the client of TUF means for the robot."""
     from tuf.api import exceptions
 

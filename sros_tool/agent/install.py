@@ -47,7 +47,7 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.keystore.reader import OpenedEnclave, open_enclave, weaknesses
-from sros_tool.keystore.transaction.transaction import Transaction, tidy
+from sros_tool.keystore.transaction.transaction import Transaction, recover_keystore
 from sros_tool.pki.certificates import (
     digest,
     load_certificates,
@@ -122,7 +122,7 @@ def install_release(
         OSError: nothing could be written, for example because the disk is full; the revocation
             lists were installed if there was room for them.
     """
-    tidy(folder)
+    recover_keystore(folder)
     _check_folder(folder)
     present = search_enclaves(folder)[0]
     _check_release(folder, present, release, robot, installed, pinned)

@@ -194,39 +194,49 @@ def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
         elif key == "unit" and isinstance(entry, list):
             fields["units"] = tuple(_unit(unit, label) for unit in entry)
         else:
-            raise _wrong(label, f"{key} is not a known key, or its value has the wrong form")
+            raise _invalid_settings_error(
+                label, f"{key} is not a known key, or its value has the wrong form"
+            )
     if missing := [key for key in ("robot", "from", "inbox") if _TEXTS[key] not in fields]:
-        raise _wrong(label, f"it lacks {', '.join(missing)}")
+        raise _invalid_settings_error(label, f"it lacks {', '.join(missing)}")
     settings = AgentSettings(**fields)
     if problem := name_problem(settings.robot):
-        raise _wrong(label, f"{settings.robot!r} is not the name of a robot: {problem}")
+        raise _invalid_settings_error(
+            label, f"{settings.robot!r} is not the name of a robot: {problem}"
+        )
     for place in (settings.source, settings.inbox):
         if not _SOURCE.match(place):
-            raise _wrong(label, f"{place!r} is neither a URL (https, http) nor an absolute path")
+            raise _invalid_settings_error(
+                label, f"{place!r} is neither a URL (https, http) nor an absolute path"
+            )
     if not all(map(_DIGEST.match, settings.authorities)):
-        raise _wrong(label, "authorities are the SHA-256 of CAs, in lower-case hexadecimal")
+        raise _invalid_settings_error(
+            label, "authorities are the SHA-256 of CAs, in lower-case hexadecimal"
+        )
     if not settings.systemctl:
-        raise _wrong(label, "systemctl is empty")
+        raise _invalid_settings_error(label, "systemctl is empty")
     return settings
 
 
 def _unit(value: Any, label: str) -> Unit:
     if not isinstance(value, dict) or value.keys() != {"name", "enclaves"}:
-        raise _wrong(label, "a unit has the keys name and enclaves")
+        raise _invalid_settings_error(label, "a unit has the keys name and enclaves")
     name, enclaves = value["name"], value["enclaves"]
     if not isinstance(name, str) or not _UNIT.match(name):
-        raise _wrong(label, f"{name!r} is not the name of a service or target of systemd")
+        raise _invalid_settings_error(
+            label, f"{name!r} is not the name of a service or target of systemd"
+        )
     if not _is_texts(enclaves):
-        raise _wrong(label, f"the enclaves of {name} are not a list of names")
+        raise _invalid_settings_error(label, f"the enclaves of {name} are not a list of names")
     try:
         return Unit(name, tuple(map(check_enclave_name, enclaves)))
     except InvalidNameError as error:
-        raise _wrong(label, str(error)) from error
+        raise _invalid_settings_error(label, str(error)) from error
 
 
 def _is_texts(value: object) -> bool:
     return isinstance(value, list) and all(isinstance(entry, str) for entry in value)
 
 
-def _wrong(what: str, why: str) -> DocumentError:
+def _invalid_settings_error(what: str, why: str) -> DocumentError:
     return DocumentError(f"{what} are not the settings of an agent", f"{why}.", "Correct it.")

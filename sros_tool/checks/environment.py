@@ -211,7 +211,7 @@ def variable_findings(
     environment: Mapping[str, str], *, now: datetime, zone: tzinfo
 ) -> Iterator[Finding]:
     """Yield findings about the environment variables and the enclave that they name."""
-    yield from _spelling(environment)
+    yield from _spelling_findings(environment)
     if environment.get(ENABLE) != "true":
         return
     if environment.get(STRATEGY) != "Enforce" and environment.get(STRATEGY) in (
@@ -239,7 +239,7 @@ def variable_findings(
             missing, remedy = f"is not read. {error.why}".rstrip("."), error.remedy
         yield KEYSTORE_NOT_FOUND.found(KEYSTORE, f"'{root}' {missing}", remedy=remedy)
         return
-    yield from _enclave(environment, root, domain, now=now, zone=zone)
+    yield from _enclave_findings(environment, root, domain, now=now, zone=zone)
 
 
 def set_without_enable(environment: Mapping[str, str]) -> list[str]:
@@ -249,7 +249,7 @@ def set_without_enable(environment: Mapping[str, str]) -> list[str]:
     return [name for name in (STRATEGY, KEYSTORE, ENCLAVE) if environment.get(name)]
 
 
-def _spelling(environment: Mapping[str, str]) -> Iterator[Finding]:
+def _spelling_findings(environment: Mapping[str, str]) -> Iterator[Finding]:
     enable, strategy = environment.get(ENABLE), environment.get(STRATEGY)
     if enable not in (None, "", "true", "false"):
         yield ENABLE_MISSPELT.found(ENABLE, value_text(environment, ENABLE))
@@ -269,7 +269,7 @@ def _spelling(environment: Mapping[str, str]) -> Iterator[Finding]:
             yield MISSPELT.found(name, f"{name} is set; ROS 2 reads {meant}")
 
 
-def _enclave(
+def _enclave_findings(
     environment: Mapping[str, str],
     root: Path,
     domain: int | None,
@@ -517,8 +517,8 @@ def zenoh_environment_findings(environment: Mapping[str, str]) -> Iterator[Findi
             yield MALFORMED.found(name, str(error), str(path))
             continue
         yield from document_findings(effective)
-        yield from _overridden(document, effective, overrides)
-        yield from _certificates(effective, name)
+        yield from _override_findings(document, effective, overrides)
+        yield from _certificate_file_findings(effective, name)
 
 
 def _is_readable(path: Path) -> bool:
@@ -557,7 +557,7 @@ def open_because(data: bytes, name: str, override: str) -> str:
     return "" if document.access.enabled else f"access_control is off in '{name}' with {OVERRIDE}"
 
 
-def _overridden(
+def _override_findings(
     stated: ConfigurationDocument,
     effective: ConfigurationDocument,
     overrides: tuple[tuple[str, str], ...],
@@ -571,7 +571,7 @@ def _overridden(
         yield OVERRIDDEN.found(OVERRIDE, f"it has {keys[:300]}", effective.name)
 
 
-def _certificates(document: ConfigurationDocument, variable: str) -> Iterator[Finding]:
+def _certificate_file_findings(document: ConfigurationDocument, variable: str) -> Iterator[Finding]:
     missing: list[str] = []
     for side, needed in _NEEDED.items():
         endpoints = document.listen if side == "listen" else document.connect

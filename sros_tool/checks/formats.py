@@ -30,7 +30,7 @@ from sros_tool.keystore.layout import (
     ROLES,
 )
 from sros_tool.keystore.reader import Keystore
-from sros_tool.markdown import bounded, code, plain
+from sros_tool.markdown import bounded_list, code, plain
 from sros_tool.pki.certificates import validity_of
 from sros_tool.pki.crl import load_crl
 from sros_tool.prometheus import Metric, Sample
@@ -148,13 +148,13 @@ def findings_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None = Non
     """
     rest = "which `sros check` shows"
     groups = folded_findings(by_cause(chosen_findings.shown), fleet)
-    listed = bounded((_item(group, others) for group, others in groups), _MOST, rest)
+    listed = bounded_list((_markdown_item(group, others) for group, others in groups), _MOST, rest)
     title = f"### Findings: {plain(chosen_findings.summary())}"
     return "\n\n".join(part for part in (title, listed) if part) + "\n"
 
 
-def _item(findings: Sequence[Finding], others: str) -> str:
-    lines = _lines(findings[0]) if len(findings) == 1 else _cause_lines(findings)
+def _markdown_item(findings: Sequence[Finding], others: str) -> str:
+    lines = _finding_lines(findings[0]) if len(findings) == 1 else _cause_lines(findings)
     return "<br>".join((*lines, *([code(others)] if others else [])))
 
 
@@ -169,7 +169,7 @@ def _cause_lines(findings: Sequence[Finding]) -> Iterator[str]:
     yield code(first.cause.remedy)
 
 
-def _lines(finding: Finding) -> Iterator[str]:
+def _finding_lines(finding: Finding) -> Iterator[str]:
     word = finding.severity.word
     title = f"{plain(finding.kind.title)} ({code(finding.id)})"
     yield f"{_SIGNS[word]} **{word}** {code(finding.place)} {title}"

@@ -33,7 +33,7 @@ from sros_tool.dds.permissions import (
     MAX_SIGNED_BYTES,
     Permissions,
     mistaken_names,
-    outside,
+    portability_problems,
     some_pairs,
 )
 from sros_tool.errors import DocumentError, Note, PolicyError, SrosError
@@ -64,7 +64,7 @@ from sros_tool.policy.model import (
     Policy,
     Profile,
     Source,
-    instances,
+    nodes_in_several_namespaces,
     stated_protections,
 )
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix
@@ -269,13 +269,13 @@ def _check_names(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             yield statement.found(
                 DDS_NAME, f"{statement.written} means the ROS name {statement.name}"
             )
-        if kind := _belongs(statement):
+        if kind := _kind_of_ros_name(statement):
             yield statement.found(
                 WRONG_KIND,
                 f"{statement.name} is one of the {kind}, not of the {statement.right.kind}",
             )
         if statement.allows:
-            yield from _broad_right(statement)
+            yield from _broad_right_findings(statement)
 
 
 def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
@@ -298,7 +298,7 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         for statement in checked_policy.statements
         if (other := _ASKING_SIDE.get(statement.right.right)) and is_alone(statement, other)
     ]
-    yield from _offered_by_others(alone)
+    yield from _offered_by_others_findings(alone)
     offered: dict[str, list[_Statement]] = defaultdict(list)
     for statement in alone:
         if not _is_of_a_node(statement.name):
@@ -316,11 +316,11 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             continue
         candidates = [
             one
-            for name in (statement.name, *near.near(statement.name))
+            for name in (statement.name, *near.similar_names(statement.name))
             for one in offered.get(name, ())
         ] + [
             one
-            for name in near.in_other_namespace(statement.name)
+            for name in near.same_name_elsewhere(statement.name)
             for one in offered[name]
             if one.right.right == other
         ]
@@ -328,16 +328,16 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         candidates = [one for one in candidates if one.profile is not statement.profile]
         same_end = [
             one
-            for name in near.with_same_end(statement.name)
+            for name in near.names_with_same_end(statement.name)
             for one in offered[name][:1]
             if one.right.right == other and one.profile is not statement.profile
         ]
         if not candidates and len(same_end) == 1 and _is_namespace_apart(statement, same_end[0]):
             candidates = same_end
         if candidates:
-            yield _misspelt(statement, other, candidates)
+            yield _misspelt_name_finding(statement, other, candidates)
         else:
-            hint = f"; {_meant(same_end)}" if same_end else ""
+            hint = f"; {_candidates_text(same_end)}" if same_end else ""
             yield statement.found(NO_COUNTERPART, f"no enclave may {other} {statement.name}{hint}")
 
 
@@ -350,7 +350,7 @@ def _is_namespace_apart(one: _Statement, other: _Statement) -> bool:
     return longer.name.endswith(shorter.name) and not {*"/~"} & {*longer.written}
 
 
-def _meant(candidates: Sequence[_Statement]) -> str:
+def _candidates_text(candidates: Sequence[_Statement]) -> str:
     names = " or ".join(f"{one.name} ({one.right.right})" for one in candidates[:_NAMES_SHOWN])
     return f"perhaps you mean {names}, which nobody uses"
 
@@ -360,7 +360,7 @@ def _is_of_a_node(name: str) -> bool:
     return name.rpartition("/")[2] in NODE_SERVICES
 
 
-def _offered_by_others(unused_statements: Iterable[_Statement]) -> Iterator[Finding]:
+def _offered_by_others_findings(unused_statements: Iterable[_Statement]) -> Iterator[Finding]:
     """Yield findings about services that nobody calls, offered by their node and by others."""
     owners = {
         (statement.right.right, statement.name): statement
@@ -380,10 +380,12 @@ def _offered_by_others(unused_statements: Iterable[_Statement]) -> Iterator[Find
             yield statement.found(MISTAKEN_SIDE, text, remedy)._replace(related=(place,))
 
 
-def _misspelt(each: _Statement, other: str, candidates: Sequence[_Statement]) -> Finding:
+def _misspelt_name_finding(
+    each: _Statement, other: str, candidates: Sequence[_Statement]
+) -> Finding:
     """Return the finding on a name without counterpart, which suggests similar names."""
     shown, remedy = candidates[:_NAMES_SHOWN], ""
-    hint, first = _meant(shown), shown[0]
+    hint, first = _candidates_text(shown), shown[0]
     if first.name == each.name:
         kind = first.right.kind.removesuffix("s")
         article = "an" if kind == "action" else "a"
@@ -412,7 +414,7 @@ def _source_place(source: Source) -> tuple[str, int | None]:
 def _check_instances(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about enclaves that have a node in several namespaces."""
     enclaves = checked_policy.policy.enclaves
-    for (enclave, node), profiles in instances(enclaves).items():
+    for (enclave, node), profiles in nodes_in_several_namespaces(enclaves).items():
         names = [profile.ns for profile in profiles]
         source = profiles[-1].source
         text = f"{enclave} has the node {node} in {first_few(names, _NAMES_SHOWN)}"
@@ -438,7 +440,7 @@ def _impossible_because(name: str) -> str:
     return "a part of it begins with a digit" if _DIGIT_FIRST.search(name) else ""
 
 
-def _belongs(statement: _Statement) -> str:
+def _kind_of_ros_name(statement: _Statement) -> str:
     """Return the kind, "topics" or "services", of a ROS 2 name; "" if the rule has that kind."""
     kind, name = statement.right.kind, statement.name
     if kind != "services":
@@ -449,7 +451,7 @@ def _belongs(statement: _Statement) -> str:
     return "topics" if name in _GLOBAL_TOPICS or action_part(name)[1] in ACTION_TOPICS else ""
 
 
-def _broad_right(statement: _Statement) -> Iterator[Finding]:
+def _broad_right_findings(statement: _Statement) -> Iterator[Finding]:
     name, right = statement.name, statement.right.right
     if right == "publish" and name == "/clock":
         yield statement.found(SETS_CLOCK, f"{statement.right.enclave} may publish /clock")
@@ -566,7 +568,7 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         for enclave in checked_policy.policy.enclaves
         for profile in enclave.all_profiles()
         if profile.node and profile.ns.startswith("/") and not profile.node.startswith("_")
-        for gap in _basics(checked_policy, enclave, profile)
+        for gap in _lacking_basics(checked_policy, enclave, profile)
     ]
     groups: dict[tuple[str, str], list[_Lacking]] = defaultdict(list)
     differs = cache(_is_not_shipped)
@@ -683,7 +685,7 @@ def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
     )
 
 
-def _basics(
+def _lacking_basics(
     checked_policy: _CheckedPolicy, enclave: Enclave, profile: Profile
 ) -> Iterator[_Lacking]:
     node = expand("~", profile.ns, profile.node)
@@ -865,9 +867,11 @@ def _check_portability(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             domains=_DOMAINS,
         )
         size = _signed_bytes(enclave)
-        for finding in outside_findings(permissions, size, enclave.path, source.file, source.line):
+        for finding in portability_findings(
+            permissions, size, enclave.path, source.file, source.line
+        ):
             yield (
-                _located_at_denial(finding, checked_policy)
+                _with_place_of_denial(finding, checked_policy)
                 if finding.kind is DENY_BLOCKS
                 else finding
             )
@@ -881,7 +885,7 @@ def _check_portability(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         yield ENCLAVE_NAMES.found(pairs[0][0], text, checked_policy.policy.file, line)
 
 
-def _located_at_denial(finding: Finding, checked_policy: _CheckedPolicy) -> Finding:
+def _with_place_of_denial(finding: Finding, checked_policy: _CheckedPolicy) -> Finding:
     """Return the finding with the file and line of the first denial in its enclave."""
     denials = (
         s for s in checked_policy.statements if s.right.enclave == finding.subject and not s.allows
@@ -890,11 +894,13 @@ def _located_at_denial(finding: Finding, checked_policy: _CheckedPolicy) -> Find
     return finding._replace(file=source.file, line=source.line)
 
 
-def outside_findings(
+def portability_findings(
     permissions: Permissions, signed_bytes: int, subject: str, file: str, line: int | None = None
 ) -> Iterator[Finding]:
     """Yield findings about parts of permissions that are outside the portable profile."""
-    for identity, fact in outside(permissions, signed_bytes, lambda names: Names(names).meets):
+    for identity, fact in portability_problems(
+        permissions, signed_bytes, lambda names: Names(names).meets
+    ):
         yield _OUTSIDE[identity].found(subject, fact, file, line)
 
 
@@ -960,15 +966,15 @@ def _check_rules(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about contradicting, unused and repeated statements of an enclave."""
     for statement in checked_policy.statements:
         if statement.allows:
-            yield from _permission(statement, checked_policy.rules)
-        elif not checked_policy.rules.meet(statement.right._replace(qualifier=ALLOW)):
+            yield from _statement_findings(statement, checked_policy.rules)
+        elif not checked_policy.rules.overlaps(statement.right._replace(qualifier=ALLOW)):
             yield statement.found(NO_EFFECT, f"no rule allows to {statement.right.describe()}")
-    yield from _redundant(checked_policy)
+    yield from _redundancy_findings(checked_policy)
 
 
-def _permission(statement: _Statement, rules: Rules) -> Iterator[Finding]:
+def _statement_findings(statement: _Statement, rules: Rules) -> Iterator[Finding]:
     denial = statement.right._replace(qualifier=DENY)
-    if denials := rules.covering(denial):
+    if denials := rules.covering_rights(denial):
         same = set(parts(denial)) == set(denials)
         shown = ", ".join(sorted({f"{by.right} {by.name}" for by in denials}))
         if same:
@@ -985,7 +991,7 @@ def _permission(statement: _Statement, rules: Rules) -> Iterator[Finding]:
             yield statement.found(HALF_ACTION, text)
 
 
-def _redundant(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
+def _redundancy_findings(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     wild: dict[tuple[int, str], list[str]] = defaultdict(list)
     for statement in checked_policy.statements:
         if statement.allows and is_expression(statement.name):
@@ -1100,10 +1106,10 @@ def policy_file_findings(
         try:
             known = policy if policy and len(paths) == 1 else read_policy_for(path, fleet)
         except SrosError as error:
-            yield from _unreadable(path, error)
+            yield from _unreadable_policy_findings(path, error)
             continue
         read.append(known)
-        yield from _includes(path)
+        yield from _include_findings(path)
         if fleet and (shared := [*_shared_namespaces(fleet)]):
             yield SHARED_NAMESPACE.found(str(path), first_few(shared, 3, "; "), str(path))
     yield from findings_in(read, distribution)
@@ -1119,7 +1125,7 @@ def _check_zenoh(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
         try:
             remote_rights(enclave, domain=0)
         except PolicyError as error:
-            file, line, text = _placed(error)
+            file, line, text = _split_place(error)
             yield NOT_ON_ZENOH.found(
                 enclave.path, f"{text}. {error.why}", file, line, remedy=error.remedy
             )
@@ -1162,21 +1168,21 @@ def _on_one_domain(
     return None
 
 
-def _unreadable(path: Path, error: SrosError) -> Iterator[Finding]:
+def _unreadable_policy_findings(path: Path, error: SrosError) -> Iterator[Finding]:
     found = False
     for name, line in _duplicates(path):
         found = True
         yield DUPLICATE.found(name, f"{name} is defined here again", str(path), line)
     if found:
         return
-    file, line, text = _placed(error)
+    file, line, text = _split_place(error)
     if not file and (syntax := _SYNTAX.search(error.why)):
         line = int(syntax["line"])
     why = " ".join(part for part in (f"{text}.", error.why) if part)
     yield MALFORMED.found(str(path), why, file or str(path), line, error.remedy)
 
 
-def _placed(error: SrosError) -> tuple[str, int, str]:
+def _split_place(error: SrosError) -> tuple[str, int, str]:
     """Return the file and line that an error begins with ("" and 0 if none), and its text."""
     match = _PLACE.match(error.what)
     return (match["file"], int(match["line"]), match["text"]) if match else ("", 0, error.what)
@@ -1198,11 +1204,13 @@ def _duplicates(path: Path) -> Iterator[tuple[str, int]]:
 # ── includes ───────────────────────────────────────────────────────────────────────────────
 
 
-def _includes(path: Path) -> Iterator[Finding]:
+def _include_findings(path: Path) -> Iterator[Finding]:
     """Yield findings about the includes of a file; reads an included file only once."""
     graph = _IncludeGraph(Path(os.path.realpath(path)))
     for includes in graph.by_parent():
-        reached = {each for file in {file for _, file in includes} for each in graph.reached(file)}
+        reached = {
+            each for file in {file for _, file in includes} for each in graph.included_files(file)
+        }
         seen: set[tuple[Path, str]] = set()
         for element, file in includes:
             href, line = element.get("href", ""), element.sourceline
@@ -1232,7 +1240,7 @@ class _IncludeGraph:
                 found = ((element, self._target(self._file, element)) for element in includes)
                 yield [(element, file) for element, file in found if file]
 
-    def reached(self, file: Path) -> frozenset[Path]:
+    def included_files(self, file: Path) -> frozenset[Path]:
         """Return the files that a file includes, directly or through other files."""
         if file not in self._reached:
             paths: set[Path] = set()
@@ -1287,7 +1295,7 @@ class NearNames:
             for key in set(_keys(name)):
                 self._by_key[key].append(name)
 
-    def near(self, name: str) -> list[str]:
+    def similar_names(self, name: str) -> list[str]:
         """Return the sorted names that look like a typing error of ``name``, except itself.
 
         Similar names differ in one part (between "/" and "_") by one letter that is added,
@@ -1297,7 +1305,7 @@ class NearNames:
         found = {candidate for key in set(_keys(name)) for candidate in self._by_key.get(key, ())}
         return sorted(other for other in found if other != name and _is_near(name, other))
 
-    def in_other_namespace(self, name: str) -> list[str]:
+    def same_name_elsewhere(self, name: str) -> list[str]:
         """Return the sorted names that are ``name`` with a namespace more, or less, before it.
 
         Names of one part, such as /scan, are left out: they may stand in several namespaces.
@@ -1306,7 +1314,7 @@ class NearNames:
         longer = self._by_end.get(name, ()) if name.count("/") > 1 else ()
         return sorted({*shorter, *longer} - {name})
 
-    def with_same_end(self, name: str) -> list[str]:
+    def names_with_same_end(self, name: str) -> list[str]:
         """Return the sorted names with the same last part as ``name``, except itself.
 
         None if there are many: then the part means nothing, or each robot of a fleet has it.

@@ -161,10 +161,10 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
         yield PROCESS_NOT_SEEN.found(process.label, text)
         return
     newer = list(newer_files(process, enclave))
-    loaded = _loaded(enclave, newer, process.started)
+    loaded = _loaded_files(enclave, newer, process.started)
     if revoked := loaded.revoked:
         yield PROCESS_REVOKED.found(process.label, f"the certificate of {name} was {revoked}")
-    elif not enclave.is_there or len(enclave.lacking) == len(_required(enclave)):
+    elif not enclave.is_there or len(enclave.lacking) == len(_required_files(enclave)):
         if not _unsecured_because(process):
             text = f"{name} in '{plain(enclave.keystore, _LONGEST_PATH)}' has no files"
             unknown = f"; {loaded.unknown}" if loaded.unknown else ""
@@ -180,17 +180,17 @@ def _file_findings(process: Process, *, now: datetime, zone: tzinfo) -> Iterator
         expired = ", ".join(f"{what} at {iso(end)}" for what, end in ends.items())
         remedy = _NEW_AUTHORITY if ends.keys() & set(_AUTHORITIES.values()) else ""
         yield PROCESS_EXPIRED.found(process.label, f"of {name} expired: {expired}", remedy=remedy)
-    yield from _local_time(process, loaded, now, zone)
+    yield from _local_time_findings(process, loaded, now, zone)
     if enclave.writable:
         yield PROCESS_REPLACEABLE.found(process.label, _plain_path(enclave.writable))
     mode = enclave.file(KEY_FILE).mode
     if mode & 0o077:
         path = _plain_path(str(enclave_path(Path(enclave.keystore), enclave.name) / KEY_FILE))
         yield PROCESS_KEY_READABLE.found(process.label, f"the mode of '{path}' is {mode:04o}")
-    yield from _unread_files(process, enclave)
+    yield from _unread_file_findings(process, enclave)
 
 
-def _required(enclave: ProcessEnclave) -> Sequence[str]:
+def _required_files(enclave: ProcessEnclave) -> Sequence[str]:
     return [file.name for file in enclave.files if file.name not in (CRL_FILE, KEY_URI_FILE)]
 
 
@@ -209,7 +209,7 @@ def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
         yield from (f"'{_plain_path(file)}' (its place or mode)" for file in moved[:1])
 
 
-def _unread_files(process: Process, enclave: ProcessEnclave) -> Iterator[Finding]:
+def _unread_file_findings(process: Process, enclave: ProcessEnclave) -> Iterator[Finding]:
     unread = [f"{file.name} ({file.problem})" for file in enclave.files if file.problem]
     if unread:
         text = f"its files cannot be looked at: {', '.join(unread)}"
@@ -232,7 +232,9 @@ class _Loaded:
     unknown: str = ""
 
 
-def _loaded(enclave: ProcessEnclave, newer_files: Sequence[str], started: datetime) -> _Loaded:
+def _loaded_files(
+    enclave: ProcessEnclave, newer_files: Sequence[str], started: datetime
+) -> _Loaded:
     """Return the files that a process loaded; the ledger has those that changed since."""
     windows: dict[str, Window] = {}
     changed = {file.split()[0] for file in newer_files}
@@ -243,7 +245,7 @@ def _loaded(enclave: ProcessEnclave, newer_files: Sequence[str], started: dateti
     if certificate and CERTIFICATE_FILE not in changed:
         serial = certificate.serial_number
         windows["its certificate"] = validity_of(certificate)
-    elif recorded := _last(before, "certificate"):
+    elif recorded := _last_entry(before, "certificate"):
         serial = int(recorded.serial or "0", 16)
         windows |= _recorded_window("its certificate", recorded)
     grant = None
@@ -251,7 +253,7 @@ def _loaded(enclave: ProcessEnclave, newer_files: Sequence[str], started: dateti
         grant = _grant(enclave, subject_text(certificate.subject)) if certificate else None
         with suppress(SrosError, ValueError):
             windows |= {"its permissions": grant.validity} if grant else {}
-    elif recorded := _last(before, "permissions"):
+    elif recorded := _last_entry(before, "permissions"):
         windows |= _recorded_window("its permissions", recorded)
     for file, authority in _AUTHORITIES.items():
         certificates = () if file in changed else _certificates_in(enclave, file)
@@ -259,7 +261,7 @@ def _loaded(enclave: ProcessEnclave, newer_files: Sequence[str], started: dateti
         valid = [validity_of(issuer) for issuer in issuers or certificates]
         if valid:
             windows[authority] = max(valid, key=lambda window: window.not_after)
-    return _Loaded(windows, grant, _revoked(enclave, entries, serial), unknown)
+    return _Loaded(windows, grant, _revocation_clause(enclave, entries, serial), unknown)
 
 
 _AUTHORITIES = {
@@ -268,7 +270,7 @@ _AUTHORITIES = {
 }
 
 
-def _last(entries: Sequence[Entry], what: str) -> Entry | None:
+def _last_entry(entries: Sequence[Entry], what: str) -> Entry | None:
     return next((entry for entry in reversed(entries) if entry.what == what), None)
 
 
@@ -278,7 +280,7 @@ def _recorded_window(what: str, entry: Entry) -> Mapping[str, Window]:
     return {}
 
 
-def _revoked(enclave: ProcessEnclave, entries: Sequence[Entry], serial: int) -> str:
+def _revocation_clause(enclave: ProcessEnclave, entries: Sequence[Entry], serial: int) -> str:
     """Return a clause that says when and why a certificate was revoked, or "".
 
     The ledger and the enclave's revocation list are searched for the serial number.
@@ -334,7 +336,7 @@ def _grant(enclave: ProcessEnclave, subject: str) -> Grant | None:
     return None
 
 
-def _local_time(
+def _local_time_findings(
     process: Process, loaded_files: _Loaded, now: datetime, zone: tzinfo
 ) -> Iterator[Finding]:
     """Yield a finding if permissions, read in local time as Fast DDS does, are not valid."""
@@ -573,12 +575,12 @@ def process_findings(
         if process.is_daemon:
             # Each domain has its own daemon; commands ask the daemon of their domain.
             if is_secured_here and _network_and_domain(process) == here:
-                yield from _daemon(process, environment)
+                yield from _daemon_findings(process, environment)
             continue
-        yield from _zenoh(process)
+        yield from _zenoh_findings(process)
         if process.asks_for_security:
             yield from _file_findings(process, now=now, zone=zone)
-            yield from _unsecured(process)
+            yield from _unsecured_findings(process)
         elif security[process.pid] is Security.OPEN:
             if _network_and_domain(process) in closed:
                 value = process.environment.get(ENABLE)
@@ -587,12 +589,12 @@ def process_findings(
                 yield PROCESS_UNSECURED.found(process.label, text)
             else:
                 open_nodes.append(process)
-    yield from _not_secured(environment, open_nodes, one_by_one=one_by_one)
+    yield from _unsecured_node_findings(environment, open_nodes, one_by_one=one_by_one)
     starts_nodes = is_secured_here and bool(environment.get(ENCLAVE))
-    yield from _mixed_vendors(secured, environment if starts_nodes else None)
-    yield from _other_keystores(secured, environment if is_secured_here else None)
-    yield from _elsewhere(nodes, security)
-    yield from _not_seen(running)
+    yield from _mixed_vendor_findings(secured, environment if starts_nodes else None)
+    yield from _other_keystore_findings(secured, environment if is_secured_here else None)
+    yield from _different_security_findings(nodes, security)
+    yield from _unseen_process_findings(running)
 
 
 def _network_and_domain(process: Process) -> tuple[str, str]:
@@ -605,7 +607,7 @@ def _domain_text(process: Process) -> str:
     return f"in domain {process.domain}{there}"
 
 
-def _daemon(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
+def _daemon_findings(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
     if not process.asks_for_security:
         text = f"{ENABLE} is not 'true' in the environment of {process.label}"
         yield DAEMON_UNSECURED.found(process.label, text)
@@ -623,7 +625,7 @@ def _daemon(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
 # ── open ───────────────────────────────────────────────────────────────────────────────────
 
 
-def _unsecured(process: Process) -> Iterator[Finding]:
+def _unsecured_findings(process: Process) -> Iterator[Finding]:
     if process.is_zenoh or process.environment.get(STRATEGY) == "Enforce":
         return
     if why := _unsecured_because(process):
@@ -631,11 +633,11 @@ def _unsecured(process: Process) -> Iterator[Finding]:
         yield PROCESS_RUNS_UNSECURED.found(process.label, text)
     elif process.enclave and not process.enclave.problem:
         yield PROCESS_PERMISSIVE.found(
-            process.label, value_text(_shown(process.environment), STRATEGY)
+            process.label, value_text(_shown_variables(process.environment), STRATEGY)
         )
 
 
-def _shown(environment: Mapping[str, str]) -> Mapping[str, str]:
+def _shown_variables(environment: Mapping[str, str]) -> Mapping[str, str]:
     return {name: plain(value) for name, value in environment.items() if name == STRATEGY}
 
 
@@ -656,7 +658,7 @@ def _zenoh_opening(process: Process) -> str:
     )
 
 
-def _zenoh(process: Process) -> Iterator[Finding]:
+def _zenoh_findings(process: Process) -> Iterator[Finding]:
     if not process.is_zenoh:
         return
     configuration = process.configuration
@@ -694,7 +696,7 @@ def _is_open(environment: Mapping[str, str]) -> bool:
     return not is_zenoh(environment) or bool(enforces_nothing(environment, SESSION_URI))
 
 
-def _not_secured(
+def _unsecured_node_findings(
     environment: Mapping[str, str], nodes: Sequence[Process], *, one_by_one: bool
 ) -> Iterator[Finding]:
     """Yield findings about running open nodes; a single finding if no security is requested."""
@@ -726,7 +728,7 @@ def _by_network_and_domain(processes: Iterable[Process]) -> Mapping[tuple[str, s
     return found
 
 
-def _mixed_vendors(
+def _mixed_vendor_findings(
     secured: Sequence[Process], environment: Mapping[str, str] | None
 ) -> Iterator[Finding]:
     """Yield a finding for each network and domain with secured processes of several RMWs.
@@ -749,7 +751,7 @@ def _mixed_vendors(
             yield MIXED_VENDORS.found("RMWs", text)
 
 
-def _other_keystores(
+def _other_keystore_findings(
     secured: Sequence[Process], environment: Mapping[str, str] | None
 ) -> Iterator[Finding]:
     """Yield findings about DDS processes that trust another identity CA than their neighbours.
@@ -819,14 +821,16 @@ def _keys(certificates: Iterable[x509.Certificate]) -> _Keys:
 _FORM = (Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
 
 
-def _elsewhere(nodes: Sequence[Process], security: Mapping[int, Security]) -> Iterator[Finding]:
+def _different_security_findings(
+    nodes: Sequence[Process], security: Mapping[int, Security]
+) -> Iterator[Finding]:
     for node in nodes:
         if node.network:
             text = f"{security[node.pid]}, in domain {node.domain} of {node.network}"
             yield PROCESS_ELSEWHERE.found(node.label, text)
 
 
-def _not_seen(running: RunningProcesses) -> Iterator[Finding]:
+def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
     """Yield a finding for each node that could not be examined, and one with their number."""
     remedy = _ROOT_MAY_NOT if running.by_root else ""
     for process in running.unseen:

@@ -9,7 +9,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from sros_tool.checks.environment import variable_findings, zenoh_environment_findings
-from sros_tool.checks.keystores.keystore import joined
+from sros_tool.checks.keystores.keystore import with_joined_findings
 from sros_tool.checks.kind import ERROR, Finding, FindingKind
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
 from sros_tool.checks.vulnerabilities import vulnerability_findings
@@ -74,19 +74,19 @@ _TOLERANCE = timedelta(minutes=2)
 def runtime_findings(state: RuntimeState) -> list[Finding]:
     """Return all findings about an environment and the host on which it is set."""
     environment = state.environment
-    return joined(
+    return with_joined_findings(
         [
             *variable_findings(environment, now=state.now, zone=state.zone),
-            *_rmw(state),
+            *_rmw_findings(state),
             *zenoh_environment_findings(environment),
-            *_clock(state),
+            *_clock_findings(state),
             *process_findings(environment, state.running, now=state.now, zone=state.zone),
             *vulnerability_findings(state.running, state.libraries, state.advisories),
         ]
     )
 
 
-def _rmw(state: RuntimeState) -> Iterator[Finding]:
+def _rmw_findings(state: RuntimeState) -> Iterator[Finding]:
     chosen = state.environment.get(RMW, "")
     if chosen and state.rmws and chosen not in state.rmws:
         text = f"{RMW} is {chosen}; installed: {', '.join(state.rmws)}"
@@ -100,7 +100,7 @@ def _rmw(state: RuntimeState) -> Iterator[Finding]:
         yield RMW_INSECURE.found(used, state.insecure_rmws[used])
 
 
-def _clock(state: RuntimeState) -> Iterator[Finding]:
+def _clock_findings(state: RuntimeState) -> Iterator[Finding]:
     """Yield a finding if a keystore of this shell, or of a process, is newer than the clock."""
     clock = state.clock or state.now
     enclaves = (process.enclave for process in state.running.processes)

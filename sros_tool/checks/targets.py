@@ -91,9 +91,9 @@ def stranger_findings(paths: Iterable[Path], circumstances: Circumstances) -> li
             targets[str(path)] = circumstances.keystore(root), (name,)
     if len(targets) < 2:
         return []
-    from sros_tool.checks.keystores.trust import strangers
+    from sros_tool.checks.keystores.trust import stranger_findings
 
-    return list(strangers(targets, on_zenoh=circumstances.vendors == (ZENOH,)))
+    return list(stranger_findings(targets, on_zenoh=circumstances.vendors == (ZENOH,)))
 
 
 def _no_policy_findings(path: Path, circumstances: Circumstances) -> list[Finding] | None:

@@ -22,7 +22,7 @@ from sros_tool.zenoh.document import (
     UnreadConfigurationError,
     parse_configuration,
 )
-from sros_tool.zenoh.key_expressions import includes, intersects, widest
+from sros_tool.zenoh.key_expressions import includes, intersects, widest_expression
 
 _TESTED = "Zenoh 1.10.2, tested."
 _BY_SROS = "Let `sros zenoh` write the files: rules for each enclave, by its name."
@@ -254,15 +254,15 @@ def document_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     """Yield the findings in a configuration."""
     for setting in document.unknown:
         yield _finding_at(document, UNKNOWN_SETTING, setting, f"Zenoh up to 1.10 has no {setting}")
-    yield from _links(document)
+    yield from _link_findings(document)
     yield from _open_features(document)
     if not document.access.enabled:
         kind = ROUTER_WITHOUT_RULES if document.mode is Mode.ROUTER else SESSION_WITHOUT_RULES
         yield _finding_at(document, kind, f"{_ACCESS}/enabled", "access_control is off")
         return
-    yield from _rules(document)
-    yield from _subjects(document)
-    yield from _denials(document)
+    yield from _rule_findings(document)
+    yield from _subject_findings(document)
+    yield from _denial_findings(document)
 
 
 def _finding_at(
@@ -274,7 +274,7 @@ def _finding_at(
 # ── connections ────────────────────────────────────────────────────────────────────────────
 
 
-def _links(document: ConfigurationDocument) -> Iterator[Finding]:
+def _link_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     both = (("listen", document.listen), ("connect", document.connect))
     for what, endpoints in both:
         for endpoint in endpoints:
@@ -346,7 +346,7 @@ def _open_features(document: ConfigurationDocument) -> Iterator[Finding]:
 # ── access control ─────────────────────────────────────────────────────────────────────────
 
 
-def _rules(document: ConfigurationDocument) -> Iterator[Finding]:
+def _rule_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     access = document.access
     if access.allows_by_default:
         text = "default_permission is allow"
@@ -377,7 +377,7 @@ def _allowing_subjects_without_name(document: ConfigurationDocument) -> list[Acl
     ]
 
 
-def _subjects(document: ConfigurationDocument) -> Iterator[Finding]:
+def _subject_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     access = document.access
     open_to_all = _allowing_subjects_without_name(document)
     if open_to_all and is_self_limiting(document):
@@ -387,7 +387,7 @@ def _subjects(document: ConfigurationDocument) -> Iterator[Finding]:
         for subject in open_to_all:
             text = f"subject {subject.id} has {_described_subject(subject)}, and rules that allow"
             yield EVERYBODY.found(f"subject {subject.id}", text, document.name, subject.line)
-    pairs = list(islice(_overlapping(access.subjects), _MOST_PAIRS + 1))
+    pairs = list(islice(_overlapping_subjects(access.subjects), _MOST_PAIRS + 1))
     if pairs:
         first, second = pairs[0]
         least = "at least " if len(pairs) > _MOST_PAIRS else ""
@@ -396,7 +396,9 @@ def _subjects(document: ConfigurationDocument) -> Iterator[Finding]:
         yield OVERLAPPING.found(f"subject {second.id}", text, document.name, second.line)
 
 
-def _overlapping(subjects: Sequence[AclSubject]) -> Iterator[tuple[AclSubject, AclSubject]]:
+def _overlapping_subjects(
+    subjects: Sequence[AclSubject],
+) -> Iterator[tuple[AclSubject, AclSubject]]:
     limit = ComparisonLimit()
     kinds: dict[tuple[str, ...], list[AclSubject]] = {}
     for subject in subjects:  # two that state the same properties match the same process as one
@@ -419,7 +421,7 @@ def _described_subject(subject: AclSubject) -> str:
     return f"only {' and '.join(stated)}" if stated else "no property"
 
 
-def _denials(document: ConfigurationDocument) -> Iterator[Finding]:
+def _denial_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     """Yield a finding for each denial that some messages can circumvent."""
     access, limit = document.access, ComparisonLimit()
     reported: set[tuple[str, str]] = set()
@@ -431,15 +433,15 @@ def _denials(document: ConfigurationDocument) -> Iterator[Finding]:
         others = [other for other in access.subjects if other.overlaps(subject)]
         for rule in denials:
             for kind, text in (
-                (DENY_IN_WILDCARD, _wildcard_past(rule, subject, access, limit)),
-                (DENY_OVERRULED, _overruled(rule, others, access, limit)),
+                (DENY_IN_WILDCARD, _wildcard_that_circumvents(rule, subject, access, limit)),
+                (DENY_OVERRULED, _overruling_subject(rule, others, access, limit)),
             ):
                 if text and (kind.id, rule.id) not in reported:
                     reported.add((kind.id, rule.id))
                     yield kind.found(f"rule {rule.id}", text, document.name, rule.line)
 
 
-def _wildcard_past(
+def _wildcard_that_circumvents(
     rule: AclRule, subject: AclSubject, access: Enforcement, limit: ComparisonLimit
 ) -> str:
     """Return how a message with a wildcard circumvents a denial, or "" if none can."""
@@ -451,7 +453,7 @@ def _wildcard_past(
         denied = _keys(same, allows=False)
         for key in rule.key_expressions:
             if access.allows_by_default:
-                passing = [(widest(key), "the default")]
+                passing = [(widest_expression(key), "the default")]
             else:
                 passing = [
                     (wide, f"rule {allowing.id}")
@@ -468,7 +470,7 @@ def _wildcard_past(
     return ""
 
 
-def _overruled(
+def _overruling_subject(
     rule: AclRule, other_subjects: Sequence[AclSubject], access: Enforcement, limit: ComparisonLimit
 ) -> str:
     """Return one of ``other_subjects`` that allows a message which ``rule`` denies, or ""."""

@@ -121,7 +121,7 @@ def print_plan(root: Path, changes: Sequence[Change]) -> None:
     for change in changes:
         plan.setdefault(change.action, []).append(change.path)
     for action, paths in plan.items():
-        shown = paths if every else list(_folded_files(root, paths))
+        shown = paths if every else list(_change_lines(root, paths))
         if len(shown) > MAX_NAMES and not every:
             places = [str(root / path) for path in paths]
             shown_files = first_few(places, _NAMES_SHOWN)
@@ -133,7 +133,7 @@ def print_plan(root: Path, changes: Sequence[Change]) -> None:
         echo("nothing would change")
 
 
-def _folded_files(root: Path, paths: Sequence[str]) -> Iterator[str]:
+def _change_lines(root: Path, paths: Sequence[str]) -> Iterator[str]:
     """Yield the paths of files; those that differ only in the robot of a fleet are one."""
     from sros_tool.fleet.robots import folded
     from sros_tool.keystore.fleet import load_fleet
@@ -179,7 +179,7 @@ def rights_lines(
     fleet = load_fleet(Keystore(root)) if replaced_rights else None
     together: dict[tuple[str, str], list[str]] = {}
     for rights in replaced_rights:
-        for verb, text in (("lose", rights.loses(fleet)), ("gain", rights.gains(fleet))):
+        for verb, text in (("lose", rights.lost_text(fleet)), ("gain", rights.gained_text(fleet))):
             if text:
                 together.setdefault((verb, text), []).append(rights.enclave)
     lines = []

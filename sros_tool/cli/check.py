@@ -306,7 +306,7 @@ def check(
     at = replace(at, distribution=nodes_of, vendors=vendors, advisories=known)
     if upgrade_to:
         _refuse_besides_upgrade()
-        from sros_tool.distributions import ROS_DISTRO, sourced
+        from sros_tool.distributions import ROS_DISTRO, sourced_distribution
         from sros_tool.proof.upgrade import check_upgrade
 
         path = _one_path(family, paths, "--upgrade-to")
@@ -316,10 +316,10 @@ def check(
                 upgrade_to,
                 at,
                 present=distro,
-                here=sourced(os.environ.get(ROS_DISTRO)),
+                here=sourced_distribution(os.environ.get(ROS_DISTRO)),
                 vendor=vendor or "",
             )
-        chosen = selection.choose(map(_shown, changed.findings))
+        chosen = selection.choose(map(_with_relative_paths, changed.findings))
         others = changed.enclaves - changed.compared
         rest = f"; {others} already for {upgrade_to.title}" if others else ""
         echo(f"compared {counted(changed.compared, 'enclave')}{rest}", err=True)
@@ -342,7 +342,11 @@ def check(
         every = [*_findings(family, paths, at), *_stated_differences(paths, at)]
         if decide:
             every += decide(lambda paths: _system(paths, at, template))
-        findings = [_shown(finding) for finding in every if not _is_mended_by(template, finding)]
+        findings = [
+            _with_relative_paths(finding)
+            for finding in every
+            if not _is_mended_by(template, finding)
+        ]
     chosen = selection.choose(findings)
     if form == "text":
         _print_text(chosen, _fleet_of(at, paths))
@@ -656,7 +660,7 @@ def _findings_here(
     return runtime_findings(state)
 
 
-def _shown(finding: Finding) -> Finding:
+def _with_relative_paths(finding: Finding) -> Finding:
     """Return the finding; files below the working directory get relative paths."""
     related = tuple(place._replace(file=_relative(place.file)) for place in finding.related)
     return finding._replace(file=_relative(finding.file), related=related)
@@ -703,12 +707,12 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
 
 def renewal_markdown(lines: Sequence[str], text_if_none: str, text: str) -> str:
     """Return the enclaves to renew soon as Markdown, or a sentence that there are none."""
-    from sros_tool.markdown import bounded, code, plain
+    from sros_tool.markdown import bounded_list, code, plain
 
     if not lines:
         return f"### Certificates: {plain(text_if_none)}\n"
     count = "1 enclave needs" if len(lines) == 1 else f"{len(lines)} enclaves need"
-    listed = bounded(map(code, lines), 4000, "which `sros check --needs-renewal` shows")
+    listed = bounded_list(map(code, lines), 4000, "which `sros check --needs-renewal` shows")
     return f"### Certificates: {count} to be renewed {plain(f'({text})')}\n\n{listed}\n"
 
 

@@ -774,7 +774,7 @@ class _Secrets:
             value = self._lines[file]
         if not value and sys.stdin.isatty():
             confirm = self._new and not is_pin
-            with paused():
+            with without_progress():
                 value = ask_secret(what, confirm=confirm)
         if not value:
             names = _PIN if is_pin else f"{_PASSPHRASE} or {_PASSPHRASE_FILE}"
@@ -843,7 +843,7 @@ def _read_at_most(path: Path, count: int) -> bytes:
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         is_pipe = stat.S_ISFIFO(os.fstat(handle).st_mode)
-        data = bytearray(_first_of_pipe(handle, path) if is_pipe else b"")
+        data = bytearray(_first_bytes_of_pipe(handle, path) if is_pipe else b"")
         poll = select.poll()
         poll.register(handle, select.POLLIN)
         while len(data) < count:
@@ -867,7 +867,7 @@ _PART = 1024 * 1024
 """Number of bytes that are read at a time."""
 
 
-def _first_of_pipe(handle: int, path: Path) -> bytes:
+def _first_bytes_of_pipe(handle: int, path: Path) -> bytes:
     """Wait for a writer of a pipe; return the first byte, or b"" if the writer wrote nothing.
 
     Raises:
@@ -934,7 +934,7 @@ def echo_findings(findings: Sequence[Finding], *, err: bool = False) -> None:
         ids = ", ".join(dict.fromkeys(finding.id for finding in findings))
         lines = [f"{place}: {first.severity.word}: {first.cause.title}"]
         for text in (f"[{ids}]", first.cause.text, first.cause.remedy):
-            lines += _wrapped(text, "    ")
+            lines += _wrapped_lines(text, "    ")
     else:
         lines = finding_lines(first)
     word = first.severity.word
@@ -963,7 +963,7 @@ def finding_lines(finding: Finding) -> list[str]:
     return [head, f"    {subject}{finding.text}{by}", *related, f"    {finding.remedy}"]
 
 
-def _wrapped(text: str, indent: str) -> list[str]:
+def _wrapped_lines(text: str, indent: str) -> list[str]:
     """Return lines of at most 80 characters; text to copy stays on one line, however long."""
     from textwrap import wrap
 
@@ -1047,12 +1047,14 @@ class _Line:
             done, total, left = self._tally.done(), self._tally.total, self._tally.left()
         count = f" {done} of {total}" if total and done else ""
         seconds = time.monotonic() - self._began
-        rest = "" if left is None or seconds < _ESTIMATED else f", about {_rounded(left)} left"
+        rest = (
+            "" if left is None or seconds < _ESTIMATED else f", about {_duration_text(left)} left"
+        )
         redraw(f"{self._label}{count} ... {seconds:.0f} s{rest}")
         self._drawn = True
 
 
-def _rounded(seconds: float) -> str:
+def _duration_text(seconds: float) -> str:
     """Return a duration as text, in minutes if it is two minutes or longer."""
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
@@ -1087,7 +1089,7 @@ def progress(label: str, total: int = 0) -> Iterator[Callable[[str], None] | Non
 
 
 @contextmanager
-def paused() -> Iterator[None]:
+def without_progress() -> Iterator[None]:
     """Keep the terminal free for a question, such as for a passphrase."""
     for line in _lines:
         line.pause()

@@ -298,7 +298,7 @@ def explain(
             text = "It follows the rights, which are the same for all DDS vendors."
             raise UsageError("--reach takes only --vendor zenoh", text, "Leave it out.")
         stated = policy, fleet_file
-        zenoh = bool(_why_zenoh(vendor, root))
+        zenoh = bool(_reason_for_zenoh(vendor, root))
         only_in = domain_of(domain)
         return _show_reach(reach, root, rest, stated, infrastructure, only_in, as_json, zenoh=zenoh)
     asking = _circumstances(moment, domain, time_zone, fleet_file)
@@ -308,7 +308,7 @@ def explain(
     if vendor == ZENOH and distro:
         text = "Zenoh decides alike in every distribution."
         raise UsageError("--vendor zenoh takes no --distro", text, "Leave it out.")
-    why_zenoh = "" if all_vendors or all_distros else _why_zenoh(vendor, root)
+    why_zenoh = "" if all_vendors or all_distros else _reason_for_zenoh(vendor, root)
     if not (why_zenoh or vendor or distro or all_vendors or all_distros):
         from sros_tool.distributions import unknown_distribution
 
@@ -400,7 +400,7 @@ def _notes_on_past(moment: datetime, root: Path | None) -> Iterator[Note]:
     yield Note("explain.past", text)
 
 
-def _why_zenoh(vendor: str | None, root: Path | None) -> str:
+def _reason_for_zenoh(vendor: str | None, root: Path | None) -> str:
     """Return the reason to ask Zenoh and not a DDS vendor, or ""."""
     from sros_tool.keystore.layout import has_zenoh_files, is_keystore
     from sros_tool.runtime.rmw import RMW
@@ -486,7 +486,7 @@ _LABEL_WIDTH = 10
 _MOST_SHOWN = 10
 
 
-def _row(label: str, text: str) -> str:
+def _labelled_row(label: str, text: str) -> str:
     """Return a line of an answer: a label and a text in two columns."""
     return f"  {label:{_LABEL_WIDTH}}{text}"
 
@@ -505,9 +505,9 @@ def _vendor_lines(explanation: DdsExplanation) -> Iterator[str]:
 def _beside_lines(on_zenoh: ZenohBeside | None) -> Iterator[str]:
     if on_zenoh and on_zenoh.zenoh:
         word = "yes" if on_zenoh.zenoh.allowed else f"no, {on_zenoh.zenoh.outcome}"
-        yield _row("zenoh", f"{word}: {on_zenoh.zenoh.text}")
+        yield _labelled_row("zenoh", f"{word}: {on_zenoh.zenoh.text}")
     elif on_zenoh:
-        yield _row("zenoh", f"not known: {on_zenoh.problem}")
+        yield _labelled_row("zenoh", f"not known: {on_zenoh.problem}")
 
 
 def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
@@ -519,41 +519,41 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
     may = f"yes: {name} may" if answer.allowed else f"no: {name} may not"
     documented = ", as documented" if answer.as_documented else ""
     yield f"{may} {answer.question}, on {answer.vendor.title} ({why}{documented})"
-    yield _row("why", decision.clause)
-    yield from (_row("and", str(problem)) for problem in answer.problems[1:])
+    yield _labelled_row("why", decision.clause)
+    yield from (_labelled_row("and", str(problem)) for problem in answer.problems[1:])
     if len(answer.parts) > 1 and not answer.allowed:
         for part in answer.parts:
             sign = "ok" if part.decision.outcome.ok else str(part.decision.outcome)
-            yield _row("part", f"{part.part}: {sign}")
+            yield _labelled_row("part", f"{part.part}: {sign}")
     if decision.rule is not None and grant:
         what = f"{'allow' if grant.rules[decision.rule].allow else 'deny'} rule {decision.rule + 1}"
-        yield _row("rule", f"{what} of grant {grant.name}: {decision.expression}")
+        yield _labelled_row("rule", f"{what} of grant {grant.name}: {decision.expression}")
     if answer.wildcard:
-        yield _row("wildcard", f"{answer.wildcard} also matches other names")
+        yield _labelled_row("wildcard", f"{answer.wildcard} also matches other names")
     for line in answer.lines:
         stated = line.stated
         if level := line.group.protect:
             stated += f", protected at least with {level.lower()}"
-        yield _row("from", f"{_shown(line.source)}: {stated}")
+        yield _labelled_row("from", f"{_place_text(line.source)}: {stated}")
     if answer.policy_sha256 and not answer.enclave.policy_file and decision.rule is not None:
         digest = answer.policy_sha256
         default = template_default(digest)
-        yield _row(
+        yield _labelled_row(
             "from",
             f"the default of the keystore's template, {default}: no policy file has been signed"
             if default
             else f"a policy file: add --policy FILE to see its line (digest {digest[:12]})",
         )
     if answer.allowed:
-        yield _row("protected", ", ".join(_protection_words(answer)))
+        yield _labelled_row("protected", ", ".join(_protection_words(answer)))
     elif answer.denied_by:
-        yield _row("denied by", answer.denied_by)
+        yield _labelled_row("denied by", answer.denied_by)
     if answer.until and answer.allowed:
         from sros_tool.keystore.layout import CERTIFICATE_FILE
 
         dropped = answer.vendor.traits.drops_expired and answer.until_file == CERTIFICATE_FILE
         then = "; running nodes lose their peers then" if dropped else ""
-        yield _row("until", f"{iso(answer.until)}, when {answer.until_file} expires{then}")
+        yield _labelled_row("until", f"{iso(answer.until)}, when {answer.until_file} expires{then}")
     yield from _to_do_lines(answer)
 
 
@@ -562,22 +562,22 @@ def _to_do_lines(answer: Answer) -> Iterator[str]:
 
     If requirements of a closed robot forbid the change, yield these requirements instead.
     """
-    if forbidding := _forbidding(answer):
+    if forbidding := _requirements_forbidding(answer):
         from sros_tool.proof.requirements import demand
 
         for requirement in forbidding:
-            text = f"{_shown(requirement.source)} forbids this: {demand(requirement)}"
-            yield _row("required", text)
+            text = f"{_place_text(requirement.source)} forbids this: {demand(requirement)}"
+            yield _labelled_row("required", text)
         return
     if answer.change:
         yield from _change_lines(answer)
     if answer.remedy:
-        yield _row("remedy", answer.remedy)
+        yield _labelled_row("remedy", answer.remedy)
     for number, command in enumerate(answer.commands):
-        yield _row("run" if not number else "", command)
+        yield _labelled_row("run" if not number else "", command)
 
 
-def _forbidding(answer: Answer) -> Sequence[Requirement]:
+def _requirements_forbidding(answer: Answer) -> Sequence[Requirement]:
     """Return the requirements next to the keystore of a closed robot that forbid the change."""
     from sros_tool.keystore.layout import closed_robot
 
@@ -585,12 +585,12 @@ def _forbidding(answer: Answer) -> Sequence[Requirement]:
     robot = closed_robot(root) if root else None
     if not (robot and change and change.document) or answer.enclave.has_placeholders:
         return ()
-    from sros_tool.closing import forbidding
+    from sros_tool.closing import requirements_broken_by
 
-    return forbidding(robot, change.document, moment_of(None))
+    return requirements_broken_by(robot, change.document, moment_of(None))
 
 
-def _shown(source: Source) -> str:
+def _place_text(source: Source) -> str:
     """Return file:line, with a relative path if the file is below the working directory."""
     here = Path.cwd()
     file = Path(source.file)
@@ -619,14 +619,14 @@ def _change_lines(answer: Answer) -> Iterator[str]:
     change, policy = answer.change, answer.enclave.policy
     if change is None:
         return
-    yield _row("change", "in the policy:")
+    yield _labelled_row("change", "in the policy:")
     for edit in change.edits:
         if edit.xml:
             group = edit.xml.partition(" ")[0].removeprefix("<")
-            yield f"    at {_shown(edit.source)}, change the <{group}> group to"
+            yield f"    at {_place_text(edit.source)}, change the <{group}> group to"
             yield from (f"      {line}" for line in edit.xml.splitlines())
         else:
-            yield f"    remove the group at {_shown(edit.source)}"
+            yield f"    remove the group at {_place_text(edit.source)}"
     if change.lift and not change.edits:
         yield from (f"    remove: {right.qualifier} {right.describe()}" for right in change.lift)
     for right in change.lift:
@@ -634,7 +634,7 @@ def _change_lines(answer: Answer) -> Iterator[str]:
             yield f"    this also removes the DENY of all other names in {right.name}"
     if change.document:
         if answer.enclave.has_placeholders:
-            place = f"at {_shown(policy.source)}" if policy else "to the fleet's policy"
+            place = f"at {_place_text(policy.source)}" if policy else "to the fleet's policy"
             yield f"    add {place}, with placeholders for the robot's name and namespace"
         else:
             yield f"    save as {ADDITION}"
@@ -678,21 +678,21 @@ def _zenoh_lines(explanation: ZenohExplanation) -> Iterator[str]:
     may = f"yes: {answer.enclave} may" if allowed else f"no: {answer.enclave} may not"
     mode = f" in {answer.mode} mode" if answer.mode else ""
     yield f"{may} {answer.question}, on {_ZENOH_TITLE}{mode} ({explanation.vendor_why})"
-    yield _row("why", answer.text)
+    yield _labelled_row("why", answer.text)
     yield from _link_lines(answer)
     if dropped := answer.dropped:
         what = f"{dropped.enforcer}: silently dropped, and {answer.enclave} gets no error"
-        yield _row("denied by", what)
+        yield _labelled_row("denied by", what)
     if allowed and answer.question.word in _DOES:
         yield from _reached_lines(answer)
     if allowed and answer.until:
-        yield _row("until", f"{iso(answer.until)}, when cert.pem expires")
+        yield _labelled_row("until", f"{iso(answer.until)}, when cert.pem expires")
     for line in stated.lines:
-        yield _row("from", f"{_shown(line.source)}: {line.stated}")
+        yield _labelled_row("from", f"{_place_text(line.source)}: {line.stated}")
     if explanation.wants_rights:
         yield from _to_do_lines(stated)
     if explanation.written:
-        yield _row("remedy", explanation.written)
+        yield _labelled_row("remedy", explanation.written)
 
 
 def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
@@ -701,28 +701,30 @@ def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
     for number, link in enumerate(links[:_MOST_SHOWN]):
         between = " and ".join(link.enclaves)
         if len(links) == 1 or (number == 0 and not answer.allowed):
-            yield _row("link", f"between {between}:")
-            yield from (_row("", f"  {line}") for line in _message_lines(link.checks))
+            yield _labelled_row("link", f"between {between}:")
+            yield from (_labelled_row("", f"  {line}") for line in _message_lines(link.checks))
         else:
-            yield _row("link", f"between {between}: {_link_text(link)}")
+            yield _labelled_row("link", f"between {between}: {_link_text(link)}")
     if more := links[_MOST_SHOWN:]:
         passing = sum(link.passes for link in more)
-        yield _row("link", f"{len(more)} more: {passing} pass it, {len(more) - passing} drop it")
+        yield _labelled_row(
+            "link", f"{len(more)} more: {passing} pass it, {len(more) - passing} drop it"
+        )
 
 
 def _reached_lines(answer: ZenohAnswer) -> Iterator[str]:
     does, wide_does = _DOES[answer.question.word]
     reachable = [reached.enclave for reached in answer.reached if not reached.problem]
-    yield _row(does, _names(reachable))
+    yield _labelled_row(does, _names_text(reachable))
     for reached in [reached for reached in answer.reached if reached.problem][:_MOST_SHOWN]:
-        yield _row("", f"not {reached.enclave}, which has the right: {reached.problem}")
+        yield _labelled_row("", f"not {reached.enclave}, which has the right: {reached.problem}")
     for wildcard, enclaves in answer.wildcards:
-        yield _row("wildcard", f"{wildcard} also matches other names")
+        yield _labelled_row("wildcard", f"{wildcard} also matches other names")
         if wide_does:
-            yield _row("", f"{wide_does} {_names(enclaves)}")
+            yield _labelled_row("", f"{wide_does} {_names_text(enclaves)}")
 
 
-def _names(names: Sequence[str]) -> str:
+def _names_text(names: Sequence[str]) -> str:
     return first_few(names, _MOST_SHOWN) or "nobody"
 
 
@@ -994,7 +996,7 @@ def _show_log(
         lines = text.count("\n") + (not text.endswith("\n")) if text else 0
         nothing = "looks like a message of DDS Security, or of a denial by Zenoh"
         echo(
-            f"none of {counted(lines, 'line')} {nothing}: {_silence(text)}"
+            f"none of {counted(lines, 'line')} {nothing}: {_text_without_findings(text)}"
             if lines
             else "the log is empty",
             err=True,
@@ -1004,7 +1006,7 @@ def _show_log(
     return 1 if explained.findings else 0
 
 
-def _silence(log: str) -> str:
+def _text_without_findings(log: str) -> str:
     """Return what a log without a message of security shows, and what to do next."""
     from sros_tool.runtime.vendor_log import SECURITY_DIRECTORY
 

@@ -170,7 +170,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     from sros_tool.keystore.confirmation import (
         MAX_BYTES,
         KeptConfirmation,
-        keep,
+        keep_confirmation,
         locked_confirmations,
         receive,
     )
@@ -187,7 +187,7 @@ def _confirm(words: tuple[str, ...], robot: str, dry_run: bool, as_json: bool) -
     changes = file_change(root / path, existed=(root / path).exists())
     if not dry_run:
         with locked_confirmations(root):
-            keep(root, received)
+            keep_confirmation(root, received)
     confirmation = received.confirmation
     enclaves = confirmation.enclaves()
     notes = [Note("fleet.clock", f"{robot}: {text}")] if (text := received.clock_note()) else []
@@ -322,21 +322,21 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
     messages = Counter(robot.outcome for robot in collected.robots)
     asked = Counter(request.outcome for _, request in requests)
     line = f"{counted(len(collected.robots), 'robot')}: "
-    line += _numbers(messages, MESSAGE_OUTCOMES, would)
+    line += _outcome_numbers(messages, MESSAGE_OUTCOMES, would)
     if requests:
         line += f"; {counted(len(requests), 'request')}: "
-        line += _numbers(asked, REQUEST_OUTCOMES, would)
+        line += _outcome_numbers(asked, REQUEST_OUTCOMES, would)
     yield line
     by_outcome = sorted(collected.robots, key=lambda robot: MESSAGE_OUTCOMES.index(robot.outcome))
     alike: dict[str, dict[str, str]] = {}
     for robot in by_outcome:
         why = (f"{robot.outcome}: {robot.why}",) if robot.why else ()
         for text in (*why, *robot.remarks):
-            unnamed = _unnamed(text, robot.robot)
+            unnamed = _without_robot_name(text, robot.robot)
             alike.setdefault(_DURATION.sub("", unnamed), {})[robot.robot] = unnamed
     names = [robot.robot for robot in collected.robots]
     for texts in alike.values():
-        yield f"{_robot_names(texts, names)}: {_joined(texts)}"
+        yield f"{_robot_names(texts, names)}: {_joined_durations(texts)}"
     for name, request in sorted(
         requests, key=lambda request: REQUEST_OUTCOMES.index(request[1].outcome)
     ):
@@ -347,7 +347,7 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
             yield f"{enclave}: {request.outcome.replace('_', ' ')}: {request.why}"
 
 
-def _numbers(numbers: Mapping[str, int], outcomes: Sequence[str], verb_form: str) -> str:
+def _outcome_numbers(numbers: Mapping[str, int], outcomes: Sequence[str], verb_form: str) -> str:
     """Return the number of messages or requests with each outcome, in words."""
     there = (outcome for outcome in outcomes if numbers.get(outcome))
     return ", ".join(f"{numbers[name]} {verb_form}{name.replace('_', ' ')}" for name in there)
@@ -665,7 +665,7 @@ def _lines(
     Unless ``findings`` is set or robots are named, the findings are only counted.
     """
     status = compared_fleet.status
-    counts = ", ".join(f"{number} {_word(state)}" for state, number in status.counts.items())
+    counts = ", ".join(f"{number} {_state_text(state)}" for state, number in status.counts.items())
     yield f"{counted(len(status.robots), 'robot')}: {counts}"
     yield from _facts(compared_fleet)
     rows = list(_rows(compared_fleet, robots))
@@ -678,7 +678,7 @@ def _lines(
     if robots or findings:
         yield from _dds_findings(compared_fleet)
     else:
-        yield from _dds_counts(compared_fleet)
+        yield from _dds_count_lines(compared_fleet)
 
 
 def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
@@ -774,7 +774,7 @@ class _Group(NamedTuple):
         """Names of the robots."""
         return [robot.robot for robot in self.robots]
 
-    def confirmed(self, moment: datetime) -> RobotStatus:
+    def oldest_confirmation(self, moment: datetime) -> RobotStatus:
         """Return the robot whose last confirmation is the oldest."""
         return min(self.robots, key=lambda robot: robot.received or moment)
 
@@ -790,8 +790,8 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
     whats: dict[str, str] = {}
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
         if robots or robot.state not in ("current", "none") or robot.notes or robot.problems:
-            clauses = (*_expired(robot, compared_fleet.at), *_summary(robot, status.stage))
-            what = _CLOCK.sub("", _unnamed("; ".join(clauses), robot.robot))
+            clauses = (*_expiry_clauses(robot, compared_fleet.at), *_summary(robot, status.stage))
+            what = _CLOCK.sub("", _without_robot_name("; ".join(clauses), robot.robot))
             whats[robot.robot] = what
             row = (robot.state.value, robot.to_do, _DURATION.sub("", what))
             alike.setdefault((*row, robot.robot if robots else ""), []).append(robot)
@@ -799,7 +799,7 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
             current.append(robot)
     groups = []
     for (state, to_do, *_), group in alike.items():
-        what = _joined({robot.robot: whats[robot.robot] for robot in group})
+        what = _joined_durations({robot.robot: whats[robot.robot] for robot in group})
         groups.append(_Group(group, state, to_do, what))
     return [*groups, _Group(current, "current", "", "")] if current else groups
 
@@ -814,8 +814,8 @@ def _rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tupl
     yield "robot", "state", "confirmed", "to do", "what"
     for group in groups:
         names = _robot_names(group.names, compared_fleet.status.names, compared_fleet.status.groups)
-        age = _age(group.confirmed(compared_fleet.at), compared_fleet.at)
-        yield names, _word(group.state), age, group.to_do, group.what
+        age = _age_text(group.oldest_confirmation(compared_fleet.at), compared_fleet.at)
+        yield names, _state_text(group.state), age, group.to_do, group.what
 
 
 def _page_rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
@@ -827,7 +827,7 @@ def _page_rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator
     for group in _groups(compared_fleet, robots):
         status, most = compared_fleet.status, len(group.robots)
         names = _robot_names(group.names, status.names, status.groups, most)
-        received = group.confirmed(compared_fleet.at).received
+        received = group.oldest_confirmation(compared_fleet.at).received
         expiry = [moment for robot in group.robots for moment in robot.expiry.values()]
         yield (
             group.state,
@@ -850,7 +850,7 @@ _CLOCK = re.compile(r" The clock here shows \S+\.")
 _UNITS = {"d": 86400, "h": 3600, "min": 60, "s": 1}
 
 
-def _joined(texts: Mapping[str, str]) -> str:
+def _joined_durations(texts: Mapping[str, str]) -> str:
     """Join texts of robots that differ only in durations, such as "2 min to 5 min behind".
 
     The text of a single robot has its name in place of `_ROBOT`.
@@ -874,19 +874,19 @@ def _seconds(duration: str) -> int:
     )
 
 
-def _unnamed(text: str, robot: str) -> str:
+def _without_robot_name(text: str, robot: str) -> str:
     """Return a text with `_ROBOT` in place of the robot's name in paths."""
     return re.sub(rf"(?<=/){re.escape(robot)}(?=[/\s,;.:]|$)", _ROBOT, text)
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def _natural_sort_key(name: str) -> list[tuple[int, str]]:
     """Return the key that sorts r2 before r10."""
     return [(int(part or 0), "") if part.isdigit() else (0, part) for part in _DIGITS.split(name)]
 
 
 def _robot_positions(robots: Iterable[str]) -> dict[str, int]:
     """Map the robots of a fleet to their positions, r2 before r10."""
-    return {name: place for place, name in enumerate(sorted(robots, key=_natural))}
+    return {name: place for place, name in enumerate(sorted(robots, key=_natural_sort_key))}
 
 
 def _robot_names(
@@ -931,7 +931,7 @@ def _dds_findings(compared_fleet: ComparedFleet) -> Iterator[str]:
             yield from finding_lines(finding)
 
 
-def _dds_counts(compared_fleet: ComparedFleet) -> Iterator[str]:
+def _dds_count_lines(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield the robots with an outdated DDS, or the number of findings on the DDS of robots."""
     status, outdated = compared_fleet.status, compared_fleet.outdated_dds
     if outdated:
@@ -947,7 +947,7 @@ def _dds_counts(compared_fleet: ComparedFleet) -> Iterator[str]:
         yield f"on the DDS of robots: {words}; see --robot NAME, or --json"
 
 
-def _expired(robot: RobotStatus, moment: datetime) -> Iterator[str]:
+def _expiry_clauses(robot: RobotStatus, moment: datetime) -> Iterator[str]:
     """Yield a clause for each kind of file on a robot that has expired."""
     from sros_tool.validity import elapsed
 
@@ -974,7 +974,9 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
         if file.state not in ("another", "revoked"):
             groups.setdefault((file.state, file.since), Counter())[file.kind] += 1
     for (state, since), kinds in list(groups.items())[:_MOST_GROUPS]:
-        named = (kind if number == 1 else _several(number, kind) for kind, number in kinds.items())
+        named = (
+            kind if number == 1 else _kind_in_plural(number, kind) for kind, number in kinds.items()
+        )
         yield f"{state} {', '.join(named)}{f' of {since}' if since else ''}"
     if len(groups) > _MOST_GROUPS:
         yield f"more, see --robot {robot.robot}"
@@ -998,7 +1000,7 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
     yield from (robot.problems or ())[:_MOST_GROUPS]
 
 
-def _several(number: int, kind: str) -> str:
+def _kind_in_plural(number: int, kind: str) -> str:
     if kind == "permissions":
         return f"{number} {kind}"
     return f"{number} certificates" if kind == "certificate" else f"{number} {kind} files"
@@ -1038,11 +1040,11 @@ def _details(robot: RobotStatus) -> Iterator[str]:
         yield f"  and {more} more, see --json"
 
 
-def _age(robot: RobotStatus, moment: datetime) -> str:
+def _age_text(robot: RobotStatus, moment: datetime) -> str:
     from sros_tool.validity import elapsed
 
     return f"{elapsed(moment - robot.received)} ago" if robot.received else "-"
 
 
-def _word(state: str) -> str:
+def _state_text(state: str) -> str:
     return _WORDS.get(state, state)

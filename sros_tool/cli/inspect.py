@@ -122,13 +122,13 @@ def _enclave_of(root: Path, name: str) -> Path:
     """Return the folder of an enclave of a keystore."""
     from sros_tool.keystore.layout import check_keystore
     from sros_tool.keystore.reader import Keystore
-    from sros_tool.keystore.selection import no_such_enclave
+    from sros_tool.keystore.selection import missing_enclave_error
 
     check_keystore(root)
     keystore = Keystore(root)
     names = keystore.names
     if name not in names:
-        raise no_such_enclave(keystore, name, names)
+        raise missing_enclave_error(keystore, name, names)
     return keystore.folder(name)
 
 
@@ -156,7 +156,7 @@ def _show_history(root: Path, as_json: bool) -> int:
     return 1 if found.unexplained or found.gaps else 0
 
 
-def _keystore(keystore: DescribedKeystore) -> Iterator[str]:
+def _keystore_lines(keystore: DescribedKeystore) -> Iterator[str]:
     from sros_tool.keystore.describe import UnreadableFile
 
     template = keystore.template
@@ -166,11 +166,11 @@ def _keystore(keystore: DescribedKeystore) -> Iterator[str]:
         else "no template: exports, and keystores made by other programs, have none"
     )
     for role, authority in keystore.authorities.items():
-        yield from _authority(role, authority)
+        yield from _authority_lines(role, authority)
     if isinstance(keystore.governance, UnreadableFile):
         yield f"  governance: {keystore.governance.error}"
     elif keystore.governance:
-        yield from _indented(_domain_rules(keystore.governance))
+        yield from _indented(_domain_rule_lines(keystore.governance))
     if network := keystore.zenoh:
         yield (
             f"  Zenoh in {network.mode} mode: router {network.router} at "
@@ -198,7 +198,7 @@ def _keystore(keystore: DescribedKeystore) -> Iterator[str]:
         yield f"    {problem}"
 
 
-def _authority(role: str, authority: AuthorityFile | UnreadableFile) -> Iterator[str]:
+def _authority_lines(role: str, authority: AuthorityFile | UnreadableFile) -> Iterator[str]:
     from sros_tool.keystore.describe import UnreadableFile
 
     if isinstance(authority, UnreadableFile):
@@ -234,7 +234,7 @@ def _state(facts: EnclaveFacts, *, key_on_robot: bool) -> str:
     return "loadable" if facts.loadable else "NOT LOADABLE"
 
 
-def _enclave(enclave: DescribedEnclave) -> Iterator[str]:
+def _enclave_lines(enclave: DescribedEnclave) -> Iterator[str]:
     facts = enclave.facts
     yield f"enclave {enclave.path}: {_state(facts, key_on_robot=enclave.key_on_robot)}"
     for problem in facts.problems:
@@ -248,25 +248,25 @@ def _enclave(enclave: DescribedEnclave) -> Iterator[str]:
     if facts.token:
         yield f"  {_place(facts.token)}"
     for grant in facts.permissions or ():
-        yield from _indented(_grant(grant))
+        yield from _indented(_grant_lines(grant))
     if zenoh := enclave.zenoh:
         yield f"  Zenoh: {', '.join(file.file for file in zenoh.files) or 'NOT USABLE'}"
         for problem in zenoh.problems:
             yield f"    {problem}"
 
 
-def _certificates(certificates: DescribedCertificates) -> Iterator[str]:
+def _certificate_file_lines(certificates: DescribedCertificates) -> Iterator[str]:
     file = certificates.file
     yield f"{'CA certificate' if file.first.is_ca else 'certificate'} {certificates.path}"
-    yield from _indented(_certificate(file.first))
+    yield from _indented(_certificate_lines(file.first))
     for other in file.further or ():
         yield "next to it, in the same file"
-        yield from _indented(_certificate(other))
+        yield from _indented(_certificate_lines(other))
     if file.crl:
         yield _list(file.crl)
 
 
-def _certificate(certificate: CertificateFacts) -> Iterator[str]:
+def _certificate_lines(certificate: CertificateFacts) -> Iterator[str]:
     yield f"subject {certificate.subject}"
     yield f"issuer {certificate.issuer}"
     yield f"serial {certificate.serial}"
@@ -276,7 +276,7 @@ def _certificate(certificate: CertificateFacts) -> Iterator[str]:
     yield f"SHA-256 {certificate.sha256}"
 
 
-def _revocation_list(described_list: DescribedList) -> Iterator[str]:
+def _revocation_list_lines(described_list: DescribedList) -> Iterator[str]:
     yield _list(described_list.facts)
     for serial in described_list.facts.revoked:
         yield f"  {serial}"
@@ -290,7 +290,7 @@ def _list(crl: ListFacts) -> str:
     )
 
 
-def _key(key: DescribedKey) -> Iterator[str]:
+def _key_lines(key: DescribedKey) -> Iterator[str]:
     yield f"private key {key.path}: {key.algorithm}, mode {key.mode}"
     if key.mode not in ("0600", "0400"):
         yield "  others can read it: chmod 600"
@@ -301,26 +301,26 @@ def _place(place: TokenPlace) -> str:
     return f"key {place.object} on the token {place.token}{pin}"
 
 
-def _token(described_token: DescribedToken) -> Iterator[str]:
+def _token_lines(described_token: DescribedToken) -> Iterator[str]:
     yield f"{described_token.path}: {_place(described_token.place)}"
 
 
-def _permissions(permissions: DescribedPermissions) -> Iterator[str]:
+def _permissions_lines(permissions: DescribedPermissions) -> Iterator[str]:
     yield f"permissions {permissions.path}"
-    yield from _indented(_signature(permissions.signature))
+    yield from _indented(_signature_lines(permissions.signature))
     for grant in permissions.grants:
-        yield from _indented(_grant(grant))
+        yield from _indented(_grant_lines(grant))
 
 
-def _governance(governance: DescribedGovernance) -> Iterator[str]:
+def _governance_lines(governance: DescribedGovernance) -> Iterator[str]:
     yield f"governance {governance.path}"
-    yield from _indented(_signature(governance.signature))
-    yield from _indented(_domain_rules(governance))
+    yield from _indented(_signature_lines(governance.signature))
+    yield from _indented(_domain_rule_lines(governance))
 
 
-def _configuration(described_configuration: DescribedConfiguration) -> Iterator[str]:
+def _configuration_lines(described_configuration: DescribedConfiguration) -> Iterator[str]:
     yield f"Zenoh configuration {described_configuration.path}"
-    yield from _indented(_signature(described_configuration.signature))
+    yield from _indented(_signature_lines(described_configuration.signature))
     for problem in described_configuration.problems:
         yield f"  {problem}"
     if not described_configuration.made_by_sros:
@@ -343,13 +343,13 @@ def _configuration(described_configuration: DescribedConfiguration) -> Iterator[
     if described_configuration.domains:
         yield f"  domain {', '.join(map(str, described_configuration.domains))}"
     for remote in described_configuration.rights:
-        yield from _indented(_remote(remote))
+        yield from _indented(_remote_lines(remote))
 
 
-def _remote(remote: RemoteFacts) -> Iterator[str]:
+def _remote_lines(remote: RemoteFacts) -> Iterator[str]:
     if remote.own_rights_by_router:
         yield f"through the router {remote.enclave} this enclave may"
-        yield from _indented(_rights(remote.may))
+        yield from _indented(_right_lines(remote.may))
         return
     counts = [
         f"{right} {counted(len(names), kind.removesuffix('s'))}"
@@ -359,13 +359,13 @@ def _remote(remote: RemoteFacts) -> Iterator[str]:
     yield f"processes of {remote.enclave} may {', '.join(counts) or 'only see the graph'}"
 
 
-def _rights(table: RightNames) -> Iterator[str]:
+def _right_lines(table: RightNames) -> Iterator[str]:
     for kind, rights in sorted(table.items()):
         for right, names in rights.items():
             yield f"{right} {kind}: {', '.join(names)}"
 
 
-def _signature(signature: SignatureFacts) -> Iterator[str]:
+def _signature_lines(signature: SignatureFacts) -> Iterator[str]:
     signer = signature.signer
     if signer is None:
         yield "not signed"
@@ -379,18 +379,18 @@ def _signature(signature: SignatureFacts) -> Iterator[str]:
         yield f"  {signer.signature_problem}"
 
 
-def _grant(grant: GrantFacts) -> Iterator[str]:
+def _grant_lines(grant: GrantFacts) -> Iterator[str]:
     yield f"grant {grant.name} for {grant.subject}"
     expired = ": NOT VALID NOW" if grant.valid_now is False else ""
     yield f"  valid from {grant.not_before} to {grant.not_after}{expired}"
     for rule in grant.rules:
         where = f" in partitions {', '.join(rule.partitions)}" if rule.partitions else ""
         yield f"  {rule.qualifier} in domain {rule.domains}{where}"
-        yield from _indented(_indented(_rights(rule.rights)))
+        yield from _indented(_indented(_right_lines(rule.rights)))
     yield f"  everything else: {grant.default}"
 
 
-def _domain_rules(governance: DescribedGovernance) -> Iterator[str]:
+def _domain_rule_lines(governance: DescribedGovernance) -> Iterator[str]:
     for described in governance.domain_rules:
         rule = described.rule
         yield f"governance of domain {described.domains}"
@@ -419,13 +419,13 @@ def _indented(lines: Iterable[str]) -> Iterator[str]:
 
 
 _TEXT: dict[str, Callable[[Any], Iterator[str]]] = {
-    "keystore": _keystore,
-    "enclave": _enclave,
-    "certificate": _certificates,
-    "private key": _key,
-    "key on a token": _token,
-    "revocation list": _revocation_list,
-    "permissions": _permissions,
-    "governance": _governance,
-    "Zenoh configuration": _configuration,
+    "keystore": _keystore_lines,
+    "enclave": _enclave_lines,
+    "certificate": _certificate_file_lines,
+    "private key": _key_lines,
+    "key on a token": _token_lines,
+    "revocation list": _revocation_list_lines,
+    "permissions": _permissions_lines,
+    "governance": _governance_lines,
+    "Zenoh configuration": _configuration_lines,
 }

@@ -309,7 +309,7 @@ def _show(
         result,
         shown,
         _created_lines(result),
-        first=_hints(result, as_json),
+        first=_next_step_hints(result, as_json),
         after=filter(None, (lasting_text(result.root, result.rights),)),
     )
     if findings and not as_json:
@@ -318,7 +318,11 @@ def _show(
 
 def _created_lines(result: Creation) -> Iterator[str]:
     """Yield what was done with each enclave."""
-    same = {rights.enclave for rights in result.rights if not (rights.loses() or rights.gains())}
+    same = {
+        rights.enclave
+        for rights in result.rights
+        if not (rights.lost_text() or rights.gained_text())
+    }
     again = [name for name in result.changed if name in same]
     others = [name for name in result.changed if name not in same]
     for names, text in (
@@ -330,7 +334,7 @@ def _created_lines(result: Creation) -> Iterator[str]:
         yield from enclave_lines(names, text)
 
 
-def _hints(result: Creation, as_json: bool) -> Iterator[str]:
+def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
     """Yield hints for standard error: how enclaves get to robots, and unchanged enclaves."""
     from sros_tool.keystore.fleet import publish_command
     from sros_tool.keystore.layout import FLEET
@@ -504,8 +508,10 @@ def create_keystore(
     domains = DomainSet.parse(domain, "--domain") if domain is not None else None
     if own is not None:
         domains = DomainSet.of((own, own))
-    template = _choices(template_name, ca_layout, ca_validity, validity, permissions_validity)
-    imported = _imported({"identity": identity_ca, "permissions": permissions_ca})
+    template = _chosen_template(
+        template_name, ca_layout, ca_validity, validity, permissions_validity
+    )
+    imported = _imported_cas({"identity": identity_ca, "permissions": permissions_ca})
     result = create(
         root,
         template=template,
@@ -525,7 +531,7 @@ def create_keystore(
         _print_open_rights(root, template)
 
 
-def _choices(
+def _chosen_template(
     name: str,
     ca_layout: str | None,
     ca_validity: str | None,
@@ -555,7 +561,7 @@ def _choices(
     return template
 
 
-def _imported(files: dict[str, Path | None]) -> dict[str, bytes]:
+def _imported_cas(files: dict[str, Path | None]) -> dict[str, bytes]:
     from sros_tool.xml import read_bytes
 
     return {
@@ -770,7 +776,7 @@ def update_keystore(
     elif take_edits:
         target, domains = edited_settings(root, present)
     else:
-        target = present.undone() if discard_edits else present.base()
+        target = present.without_edits() if discard_edits else present.settings_to_change()
     target = with_values(
         target,
         [_key_and_value(value) for value in values],

@@ -484,7 +484,7 @@ def rotate_ca(
     if sum((status, go_on, to is not None, finish, same_key)) > 1:
         raise UsageError("give only one of --status, --next, --to, --finish and --same-key")
     if not (go_on or to or finish or same_key):
-        _show_status(rotation_status(root, now=now()), _unconfirmed(root), as_json)
+        _show_status(rotation_status(root, now=now()), _unconfirmed_robots(root), as_json)
         return
     if identity_ca and not same_key:
         raise UsageError("--identity-ca has no effect without --same-key", "", "Add --same-key.")
@@ -580,7 +580,7 @@ def _print_step(
         echo(remark, err=True)
 
 
-def _unconfirmed(root: Path) -> tuple[str, ...] | str:
+def _unconfirmed_robots(root: Path) -> tuple[str, ...] | str:
     """Return the robots that have not confirmed the stage of a rotation, or why that is unknown."""
     from sros_tool.keystore.lifecycle.rotate import robots_cut_off
     from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation

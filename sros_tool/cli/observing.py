@@ -139,9 +139,9 @@ def observe(
         ObserverError,
         RosGraph,
         Settling,
-        identified,
         look_for,
         settle,
+        with_certified_enclaves,
     )
     from sros_tool.runtime.variables import ENABLE
     from sros_tool.validity import parse_duration
@@ -151,7 +151,7 @@ def observe(
     enclaves = _enclaves_by_identity(everything)
 
     def identify(observation: Observation) -> Observation:
-        return identified(observation, enclaves)
+        return with_certified_enclaves(observation, enclaves)
 
     if watch not in (None, _FOREVER):
         seconds = parse_duration(watch).total_seconds()
@@ -170,7 +170,7 @@ def observe(
                 everything=identify(snapshot.everything),
             ), graph.rmw
     except ObserverError as error:
-        raise _explained(error, environment) from error
+        raise _observer_error(error, environment) from error
 
 
 def _enclaves_by_identity(environment: Mapping[str, str]) -> dict[str, str]:
@@ -206,10 +206,12 @@ def _until_signalled() -> Iterator[Callable[[], bool]]:
     """Catch Ctrl-C and SIGTERM; yield a function that returns whether one was received."""
     came: list[int] = []
 
-    def note(number: int, _frame: object) -> None:
+    def note_signal(number: int, _frame: object) -> None:
         came.append(number)
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.signal(number, note_signal) for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         yield lambda: bool(came)
     finally:
@@ -217,7 +219,7 @@ def _until_signalled() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
+def _observer_error(error: ObserverError, environment: dict[str, str]) -> SrosError:
     """Return an error for the observer's failure, with the cause that its DDS output shows."""
     from sros_tool.runtime.variables import ENABLE, ENCLAVE
     from sros_tool.runtime.vendor_log import (
@@ -437,9 +439,9 @@ def generate_policy(
         News,
         common_parts,
         draft,
+        first_subjects,
         is_tool_name,
         learn,
-        listed,
         write,
     )
     from sros_tool.graph.learn import enclave_per_node as name_enclaves
@@ -468,7 +470,7 @@ def generate_policy(
     learned = learn(seen.observation, None if flat else common).noting(seen.notes)
     if not learned.profiles:
         if as_json:
-            print_json(_printed(None, file, learned, seen.observation, dry_run))
+            print_json(_learned_json(None, file, learned, seen.observation, dry_run))
         echo(_NO_NODES, err=True)
         print_notes(learned.notes)
         echo(why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave), err=True)
@@ -477,12 +479,15 @@ def generate_policy(
     if not dry_run:
         write(plan)
     if as_json:
-        print_json(_printed(plan, file, learned, seen.observation, dry_run)._replace(ended=ended))
+        print_json(
+            _learned_json(plan, file, learned, seen.observation, dry_run)._replace(ended=ended)
+        )
     else:
         _show(plan, learned, written=not dry_run)
     gone = sorted(node for node in snapshot.gone if not is_tool_name(node.rpartition("/")[2]))
     if gone and watch is None:
-        text = f"left out, because these nodes ended while the graph was observed: {listed(gone)}"
+        nodes = first_subjects(gone)
+        text = f"left out, because these nodes ended while the graph was observed: {nodes}"
         echo(f"{text}; --watch keeps them.", err=True)
     if not snapshot.settled:
         echo(
@@ -509,7 +514,7 @@ def _present_policy(file: Path | None) -> Policy | None:
     return None
 
 
-def _printed(
+def _learned_json(
     plan: Draft | None, file: Path | None, learned: Learned, observation: Observation, dry_run: bool
 ) -> LearnedPolicy:
     """Return the ``--json`` output about learned rights; without a ``plan``, no file changes."""
@@ -589,7 +594,7 @@ def _propose(
 
     if not learned.profiles or file is None:
         if as_json:
-            value = _printed(None, file, learned, Observation(), dry_run)
+            value = _learned_json(None, file, learned, Observation(), dry_run)
             print_json(value._replace(accepted=accept, denials=lines))
         if not learned.profiles:
             return 1
@@ -604,7 +609,7 @@ def _propose(
     if written:
         write(plan)
     if as_json:
-        value = _printed(plan, file, learned, Observation(), dry_run)
+        value = _learned_json(plan, file, learned, Observation(), dry_run)
         if not (written or dry_run):
             value = value._replace(changes=())
         print_json(value._replace(accepted=accept, denials=lines))

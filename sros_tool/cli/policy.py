@@ -307,7 +307,7 @@ def rights_markdown(
     first_source: RightsSource, second_source: RightsSource, difference: SourcesDifference
 ) -> str:
     """Return how rights differ as Markdown, with a picture."""
-    from sros_tool.markdown import bounded, code, fenced, plain
+    from sros_tool.markdown import bounded_list, code, fenced, plain
     from sros_tool.report.sources import drawn_difference
 
     drawn = drawn_difference(
@@ -322,14 +322,17 @@ def rights_markdown(
         signed = [line.removeprefix(f"{sign} ") for line in lines if line.startswith(sign)]
         if signed:
             parts.append(f"**{len(signed)} {title}**")
-            parts.append(bounded(map(code, signed), _MOST_LINES, rest))
+            parts.append(bounded_list(map(code, signed), _MOST_LINES, rest))
     if unanswered := list(unanswered_lines(difference, second_source.fleet)):
-        parts += ["**Nobody answers any more**", bounded(map(code, unanswered), _MOST_LINES, rest)]
+        parts += [
+            "**Nobody answers any more**",
+            bounded_list(map(code, unanswered), _MOST_LINES, rest),
+        ]
     if difference.governance_differs:
         parts.append("**The governance differs**: see `sros diff_policy --no-new-access`")
     notes = [f"{note.id}: {note.text}" for note in (*first_source.notes, *second_source.notes)]
     if notes:
-        parts += ["**Notes**", bounded(map(code, notes), 4000, rest)]
+        parts += ["**Notes**", bounded_list(map(code, notes), 4000, rest)]
     differ = counted(len(lines), "difference") if lines else "no difference"
     title = f"### Rights: {plain(differ)}"
     if lines and drawn is None:
@@ -820,7 +823,7 @@ def _folded_gains(
 
 
 def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
-    from sros_tool.dds.decision.vendors import together
+    from sros_tool.dds.decision.vendors import joined_titles
 
     who, other = first_few(gain.enclaves, _MOST_NEW_LINES), "BASE" if sign == "+" else "HEAD"
     if gain.action == "join":
@@ -839,7 +842,7 @@ def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
         at = f" at {gain.denied_at}" if gain.denied_at else ""
         text += f", which {other} denies by {gain.denied.name}{at}"
     if gain.worlds != growth.worlds:
-        text += f"; with {', '.join(together(gain.worlds))}"
+        text += f"; with {', '.join(joined_titles(gain.worlds))}"
     if gain.domains != (0,) or len(growth.domains) > 1:
         text += f"; in domain {', '.join(map(str, gain.domains))}"
     return text
@@ -865,9 +868,9 @@ def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
 
 def access_summary(growth: Growth) -> str:
     """Return the added access and reach of a change in one sentence."""
-    from sros_tool.dds.decision.vendors import together
+    from sros_tool.dds.decision.vendors import joined_titles
 
-    worlds = ", ".join(together(growth.worlds))
+    worlds = ", ".join(joined_titles(growth.worlds))
     basis = "".join(
         f"; {title}: {', '.join(clauses)}"
         for title, clauses in (
@@ -900,7 +903,7 @@ def _count(number: int, what: str) -> str:
 
 def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> str:
     """Return the added and removed access of a change as Markdown."""
-    from sros_tool.markdown import bounded, code, plain
+    from sros_tool.markdown import bounded_list, code, plain
 
     rest = "which `sros diff_policy --no-new-access` shows"
     parts = [f"### New access: {plain('yes' if growth else 'none')}", plain(access_summary(growth))]
@@ -913,5 +916,5 @@ def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> s
     ):
         if lines:
             parts.append(f"**{len(lines)} {title}**")
-            parts.append(bounded((code(line[2:]) for line in lines), _MOST_CHARACTERS, rest))
+            parts.append(bounded_list((code(line[2:]) for line in lines), _MOST_CHARACTERS, rest))
     return "\n\n".join(parts) + "\n"

@@ -303,10 +303,10 @@ def report_error(error: BaseException, arguments: Sequence[str], name: str = "sr
         where = error.ctx.command_path if error.ctx else _named_command(arguments, name)
         return _print_error(f"{where}: {error.format_message()} See `{where} --help`.")
     if isinstance(error, SrosError):
-        return _print_error(_prefixed(str(error), arguments))
+        return _print_error(_with_usage_prefix(str(error), arguments))
     if isinstance(error, OSError):
-        return _print_error(_prefixed(_os_problem(error), arguments))
-    return _defect(error, arguments)
+        return _print_error(_with_usage_prefix(_os_problem(error), arguments))
+    return _report_defect(error, arguments)
 
 
 def _named_command(arguments: Sequence[str], name: str) -> str:
@@ -324,7 +324,7 @@ def _print_error(text: str) -> int:
     return NOT_DONE
 
 
-def _prefixed(text: str, arguments: Sequence[str]) -> str:
+def _with_usage_prefix(text: str, arguments: Sequence[str]) -> str:
     verb = _verb(arguments)
     if verb is None:
         return f"sros: {text}"
@@ -380,15 +380,15 @@ def _numbers(version: str) -> list[int]:
     return [int(digits) for digits in re.findall(r"\d+", version)[:2]]
 
 
-def _defect(error: BaseException, arguments: Sequence[str]) -> int:
+def _report_defect(error: BaseException, arguments: Sequence[str]) -> int:
     if isinstance(error, (ImportError, AttributeError)) and (problem := _outdated_dependency()):
-        return _print_error(_prefixed(problem, arguments))
+        return _print_error(_with_usage_prefix(problem, arguments))
     if os.environ.get("SROS_DEBUG"):
         import traceback
 
         echo_lines("".join(traceback.format_exception(error)).rstrip("\n"), err=True)
     return _print_error(
-        _prefixed(
+        _with_usage_prefix(
             f"this is a defect of sros: {type(error).__name__}: {error}. Please report it; "
             "SROS_DEBUG=1 prints a traceback.",
             arguments,

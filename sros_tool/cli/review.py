@@ -254,11 +254,11 @@ def review(
         steps = [
             StepResult(
                 step.kind,
-                result.shown(step.subject) or None,
+                result.with_shown_paths(step.subject) or None,
                 step.status,
                 step.allowed,
                 _sentence(result, step),
-                [result.shown(line) for line in _reasons(step)],
+                [result.with_shown_paths(line) for line in _lines_to_read(step)],
             )
             for step in result.steps
         ]
@@ -388,7 +388,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             more = f", and {len(lines) - 1} more" if len(lines) > 1 else ""
             return f"'{lines[0][1]}' {lines[0][0]}{more}"
         case error:
-            return result.shown(str(error))
+            return result.with_shown_paths(str(error))
 
 
 def _sentences(result: Review, steps: Sequence[ReviewStep]) -> Iterator[tuple[ReviewStep, str]]:
@@ -398,7 +398,7 @@ def _sentences(result: Review, steps: Sequence[ReviewStep]) -> Iterator[tuple[Re
         sentence = _sentence(result, step)
         if isinstance(step.content, SrosError) and sentence in said:
             sentence = "could not be decided, for the same reason"
-        said += "\n".join((sentence, *map(result.shown, _reasons(step))))
+        said += "\n".join((sentence, *map(result.with_shown_paths, _lines_to_read(step))))
         yield step, sentence
 
 
@@ -406,16 +406,16 @@ def _text(result: Review) -> list[str]:
     """Return the review as lines."""
     lines = []
     for step, sentence in _sentences(result, result.steps):
-        subject = f" {result.shown(step.subject)}" if step.subject else ""
+        subject = f" {result.with_shown_paths(step.subject)}" if step.subject else ""
         lines.append(f"{step.kind}{subject}: {sentence}")
-        said = _reasons(step)
+        said = _lines_to_read(step)
         more = [f"and {len(said) - _MOST_REASONS} more (--summary FILE has all)"]
         shown = said[:_MOST_REASONS] + more * (len(said) > _MOST_REASONS)
-        lines += [f"  {result.shown(line)}" for line in shown]
+        lines += [f"  {result.with_shown_paths(line)}" for line in shown]
     return [*lines, _verdict(result)]
 
 
-def _reasons(step: ReviewStep) -> list[str]:
+def _lines_to_read(step: ReviewStep) -> list[str]:
     """Return what a reviewer has to read: new access and dropped requirements, also if they are
     allowed; rights that nobody answers any more; the findings of a failed step.
     """
@@ -485,14 +485,14 @@ def _verdict(result: Review) -> str:
 
 def _markdown(result: Review, request: ReviewRequest) -> str:
     """Return the review as Markdown: the steps in short, then each of them, the worst first."""
-    from sros_tool.markdown import bounded, code, plain
+    from sros_tool.markdown import bounded_list, code, plain
 
     allowed = any(step.allowed for step in result.steps)
     passed = "only what is allowed was found" if allowed else "nothing found"
     verdict = (passed, "something found", "could not be decided")[result.status]
     lines = (
         f"{_SIGN_ALLOWED if step.allowed else _SIGNS[step.status]} {_TITLES[step.kind]}"
-        f"{' ' + code(result.shown(step.subject)) if step.subject else ''}: "
+        f"{' ' + code(result.with_shown_paths(step.subject)) if step.subject else ''}: "
         f"{code(sentence)}"
         for step, sentence in _sentences(result, _by_weight(result))
     )
@@ -502,11 +502,11 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
     sides += f", compared with {code(result.base)}." if result.base else "."
     printed = "which `sros review` prints"
     parts = [f"## Review: {plain(verdict)}{out}"]
-    parts += [bounded(map(code, result.left_out), 6000, printed)] if count else []
-    parts += [sides, bounded(lines, 12_000, printed)]
+    parts += [bounded_list(map(code, result.left_out), 6000, printed)] if count else []
+    parts += [sides, bounded_list(lines, 12_000, printed)]
     room = _MOST - sum(map(len, parts))
     for step in _by_weight(result):
-        detail = result.shown(_detail(result, step, request))
+        detail = result.with_shown_paths(_detail(result, step, request))
         if detail and len(detail) > room:
             detail = f"### {_TITLES[step.kind]}: too long for a comment"
         if detail:
@@ -530,7 +530,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     from sros_tool.cli.check import renewal_markdown
     from sros_tool.cli.policy import access_markdown, rights_markdown
     from sros_tool.keystore.expiry import ExpiryCheck, describe_lifetime
-    from sros_tool.markdown import bounded, code
+    from sros_tool.markdown import bounded_list, code
     from sros_tool.proof.review import (
         AccessChange,
         DroppedRequirements,
@@ -553,7 +553,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
             parts = [rights_markdown(before, after, compared)] if compared else []
             if lines := list(_absolute_lines(change)):
                 title = f"### {counted(len(change.absolute), 'name')} made absolute"
-                parts += [title, bounded(map(code, lines), 6000, rest)]
+                parts += [title, bounded_list(map(code, lines), 6000, rest)]
             return "\n\n".join(part.rstrip("\n") for part in parts)
         case DroppedRequirements(chosen=chosen):
             title = "### The requirements changed: these are checked as they were before"
@@ -564,7 +564,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
             return renewal_markdown(lines, "", "as asked") if lines else ""
         case Facts(lines=facts):
             said = (f"{code(name)} {code(text)}" for text, name in facts)
-            return f"### {_TITLES[step.kind]}\n\n{bounded(said, 6000, rest)}"
+            return f"### {_TITLES[step.kind]}\n\n{bounded_list(said, 6000, rest)}"
     return ""
 
 

@@ -327,7 +327,7 @@ def _show_from(
                 "`sros zenoh --from` without -o shows what the rules allow. `sros generate_policy` "
                 "makes a policy from a running robot.",
             )
-        notes = tuple(_not_in_policy(rights))
+        notes = tuple(_untranslatable_notes(rights))
         changes = file_change(output, existed=output.exists())
         saved = "" if dry_run else save(output, write_policy(policy))
     if as_json:
@@ -365,18 +365,18 @@ def _lines(document: ConfigurationDocument, subjects: Sequence[RightsBehindRules
         if not (rights.rights or rights.unsaid or rights.denied):
             continue
         obeys = ", by rules that bind only itself" if rights.self_limiting else ""
-        yield f"{_who(rights)}{obeys}"
+        yield f"{_subject_text(rights)}{obeys}"
         for right in VERBS:
             stated = [one for one in rights.rights if one.right == right]
             for one in stated:
                 domain = "" if one.domain == "0" else f" (domain {one.domain})"
                 lacks = f" (of no use without {', '.join(one.lacks)})" if one.lacks else ""
                 yield f"  may {VERBS[right]} {one.name}{domain}{lacks}"
-        yield from _keys("may also", rights.unsaid)
-        yield from _keys("is denied, if no wildcard is used,", rights.denied)
+        yield from _key_lines("may also", rights.unsaid)
+        yield from _key_lines("is denied, if no wildcard is used,", rights.denied)
 
 
-def _keys(what: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
+def _key_lines(what: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
     from sros_tool.checks.zenoh import VERBS
 
     for right, word in VERBS.items():
@@ -390,7 +390,7 @@ def _kind(document: ConfigurationDocument) -> str:
     return mode if mode == "router" else f"session (mode {mode})"
 
 
-def _who(rights: RightsBehindRules) -> str:
+def _subject_text(rights: RightsBehindRules) -> str:
     if rights.self_limiting:
         return f"the process itself ({rights.subject})"
     if rights.names is None:
@@ -400,7 +400,7 @@ def _who(rights: RightsBehindRules) -> str:
 
 def _why_no_policy(subjects: Sequence[RightsBehindRules]) -> str:
     """Return a sentence on the subjects that have rights but are not enclaves."""
-    strangers = [_who(rights) for rights in subjects if rights.rights]
+    strangers = [_subject_text(rights) for rights in subjects if rights.rights]
     if not strangers:
         return "They let nobody publish, subscribe, call or serve any ROS name."
     return (
@@ -409,19 +409,21 @@ def _why_no_policy(subjects: Sequence[RightsBehindRules]) -> str:
     )
 
 
-def _not_in_policy(subjects: Sequence[RightsBehindRules]) -> Iterator[Note]:
+def _untranslatable_notes(subjects: Sequence[RightsBehindRules]) -> Iterator[Note]:
     """Yield notes about what the rules allow or deny but the policy does not state."""
     from sros_tool.translate_zenoh.rights import enclave_of
 
     for rights in subjects:
         if (rights.rights or rights.unsaid) and not enclave_of(rights):
-            yield Note("zenoh.no-enclave", f"{_who(rights)}: no enclave, so not in the policy")
+            yield Note(
+                "zenoh.no-enclave", f"{_subject_text(rights)}: no enclave, so not in the policy"
+            )
         elif rights.unsaid:
             keys = ", ".join(key for _, key in rights.unsaid[:_MOST_KEYS])
             yield Note(
                 "zenoh.unsaid",
-                f"{_who(rights)}: the policy lacks {len(rights.unsaid)} rights that no ROS name "
-                f"states exactly: {keys}",
+                f"{_subject_text(rights)}: the policy lacks {len(rights.unsaid)} rights that no "
+                f"ROS name states exactly: {keys}",
             )
     domains = sorted(
         {one.domain for rights in subjects for one in rights.rights} - {"0", "*"}, key=int

@@ -331,7 +331,7 @@ _LONGEST_NAME = 8  # parts; a longer enclave name has too many subsets to compar
 
 def document_notes(label: str, permissions: Permissions, signed_bytes: int) -> Iterator[Note]:
     """Yield notes on a permissions document named ``label``; ``signed_bytes`` is its size."""
-    for identity, fact in outside(permissions, signed_bytes):
+    for identity, fact in portability_problems(permissions, signed_bytes):
         yield Note(identity, f"{label}: {fact}{_CONSEQUENCES[identity]}")
 
 
@@ -357,7 +357,7 @@ def _meets_text(names: Sequence[str]) -> Meets:
     return lambda name: any(fnmatchcase(each, name) or fnmatchcase(name, each) for each in names)
 
 
-def outside(
+def portability_problems(
     permissions: Permissions,
     signed_bytes: int,
     meets_some_of: Callable[[Sequence[str]], Meets] = _meets_text,
@@ -383,7 +383,7 @@ def outside(
         allowed = [r for r in grant.rules if r.allow]
         denied = [r for r in grant.rules if not r.allow]
         for direction, other in (("publish", "subscribe"), ("subscribe", "publish")):
-            blocked = _blocked(
+            blocked = _blocked_by_denials(
                 [t for r in denied for t in _topics(getattr(r, direction))],
                 {t for r in denied for t in _topics(getattr(r, other))},
                 meets_some_of([t for r in allowed for t in _topics(getattr(r, other))]),
@@ -405,7 +405,7 @@ def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
     return tuple(topic for criterion in criteria for topic in criterion.topics)
 
 
-def _blocked(denied: list[str], denied_too: set[str], is_allowed: Meets) -> list[str]:
+def _blocked_by_denials(denied: list[str], denied_too: set[str], is_allowed: Meets) -> list[str]:
     """Return the denied expressions that share a name with one allowed in the other direction."""
     return [each for each in denied if each not in denied_too and is_allowed(each)]
 
@@ -451,7 +451,7 @@ def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
             (inner, outer)
             for outer, parts in parts_of.items()
             if len(parts) <= _LONGEST_NAME
-            for inner in _contained(parts, by_parts)
+            for inner in _names_within(parts, by_parts)
             if inner != outer
         }
     )
@@ -462,7 +462,7 @@ def some_pairs(pairs: Sequence[tuple[str, str]]) -> str:
     return first_few([f"{inner} for {outer}" for inner, outer in pairs], _SHOWN)
 
 
-def _contained(
+def _names_within(
     parts: frozenset[str], by_parts: Mapping[frozenset[str], list[str]]
 ) -> Iterator[str]:
     for size in range(1, len(parts) + 1):

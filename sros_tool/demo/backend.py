@@ -384,7 +384,7 @@ def _rmw_here(environment: Mapping[str, str]) -> str:
     return environment.get(RMW) or next(filter(vendor_of, installed), "")
 
 
-def _deaf_to(node: HandNode, environment: Mapping[str, str]) -> str:
+def _types_not_heard(node: HandNode, environment: Mapping[str, str]) -> str:
     """Return which nodes a secured node will not hear, judging by the ROS of this shell."""
     rmw = _rmw_here(environment)
     is_deaf = node.backend == CYCLONE and vendor_of(rmw) not in (None, Vendor.CYCLONE)
@@ -404,7 +404,7 @@ def run_by_hand(node: HandNode, say: Callable[[str], None]) -> int:
         SrosError: The environment demands security, and the enclave cannot be loaded.
     """
     say(f"{security_of(node, os.environ)} (stop with Ctrl-C)")
-    if deaf := _deaf_to(node, os.environ):
+    if deaf := _types_not_heard(node, os.environ):
         say(deaf)
     events, writing = os.pipe()
     module = f"sros_tool.demo.{_MODULES[node.backend]}_node"

@@ -26,8 +26,8 @@ from sros_tool.demo.scenarios.attacks import (
     WIDEST_PUBLISHER,
     WIDEST_SERVER,
     WIDEST_SUBSCRIBER,
-    joining,
-    revoked_joining,
+    faulty_enclave_row,
+    revoked_enclave_row,
 )
 from sros_tool.demo.scenarios.model import (
     DEFAULT_TOPIC,
@@ -119,7 +119,7 @@ class UserKeystore(NamedTuple):
         of_rows = {party.identity.enclave for row in self.rows for party in row.parties}
         names = {*self.cast.values(), *(part for part in of_rows if part.startswith("/"))}
         folders = {f"{ENCLAVES}{name}" for name in names}
-        shutil.copytree(self.root, target, symlinks=True, ignore=_all_but(self.root, folders))
+        shutil.copytree(self.root, target, symlinks=True, ignore=_copy_filter(self.root, folders))
 
     def keyring(self) -> Keyring:
         """Return the keyring of the CA keys: in the keystore, or where its settings say."""
@@ -132,7 +132,7 @@ class UserKeystore(NamedTuple):
         name = party.topic or topic
         return (self.service or SERVICE) if name == SERVICE else name
 
-    def rightful(self, row: Row) -> str:
+    def permitted_enclave(self, row: Row) -> str:
         """Return the enclave that plays attacker and permitted party of a row, else ""."""
         attackers, others = (
             {
@@ -144,7 +144,7 @@ class UserKeystore(NamedTuple):
         )
         return next((enclave for _, enclave in attackers & others), "")
 
-    def opened(self, row: Row, topic: str) -> Row:
+    def row_if_allowed(self, row: Row, topic: str) -> Row:
         """Return a row that expects success, if the attacker's permissions allow the attack.
 
         ``topic`` is the attacked ROS topic.  The new row has no other party: success needs no
@@ -156,7 +156,7 @@ class UserKeystore(NamedTuple):
         enclave = self.cast.get(attacker.identity.enclave, "")
         if attacker.identity.keystore is not OWN or enclave not in self.grants:
             return row
-        if self.rightful(row):
+        if self.permitted_enclave(row):
             return row
         right, name = _RIGHTS[attacker.role], self.topic_of(attacker, topic)
         expressions = _expressions_of(self.grants[enclave], right, name)
@@ -246,8 +246,8 @@ class _Enclaves(NamedTuple):
 
     def rows(self) -> Iterator[Row]:
         """Yield a row for each enclave with faulty or revoked files, up to `_MOST_FAULTY`."""
-        rows = [revoked_joining(name, own) for name, own in self.revoked.items()]
-        rows += [joining(name, why) for name, why in self.faulty.items()]
+        rows = [revoked_enclave_row(name, own) for name, own in self.revoked.items()]
+        rows += [faulty_enclave_row(name, why) for name, why in self.faulty.items()]
         yield from rows[:_MOST_FAULTY]
 
     def not_tried(self, cast: Mapping[str, str]) -> Iterator[str]:
@@ -348,7 +348,7 @@ def _best_cast(
     best listener is one of ``without_list``, which may not know who was revoked.
     """
     best: tuple[int, dict[str, str], str] = (-1, {}, "")
-    serving = _serving(rights)
+    serving = _service_cast(rights)
     named = sorted(topic for topic in _topics(rights) if "rt/" in topic)
     for topic in [wanted] if wanted else [*named, f"rt{DEFAULT_TOPIC}"]:
         talkers = {name for name in rights if allows(rights[name], "publish", topic)}
@@ -401,12 +401,12 @@ def _best_first(
         key=lambda name: (
             _is_denied(rights[name], topic),
             name in others,
-            not _may(rights[name], right, topic.removeprefix("rt"), named=True),
+            not _allows_name(rights[name], right, topic.removeprefix("rt"), named=True),
         ),
     )
 
 
-def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
+def _service_cast(rights: Mapping[str, Grant]) -> dict[str, str]:
     """Return the cast of a server and a client of one service; empty if there is none.
 
     A client that may not serve is preferred, and one that names the service.
@@ -421,7 +421,7 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
             if not allows(rights[client], "publish", dds_names("request", service).publish[0]):
                 continue
             score = 2 * (not allows(rights[client], "publish", topic))
-            score += _may(rights[client], "request", service, named=True)
+            score += _allows_name(rights[client], "request", service, named=True)
             if score > best:
                 best, cast = score, {"server": server, "client": client}
             if best == 3:
@@ -458,7 +458,8 @@ def _widest_enclaves(
         unnamed = [
             enclave
             for enclave, grant in rights.items()
-            if not _may(grant, right, name, named=True) or _may(grant, right, DENIED_TOPIC)
+            if not _allows_name(grant, right, name, named=True)
+            or _allows_name(grant, right, DENIED_TOPIC)
         ]
         tried = {cast[other] for other in others if other in cast}
         width = {enclave: _width(rights[enclave], right, name) for enclave in unnamed}
@@ -480,7 +481,7 @@ def _width(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
         for rule in grant.rules
         for criteria in (*rule.publish, *rule.subscribe)
     )
-    return _may(grant, right, name), _may(grant, right, DENIED_TOPIC), size
+    return _allows_name(grant, right, name), _allows_name(grant, right, DENIED_TOPIC), size
 
 
 def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
@@ -501,12 +502,12 @@ def _topics(rights: Mapping[str, Grant]) -> set[str]:
     return {topic for grant in rights.values() for topic in _application_topics(grant, "publish")}
 
 
-def _all_but(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[str]]:
+def _copy_filter(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[str]]:
     """Return an ``ignore`` function for `shutil.copytree` that skips CA keys and other enclaves."""
     wanted = {root / folder for folder in folders}
     kept = {parent for folder in wanted for parent in folder.parents} | wanted
 
-    def left_out(parent: str, names: list[str]) -> set[str]:
+    def left_out_names(parent: str, names: list[str]) -> set[str]:
         if Path(parent) == root:
             return {name for name in names if name == PRIVATE or name.startswith(".")}
         inside = Path(parent).relative_to(root).parts[0] == ENCLAVES
@@ -515,7 +516,7 @@ def _all_but(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[st
             name for name, path in paths.items() if inside and path.is_dir() and path not in kept
         }
 
-    return left_out
+    return left_out_names
 
 
 _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events", "rt/clock", "ros_discovery_info")
@@ -571,7 +572,7 @@ def _expressions_of(grant: Grant, right: str, name: str) -> tuple[str, ...]:
     )
 
 
-def _may(grant: Grant, right: str, name: str, *, named: bool = False) -> bool:
+def _allows_name(grant: Grant, right: str, name: str, *, named: bool = False) -> bool:
     """Return whether a grant allows a right on a ROS name; with ``named``, by exact name only."""
     return all(
         expression and not (named and _is_wild(expression))

@@ -146,7 +146,7 @@ class KeystoreCopy:
         part = next(iter(self.cast))
         return smime.parse(self.read(part, GOVERNANCE_FILE)).document
 
-    def widened(
+    def widened_permissions(
         self, part: str, publish: Sequence[str] = (), subscribe: Sequence[str] = ()
     ) -> bytes:
         """Return an enclave's permissions as XML, with more DDS topics in the first allow rule."""
@@ -191,7 +191,7 @@ Forge = Callable[[KeystoreCopy], None]
 """A function that changes a keystore as an attacker would."""
 
 
-def _unchanged(_copy: KeystoreCopy) -> None:
+def _forge_nothing(_copy: KeystoreCopy) -> None:
     """Leave the keystore unchanged."""
 
 
@@ -203,7 +203,7 @@ def _same_template(template: Template) -> Template:
 class Undefended(NamedTuple):
     """A forgery in a new keystore that lacks a defence: its template is changed first."""
 
-    forge: Forge = _unchanged
+    forge: Forge = _forge_nothing
     template: Callable[[Template], Template] = _same_template
 
 
@@ -216,12 +216,14 @@ def name_of(forgery: Forge | Undefended) -> str:
 
 def _with_topics(rule: Rule, publish: Sequence[str], subscribe: Sequence[str]) -> Rule:
     return rule._replace(
-        publish=_widened(rule.publish, publish),
-        subscribe=_widened(rule.subscribe, subscribe),
+        publish=_widened_criteria(rule.publish, publish),
+        subscribe=_widened_criteria(rule.subscribe, subscribe),
     )
 
 
-def _widened(criteria: tuple[Criteria, ...], topics: Sequence[str]) -> tuple[Criteria, ...]:
+def _widened_criteria(
+    criteria: tuple[Criteria, ...], topics: Sequence[str]
+) -> tuple[Criteria, ...]:
     if not topics:
         return criteria
     if not criteria:
@@ -278,7 +280,7 @@ def weaker_governance(copy: KeystoreCopy) -> None:
 
 def _wider_permissions(copy: KeystoreCopy) -> bytes:
     """Return the guest's permissions with the right to publish the topic, as XML."""
-    return copy.widened("guest", publish=[copy.dds_topic])
+    return copy.widened_permissions("guest", publish=[copy.dds_topic])
 
 
 def permissions_of_another(copy: KeystoreCopy) -> None:
@@ -382,11 +384,11 @@ def old_permissions_after_renewal(copy: KeystoreCopy) -> None:
 
 def permissions_for_another_domain(copy: KeystoreCopy) -> None:
     """Give the guest permissions with one more topic, signed by the CA for another domain."""
-    permissions = Permissions(_only_elsewhere(_wider_permissions(copy), copy.domain))
+    permissions = Permissions(_for_another_domain(_wider_permissions(copy), copy.domain))
     copy.put("guest", PERMISSIONS_FILE, copy.sign(render_permissions(permissions)))
 
 
-def _only_elsewhere(document: bytes, domain: int) -> tuple[Grant, ...]:
+def _for_another_domain(document: bytes, domain: int) -> tuple[Grant, ...]:
     elsewhere = DomainSet.of((0, 0) if domain else (1, 1))
     return tuple(
         grant._replace(rules=tuple(rule._replace(domains=elsewhere) for rule in grant.rules))
@@ -421,7 +423,7 @@ def client_may_do_everything(copy: KeystoreCopy) -> None:
 
 def _allow_everything(copy: KeystoreCopy, part: str) -> None:
     """Give an enclave the permissions that ros2/sros2 gives without a policy."""
-    wide = copy.widened(part, publish=["*"], subscribe=["*"])
+    wide = copy.widened_permissions(part, publish=["*"], subscribe=["*"])
     copy.put(part, PERMISSIONS_FILE, copy.sign(wide))
 
 

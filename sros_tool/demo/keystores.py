@@ -165,7 +165,7 @@ class KeystoreSet:
                 return f"the keystore has no enclave that can be the {part}"
             if isinstance(error := self._missing(party), UncastError):
                 return str(error)
-        if self.user is not None and (enclave := self.user.rightful(row)):
+        if self.user is not None and (enclave := self.user.permitted_enclave(row)):
             return f"the keystore has no other enclave than {enclave}, which is permitted to do it"
         return ""
 

@@ -192,12 +192,14 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             )
             endpoint = _ENDPOINT if isolation.isolated else f"localhost:{_free_port()}"
             spec = KeystoreSpec(topic, keystore_domains, template, now, endpoint)
-            rows = tuple(_expected(row, backend, template, topic) for row in scenario.rows)
+            rows = tuple(_with_expectation(row, backend, template, topic) for row in scenario.rows)
             if user:
                 strong = load_template(_DEFAULT_TEMPLATE)
                 rows = tuple(
-                    _gated(
-                        user.opened(row, topic), _expected(same, backend, strong, topic), options
+                    _with_default_template_status(
+                        user.row_if_allowed(row, topic),
+                        _with_expectation(same, backend, strong, topic),
+                        options,
                     )
                     for row, same in zip(rows, scenario.rows, strict=True)
                 )
@@ -276,12 +278,12 @@ def _scenario_results(
         yield _result_of(scenario, own)
 
 
-def _expected(row: Row, backend: Backend, template: Template, topic: str) -> Row:
+def _with_expectation(row: Row, backend: Backend, template: Template, topic: str) -> Row:
     """Return the row with the outcome that a keystore from this template should give."""
-    return row.expected_under(conditions(backend, template, _dds_topic(row, topic)))
+    return row.with_expected_status(conditions(backend, template, _dds_topic(row, topic)))
 
 
-def _gated(row: Row, strong_row: Row, options: DemoOptions) -> Row:
+def _with_default_template_status(row: Row, strong_row: Row, options: DemoOptions) -> Row:
     """Return the row, marked as accepted, or as open although the default template prevents it."""
     opened = bool(row.open_because) and not strong_row.open_because
     accepted = row.name in options.accept_open
@@ -544,7 +546,7 @@ class _Runner:
 
     async def run(self) -> list[RowResult]:
         plan = self._plan
-        groups = worlds(plan.rows)
+        groups = groups_of_rows(plan.rows)
         waves = math.ceil(len(groups) / plan.rows_at_once)
         self._end = time.monotonic() + max(plan.limits.total, waves * plan.limits.wave)
         loop, task = asyncio.get_running_loop(), asyncio.current_task()
@@ -613,14 +615,14 @@ class _Runner:
         memory: Mapping[str, int] = {}
         network = RowNetwork(own=self._plan.own_networks)
         try:
-            with network.entered():
+            with network.in_network():
                 if row.tapped:
                     tap = self._listen_in(index, row)
                     if tap.problem:
                         return RowRecord(row, domain, skipped=tap.problem)
             for turn in sorted({party.turn for party in row.parties}):
-                await self._settled(processes.values())
-                with network.entered():
+                await self._wait_until_settled(processes.values())
+                with network.in_network():
                     for party in row.parties:
                         if party.turn == turn:
                             started = self._start(index, row, party, folder, patience)
@@ -664,7 +666,7 @@ class _Runner:
         """Return the seconds since the plan was made."""
         return time.monotonic() - self._plan.started
 
-    async def _settled(self, processes: Collection[_PartyProcess]) -> bool:
+    async def _wait_until_settled(self, processes: Collection[_PartyProcess]) -> bool:
         """Wait until all processes are settled; return False if that takes too long."""
         deadline = min(time.monotonic() + self._plan.limits.start, self._end)
         while not all(process.settled for process in processes):
@@ -731,7 +733,7 @@ class _Runner:
         self, row: Row, processes: Mapping[str, _PartyProcess], expiry: float | None
     ) -> tuple[float, float] | None:
         limits = self._plan.limits
-        if not await self._settled(processes.values()):
+        if not await self._wait_until_settled(processes.values()):
             return None
         if _is_decided_by_start(row):
             now = time.monotonic()
@@ -797,7 +799,7 @@ def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProces
     return claim.denied not in DENIALS or all(processes[name].running for name in names)
 
 
-def worlds(rows: Sequence[Row]) -> list[list[int]]:
+def groups_of_rows(rows: Sequence[Row]) -> list[list[int]]:
     """Return groups of rows that can share processes, as indexes of rows."""
     groups: dict[object, list[int]] = {}
     for index, row in enumerate(rows):

@@ -198,7 +198,7 @@ def _observe(record: RowRecord) -> _Finding:
     if record.skipped:
         return _Finding(RowStatus.SKIPPED, record.skipped)
     for party in record.row.parties:
-        lost = _lost_import(party, record.parties[party.name])
+        lost = _missing_import(party, record.parties[party.name])
         if lost:
             return _Finding(RowStatus.SKIPPED, lost)
     claims = [(claim, _judge_claim(claim, record)) for claim in record.row.claims]
@@ -218,7 +218,7 @@ def _observe(record: RowRecord) -> _Finding:
     return _Finding(record.row.expected, "; ".join(details))
 
 
-def _lost_import(party: Party, record: PartyRecord) -> str:
+def _missing_import(party: Party, record: PartyRecord) -> str:
     """Return why a node could not import rclpy or a ROS interface, or ""."""
     if party.role in (Role.TALKER, Role.LISTENER):
         return ""
@@ -249,7 +249,7 @@ class _Case:
 
     def heard(self) -> list[Event]:
         """Return the talker's messages that the subject heard, at any time."""
-        return _heard_of(self.talker, self.subject)
+        return _messages_heard(self.talker, self.subject)
 
 
 def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
@@ -380,7 +380,7 @@ def _judge_forgery(case: _Case) -> _Finding:
     )
 
 
-def _heard_of(speaker: PartyRecord, listener: PartyRecord) -> list[Event]:
+def _messages_heard(speaker: PartyRecord, listener: PartyRecord) -> list[Event]:
     mark = f"{speaker.text}: "
     return [e for e in listener.events if e.kind is EventKind.HEARD and e.text.startswith(mark)]
 
@@ -459,11 +459,11 @@ def _why_not_running(name: str, record: PartyRecord) -> _Finding | None:
     ready = any(event.kind is EventKind.READY for event in record.events)
     for event in record.events:
         if event.kind is EventKind.REFUSED:
-            return _refusal_finding(name, event.stage, _own_denial(record, "") or event.text)
+            return _refusal_finding(name, event.stage, _denial_by_itself(record, "") or event.text)
         if event.kind is EventKind.FAILED:
             return _failure(name, record, event)
     if record.status is not None:
-        return _Finding(RowStatus.CRASHED, f"{name} {_end_of(record)}")
+        return _Finding(RowStatus.CRASHED, f"{name} {_exit_text(record)}")
     if not ready:
         return _Finding(RowStatus.NOT_STARTED, f"{name} was not ready in time")
     return None
@@ -474,7 +474,7 @@ def _failure(name: str, record: PartyRecord, event: Event) -> _Finding:
     reason = " ".join(event.text.split())
     if lacking := missing_security(reported):
         return _Finding(RowStatus.NOT_STARTED, f"{name}: {lacking}")
-    if event.stage is ProcessStage.ENDPOINT and (refusal := _own_denial(record, event.text)):
+    if event.stage is ProcessStage.ENDPOINT and (refusal := _denial_by_itself(record, event.text)):
         return _refusal_finding(name, ProcessStage.ENDPOINT, refusal)
     if event.stage in (ProcessStage.PARTICIPANT, ProcessStage.ENDPOINT):
         # A ROS node has standard topics and services: if one is denied, it does not start.
@@ -484,7 +484,7 @@ def _failure(name: str, record: PartyRecord, event: Event) -> _Finding:
     return _Finding(RowStatus.CRASHED, f"{name} failed: {reason}")
 
 
-def _own_denial(record: PartyRecord, reported: str) -> str:
+def _denial_by_itself(record: PartyRecord, reported: str) -> str:
     """Return the log message in which DDS Security denies the party's own topic, or ""."""
     lines = f"{record.output}\n{reported}".splitlines()
     return endpoint_refusal("\n".join(line for line in lines if _is_about(line, record.topic)))
@@ -503,7 +503,7 @@ def _refusal_finding(name: str, stage: ProcessStage | None, reason: str) -> _Fin
     return _Finding(RowStatus.NOT_LET_IN, f"{name} was refused before it used the topic: {reason}")
 
 
-def _end_of(record: PartyRecord) -> str:
+def _exit_text(record: PartyRecord) -> str:
     status = record.status or 0
     if status < 0:
         return f"was ended by {signal_name(-status)}"
@@ -850,7 +850,7 @@ def summary_page(result: DemoResult, now: datetime) -> str:
         ]
         lines.append("")
     if attacks:
-        lines += _attacks(attacks, [row for row in result.rows if row.defence_removed])
+        lines += _attack_lines(attacks, [row for row in result.rows if row.defence_removed])
     if others:
         lines += ["## Other rows", "", *_rows_table(others)]
     return "\n".join(lines).rstrip() + "\n"
@@ -881,7 +881,9 @@ def _verdict(result: DemoResult, wrong: Sequence[RowResult]) -> str:
     return ", ".join([*parts, *_left_out(result)]) + "."
 
 
-def _attacks(attacks: Sequence[RowResult], rows_without_defence: Sequence[RowResult]) -> list[str]:
+def _attack_lines(
+    attacks: Sequence[RowResult], rows_without_defence: Sequence[RowResult]
+) -> list[str]:
     closed = [row for row in attacks if not row.open_because]
     open_ = [row for row in attacks if row.open_because]
     lines = [
@@ -895,7 +897,7 @@ def _attacks(attacks: Sequence[RowResult], rows_without_defence: Sequence[RowRes
     ]
     for row in closed:
         twins = "; ".join(
-            _unique(_twin(twin) for twin in rows_without_defence if twin.attack == row.attack)
+            _unique(_twin_text(twin) for twin in rows_without_defence if twin.attack == row.attack)
         )
         lines.append(f"| {_cells(row)} | {row.mechanism} | {twins} |")
     if open_:
@@ -908,7 +910,7 @@ def _attacks(attacks: Sequence[RowResult], rows_without_defence: Sequence[RowRes
     return [*lines, ""]
 
 
-def _twin(row: RowResult) -> str:
+def _twin_text(row: RowResult) -> str:
     """Return the result without the defence, such as ``heard with the right key``."""
     if row.defence_removed.startswith("the wrong "):
         # The defence is a fault of the attacker's own files.

@@ -149,7 +149,7 @@ def _talker(node: Any, options: NodeOptions, events: EventWriter) -> None:
 
     node.create_timer(options.period, speak)
     if options.by_hand:
-        types = partial(_types_of, node.get_subscriptions_info_by_topic, options.topic)
+        types = partial(_types_of_endpoints, node.get_subscriptions_info_by_topic, options.topic)
         node.create_timer(options.period, OtherTypes(options, events, types).step)
 
 
@@ -166,7 +166,9 @@ def _message_class(kind: str) -> Any:
         raise ImportError(str(error)) from error
 
 
-def _types_of(endpoint_infos: Callable[[str], Sequence[Any]], topic: str) -> Sequence[str]:
+def _types_of_endpoints(
+    endpoint_infos: Callable[[str], Sequence[Any]], topic: str
+) -> Sequence[str]:
     return [info.topic_type for info in endpoint_infos(topic)]
 
 
@@ -189,7 +191,7 @@ def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
     from rclpy.qos import qos_profile_sensor_data  # hears publishers of any reliability
 
     texts = node.create_subscription(String, options.topic, hear, qos_profile_sensor_data)
-    types = partial(_types_of, node.get_publishers_info_by_topic, options.topic)
+    types = partial(_types_of_endpoints, node.get_publishers_info_by_topic, options.topic)
 
     def count(kind: str, on_count: Callable[[int], None]) -> str:
         try:

@@ -188,12 +188,12 @@ def mapped_segments(process: int) -> frozenset[Path]:
 def shared_memory(texts: Mapping[str, str], segments: Collection[Path]) -> dict[str, int]:
     """Return for each party the number of shared memory segments that contain its text."""
     return {
-        name: sum(_shows(path, text) for path in segments) if text else 0
+        name: sum(_contains_text(path, text) for path in segments) if text else 0
         for name, text in texts.items()
     }
 
 
-def _shows(path: Path, text: str) -> bool:
+def _contains_text(path: Path, text: str) -> bool:
     try:
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size

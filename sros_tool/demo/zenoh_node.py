@@ -62,7 +62,7 @@ _QOS = "::,7:,:,:,,"
 _CDR_HEADER = b"\0\1\0\0"
 
 
-def _type_of(name: str, default: tuple[str, str]) -> tuple[str, str]:
+def _type_of_topic(name: str, default: tuple[str, str]) -> tuple[str, str]:
     """Return the type of a name and its hash: of a part of an action, or else ``default``."""
     return _ACTION_TYPES.get(name.rpartition("/_action/")[2], default)
 
@@ -110,7 +110,7 @@ class _ZenohNode:
 
     def publisher(self, name: str) -> Hear:
         """Return a function that publishes a text; ``name`` may have Zenoh wildcards."""
-        kind = _type_of(name, _MESSAGE)
+        kind = _type_of_topic(name, _MESSAGE)
         gid = _GID if "*" in name else self._announce("MP", name, kind)
         key, numbers = self._key_of(name, kind), itertools.count(1)
 
@@ -122,7 +122,7 @@ class _ZenohNode:
 
     def subscribe(self, name: str, hear: Hear) -> None:
         """Subscribe to a topic; ``hear`` gets each text."""
-        kind = _type_of(name, _MESSAGE)
+        kind = _type_of_topic(name, _MESSAGE)
         if "*" not in name:
             self._announce("MS", name, kind)
         key = self._key_of(name, kind)
@@ -147,7 +147,7 @@ class _ZenohNode:
 
     def serve(self, name: str, answer: Callable[[str], str]) -> None:
         """Offer a service; ``answer`` gets each request and returns the reply."""
-        kind = _type_of(name, _SERVICE)
+        kind = _type_of_topic(name, _SERVICE)
         self._announce("SS", name, kind)
         key = self._key_of(name, kind)
 
@@ -163,7 +163,7 @@ class _ZenohNode:
 
         ``name`` may have Zenoh wildcards.
         """
-        kind = _type_of(name, _SERVICE)
+        kind = _type_of_topic(name, _SERVICE)
         gid = _GID if "*" in name else self._announce("SC", name, kind)
         key, numbers = self._key_of(name, kind), itertools.count(1)
         exact = "*" not in key

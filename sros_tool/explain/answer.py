@@ -152,8 +152,9 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
     if chosen not in fitting:
         others = " or ".join(verb for verb, right in _RIGHTS if right == chosen)
         raise UsageError(
-            f"nobody can {word} {_a(chosen)}",
-            f"A node can {word} {' or '.join(map(_a, fitting))}, and {others} {_a(chosen)}.",
+            f"nobody can {word} {_with_article(chosen)}",
+            f"A node can {word} {' or '.join(map(_with_article, fitting))}, and "
+            f"{others} {_with_article(chosen)}.",
             f"Leave --type out, or write --type {fitting[0]}.",
         )
     return Question(word, chosen, _RIGHTS[word, chosen], _checked_name(name, word, chosen))
@@ -179,7 +180,9 @@ def about_action(question: Question, rights: Iterable[Right]) -> Question | None
 def _checked_name(name: str, word: str, kind: str) -> str:
     """Return the name; raise UsageError if no node can use it."""
     if not name:
-        raise UsageError(f"{word} needs the name of {_a(kind)}", "", f"Write `{word} /NAME`.")
+        raise UsageError(
+            f"{word} needs the name of {_with_article(kind)}", "", f"Write `{word} /NAME`."
+        )
     problem = expression_problem(name)
     remedy = ""
     if not problem and is_expression(name):
@@ -192,11 +195,13 @@ def _checked_name(name: str, word: str, kind: str) -> str:
     elif not problem and name == "/":
         problem = "It is a namespace."
     if problem:
-        raise UsageError(f"{name!r} cannot be the name of {_a(kind)} here", problem, remedy)
+        raise UsageError(
+            f"{name!r} cannot be the name of {_with_article(kind)} here", problem, remedy
+        )
     return name
 
 
-def _a(kind: str) -> str:
+def _with_article(kind: str) -> str:
     return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
 
 
@@ -504,16 +509,16 @@ class Answer(NamedTuple):
             recorded = keystore and (keystore / FLEET).exists()
             robots = f"{root}/{FLEET}" if recorded else "FLEET_FILE"
             sign = f"sros generate_artifacts -k {root} -p {file} --fleet {robots}"
-            return [sign, *self._exporting(root)]
+            return [sign, *self._export_commands(root)]
         commands = []
         if self.change and self.change.document:
             commands.append(f"sros merge_policy {file} {ADDITION} --in-place")
         if robot:
             return [*commands, f"sros close {robot}"]
         sign = f"sros create_permission {root} {self.enclave.name} {file}"
-        return [*commands, sign, *self._exporting(root)]
+        return [*commands, sign, *self._export_commands(root)]
 
-    def _exporting(self, root: str) -> list[str]:
+    def _export_commands(self, root: str) -> list[str]:
         """Return the command that exports an exported enclave again; none for other enclaves."""
         export = f"sros distribute_key {root} {self.enclave.name} TARGET --force"
         return [export] if self.is_of_export else []

@@ -140,7 +140,7 @@ def open_to_ask(
         stated, policy = policy_to_ask(policy_file, fleet_of(asking.fleet_file, keystore))
         own = policy.enclave(name)
         if own is None and not is_enclave(Path(name)):
-            raise not_in_policy(policy, name, policy_file)
+            raise not_in_policy_error(policy, name, policy_file)
     enclave = signed_enclave(keystore, name, asking.at, planned=own is not None)
     if enclave is None:
         assert own is not None
@@ -148,7 +148,7 @@ def open_to_ask(
     elif own is None and policy_file and policy:
         own = policy.enclave(enclave.name)
         if own is None and not is_enclave(Path(enclave.name)):
-            raise not_in_policy(policy, enclave.name, policy_file)
+            raise not_in_policy_error(policy, enclave.name, policy_file)
     enclave = enclave._replace(
         keystore=keystore,
         policy=own,
@@ -176,7 +176,7 @@ def _is_of_robot(keystore: Keystore, enclave: str) -> bool:
     return fleet is not None and robot_of(fleet, enclave) is not None
 
 
-def not_in_policy(policy: Policy, name: str, file: Path) -> PolicyError:
+def not_in_policy_error(policy: Policy, name: str, file: Path) -> PolicyError:
     """Return the error for an enclave that a policy does not have."""
     from sros_tool.keystore.selection import likely_names
 
@@ -212,9 +212,9 @@ def signed_enclave(
         return load_enclave_of(keystore, name, moment=moment)
     if planned:
         return None
-    from sros_tool.keystore.selection import no_such_enclave
+    from sros_tool.keystore.selection import missing_enclave_error
 
-    raise no_such_enclave(keystore, name, keystore.names)
+    raise missing_enclave_error(keystore, name, keystore.names)
 
 
 def _load_enclave(folder: Path, moment: datetime) -> LoadedEnclave:

@@ -27,7 +27,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.explain.answer import Evaluator, Part, Question
-from sros_tool.explain.explanation import meant_instead, named_rights
+from sros_tool.explain.explanation import likely_meaning, named_rights
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.robots import Fleet
 from sros_tool.graph.learn import (
@@ -35,10 +35,10 @@ from sros_tool.graph.learn import (
     Learned,
     RightsFound,
     enclave_per_node,
+    first_subjects,
     is_tool,
     is_tool_name,
     learn,
-    listed,
     rights_of_endpoints,
 )
 from sros_tool.graph.observation import (
@@ -367,7 +367,7 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
     the enclave of the process that observed, or "": an enclave without named nodes counts as seen
     if that process runs in it.
     """
-    unjudged = _unjudged(observation)
+    unjudged = _unjudged_notes(observation)
     notes = [note for note, _ in unjudged]
     processes: dict[str, list[ObservedNode]] = {}
     for node in observation.nodes:
@@ -414,11 +414,15 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
             judged.append(node)
             denied += _without_enclave(node, enclaves.what)
     if divided:
-        notes.append(Note("audit.divided-process", f"{_DIVIDED}: {listed(sorted(divided), '; ')}"))
+        notes.append(
+            Note("audit.divided-process", f"{_DIVIDED}: {first_subjects(sorted(divided), '; ')}")
+        )
     if unclear:
-        notes.append(Note("audit.several-enclaves", f"{_UNCLEAR}: {listed(sorted(unclear), '; ')}"))
+        notes.append(
+            Note("audit.several-enclaves", f"{_UNCLEAR}: {first_subjects(sorted(unclear), '; ')}")
+        )
     return Audit(
-        _by_right(denied),
+        _group_by_right(denied),
         refused,
         make_observation(judged),
         tuple(notes),
@@ -445,7 +449,7 @@ _SILENT = "not judged, because these nodes were announced but had no endpoint"
 _STRAYS = "not judged, because the writers or readers of these topics belong to no ROS node"
 
 
-def _unjudged(observation: Observation) -> list[tuple[Note, str]]:
+def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
     """Return notes on what was observed but not judged, each with its number in words.
 
     The words are "" for tools that only observe.
@@ -470,7 +474,7 @@ def _unjudged(observation: Observation) -> list[tuple[Note, str]]:
 
 def _note(kind: str, text: str, subjects: Iterable[str]) -> Note | None:
     names = sorted(subjects)
-    return Note(f"audit.{kind}", f"{text}: {listed(names)}") if names else None
+    return Note(f"audit.{kind}", f"{text}: {first_subjects(names)}") if names else None
 
 
 _OF_EVERY_NODE = ("/rosout", "/parameter_events")
@@ -518,11 +522,11 @@ def _judge(process: Sequence[ObservedNode], enclave: str, enclaves: AuditedEncla
     if not join.allowed:
         return _Judgement((), join.decision.clause)
     return _Judgement(
-        tuple(right for node in process for right in _denied_to(node, enclave, evaluator))
+        tuple(right for node in process for right in _denied_rights(node, enclave, evaluator))
     )
 
 
-def _denied_to(node: ObservedNode, enclave: str, evaluator: Evaluator) -> Iterator[DeniedRight]:
+def _denied_rights(node: ObservedNode, enclave: str, evaluator: Evaluator) -> Iterator[DeniedRight]:
     parts = tuple(Part(AccessVerb(e.direction), e.topic) for e in sorted(node.endpoints))
     if not parts:
         return
@@ -541,7 +545,7 @@ def _denied_to(node: ObservedNode, enclave: str, evaluator: Evaluator) -> Iterat
                 endpoint for endpoint in endpoints if decisions[endpoint].reason == _DENY_RULE
             ]
             reason = decisions[(by_rule or endpoints)[0]].clause
-            if not by_rule and (meant := meant_instead(right, used, named)):
+            if not by_rule and (meant := likely_meaning(right, used, named)):
                 reason = f"{reason}; {meant}"
             yield DeniedRight(right, (node.fqn,), reason, bool(by_rule), False, endpoints)
 
@@ -570,7 +574,7 @@ def _without_enclave(node: ObservedNode, what: str) -> Iterator[DeniedRight]:
             yield DeniedRight(right, (node.fqn,), reason, False, True, needed)
 
 
-def _by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
+def _group_by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
     """Return the denied rights without duplicates, sorted, with all nodes that use each right."""
     by_right: dict[Right, DeniedRight] = {}
     for right in denied:

@@ -295,14 +295,14 @@ def as_learned(
         present = _profiles(policy, path)
         for profile, denied in sorted(_by_profile(rights, node, present).items()):
             if present and node is None and profile not in (_ANY_NODE, *present):
-                there = ", ".join(sorted(map(_fqn, present)))
-                others[_fqn(profile)] = f"enclave {path} has {there}"
+                there = ", ".join(sorted(map(_full_name, present)))
+                others[_full_name(profile)] = f"enclave {path} has {there}"
                 continue
             has = present.get(profile, frozenset())
-            parts = _whole_parts(denied, profile, has, common) if common else ()
+            parts = _denied_common_part(denied, profile, has, common) if common else ()
             node_rights = common.given(parts, *profile) if common else frozenset[NodeRight]()
             if parts:
-                wholes[_fqn(profile)] = ", ".join(parts)
+                wholes[_full_name(profile)] = ", ".join(parts)
             groups = groups_of(denied - node_rights, *profile)
             profiles.append(LearnedProfile(path, *profile, denied | node_rights, parts, groups))
     elsewhere = {
@@ -361,14 +361,14 @@ def _by_profile(
 def _profile_of_node(fqn: str, present: Iterable[tuple[str, str]]) -> tuple[str, str]:
     """Return namespace and name of the profile for the node ``fqn``, perhaps with wildcards."""
     ns, _, name = fqn.rpartition("/")
-    return next((each for each in present if covers(_fqn(each), fqn)), (ns or "/", name))
+    return next((each for each in present if covers(_full_name(each), fqn)), (ns or "/", name))
 
 
-def _fqn(profile: tuple[str, str]) -> str:
+def _full_name(profile: tuple[str, str]) -> str:
     return f"{profile[0].rstrip('/')}/{profile[1]}"
 
 
-def _whole_parts(
+def _denied_common_part(
     denied: frozenset[NodeRight],
     profile: tuple[str, str],
     node_rights: frozenset[NodeRight],

@@ -271,14 +271,14 @@ def _smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | Non
             return PolicyChange(
                 tuple(add),
                 tuple(lift),
-                _addition(add[0], _node_names(enclave.policy, answer)) if add else "",
-                tuple(_edits(lift, enclave.policy)) if enclave.policy else (),
+                _added_xml(add[0], _node_names(enclave.policy, answer)) if add else "",
+                tuple(_group_edits(lift, enclave.policy)) if enclave.policy else (),
             )
         if tried.reason in _NO_RULE and wanted not in present:
             present.add(wanted)
             add.append(wanted)
             continue
-        blocking = _blocking(present, tried) if tried.reason == "deny-rule" else []
+        blocking = _blocking_denials(present, tried) if tried.reason == "deny-rule" else []
         if not blocking:
             return None
         present.difference_update(blocking)
@@ -300,11 +300,11 @@ def _present_rights(policy: Enclave | None, name: str, answer: Answer) -> set[Ri
     if policy:
         rights = (r for profile in policy.all_profiles() for r in profile_rights(name, profile))
     elif answer.grant:
-        rights = _granted(name, answer)
+        rights = _granted_rights(name, answer)
     return {right for right in rights if right.kind != "dds"}
 
 
-def _blocking(rights: Iterable[Right], answer: Answer) -> list[Right]:
+def _blocking_denials(rights: Iterable[Right], answer: Answer) -> list[Right]:
     """Return the denials from which the deciding expression of an answer comes.
 
     Denials of the other direction count only if there are no others: Cyclone DDS denies a whole
@@ -328,7 +328,7 @@ _ANY_NODE = ("/", "*")
 """Namespace and name of a profile for any node, because DDS only checks the enclave."""
 
 
-def _addition(right: Right, places: Iterable[tuple[str, str]]) -> str:
+def _added_xml(right: Right, places: Iterable[tuple[str, str]]) -> str:
     """Return the XML of a policy with one right, in the profile of the closest node.
 
     The closest of the ``places`` (namespace and name of nodes) is the one with the longest
@@ -352,12 +352,12 @@ def _node_names(policy: Enclave | None, answer: Answer) -> Iterator[tuple[str, s
     if policy:
         yield from ((profile.ns, profile.node) for profile in policy.all_profiles())
         return
-    for node in nodes_served((right.right, right.name) for right in _granted("", answer)):
+    for node in nodes_served((right.right, right.name) for right in _granted_rights("", answer)):
         ns, _, name = node.rpartition("/")
         yield ns or "/", name
 
 
-def _granted(name: str, answer: Answer) -> Iterator[Right]:
+def _granted_rights(name: str, answer: Answer) -> Iterator[Right]:
     """Yield the rights in the grant of an enclave."""
     from sros_tool.translate import grant_rights  # an allowed question needs none
 
@@ -378,10 +378,12 @@ def likely_names(answer: Answer) -> tuple[str, ...]:
     """
     question = answer.question
     names = {right.name for right in named_rights(answer) if right.right == question.right}
-    return _similar(question.name, names - {question.name}, is_service=question.type == "service")
+    return _similar_names(
+        question.name, names - {question.name}, is_service=question.type == "service"
+    )
 
 
-def meant_instead(right: Right, used: Collection[Right], named: Iterable[Right]) -> str:
+def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]) -> str:
     """Return what a policy may mean instead of a denied right, as a clause; "" for nothing.
 
     ``used`` are the rights that the node uses, which are meant as they are; ``named`` are the
@@ -395,7 +397,7 @@ def meant_instead(right: Right, used: Collection[Right], named: Iterable[Right])
             kind = "an action" if other.kind == "actions" else "a service"
             return f"the policy has it as {kind} ({other.right})"
     names = {other.name for other in others if other.right == right.right}
-    similar = _similar(right.name, names, is_service=right.kind == "services")
+    similar = _similar_names(right.name, names, is_service=right.kind == "services")
     return f"perhaps the policy means {' or '.join(similar)}" if similar else ""
 
 
@@ -406,7 +408,7 @@ def named_rights(answer: Answer) -> tuple[Right, ...]:
     return tuple(sorted(named, key=order))
 
 
-def _similar(name: str, names: Collection[str], *, is_service: bool) -> tuple[str, ...]:
+def _similar_names(name: str, names: Collection[str], *, is_service: bool) -> tuple[str, ...]:
     last = name.rpartition("/")[2]
     same = sorted(other for other in names if other.rpartition("/")[2] == last)
     if (is_service and last in NODE_SERVICES) or 0 < len(same) <= _SHOWN:
@@ -422,7 +424,7 @@ _SHOWN = 3
 """Highest number of names that are proposed."""
 
 
-def _edits(lifted_rights: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
+def _group_edits(lifted_rights: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
     """Yield a replacement for each group of the policy that has denials of ``lifted_rights``."""
     groups: dict[Source, Group] = {}
     lifted: dict[Source, set[tuple[str, str]]] = {}

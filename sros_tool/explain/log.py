@@ -268,11 +268,15 @@ def explain_log(
     naming = _lines_naming(lines, {denial.topic for denial in denied})
     denials = [(denial, naming[denial.process, denial.topic]) for denial in denied]
     reported = {denial.process for denial in denied}
-    hits = _strongest(_hits(_joined_lines(lines)), reported)
-    findings = [examiner.message(group) for group in _grouped(hits) if examiner.matters(group[0])]
+    hits = _strongest_hits(_log_hits(_joined_lines(lines)), reported)
+    findings = [
+        examiner.message(group)
+        for group in _grouped_hits(hits)
+        if examiner.is_security_message(group[0])
+    ]
     findings += [examiner.denial(denial, named) for denial, named in denials]
     own = find("")
-    findings += _dropped(lines, root, own.name if own else "", keystore)
+    findings += _dropped_message_findings(lines, root, own.name if own else "", keystore)
     return tuple(sorted(findings, key=lambda finding: finding.line))
 
 
@@ -322,7 +326,7 @@ def _joined_lines(lines: list[str]) -> Iterator[tuple[int, str]]:
         yield number, current[:_LONGEST]
 
 
-def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
+def _log_hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
     enclaves: dict[str, str] = {}
     following = deque(lines)
     while following:
@@ -333,7 +337,7 @@ def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
             if enclaves[process] == "/":
                 yield _Hit(number, " ".join(rest.split()), process, "/", RUNS_OPEN, {})
             continue
-        if following and (whole := _broken(process, line, rest, following[0][1])):
+        if following and (whole := _rejoined_message(process, line, rest, following[0][1])):
             following.popleft()
             line = rest = whole
         text = " ".join(rest.split())
@@ -345,7 +349,7 @@ def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
             yield _Hit(number, text, process, enclaves.get(process, ""), meaning, fields)
 
 
-def _broken(process: str, line: str, rest: str, following: str) -> str:
+def _rejoined_message(process: str, line: str, rest: str, following: str) -> str:
     """Return a message that was broken into two lines, for instance by a terminal; else "".
 
     ``line`` counts as broken if it and ``following`` have no known meaning, but both together do.
@@ -373,7 +377,7 @@ def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
     return UNKNOWN, None if denied_topic(line) else UNKNOWN.pattern.search(rest)
 
 
-def _strongest(hits: Iterable[_Hit], reported: set[str]) -> Iterator[_Hit]:
+def _strongest_hits(hits: Iterable[_Hit], reported: set[str]) -> Iterator[_Hit]:
     """Yield the hits, without weak hits if the same process has a stronger one.
 
     ``reported`` are the processes whose denied topics are reported separately.
@@ -386,7 +390,7 @@ def _strongest(hits: Iterable[_Hit], reported: set[str]) -> Iterator[_Hit]:
     return (hit for hit in all_hits if hit.meaning.weak <= least.get(hit.process, 0))
 
 
-def _grouped(hits: Iterable[_Hit]) -> Iterator[list[_Hit]]:
+def _grouped_hits(hits: Iterable[_Hit]) -> Iterator[list[_Hit]]:
     groups: dict[tuple[str, str, str], list[_Hit]] = {}
     for hit in hits:
         groups.setdefault((hit.process, hit.enclave, hit.kind), []).append(hit)
@@ -433,7 +437,7 @@ _GRAPH: Mapping[tuple[str, bool], str] = {
 }
 
 
-def _dropped(
+def _dropped_message_findings(
     lines: Iterable[str], root: str, own: str, keystore: SearchedKeystore | None
 ) -> Iterator[LogFinding]:
     """Yield a finding for each right whose lack made Zenoh drop messages.
@@ -514,7 +518,7 @@ class _Examiner:
         self._keystore = keystore
         self._evaluators: dict[tuple[Vendor, str], Evaluator] = {}
 
-    def matters(self, hit: _Hit) -> bool:
+    def is_security_message(self, hit: _Hit) -> bool:
         """Return whether a hit is a security message; one line is not if the enclave "/" exists."""
         return hit.meaning is not RUNS_OPEN or self._find("/") is None
 
@@ -541,7 +545,7 @@ class _Examiner:
             zenoh=meaning.id.startswith(ZENOH_IDS),
         )
         if meaning.id.startswith("peer-"):
-            return self._peer(plain, hits)
+            return self._with_peer_causes(plain, hits)
         if better := self._other_folder(first.fields.get("path", ""), remedy_of):
             return replace(plain, remedy=better)
         examined = meaning.faults or meaning.id == "service"
@@ -552,7 +556,7 @@ class _Examiner:
         causes = list(self._causes(enclave, answer, meaning.faults))
         if meaning.id == "service" and not causes:
             return replace(plain, enclave=enclave.name, found=_nodes(answer), checked=True)
-        causes = causes or list(self._wrong_domain(enclave, answer, first))
+        causes = causes or list(self._wrong_domain_cause(enclave, answer, first))
         remedies = list(dict.fromkeys(remedy for _, remedy in causes if remedy))
         unseen = self._with_names(meaning.unseen, enclave, first)
         nothing = f"{_nothing_found(enclave)} {unseen}".rstrip()
@@ -590,7 +594,7 @@ class _Examiner:
                 text = plain.join(re.split(rf"\b{word}\b", text))
         return text.format(**hit.quoted)
 
-    def _peer(self, finding: LogFinding, hits: Sequence[_Hit]) -> LogFinding:
+    def _with_peer_causes(self, finding: LogFinding, hits: Sequence[_Hit]) -> LogFinding:
         """Return the finding with causes and remedies in the enclaves of the peers in the log."""
         shown = dict.fromkeys(hit.fields["peer"] for hit in hits if hit.fields.get("peer"))
         names = (
@@ -650,16 +654,16 @@ class _Examiner:
         answer = self._answer(enclave, denial.vendor, _question(denial))
         if answer.allowed:
             facts = ["the present permissions allow it"]
-            elsewhere, remedy = self._in_other_folder(denial, enclave)
+            elsewhere, remedy = self._other_folder_cause(denial, enclave)
             facts += elsewhere
             remedy = remedy or (
                 "Restart the process: it loaded earlier permissions. If it runs from an export, "
                 "export the enclave again first."
             )
         else:
-            other, better = self._other_node(denial, answer)
+            other, better = self._other_node_cause(denial, answer)
             if not other:
-                other, better = self._other_name(denial, name, enclave, finding.remedy)
+                other, better = self._similar_name_cause(denial, name, enclave, finding.remedy)
             facts = [answer.decision.text, *other]
             remedy = better or finding.remedy
         remedy = remedy.replace("ENCLAVE", enclave.name)
@@ -667,7 +671,7 @@ class _Examiner:
             finding, enclave=enclave.name, found=tuple(facts), checked=True, remedy=remedy
         )
 
-    def _in_other_folder(self, denial: Denial, enclave: LoadedEnclave) -> tuple[list[str], str]:
+    def _other_folder_cause(self, denial: Denial, enclave: LoadedEnclave) -> tuple[list[str], str]:
         """Return cause and remedy if the process runs from another folder than the enclave's."""
         folder, loaded = Path(denial.folder), None
         with suppress(SrosError, OSError):  # the log chooses the path
@@ -684,19 +688,21 @@ class _Examiner:
             f"Export enclave {enclave.name} again, install it there, and restart the process."
         )
 
-    def _other_node(self, denial: Denial, answer: Answer) -> tuple[list[str], str]:
+    def _other_node_cause(self, denial: Denial, answer: Answer) -> tuple[list[str], str]:
         """Return causes and a remedy if the permissions are for a node with another name."""
-        node, nodes = serving_node(denial), _served(answer)
+        node, nodes = serving_node(denial), _served_names(answer)
         if node and not any(covers(each, node) for each in nodes):
             enclaves = self._keystore.enclaves_for(node) if self._keystore else ()
             this = f"the permissions are for {_listed_nodes(nodes)}, and " if nodes else ""
             if enclaves:
-                return [f"{this}this is the node {node}, for which there is {_or(enclaves)}"], (
+                return [
+                    f"{this}this is the node {node}, for which there is {_enclaves_text(enclaves)}"
+                ], (
                     f"Start it in the enclave that is for it: `sros run {quote(self._root)} "
                     f"{quote(enclaves[0])} -- COMMAND`."
                 )
             if nodes:
-                return [f"{this}this is the node {node}"], _renamed(nodes[0], node)
+                return [f"{this}this is the node {node}"], _renaming_advice(nodes[0], node)
         if not nodes and (node or denial.topic in _TOPICS_OF_EVERY_NODE):
             return [f"the permissions lack {_EVERY_NODE}"], (
                 'Add <xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> to the '
@@ -705,7 +711,7 @@ class _Examiner:
             )
         return [], ""
 
-    def _other_name(
+    def _similar_name_cause(
         self, denial: Denial, name: str, enclave: LoadedEnclave, remedy: str
     ) -> tuple[list[str], str]:
         """Return causes and a remedy if the enclave has rights to similar names."""
@@ -754,7 +760,7 @@ class _Examiner:
             decision = answer.decision
             yield decision.text, remedy(decision.reason, self._root, enclave.name)
 
-    def _wrong_domain(
+    def _wrong_domain_cause(
         self, enclave: LoadedEnclave, answer: Answer, hit: _Hit
     ) -> Iterator[tuple[str, str]]:
         """Yield the cause and remedy if a process was in a domain that its documents exclude."""
@@ -799,18 +805,18 @@ _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events")
 
 def _nodes(answer: Answer) -> tuple[str, ...]:
     """Return a clause on the nodes that an enclave's permissions name, in a tuple; or ()."""
-    nodes = _served(answer)
+    nodes = _served_names(answer)
     if nodes:
         return (f"its permissions are for {_listed_nodes(nodes)}",)
     return (f"its permissions lack {_EVERY_NODE}",)
 
 
-def _served(answer: Answer) -> tuple[str, ...]:
+def _served_names(answer: Answer) -> tuple[str, ...]:
     rights = grant_rights("", answer.grant) if answer.grant else ()
     return nodes_served((right.right, right.name) for right in rights)
 
 
-def _renamed(right: str, wrong: str) -> str:
+def _renaming_advice(right: str, wrong: str) -> str:
     ns, _, name = right.rpartition("/")
     return (
         f"Start it under that name (`--ros-args -r __node:={quote(name)} "
@@ -820,7 +826,7 @@ def _renamed(right: str, wrong: str) -> str:
     )
 
 
-def _or(enclaves: Sequence[str]) -> str:
+def _enclaves_text(enclaves: Sequence[str]) -> str:
     return f"the enclave{'s' * (len(enclaves) > 1)} {' and '.join(enclaves)}"
 
 

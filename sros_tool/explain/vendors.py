@@ -142,7 +142,7 @@ class Comparison(NamedTuple):
         if self.vendors:
             return _vendor_differences(self.vendors)
         decided = [(each.shipped.title, each.outcome) for each in self.distributions or ()]
-        return _differences("distributions", decided)
+        return _differing_titles("distributions", decided)
 
 
 DdsExplanation = VendorExplanation | Comparison
@@ -174,14 +174,14 @@ def explain_on_dds(
     evaluator = Evaluator(vendor, enclave, context)
     question, taken = question_meant(evaluator, asked_enclave, question, kind)
     answer = explain(evaluator, question)
-    beside = _beside(enclave, question, context)
+    beside = _zenoh_decision(enclave, question, context)
     notes = (
         *taken,
         *_provenance_notes(answer),
-        *_exported(answer),
-        *_other_type(evaluator, answer, kind),
-        *_no_topic(answer, asked_enclave),
-        *_other_name(answer),
+        *_export_notes(answer),
+        *_other_type_notes(evaluator, answer, kind),
+        *_not_a_topic_notes(answer, asked_enclave),
+        *_similar_name_notes(answer),
     )
     what = Asked(enclave.name, question, context)
     if every is Compared.VENDORS:
@@ -208,10 +208,12 @@ def explain_on_dds(
 
 def _vendor_differences(answers: Sequence[Answer]) -> str:
     """Return a sentence that names the vendors whose outcome differs from the first vendor's."""
-    return _differences("vendors", [(answer.vendor.title, answer.outcome) for answer in answers])
+    return _differing_titles(
+        "vendors", [(answer.vendor.title, answer.outcome) for answer in answers]
+    )
 
 
-def _differences(who: str, decided: Sequence[tuple[str, Outcome]]) -> str:
+def _differing_titles(who: str, decided: Sequence[tuple[str, Outcome]]) -> str:
     """Return a sentence with the titles whose outcome differs from the first outcome."""
     title, first = decided[0]
     others = [f"{other} ({outcome})" for other, outcome in decided if outcome != first]
@@ -238,7 +240,7 @@ def _provenance_notes(answer: Answer) -> Iterator[Note]:
     yield Note(f"explain.policy-{answer.provenance}", text)
 
 
-def _exported(answer: Answer) -> Iterator[Note]:
+def _export_notes(answer: Answer) -> Iterator[Note]:
     """Yield a note if an export denies what its keystore may allow by now."""
     if answer.change and answer.is_of_export:
         text = (
@@ -248,7 +250,7 @@ def _exported(answer: Answer) -> Iterator[Note]:
         yield Note("explain.exported", text)
 
 
-def _other_type(evaluator: Evaluator, answer: Answer, kind: str | None) -> Iterator[Note]:
+def _other_type_notes(evaluator: Evaluator, answer: Answer, kind: str | None) -> Iterator[Note]:
     """Yield a note if the enclave may not call the service, but an action with this name."""
     question = answer.question
     if question.word == "call" and question.type == "service" and not kind and not answer.allowed:
@@ -258,7 +260,7 @@ def _other_type(evaluator: Evaluator, answer: Answer, kind: str | None) -> Itera
             yield Note("explain.an-action", text)
 
 
-def _no_topic(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[Note]:
+def _not_a_topic_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[Note]:
     """Yield a note if a denied topic has the name of a service or an action."""
     name = answer.question.name
     if answer.question.type != "topic" or answer.allowed or answer.problems:
@@ -270,7 +272,7 @@ def _no_topic(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[Note]:
         yield Note("explain.no-topic", text)
 
 
-def _other_name(answer: Answer) -> Iterator[Note]:
+def _similar_name_notes(answer: Answer) -> Iterator[Note]:
     """Yield a note with similar names to which the enclave has rights."""
     if answer.allowed or answer.problems or not answer.question.right:
         return
@@ -282,7 +284,9 @@ def _other_name(answer: Answer) -> Iterator[Note]:
 # ── Zenoh, next to it ──────────────────────────────────────────────────────────────────────
 
 
-def _beside(enclave: LoadedEnclave, question: Question, context: JoinContext) -> ZenohBeside | None:
+def _zenoh_decision(
+    enclave: LoadedEnclave, question: Question, context: JoinContext
+) -> ZenohBeside | None:
     """Return Zenoh's decision, or why it is unknown; None if the keystore has no Zenoh files."""
     keystore = enclave.keystore
     if keystore is None or enclave.state is None or not is_keystore(keystore.root):

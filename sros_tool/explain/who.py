@@ -15,7 +15,7 @@ from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import enclave_names, has_authorities
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, rights_by_domains
-from sros_tool.keystore.selection import likely_names, no_such_enclave
+from sros_tool.keystore.selection import likely_names, missing_enclave_error
 from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right
@@ -221,15 +221,15 @@ class FollowedReach(NamedTuple):
     @property
     def influences(self) -> list[ReachedEnclave]:
         """The enclaves that the enclave can influence."""
-        return list(_printed(self.reach.influences))
+        return list(_reached_enclaves(self.reach.influences))
 
     @property
     def learns_from(self) -> list[ReachedEnclave]:
         """The enclaves that the enclave can learn from."""
-        return list(_printed(self.reach.learns_from))
+        return list(_reached_enclaves(self.reach.learns_from))
 
 
-def _printed(paths: Mapping[str, HopPath]) -> Iterator[ReachedEnclave]:
+def _reached_enclaves(paths: Mapping[str, HopPath]) -> Iterator[ReachedEnclave]:
     for enclave, path in sorted(paths.items()):
         yield ReachedEnclave(enclave, [ReachedStep(*hop) for hop in path])
 
@@ -270,7 +270,7 @@ def follow_reach(
         links=source.links,
     )
     if names and enclave not in names:
-        raise no_such_enclave(Keystore(source.path), enclave, names)
+        raise missing_enclave_error(Keystore(source.path), enclave, names)
     if enclave not in network.enclaves:
         meant = likely_names(enclave, network.enclaves)
         where = "" if domain is None else f", domain {domain}"
@@ -307,7 +307,7 @@ def _rights_of_router(
         if right.qualifier is ALLOW and (
             links is None or links.router_of.get(right.enclave) == router
         ):
-            yield right.opposite(router)
+            yield right.peer_right(router)
     for passing in links.passing.values() if links else ():
         for right in passing:
             if right.qualifier is ALLOW and right.enclave == router:

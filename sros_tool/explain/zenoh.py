@@ -44,7 +44,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import check_routers
-from sros_tool.keystore.selection import no_such_enclave
+from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.keystore.zenoh_files import (
     Drift,
     enclaves_with_rights,
@@ -65,10 +65,10 @@ from sros_tool.zenoh.delivery import (
     Delivery,
     Route,
     ZenohProcess,
-    call,
-    publication,
+    deliver_query,
+    deliver_sample,
+    deliver_token,
     route,
-    token,
 )
 from sros_tool.zenoh.document import ZenohEndpoint, parse_configuration
 from sros_tool.zenoh.key_expressions import includes
@@ -271,7 +271,7 @@ class ZenohEvaluator:
         self._at = moment
         self._file = cache(self._read)
         self._rendered = RenderedReader()
-        self._is_signed = cache(self._verified)
+        self._is_signed = cache(self._is_verified)
         self.routers = self._routers()
 
     def _routers(self) -> dict[str, ZenohFile]:
@@ -328,7 +328,7 @@ class ZenohEvaluator:
                 message, only the beginning of the enclave's file.
         """
         if enclave not in self.names:
-            raise no_such_enclave(self.keystore, enclave, self.names)
+            raise missing_enclave_error(self.keystore, enclave, self.names)
         if brief and (dropped := self._dropped_by_router(enclave, question)):
             return dropped
         own = self._file(enclave, self._file_of(enclave))
@@ -339,7 +339,7 @@ class ZenohEvaluator:
             _Outcome.REFUSED,
             own.problem,
             until=own.until,
-            unsigned=() if brief else self._unsigned(own),
+            unsigned=() if brief else self._unsigned_files(own),
         )
         if own.process is None:
             return answer
@@ -358,7 +358,7 @@ class ZenohEvaluator:
         wanted = self._rights(enclave, question)
         checks = self._deciding_checks(own.process, router.process, wanted, brief=brief)
         answer = replace(answer, checks=checks)
-        text = self._why(answer.deciding)
+        text = self._reason_text(answer.deciding)
         if answer.dropped:
             return replace(answer, outcome=_Outcome.DROPPED, text=text)
         reached = tuple(self._reached_enclaves(own, wanted)) if reach else ()
@@ -381,28 +381,30 @@ class ZenohEvaluator:
         if router.process is None or enclave in self.routers or not path.exists():
             return None
         try:
-            begun = self._rendered.beginning(self.keystore.read(path, "Zenoh configuration"))
+            begun = self._rendered.configuration_without_rules(
+                self.keystore.read(path, "Zenoh configuration")
+            )
         except SrosError:
             return None
         if begun is None or not _addresses_meet(
             tuple(map(ZenohEndpoint, begun.connect)), router.endpoints
         ):
             return None
-        session = _unrestricted(enclave, begun.mode)
+        session = _unrestricted_process(enclave, begun.mode)
         checks = tuple(self._link_checks(session, router.process, self._rights(enclave, question)))
         dropping = _check_to_report((check for check in checks if not check.allowed), enclave)
         if dropping is None or dropping.message not in _DATA:
             return None
-        outcome, text = _Outcome.DROPPED, self._why(dropping)
+        outcome, text = _Outcome.DROPPED, self._reason_text(dropping)
         return ZenohAnswer(enclave, question, begun.mode, outcome, text, checks)
 
-    def _why(self, check: Check | None) -> str:
+    def _reason_text(self, check: Check | None) -> str:
         """Return a clause that names the deciding check, its reason, and the file with its rule."""
         assert check
         file = self._file_of(check.enforcer)
         return f"{check}: {check.decision.why}, in {file} of {check.enforcer}"
 
-    def out_of_date(self, answer: ZenohAnswer) -> tuple[str, ...] | None:
+    def outdated_enclaves(self, answer: ZenohAnswer) -> tuple[str, ...] | None:
         """Return the names of files that decide an answer and do not match the permissions.
 
         Only the rules that concern the question are compared.  None if the files cannot be
@@ -427,7 +429,7 @@ class ZenohEvaluator:
                 self._at,
                 only_enclaves=deciding,
                 # What may pass between routers depends on all enclaves on both sides.
-                among=() if network.routers else deciding | self._concerned(answer, ends),
+                among=() if network.routers else deciding | self._enclaves_to_check(answer, ends),
                 reader=self._rendered,
             ).files
         except SrosError:
@@ -457,14 +459,16 @@ class ZenohEvaluator:
             if all(
                 delivery.arrives
                 for delivery in (
-                    self._deliveries_between(own, _unrestricted(name, Mode.CLIENT), wanted)
+                    self._deliveries_between(own, _unrestricted_process(name, Mode.CLIENT), wanted)
                     if own.mode is Mode.CLIENT
-                    else self._direct(own, _unrestricted(name, Mode.PEER), wanted)
+                    else self._direct_deliveries(
+                        own, _unrestricted_process(name, Mode.PEER), wanted
+                    )
                 )
             )
         }
 
-    def _concerned(self, answer: ZenohAnswer, ends: set[str]) -> set[str]:
+    def _enclaves_to_check(self, answer: ZenohAnswer, ends: set[str]) -> set[str]:
         """Return the enclaves on whose rights an answer depends.
 
         A denial depends on the enclave's own rights alone.  ``ends`` are the enclaves at the other
@@ -484,21 +488,23 @@ class ZenohEvaluator:
         """Return the configuration of an enclave's process, or why it opens no session."""
         folder = enclave_path(self.root, enclave)
         if not (folder / file).exists():
-            return _closed(enclave, file, f"it has no {file}: its processes open no session")
+            return _unusable_file(enclave, file, f"it has no {file}: its processes open no session")
         try:
             mode, access, endpoints = self._configuration(folder / file)
         except SrosError as error:
-            return _closed(enclave, file, f"Zenoh does not accept its {file}: {error.why}".strip())
+            return _unusable_file(
+                enclave, file, f"Zenoh does not accept its {file}: {error.why}".strip()
+            )
         identity = self.keystore.identity(enclave, now=self._at)
         certificate = identity.certificate
         faults = [problem for problem in identity.problems if problem.file in _OF_TLS]
         if faults or certificate is None:
             problem = str(faults[0]) if faults else f"{CERTIFICATE_FILE} cannot be read"
-            return _closed(enclave, file, problem)
+            return _unusable_file(enclave, file, problem)
         name = common_name_of(certificate.subject) or ""
         if name != enclave:
             problem = f"Zenoh knows its processes by the common name {name!r} of {CERTIFICATE_FILE}"
-            return _closed(enclave, file, problem)
+            return _unusable_file(enclave, file, problem)
         until = validity_of(certificate).not_after
         return ZenohFile(enclave, file, ZenohProcess(name, mode, access), "", until, endpoints)
 
@@ -513,7 +519,7 @@ class ZenohEvaluator:
         endpoints = document.listen if document.mode is Mode.ROUTER else document.connect
         return document.mode, document.access, endpoints
 
-    def _verified(self, path: Path) -> bool:
+    def _is_verified(self, path: Path) -> bool:
         try:
             document = self.keystore.read(path, "Zenoh configuration")
             authority = self.keystore.ca_certificate(PERMISSIONS)
@@ -521,7 +527,7 @@ class ZenohEvaluator:
         except SrosError:
             return False
 
-    def _unsigned(self, zenoh_file: ZenohFile) -> tuple[str, ...]:
+    def _unsigned_files(self, zenoh_file: ZenohFile) -> tuple[str, ...]:
         return tuple(
             f"{file.enclave}/{file.file}"
             for file in dict.fromkeys((zenoh_file, *self.routers.values()))
@@ -545,11 +551,13 @@ class ZenohEvaluator:
             if name == process.name:
                 continue
             # The router's rules state the same rights, and are at hand.
-            deliveries = self._direct(process, _unrestricted(name, Mode.CLIENT), wanted)
+            deliveries = self._direct_deliveries(
+                process, _unrestricted_process(name, Mode.CLIENT), wanted
+            )
             other = self._file(name, self._file_of(name)) if not brief else None
             if other and other.process and all(each.arrives for each in deliveries):
-                lawless = _unrestricted(process.name, Mode.ROUTER)
-                deliveries = self._direct(lawless, other.process, wanted)
+                lawless = _unrestricted_process(process.name, Mode.ROUTER)
+                deliveries = self._direct_deliveries(lawless, other.process, wanted)
             if all(each.arrives for each in deliveries):
                 believing.append(Reached(name, deliveries, other.problem if other else ""))
                 if brief:
@@ -575,7 +583,7 @@ class ZenohEvaluator:
             reached=tuple(believing) if not brief else (),
         )
 
-    def _direct(
+    def _direct_deliveries(
         self, process: ZenohProcess, other: ZenohProcess, wanted_rights: Sequence[Right]
     ) -> tuple[Delivery, ...]:
         return tuple(self._delivery((process, other), right) for right in wanted_rights)
@@ -600,7 +608,9 @@ class ZenohEvaluator:
             if name == process.name or name in self.routers:
                 continue
             # What the session itself lets through comes first: it needs no other file.
-            alone = self._link_checks(process, _unrestricted(name, Mode.PEER), wanted_rights)
+            alone = self._link_checks(
+                process, _unrestricted_process(name, Mode.PEER), wanted_rights
+            )
             if all(each.allowed for each in alone):
                 other = self._file(name, SESSION_FILE).process
                 if other and other.mode is Mode.PEER:
@@ -617,8 +627,8 @@ class ZenohEvaluator:
         self, process: ZenohProcess, other: ZenohProcess, wanted_rights: Sequence[Right]
     ) -> Iterator[Check]:
         """Yield the checks by which both ends of a link decide on rights, or on joining."""
-        deliveries = self._direct(process, other, wanted_rights)
-        for delivery in deliveries or self._graph(process, other):
+        deliveries = self._direct_deliveries(process, other, wanted_rights)
+        for delivery in deliveries or self._graph_deliveries(process, other):
             yield from (*delivery.checks, *delivery.replies)
 
     def _delivery(self, route: Route, right: Right, key: str = "") -> Delivery:
@@ -629,15 +639,17 @@ class ZenohEvaluator:
         key = key or f"{self.domain}{right.name}/{ANY_TYPE}"
         match right.right:
             case "publish":
-                return publication(route, key)
+                return deliver_sample(route, key)
             case "subscribe":
-                return publication(route[::-1], key)
+                return deliver_sample(route[::-1], key)
             case "request":
-                return call(route, key)
+                return deliver_query(route, key)
             case _:
-                return call(route[::-1], key)
+                return deliver_query(route[::-1], key)
 
-    def _graph(self, process: ZenohProcess, other: ZenohProcess) -> tuple[Delivery, Delivery]:
+    def _graph_deliveries(
+        self, process: ZenohProcess, other: ZenohProcess
+    ) -> tuple[Delivery, Delivery]:
         """Return the deliveries that announce a node of ``process`` and show it other nodes."""
         everything = f"@ros2_lv/{self.domain}/**"
         router = self._router_of(process.name).process
@@ -649,7 +661,7 @@ class ZenohEvaluator:
             access.allowed_keys(process.name, *announcing),
             lambda key: access.decide(Remote(process.name), *announcing, key).allowed,
         )
-        return token((process, other), node, everything), token(
+        return deliver_token((process, other), node, everything), deliver_token(
             (other, process), everything, everything
         )
 
@@ -663,7 +675,9 @@ class ZenohEvaluator:
             assert zenoh_file.process
             # What the others decide comes first: it needs no file of that enclave.
             deliveries = self._deliveries_between(
-                zenoh_file.process, _unrestricted(name, zenoh_file.process.mode), wanted_rights
+                zenoh_file.process,
+                _unrestricted_process(name, zenoh_file.process.mode),
+                wanted_rights,
             )
             if not all(each.arrives for each in deliveries):
                 continue
@@ -719,7 +733,7 @@ class ZenohEvaluator:
         return wide if "*" in untyped(wide).removesuffix("/*/*") else ""
 
 
-def _unrestricted(name: str, mode: Mode) -> ZenohProcess:
+def _unrestricted_process(name: str, mode: Mode) -> ZenohProcess:
     return ZenohProcess(name, mode, Enforcement())
 
 
@@ -749,7 +763,7 @@ def _places_text(endpoints: Sequence[ZenohEndpoint]) -> str:
     return ", ".join(endpoint.text for endpoint in endpoints[:3]) or "nothing"
 
 
-def _closed(enclave: str, file: str, problem: str) -> ZenohFile:
+def _unusable_file(enclave: str, file: str, problem: str) -> ZenohFile:
     return ZenohFile(enclave, file, None, problem)
 
 
@@ -806,7 +820,7 @@ class ZenohOfKeystore:
         names: Sequence[str] | None = None,
     ) -> None:
         self._keystore = keystore
-        self._why = why
+        self._reason_text = why
         self._domain = asking.domain
         first = asking.context(keystore.domains).domain
         one = ZenohEvaluator(keystore, moment=asking.at, domain=first)
@@ -824,7 +838,7 @@ class ZenohOfKeystore:
     @property
     def title(self) -> str:
         """The name Zenoh, and the reason to ask it."""
-        return f"Zenoh ({self._why})"
+        return f"Zenoh ({self._reason_text})"
 
     def outcomes(self, question: Question) -> tuple[ZenohAnswer, ...]:
         """Return the answer for each enclave, without the enclaves at the other end."""
@@ -856,7 +870,7 @@ class ZenohOfKeystore:
             )
             for outcome in outcomes
         ]
-        return WhoOnZenoh(str(question), "zenoh", self._why, self._domain, shown)
+        return WhoOnZenoh(str(question), "zenoh", self._reason_text, self._domain, shown)
 
     def notes(self, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
         """Yield a note on the router's key, and a note if the router's file decided for peers."""
@@ -982,7 +996,7 @@ def explain_on_zenoh(
     question, taken = question_meant(stated, asked_enclave, question, kind)
     evaluator = ZenohEvaluator(keystore, moment=context.at, domain=context.domain)
     answer = evaluator.answer(enclave.name, question)
-    outdated = evaluator.out_of_date(answer)
+    outdated = evaluator.outdated_enclaves(answer)
     by_permissions = explain(stated, question)
     notes = (*taken, *_notes(answer, by_permissions, outdated))
     what = Asked(enclave.name, question, context)

@@ -62,7 +62,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         for enclave in policy.enclaves:
             for path, robot in self._paths(enclave):
                 if path in self._of:
-                    raise _twice(path, enclave, self._of[path][0])
+                    raise _duplicate_path_error(path, enclave, self._of[path][0])
                 self._of[path] = enclave, robot
             if len(self._of) > MAX_ENCLAVES:
                 raise PolicyError(
@@ -131,7 +131,7 @@ class FleetPolicy(Mapping[str, Enclave]):
 
         def filled(profile: Profile) -> Profile:
             nonlocal count
-            ns, node = (self._one(text, robot) for text in (profile.ns, profile.node))
+            ns, node = (self._filled_name(text, robot) for text in (profile.ns, profile.node))
             if has_placeholder(profile.ns):
                 ns = check_namespace(ns)  # in the root namespace it can be empty
             groups = []
@@ -150,7 +150,7 @@ class FleetPolicy(Mapping[str, Enclave]):
 
         return replace(enclave.with_profiles(filled), path=path)
 
-    def _one(self, text: str, robot: Robot | None) -> str:
+    def _filled_name(self, text: str, robot: Robot | None) -> str:
         if robot is None or not has_placeholder(text):
             return text
         return "".join(map(str, fill(parts_of(text), robot.name, robot.namespace)))
@@ -165,33 +165,35 @@ class FleetPolicy(Mapping[str, Enclave]):
         names: list[str] = []
         lines: list[int] = []
         for index, name in enumerate(group.names):
-            filled = self._several(self._one(name, robot), name, group.source_of(index))
+            filled = self._filled_names(
+                self._filled_name(name, robot), name, group.source_of(index)
+            )
             names += filled
             lines += group.lines[index : index + 1] * len(filled)
             if len(names) > maximum:
                 break
         return replace(group, names=tuple(names), lines=tuple(lines))
 
-    def _several(self, name: str, written: str, source: Source) -> tuple[str, ...]:
+    def _filled_names(self, name: str, written: str, source: Source) -> tuple[str, ...]:
         """Return the different names that a name expands to: one name, or one for each robot."""
         if not has_placeholder(name):
             if name != written and (problem := _name_problem(name)):
-                raise _invalid_name(name, problem, source)
+                raise _invalid_name_error(name, problem, source)
             return (name,)
         key = name, source
         names = self._names.get(key)
         if names is None:
             parts = parts_of(name)
-            names = tuple(dict.fromkeys(self._for_each(parts, source)))
+            names = tuple(dict.fromkeys(self._robots_for_name(parts, source)))
             if name == written:  # the same for all enclaves that say it
                 self._names[key] = names
         return names
 
-    def _for_each(self, parts: Parts, source: Source) -> Iterator[str]:
+    def _robots_for_name(self, parts: Parts, source: Source) -> Iterator[str]:
         for robot in self._group_members(placeholders_of(parts)[0].group, source):
             name = "".join(map(str, fill(parts, robot.name, robot.namespace, plural=True)))
             if problem := _name_problem(name):
-                raise _invalid_name(name, problem, source)
+                raise _invalid_name_error(name, problem, source)
             yield name
 
 
@@ -228,11 +230,11 @@ def _name_problem(name: str) -> str:
     return "It is a namespace, not a name." if name == "/" else expression_problem(name)
 
 
-def _invalid_name(name: str, problem: str, source: Source) -> PolicyError:
+def _invalid_name_error(name: str, problem: str, source: Source) -> PolicyError:
     return PolicyError(f"{source}: with the values of the fleet, {name!r} is not valid", problem)
 
 
-def _twice(path: str, enclave: Enclave, other: Enclave) -> PolicyError:
+def _duplicate_path_error(path: str, enclave: Enclave, other: Enclave) -> PolicyError:
     remedy = "Write paths that differ, for example with {robot} in front."
     if other is not enclave and has_placeholder(enclave.path) and has_placeholder(other.path):
         remedy = (
@@ -365,7 +367,7 @@ def _stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterat
             same
             or [
                 each
-                for name in _likely(right.name, robot)
+                for name in _forms_with_placeholders(right.name, robot)
                 if rules.cover(each := Right(enclave.path, ALLOW, right.right, name))
             ][:1]
         )
@@ -398,18 +400,19 @@ def _names(policy: FleetPolicy, name: str, robot: Robot | None) -> Iterable[str]
     ]
 
 
-def _likely(name: str, robot: Robot | None) -> Iterator[str]:
+def _forms_with_placeholders(name: str, robot: Robot | None) -> Iterator[str]:
     """Yield forms of a name in which placeholders replace the robot's name or namespace."""
     if robot:
 
-        def named(text: str) -> str:
+        def with_named_placeholder(text: str) -> str:
             of_robot = "{robot}"  # noqa: RUF027 - a placeholder of policies
             return "/".join(of_robot if part == robot.name else part for part in text.split("/"))
 
-        inside = f"/{_NAMESPACE}}}{named(name.removeprefix(robot.namespace.rstrip('/')))}"
+        relative = name.removeprefix(robot.namespace.rstrip("/"))
+        inside = f"/{_NAMESPACE}}}{with_named_placeholder(relative)}"
         if robot.namespace != "/" and name.startswith(f"{robot.namespace}/"):
             yield inside
-        yield named(name)
+        yield with_named_placeholder(name)
         if robot.namespace == "/":
             yield name
             yield inside

@@ -123,28 +123,28 @@ class _Reader:
         self._words = words
 
     def fleet(self, table: Mapping[str, Any]) -> Fleet:
-        self._known(table, ("groups", "robots", "enclaves", "routers"), "")
-        groups = self._tables(table, "groups")
-        robots = self._tables(table, "robots")
+        self._check_keys(table, ("groups", "robots", "enclaves", "routers"), "")
+        groups = self._read_tables(table, "groups")
+        robots = self._read_tables(table, "robots")
         if not robots:
             raise self._error("it names no robot", "", "Write for example [robots.r7].")
         if len(robots) > MAX_ROBOTS:
             raise self._error(f"it has more than {MAX_ROBOTS} robots", "", "Divide the fleet.")
         for name, values in groups.items():
-            self._known(values, _OF_GROUP, f"groups.{name}")
-            self._values(values, {key: f"groups.{name}.{key}" for key in values}, "r")
-        enclaves = self._texts(table, "enclaves", "", MAX_PATTERNS)
+            self._check_keys(values, _OF_GROUP, f"groups.{name}")
+            self._read_values(values, {key: f"groups.{name}.{key}" for key in values}, "r")
+        enclaves = self._read_texts(table, "enclaves", "", MAX_PATTERNS)
         routers = table.get("routers", ROUTERS)
         for key, path in (*(("enclaves", path) for path in enclaves), ("routers", routers)):
             problem = pattern_problem(path) if isinstance(path, str) else "It is not a text."
             if problem:
-                raise self._refused(key, path, problem)
-        read = [self._robot(name, values, groups) for name, values in robots.items()]
+                raise self._invalid_value_error(key, path, problem)
+        read = [self._read_robot(name, values, groups) for name, values in robots.items()]
         fleet = Fleet.of(read, groups, enclaves, routers)
         for robot in read:
             if robot.router and robot_of(fleet, router_of(fleet, robot)) != robot:
                 text = f"{routers} is not a path of the enclaves of {robot.name}."
-                raise self._refused("routers", routers, text)
+                raise self._invalid_value_error("routers", routers, text)
         if both := sorted(fleet.robots.keys() & fleet.groups.keys()):
             raise self._error(
                 f"{_short_value(both[0])} is a robot and a group",
@@ -155,15 +155,15 @@ class _Reader:
             raise self._error("it is too large", problem, "Divide the fleet.")
         return fleet
 
-    def _robot(
+    def _read_robot(
         self, name: str, values: Mapping[str, Any], groups: Mapping[str, Mapping[str, Any]]
     ) -> Robot:
         at = f"{self._word('robots')}.{name}"
-        self._known(values, ("groups", *_OF_GROUP), at)
-        member = tuple(sorted(set(self._texts(values, "groups", at, _MOST_GROUPS))))
+        self._check_keys(values, ("groups", *_OF_GROUP), at)
+        member = tuple(sorted(set(self._read_texts(values, "groups", at, _MOST_GROUPS))))
         for group in member:
             if problem := name_problem(group):
-                raise self._refused(f"{at}.groups", group, problem)
+                raise self._invalid_value_error(f"{at}.groups", group, problem)
         given: dict[str, Any] = {}
         origin: dict[str, str] = {}
         for group in member:
@@ -177,17 +177,17 @@ class _Reader:
                     )
                 given[key], origin[key] = value, here
         own = {key: value for key, value in values.items() if key != "groups"}
-        given = self._values(given, origin, name) | self._values(
+        given = self._read_values(given, origin, name) | self._read_values(
             own, {key: f"{at}.{self._word(key)}" for key in own}
         )
         usual = {"namespace": f"/{name}", "address": name, "user": "", "domain": None}
         robot = Robot(name, groups=member, **(usual | given))
         if robot.crossing and not robot.router:
             text = "Names can pass only through a router, and the robot has none."
-            raise self._refused(f"{at}.crossing", list(robot.crossing), text)
+            raise self._invalid_value_error(f"{at}.crossing", list(robot.crossing), text)
         return robot
 
-    def _values(
+    def _read_values(
         self, values: Mapping[str, Any], places: Mapping[str, str], name: str = ""
     ) -> dict[str, Any]:
         """Return settings after a check; ``name`` is filled into the settings of a group."""
@@ -196,44 +196,46 @@ class _Reader:
             if key == "domain":
                 if type(value) is not int or not 0 <= value <= MAX_DOMAIN:
                     problem = f"A domain is a whole number from 0 to {MAX_DOMAIN}."
-                    raise self._refused(places[key], value, problem)
+                    raise self._invalid_value_error(places[key], value, problem)
                 checked[key] = value
                 continue
             if key == "crossing":
                 checked[key] = self._crossing(value, places[key], name)
                 continue
             if not isinstance(value, str):
-                raise self._refused(places[key], value, "It is not a text.")
+                raise self._invalid_value_error(places[key], value, "It is not a text.")
             checked[key] = value.replace(_OF_ROBOT, name) if name else value
             if problem := _VALUES[key](checked[key]):
-                raise self._refused(places[key], value, problem)
+                raise self._invalid_value_error(places[key], value, problem)
         return checked
 
     def _crossing(self, names: Any, place: str, robot: str) -> tuple[str, ...]:
         at, _, key = place.rpartition(".")
         filled = []
-        for name in self._texts({key: names}, key, at, _MOST_CROSSING):
+        for name in self._read_texts({key: names}, key, at, _MOST_CROSSING):
             filled.append(name.replace(_OF_ROBOT, robot) if robot else name)
             if problem := crossing_problem(filled[-1]):
-                raise self._refused(place, name, problem)
+                raise self._invalid_value_error(place, name, problem)
         return tuple(filled)
 
     def _word(self, key: str) -> str:
         return self._words.get(key, key)
 
-    def _tables(self, table: Mapping[str, Any], key: str) -> Mapping[str, Mapping[str, Any]]:
+    def _read_tables(self, table: Mapping[str, Any], key: str) -> Mapping[str, Mapping[str, Any]]:
         """Return the tables below ``key``, by their names, which are checked."""
         tables = table.get(key, {})
         if not isinstance(tables, dict):
             raise self._error(f"{key} is not a table", "", f"Write [{key}.NAME].")
         for name, values in tables.items():
             if problem := name_problem(name):
-                raise self._refused(key, name, problem)
+                raise self._invalid_value_error(key, name, problem)
             if not isinstance(values, dict):
                 raise self._error(f"{key}.{name} is not a table", "", f"Write [{key}.{name}].")
         return tables
 
-    def _texts(self, table: Mapping[str, Any], key: str, at: str, maximum: int) -> tuple[str, ...]:
+    def _read_texts(
+        self, table: Mapping[str, Any], key: str, at: str, maximum: int
+    ) -> tuple[str, ...]:
         values = table.get(key, [])
         where = f"{at}.{key}" if at else key
         if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
@@ -242,14 +244,14 @@ class _Reader:
             raise self._error(f"{where} has more than {maximum} names")
         return tuple(values)
 
-    def _known(self, table: Mapping[str, Any], keys: Iterable[str], at: str) -> None:
+    def _check_keys(self, table: Mapping[str, Any], keys: Iterable[str], at: str) -> None:
         known = tuple(keys)
         for key in table:
             if key not in known:
                 where = f"{at}.{_key(key)}" if at else _key(key)
                 raise self._error(f"{where} is not a known key", f"There are {', '.join(known)}.")
 
-    def _refused(self, at: str, value: object, problem: str) -> DocumentError:
+    def _invalid_value_error(self, at: str, value: object, problem: str) -> DocumentError:
         return self._error(f"{at} has {_short_value(value)}, which is not valid", problem)
 
     def _error(self, what: str, why: str = "", remedy: str = "") -> DocumentError:
@@ -485,7 +487,7 @@ class _Inventory:
         if not isinstance(group, dict):
             group = {"hosts": group} if isinstance(group, list) else self._mapping(group, name)
         inside = (*parent_groups, name)
-        set_here = self._known(group.get("vars"), f"{name}.vars")
+        set_here = self._check_keys(group.get("vars"), f"{name}.vars")
         variables = {
             **variables,
             **{key: (len(parent_groups), value) for key, value in set_here.items()},
@@ -516,8 +518,8 @@ class _Inventory:
                 "A range such as r[1:50] is only read by Ansible.",
                 _WRITE_OUT,
             )
-        values = self._own.setdefault(host, self._known(self._of_list.get(host), host))
-        values |= self._known(own, host)
+        values = self._own.setdefault(host, self._check_keys(self._of_list.get(host), host))
+        values |= self._check_keys(own, host)
         inherited = self._inherited.setdefault(host, {})
         unclear = self._unclear.setdefault(host, set())
         for key, (depth, value) in variables.items():
@@ -531,7 +533,7 @@ class _Inventory:
             if group not in _OF_ALL:
                 self._groups[group].add(host)
 
-    def _known(self, value: Any, at: object) -> dict[str, Any]:
+    def _check_keys(self, value: Any, at: object) -> dict[str, Any]:
         """Return the variables that a fleet uses; other variables are left out."""
         values = self._mapping(value, at)
         return {key: values[key] for key in (*_VARIABLES.values(), _ROBOT) if key in values}

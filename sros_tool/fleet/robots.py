@@ -301,7 +301,7 @@ def size_problem(fleet: Fleet) -> str:
 
 def robot_of(fleet: Fleet, enclave: str) -> Robot | None:
     """Return the robot that an enclave belongs to; None for an enclave of no robot."""
-    for pattern in _fitting(fleet, enclave):
+    for pattern in _fitting_patterns(fleet, enclave):
         for robot in _candidates(fleet, pattern, enclave):
             inside = group_of(pattern.parts) in ("", *robot.groups)
             if inside and path_for(pattern.parts, robot) == enclave:
@@ -317,7 +317,7 @@ def left_robot_of(fleet: Fleet, enclave: str) -> str:
     """
     if robot_of(fleet, enclave):
         return ""
-    for pattern in _fitting(fleet, enclave):
+    for pattern in _fitting_patterns(fleet, enclave):
         match = pattern.expression.fullmatch(enclave)
         name = match.groupdict().get("robot", "") if match else ""
         if name and name not in fleet.robots:
@@ -347,7 +347,10 @@ def unrecorded_enclaves(
     below: dict[str, list[str]] = {robot: [] for robot in robots}
     naming: dict[str, list[str]] = {robot: [] for robot in robots}
     for name in names:
-        owners = next((folders[path] for path in _upwards(name) if path in folders), frozenset())
+        owners = next(
+            (folders[path] for path in _path_and_folders_above(name) if path in folders),
+            frozenset(),
+        )
         named = owners | set(name.split("/")[1:])
         if named.isdisjoint(below) or robot_of(fleet, name):
             continue
@@ -359,7 +362,7 @@ def unrecorded_enclaves(
     }
 
 
-def _upwards(name: str) -> Iterator[str]:
+def _path_and_folders_above(name: str) -> Iterator[str]:
     """Yield the path of an enclave and of the folders above it, without the root."""
     while name:
         yield name
@@ -377,14 +380,14 @@ def _folders(fleet: Fleet) -> Mapping[str, frozenset[str]]:
     A folder is a path of the fleet up to the part with the first placeholder.
     """
     folders: dict[str, set[str]] = {}
-    for begin in dict.fromkeys(_begin(parts_of(path)) for path in fleet.enclaves):
+    for begin in dict.fromkeys(_beginning_of_path(parts_of(path)) for path in fleet.enclaves):
         for robot in fleet.robots.values():
             if len(folder := path_for(begin, robot)) > 1:
                 folders.setdefault(folder, set()).add(robot.name)
     return {folder: frozenset(robots) for folder, robots in folders.items()}
 
 
-def _begin(path: Parts) -> Parts:
+def _beginning_of_path(path: Parts) -> Parts:
     """Return a path up to and including the first folder whose name has a placeholder."""
     begin: list[str | Placeholder] = []
     inside = False
@@ -399,7 +402,7 @@ def _begin(path: Parts) -> Parts:
     return tuple(part for part in begin if part != "")
 
 
-def _fitting(fleet: Fleet, enclave: str) -> Iterator[_Pattern]:
+def _fitting_patterns(fleet: Fleet, enclave: str) -> Iterator[_Pattern]:
     """Yield the patterns whose end matches the end of an enclave's path."""
     patterns = _patterns(fleet.enclaves)
     end = len(enclave)
@@ -493,7 +496,7 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
         if len(names) == 1:
             yield from (text for _, text in same)
         else:
-            yield f"{folding.text}  ({_named(fleet, names, folding)})"
+            yield f"{folding.text}  ({_robots_text(fleet, names, folding)})"
 
 
 class _Folding(NamedTuple):
@@ -539,39 +542,39 @@ def for_any_robot(text: str, robot: Robot, word: str = "robot") -> str:
     """
     any_robot = f"{{{word}}}"
     if robot.namespace != "/":
-        text = _whole(robot.namespace).sub(f"/{any_robot}", text)
+        text = _whole_name_expression(robot.namespace).sub(f"/{any_robot}", text)
     return re.sub(rf"(?<![A-Za-z0-9]){robot.name}(?![A-Za-z0-9])", any_robot, text)
 
 
 def _with_placeholders(text: str, enclave: str, robot: Robot) -> str:
     of_robot = "{robot}"  # noqa: RUF027 - a placeholder of policies
-    own = _whole(robot.name).sub(of_robot, enclave)
+    own = _whole_name_expression(robot.name).sub(of_robot, enclave)
     parts = re.split(rf"(?<![A-Za-z0-9_]){re.escape(enclave)}(?![A-Za-z0-9_/])", text)
     for value, placeholder in ((robot.namespace, "{namespace}"), (robot.name, of_robot)):
         if value != "/":
-            parts = [_whole(value).sub(placeholder, part) for part in parts]
+            parts = [_whole_name_expression(value).sub(placeholder, part) for part in parts]
     return own.join(parts)
 
 
 def _with_other(text: str, robot: Robot) -> str:
     if robot.namespace != "/":
-        text = _whole(robot.namespace).sub("/{other}", text)
-    return _whole(robot.name).sub("{other}", text)
+        text = _whole_name_expression(robot.namespace).sub("/{other}", text)
+    return _whole_name_expression(robot.name).sub("{other}", text)
 
 
 @lru_cache(maxsize=4096)
-def _whole(value: str) -> re.Pattern[str]:
+def _whole_name_expression(value: str) -> re.Pattern[str]:
     """Return a regular expression that matches ``value`` only as a whole name."""
     before = "(?<![A-Za-z0-9_/])" if value.startswith("/") else "(?<![A-Za-z0-9_{])"
     return re.compile(f"{before}{re.escape(value)}(?![A-Za-z0-9_}}])")
 
 
-def _named(fleet: Fleet, names: Sequence[str], folding: _Folding) -> str:
+def _robots_text(fleet: Fleet, names: Sequence[str], folding: _Folding) -> str:
     """Return a list of robots in words, such as "r1, r2 and 3 more robots"."""
     if folding.pairs:
         sources = list(dict.fromkeys(pair.split()[0] for pair in names))
         if {*names} == {f"{one} and {two}" for one, two in permutations(sources, 2)}:
-            return f"{_named(fleet, sources, _Folding(''))}, each with every other"
+            return f"{_robots_text(fleet, sources, _Folding(''))}, each with every other"
         return f"{len(names)} pairs of robots, such as {names[0]}"
     own = folding.own
     count = f"{len(names)}{' other' if own else ''} robots"

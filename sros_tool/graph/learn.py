@@ -298,7 +298,9 @@ def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, .
     for kind, both in RIGHTS.items():
         for kind_of_right in both:
             names = sorted(
-                written(right.name, ns, node) for right in rights if right.right == kind_of_right
+                name_as_written(right.name, ns, node)
+                for right in rights
+                if right.right == kind_of_right
             )
             if names:
                 groups.append(Group(kind, ((kind_of_right, ALLOW),), tuple(names)))
@@ -343,7 +345,7 @@ def stable_name(name: str) -> str:
     return name
 
 
-def written(fqn: str, ns: str, node: str) -> str:
+def name_as_written(fqn: str, ns: str, node: str) -> str:
     """Return an absolute name as the profile of ``node`` in ``ns`` writes it.
 
     Private names of the node become ``~/x``, names in its namespace ``x``; others stay absolute.
@@ -414,7 +416,7 @@ class CommonParts:
         """Return the rights, with absolute names, that ``parts`` give to a node."""
         return frozenset().union(*(_expanded_rights(self.rights[part], ns, node) for part in parts))
 
-    def to_copy(self, parts: Iterable[str]) -> dict[str, bytes]:
+    def files_to_copy(self, parts: Iterable[str]) -> dict[str, bytes]:
         """Return the content, by path, of files that ``parts`` need and the folder lacks."""
         return {path: data for part in parts for path, data in self.missing[part].items()}
 
@@ -432,7 +434,9 @@ def common_parts(folder: Path, shipped: Path) -> CommonParts:
         else:
             copies = {path: data for path, data in needed.items() if not (folder / path).exists()}
             other = [
-                path for path in needed if path not in copies and _differs(folder, path, needed)
+                path
+                for path in needed
+                if path not in copies and _differs_from_shipped(folder, path, needed)
             ]
             known = None if other else shipped_rights
         if known:
@@ -444,7 +448,7 @@ def _expanded_rights(rights: Iterable[NodeRight], ns: str, node: str) -> frozens
     return frozenset(NodeRight(right.right, expand(right.name, ns, node)) for right in rights)
 
 
-def _differs(folder: Path, path: str, needed: Mapping[str, bytes]) -> bool:
+def _differs_from_shipped(folder: Path, path: str, needed: Mapping[str, bytes]) -> bool:
     try:
         return read_bytes(folder / path, "policy file") != needed[path]
     except DocumentError:
@@ -543,12 +547,12 @@ class _Notes:
     def notes(self) -> tuple[Note, ...]:
         """Return a note for each kind of subject, sorted by id."""
         return tuple(
-            Note(f"graph.{kind}", _TEXTS[kind].format(listed(sorted(subjects))))
+            Note(f"graph.{kind}", _TEXTS[kind].format(first_subjects(sorted(subjects))))
             for kind, subjects in sorted(self._found.items())
         )
 
 
-def listed(subjects: Sequence[str], separator: str = ", ") -> str:
+def first_subjects(subjects: Sequence[str], separator: str = ", ") -> str:
     """Return the first five subjects, and how many more there are: "a, b, c, d, e and 2 more"."""
     return first_few(subjects, _SHOWN, separator)
 
@@ -574,7 +578,9 @@ class News:
                 self._nodes.add(place)
                 lines.append(f"new: {name} ({profile.enclave})")
             for right in sorted(profile.rights):
-                plain = NodeRight(right.right, written(right.name, profile.ns, profile.node))
+                plain = NodeRight(
+                    right.right, name_as_written(right.name, profile.ns, profile.node)
+                )
                 if plain not in self._ordinary and (*place, right) not in self._rights:
                     self._rights.add((*place, right))
                     lines.append(f"new: {name} ({profile.enclave}) {right.right} {right.name}")
@@ -647,7 +653,7 @@ def _notes(
         yield Note(
             "graph.several-nodes",
             "DDS secures processes, so all nodes of a process share its enclave, which is named "
-            f"after one of these nodes: {listed(sorted(several), '; ')}",
+            f"after one of these nodes: {first_subjects(sorted(several), '; ')}",
         )
     users: dict[str, set[str]] = {}
     for node in nodes:
@@ -665,7 +671,7 @@ def _notes(
             "their nodes have the same name; unless it is a single process that was restarted, "
             "give the nodes different names (-r __node:=NAME), or start each process with "
             "--ros-args --enclave: "
-            f"{listed(shared)}",
+            f"{first_subjects(shared)}",
         )
     yield from name_notes(users, set(names.values()))
 
@@ -774,7 +780,7 @@ def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
     additions = learned.policy()
     rights = policy_rights(additions)
     if not os.path.lexists(path):
-        copies = common.to_copy(learned.includes) if common else {}
+        copies = common.files_to_copy(learned.includes) if common else {}
         added = tuple(sorted(rights, key=order))
         return Draft(path, None, render(learned), copies, added, (), rights, rights)
     before = read_bytes(path, "policy file")
@@ -789,7 +795,7 @@ def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
         path,
         before,
         document,
-        common.to_copy(included) if common else {},
+        common.files_to_copy(included) if common else {},
         merged.added,
         merged.contradictions,
         least,
@@ -917,9 +923,9 @@ def _with_includes(
         if profile is None:
             continue
         if place in known:
-            text.put(element.inner, _in_front(profile, element, text))
+            text.put(element.inner, _put_in_front(profile, element, text))
         elif all(rules.allow(profile.enclave, right.right, right.name) for right in profile.rights):
-            text.put(element.inner, _inside(profile, element, text), element.close)
+            text.put(element.inner, _put_inside(profile, element, text), element.close)
         else:
             continue
         included.update(profile.includes)
@@ -971,14 +977,14 @@ def with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> by
             # A merge leaves out what another profile of the enclave allows.
             chosen, _ = common.choose(allowed, ns, node)
             includes = tuple(part for part in chosen if common.given((part,), ns, node) & rights)
-            groups = _beyond(common.given(includes, ns, node), profile)
+            groups = _groups_not_given(common.given(includes, ns, node), profile)
             profiles.append(LearnedProfile(enclave.path, ns, node, rights, includes, groups))
     document, _ = _with_includes(path, before, merged, profiles)
     same = policy_rights(read_policy(path, document)) == policy_rights(policy)
     return document if same else merged
 
 
-def _beyond(given_rights: frozenset[NodeRight], profile: Profile) -> tuple[Group, ...]:
+def _groups_not_given(given_rights: frozenset[NodeRight], profile: Profile) -> tuple[Group, ...]:
     """Return the groups of a profile without names whose rights are all in ``given_rights``."""
     groups = []
     for group in profile.groups:
@@ -1010,7 +1016,7 @@ def _profiles_of(path: Path, document: bytes) -> frozenset[tuple[str, str, str]]
     return frozenset(_profiles(EditedText(document, f"the policy file '{path}'")))
 
 
-def _in_front(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
+def _put_in_front(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
     """Return the XML of a profile's includes, to insert before the profile's content."""
     include = f"{_prefix(text) or 'xi'}:include"
     outer = text.indent_of(element)
@@ -1018,7 +1024,7 @@ def _in_front(profile: LearnedProfile, element: PlacedElement, text: EditedText)
     return "".join(lead + line for line in _includes(profile, include))
 
 
-def _inside(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
+def _put_inside(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
     """Return the XML of a profile's content, indented like its neighbours."""
     include = f"{_prefix(text) or 'xi'}:include"
     outer = text.indent_of(element)

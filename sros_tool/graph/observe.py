@@ -10,7 +10,7 @@ combines the two lists, also if nodes of the same name run in several enclaves.
 The graph shows the enclave of ``--ros-args --enclave``, but "/" for a process whose enclave comes
 from ROS_SECURITY_ENCLAVE_OVERRIDE.  The identifier of a secured participant, however, begins with
 a digest of its certificate's subject (DDS-Security 1.1, 9.3.3), which its peers check;
-`identified` uses that digest.
+`with_certified_enclaves` uses that digest.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class RosGraph:
         try:
             answer = self._line(_START_SECONDS)
             if answer is None or "ready" not in answer:
-                raise self._failed(answer)
+                raise self._observer_error(answer)
         except BaseException:
             self.close()
             raise
@@ -164,13 +164,13 @@ class RosGraph:
                 if not data:
                     with contextlib.suppress(subprocess.TimeoutExpired):
                         self._process.wait(_END_SECONDS)
-                    raise self._failed(None)
+                    raise self._observer_error(None)
                 self._rest += data
         line, _, self._rest = self._rest.partition(b"\n")
         message: dict[str, Any] = json.loads(line)
         return message
 
-    def _failed(self, answer: Mapping[str, Any] | None) -> ObserverError:
+    def _observer_error(self, answer: Mapping[str, Any] | None) -> ObserverError:
         self._output.seek(0)
         output = self._output.read().decode("utf-8", "replace")
         if answer is None:
@@ -388,7 +388,7 @@ def _enclaves(
         for process, nodes in processes.items()
     }
     if sighting.ordered:
-        candidates = _by_order(sighting.listed, processes, candidates)
+        candidates = _decided_by_order(sighting.listed, processes, candidates)
     settled: set[str] = set()
     while True:
         news = [
@@ -411,7 +411,7 @@ def _enclaves(
                 candidates[process] = possible or left
 
 
-def _by_order(
+def _decided_by_order(
     listed_nodes: Sequence[Listed],
     processes: dict[str, frozenset[_Name]],
     candidates: dict[str, frozenset[str]],
@@ -446,7 +446,7 @@ _SECURED = tuple("89abcdef")
 _DEFAULT_ENCLAVE = ("/",)
 
 
-def identified(observation: Observation, enclaves: Mapping[str, str]) -> Observation:
+def with_certified_enclaves(observation: Observation, enclaves: Mapping[str, str]) -> Observation:
     """Return the observation with the enclaves that the certificates of participants show.
 
     ``enclaves`` maps the result of `identity_of` to an enclave.  A secured node keeps no enclave if

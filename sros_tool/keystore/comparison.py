@@ -119,8 +119,12 @@ def compare_governance(old: Governance, new: Governance) -> tuple[SettingChange,
 def _governance_changes(old: Governance, new: Governance) -> Iterator[SettingChange]:
     before, after = old.domains().closed(), new.domains().closed()
     for effect, domains, meaning in (
-        (Effect.LOOSER, _domains_without(after, before), "enclaves may also join domain {}"),
-        (Effect.TIGHTER, _domains_without(before, after), "no enclave may join domain {} any more"),
+        (Effect.LOOSER, _remaining_domains(after, before), "enclaves may also join domain {}"),
+        (
+            Effect.TIGHTER,
+            _remaining_domains(before, after),
+            "no enclave may join domain {} any more",
+        ),
     ):
         if domains.ranges:
             yield SettingChange(effect, "domain", str(before), str(after), meaning.format(domains))
@@ -140,7 +144,7 @@ def _governance_changes(old: Governance, new: Governance) -> Iterator[SettingCha
                 yield SettingChange(Effect.TIGHTER, key, "a rule", "no rule", text)
 
 
-def _domains_without(domains: DomainSet, removed_domains: DomainSet) -> DomainSet:
+def _remaining_domains(domains: DomainSet, removed_domains: DomainSet) -> DomainSet:
     return DomainSet.of(*((domain, domain) for domain in domains if domain not in removed_domains))
 
 

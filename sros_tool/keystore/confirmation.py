@@ -328,7 +328,7 @@ def parse_confirmation(data: bytes, label: str) -> Confirmation:
     try:
         value = parse_json(data)
     except ValueError as error:
-        raise _refused(label, "it is not JSON") from error
+        raise _invalid_confirmation_error(label, "it is not JSON") from error
     return _confirmation_from(value, label)
 
 
@@ -427,7 +427,7 @@ def locked_confirmations(root: Path) -> Iterator[None]:
             lock.release()
 
 
-def keep(root: Path, received: Received) -> str:
+def keep_confirmation(root: Path, received: Received) -> str:
     """Write a robot's confirmation to the keystore, replacing the previous one.
 
     What is known of the last message of its agent stays.  The caller holds `locked_confirmations`.
@@ -514,12 +514,12 @@ def last_confirmation(root: Path, robot: str) -> Received | None:
     try:
         value = parse_json(read_bytes(path, "confirmation", max_bytes=2 * MAX_BYTES))
     except ValueError as error:
-        raise _refused(what, "it is not JSON") from error
+        raise _invalid_confirmation_error(what, "it is not JSON") from error
     if not isinstance(value, dict) or value.keys() - {"message"} != {"received", "confirmation"}:
-        raise _refused(what, 'its keys are not "received" and "confirmation"')
+        raise _invalid_confirmation_error(what, 'its keys are not "received" and "confirmation"')
     confirmation = _confirmation_from(value["confirmation"], what)
     if confirmation.robot != robot:
-        raise _refused(what, f"it is the confirmation of {confirmation.robot}")
+        raise _invalid_confirmation_error(what, f"it is the confirmation of {confirmation.robot}")
     message = _message_from(value["message"], what) if "message" in value else None
     return Received(confirmation, _moment(value["received"], what), message)
 
@@ -531,9 +531,13 @@ def _message_from(value: Any, label: str) -> LastMessage:
         DocumentError: it is not of that form.
     """
     if not isinstance(value, dict) or value.keys() != set(LastMessage._fields):
-        raise _refused(label, 'the keys of its message are not "sequence", "sha256" and "enclave"')
+        raise _invalid_confirmation_error(
+            label, 'the keys of its message are not "sequence", "sha256" and "enclave"'
+        )
     if not _is_digest(value["sha256"]):
-        raise _refused(label, "the digest of its message is not a SHA-256 digest")
+        raise _invalid_confirmation_error(
+            label, "the digest of its message is not a SHA-256 digest"
+        )
     sequence = _sequence_from(value["sequence"], label)
     return LastMessage(sequence, value["sha256"], _enclave_from(value["enclave"], label))
 
@@ -545,29 +549,35 @@ def _confirmation_from(value: Any, label: str) -> Confirmation:
         DocumentError: as `parse_confirmation`.
     """
     if not isinstance(value, dict):
-        raise _refused(label, "it is not a JSON object")
+        raise _invalid_confirmation_error(label, "it is not a JSON object")
     if value.get("format") != _FORMAT or type(value["format"]) is not int:
-        raise _refused(label, f"its format is not {_FORMAT}", "Use an sros of the same version.")
+        raise _invalid_confirmation_error(
+            label, f"its format is not {_FORMAT}", "Use an sros of the same version."
+        )
     if unknown := sorted(value.keys() - _KEYS - _OPTIONAL_KEYS):
-        raise _refused(label, f"it has the unknown key {_short(unknown[0])}")
+        raise _invalid_confirmation_error(label, f"it has the unknown key {_shortened(unknown[0])}")
     if missing := sorted(_KEYS - value.keys()):
-        raise _refused(label, f"it lacks {', '.join(missing)}")
+        raise _invalid_confirmation_error(label, f"it lacks {', '.join(missing)}")
     robot = value["robot"]
     if not isinstance(robot, str) or name_problem(robot):
-        raise _refused(label, f"{_short(robot)} is not the name of a robot")
+        raise _invalid_confirmation_error(label, f"{_shortened(robot)} is not the name of a robot")
     files = dict(_entries(value, "files", label))
     for path, digest in files.items():
         if not _is_digest(digest):
-            raise _refused(label, f"the digest of {path} is not a SHA-256 digest")
+            raise _invalid_confirmation_error(
+                label, f"the digest of {path} is not a SHA-256 digest"
+            )
     certificates = {}
     for path, digests in _entries({"certificates": {}, **value}, "certificates", label):
         if path not in files or path.rpartition("/")[2] not in _CERTIFICATE_FILES:
-            raise _refused(
+            raise _invalid_confirmation_error(
                 label, f"it lists certificates of {path}, which is not a certificate file"
             )
         listed = isinstance(digests, list) and len(digests) <= _MOST_CERTIFICATES
         if not listed or not all(_is_digest(digest) for digest in digests):
-            raise _refused(label, f"the certificates of {path} are not a list of SHA-256 digests")
+            raise _invalid_confirmation_error(
+                label, f"the certificates of {path} are not a list of SHA-256 digests"
+            )
         certificates[path] = tuple(digests)
     dds = _dds_from(value["dds"], label) if "dds" in value else None
     restart = _restart_from(value["restart"], label) if "restart" in value else None
@@ -583,7 +593,7 @@ def _restart_from(value: Any, label: str) -> tuple[str, ...]:
         DocumentError: it is not a list of such names.
     """
     if not isinstance(value, list):
-        raise _refused(label, "its restart is not a list")
+        raise _invalid_confirmation_error(label, "its restart is not a list")
     return tuple(sorted({_enclave_from(name, label) for name in value}))
 
 
@@ -596,7 +606,9 @@ def _enclave_from(name: Any, label: str) -> str:
     try:
         return check_enclave_name(name if isinstance(name, str) else "")
     except InvalidNameError:
-        raise _refused(label, f"{_short(name)} is not the name of an enclave") from None
+        raise _invalid_confirmation_error(
+            label, f"{_shortened(name)} is not the name of an enclave"
+        ) from None
 
 
 # The readers of the keys that `sros agent` writes; each raises `DocumentError` for another form.
@@ -604,23 +616,25 @@ def _enclave_from(name: Any, label: str) -> str:
 
 def _sequence_from(value: Any, label: str) -> int:
     if type(value) is not int or not 1 <= value <= _MOST_NUMBER:
-        raise _refused(label, "its sequence is not a positive number")
+        raise _invalid_confirmation_error(label, "its sequence is not a positive number")
     return value
 
 
 def _release_from(value: Any, label: str) -> int:
     if type(value) is not int or not 0 <= value <= _MOST_NUMBER:
-        raise _refused(label, "its release is not a number")
+        raise _invalid_confirmation_error(label, "its release is not a number")
     return value
 
 
 def _expiry_from(value: Any, label: str) -> dict[str, EnclaveExpiry]:
     if not isinstance(value, dict):
-        raise _refused(label, "its expiry is not an object")
+        raise _invalid_confirmation_error(label, "its expiry is not an object")
     expiry = {}
     for name, times in value.items():
         if not isinstance(times, dict) or times.keys() != set(EnclaveExpiry._fields):
-            raise _refused(label, 'the keys of an expiry are not "certificate" and "permissions"')
+            raise _invalid_confirmation_error(
+                label, 'the keys of an expiry are not "certificate" and "permissions"'
+            )
         moments = (
             None if times[file] is None else _moment(times[file], label)
             for file in EnclaveExpiry._fields
@@ -631,25 +645,29 @@ def _expiry_from(value: Any, label: str) -> dict[str, EnclaveExpiry]:
 
 def _running_from(value: Any, label: str) -> dict[str, RunningFiles]:
     if not isinstance(value, dict):
-        raise _refused(label, "its running is not an object")
+        raise _invalid_confirmation_error(label, "its running is not an object")
     for state in value.values():
         if state not in tuple(RunningFiles):
-            raise _refused(label, f"{_short(state)} is not a state of running processes")
+            raise _invalid_confirmation_error(
+                label, f"{_shortened(state)} is not a state of running processes"
+            )
     return {_enclave_from(name, label): RunningFiles(state) for name, state in value.items()}
 
 
 def _clock_from(value: Any, label: str) -> RobotClock:
     if value not in tuple(RobotClock):
-        raise _refused(label, f"{_short(value)} is not the state of a clock")
+        raise _invalid_confirmation_error(label, f"{_shortened(value)} is not the state of a clock")
     return RobotClock(value)
 
 
 def _problems_from(value: Any, label: str) -> tuple[str, ...]:
     if not isinstance(value, list) or len(value) > MOST_PROBLEMS:
-        raise _refused(label, f"its problems are not a list of at most {MOST_PROBLEMS}")
+        raise _invalid_confirmation_error(
+            label, f"its problems are not a list of at most {MOST_PROBLEMS}"
+        )
     for text in value:
         if not (isinstance(text, str) and text.isprintable() and 0 < len(text) <= LONGEST_PROBLEM):
-            raise _refused(
+            raise _invalid_confirmation_error(
                 label, f"a problem is not printable text of at most {LONGEST_PROBLEM} characters"
             )
     return tuple(value)
@@ -657,16 +675,20 @@ def _problems_from(value: Any, label: str) -> tuple[str, ...]:
 
 def _requests_from(value: Any, label: str) -> tuple[str, ...]:
     if not isinstance(value, list) or len(value) > MOST_REQUESTS:
-        raise _refused(label, f"its requests are not a list of at most {MOST_REQUESTS}")
+        raise _invalid_confirmation_error(
+            label, f"its requests are not a list of at most {MOST_REQUESTS}"
+        )
     for text in value:
         if not (isinstance(text, str) and len(text) <= _LONGEST_REQUEST and _REQUEST.match(text)):
-            raise _refused(label, "one of its requests is not exactly one signing request in PEM")
+            raise _invalid_confirmation_error(
+                label, "one of its requests is not exactly one signing request in PEM"
+            )
     return tuple(value)
 
 
 def _crl_from(value: Any, label: str) -> str:
     if not (isinstance(value, str) and len(value) <= LONGEST_LIST and _LIST.match(value)):
-        raise _refused(label, "its crl is not one revocation list in PEM")
+        raise _invalid_confirmation_error(label, "its crl is not one revocation list in PEM")
     return value
 
 
@@ -689,27 +711,39 @@ def _dds_from(value: Any, label: str) -> RobotDds:
         DocumentError: it is not of that form.
     """
     if not isinstance(value, dict) or value.keys() != set(RobotDds._fields):
-        raise _refused(label, 'the keys of its dds are not "libraries" and "unseen"')
+        raise _invalid_confirmation_error(
+            label, 'the keys of its dds are not "libraries" and "unseen"'
+        )
     listed, unseen = value["libraries"], value["unseen"]
     if type(unseen) is not int or not 0 <= unseen <= _MOST_UNSEEN:
-        raise _refused(label, "its number of unseen processes is not a number")
+        raise _invalid_confirmation_error(label, "its number of unseen processes is not a number")
     if not isinstance(listed, list) or len(listed) > _MOST_LIBRARIES:
-        raise _refused(label, f"its DDS libraries are not a list of at most {_MOST_LIBRARIES}")
+        raise _invalid_confirmation_error(
+            label, f"its DDS libraries are not a list of at most {_MOST_LIBRARIES}"
+        )
     libraries = []
     for library in listed:
         if not isinstance(library, dict) or library.keys() != set(RobotLibrary._fields):
-            raise _refused(
+            raise _invalid_confirmation_error(
                 label, ('the keys of a library of its DDS are not "product", "version", ...')
             )
         product, version, path, seen = (library[key] for key in RobotLibrary._fields)
         if product not in PRODUCTS:
-            raise _refused(label, f"{_short(product)} is not a DDS that confirmations name")
+            raise _invalid_confirmation_error(
+                label, f"{_shortened(product)} is not a DDS that confirmations name"
+            )
         if not isinstance(version, str) or (version and not _LIBRARY_VERSION.match(version)):
-            raise _refused(label, f"{_short(version)} is not the version of a DDS")
+            raise _invalid_confirmation_error(
+                label, f"{_shortened(version)} is not the version of a DDS"
+            )
         if not isinstance(path, str) or not _LIBRARY_PATH.match(path):
-            raise _refused(label, f"{_short(path)} is not the path of a library")
+            raise _invalid_confirmation_error(
+                label, f"{_shortened(path)} is not the path of a library"
+            )
         if seen not in tuple(Seen):
-            raise _refused(label, f"{_short(seen)} does not say where a library was seen")
+            raise _invalid_confirmation_error(
+                label, f"{_shortened(seen)} does not say where a library was seen"
+            )
         libraries.append(RobotLibrary(product, version, path, Seen(seen)))
     return RobotDds(tuple(libraries), unseen)
 
@@ -722,16 +756,20 @@ def _entries(value: Mapping[str, Any], key: str, label: str) -> Iterator[tuple[s
     """
     entries = value[key]
     if not isinstance(entries, dict):
-        raise _refused(label, f"{key} is not an object")
+        raise _invalid_confirmation_error(label, f"{key} is not an object")
     known: set[str] = set()
     for path, entry in entries.items():
         folder, _, file = path.rpartition("/")
         if folder not in known:
             if not _is_enclave_folder(folder):
-                raise _refused(label, f"{_short(path)} is not the path of a file of an enclave")
+                raise _invalid_confirmation_error(
+                    label, f"{_shortened(path)} is not the path of a file of an enclave"
+                )
             known.add(folder)
         if file not in CONFIRMED_FILES:
-            raise _refused(label, f"{_short(path)} is not a file that a confirmation lists")
+            raise _invalid_confirmation_error(
+                label, f"{_shortened(path)} is not a file that a confirmation lists"
+            )
         yield path, entry
 
 
@@ -757,16 +795,18 @@ def _moment(text: object, label: str) -> datetime:
             return parse_iso(text)
         except ValueError:
             pass
-    raise _refused(label, f"its time {_short(text)} does not have the form 2027-05-21T12:50:48Z")
+    raise _invalid_confirmation_error(
+        label, f"its time {_shortened(text)} does not have the form 2027-05-21T12:50:48Z"
+    )
 
 
 _AGAIN = "Make the confirmation again on the robot."
 
 
-def _refused(what: str, why: str, remedy: str = _AGAIN) -> DocumentError:
+def _invalid_confirmation_error(what: str, why: str, remedy: str = _AGAIN) -> DocumentError:
     return DocumentError(f"{what} is not a confirmation: {why}", "", remedy)
 
 
-def _short(value: object) -> str:
+def _shortened(value: object) -> str:
     text = ascii(value) if isinstance(value, (str, int, float, bool)) else type(value).__name__
     return text if len(text) <= 80 else f"{text[:80]}..."

@@ -544,7 +544,7 @@ def describe(
     files = files or FilesReadOnce()
     if path.is_dir():
         if is_keystore(path):
-            return _keystore(path, now)
+            return _describe_keystore(path, now)
         of_enclave = (CERTIFICATE_FILE, PERMISSIONS_FILE, KEY_URI_FILE)
         if any((path / name).exists() for name in of_enclave):
             state = open_enclave(path, now=now, files=files)
@@ -553,7 +553,7 @@ def describe(
             facts = (
                 _facts_in_keystore(evaluation, state) if elsewhere else _enclave_facts(evaluation)
             )
-            return DescribedEnclave(path, state.key_on_robot, facts, _zenoh(path, now))
+            return DescribedEnclave(path, state.key_on_robot, facts, _describe_zenoh(path, now))
         refuse_earlier(path)
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
@@ -562,7 +562,7 @@ def describe(
         )
     data = files.read(path, "file")
     try:
-        return _file(path, data, now, authority, files)
+        return _describe_file(path, data, now, authority, files)
     except SrosError as error:
         raise DocumentError(f"'{path}' cannot be read: {error.what}", error.why) from error
 
@@ -577,30 +577,30 @@ def problems_of(described: Described) -> Sequence[str]:
     return ()
 
 
-def _file(
+def _describe_file(
     path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
 ) -> Described:
     """Describe a file; its content decides the kind, not its name."""
     if b"-----BEGIN CERTIFICATE-----" in data:
-        return DescribedCertificates(path, _certificates(data, "in it", now))
+        return DescribedCertificates(path, _describe_certificates(data, "in it", now))
     if CRL_MARK in data:
-        return DescribedList(path, _revocation_list(load_crl(data, "in it"), now))
+        return DescribedList(path, _describe_revocation_list(load_crl(data, "in it"), now))
     if path.name == KEY_URI_FILE:
-        return DescribedToken(path, _token(read_token_file(data)))
+        return DescribedToken(path, _describe_token(read_token_file(data)))
     if holds_private_key(data):
         mode = path.stat().st_mode & 0o777
         return DescribedKey(path, algorithm(load_key(data, "in it")), f"{mode:04o}")
     if b"multipart/signed" in data[:1000].lower():
         signed = files.signed(data)
-        signature = _signature(path, data, now, authority, files)
+        signature = _describe_signature(path, data, now, authority, files)
         if signed.document.lstrip()[:1] == b"<":
-            return _document(path, signed.document, signature, now)
-        return _configuration(path, signed.text, signature, now)
+            return _describe_document(path, signed.document, signature, now)
+        return _describe_configuration(path, signed.text, signature, now)
     if data.lstrip()[:1] == b"<":
-        return _document(path, data, _NOT_SIGNED, now)
+        return _describe_document(path, data, _NOT_SIGNED, now)
     if path.suffix in _OF_ZENOH or data.lstrip()[:1] == b"{":
-        return _configuration(
-            path, data, _signature_next_to(path, data, now, authority, files), now
+        return _describe_configuration(
+            path, data, _describe_signature_next_to(path, data, now, authority, files), now
         )
     raise DocumentError(
         "it is neither a PEM certificate, revocation list or key, nor a signed document, nor XML, "
@@ -608,7 +608,7 @@ def _file(
     )
 
 
-def _keystore(root: Path, now: datetime) -> DescribedKeystore:
+def _describe_keystore(root: Path, now: datetime) -> DescribedKeystore:
     keystore = Keystore(root)
     settings = keystore.settings
     authorities: dict[str, AuthorityFile | UnreadableFile] = {}
@@ -617,13 +617,13 @@ def _keystore(root: Path, now: datetime) -> DescribedKeystore:
         if not path.exists():
             continue
         try:
-            file = _certificates(keystore.read(path, "file"), f"'{path}'", now)
+            file = _describe_certificates(keystore.read(path, "file"), f"'{path}'", now)
             authorities[role] = AuthorityFile(file, (root / ca_key(role)).exists())
         except SrosError as error:
             authorities[role] = UnreadableFile(str(error))
     names, unread = search_enclaves(root)
-    enclaves = [_enclave(keystore, name, now) for name in names]
-    governance = _governance_of(keystore, now)
+    enclaves = [_describe_enclave(keystore, name, now) for name in names]
+    governance = _describe_governance(keystore, now)
     problems = [
         f"{enclave.name}: {problem}" for enclave in enclaves for problem in enclave.facts.problems
     ]
@@ -645,14 +645,14 @@ def _keystore(root: Path, now: datetime) -> DescribedKeystore:
         ledger=gaps,
         authorities=authorities,
         governance=governance,
-        zenoh=_network(settings.zenoh) if settings and settings.zenoh else None,
+        zenoh=_describe_network(settings.zenoh) if settings and settings.zenoh else None,
         enclaves=enclaves,
         unreadable=unreadable,
         problems=problems,
     )
 
 
-def _governance_of(
+def _describe_governance(
     keystore: Keystore, now: datetime
 ) -> DescribedGovernance | UnreadableFile | None:
     """Describe the governance that the enclaves of a keystore share; None without a governance."""
@@ -667,7 +667,7 @@ def _governance_of(
     return UnreadableFile(f"it is a {described.kind} document")
 
 
-def _network(network: ZenohNetwork) -> NetworkFacts:
+def _describe_network(network: ZenohNetwork) -> NetworkFacts:
     routers = [router_facts(router) for router in network.routers]
     return NetworkFacts(
         network.router,
@@ -679,7 +679,7 @@ def _network(network: ZenohNetwork) -> NetworkFacts:
     )
 
 
-def _zenoh(folder: Path, now: datetime) -> ZenohFiles | None:
+def _describe_zenoh(folder: Path, now: datetime) -> ZenohFiles | None:
     """Describe the Zenoh configurations of an enclave, with their problems; None without any."""
     opened = _opened_at(folder, now)
     if opened is None or not opened.files:
@@ -691,7 +691,7 @@ def _zenoh(folder: Path, now: datetime) -> ZenohFiles | None:
     )
 
 
-def _enclave(keystore: Keystore, name: str, now: datetime) -> KeystoreEnclave:
+def _describe_enclave(keystore: Keystore, name: str, now: datetime) -> KeystoreEnclave:
     """Describe an enclave of a keystore."""
     state = keystore.enclave(name, now=now)
     evaluation = evaluated(name, keystore.folder(name), state, moment=now)
@@ -724,13 +724,13 @@ def _enclave_facts(evaluation: EvaluatedEnclave) -> EnclaveFacts:
         permissions_ca=permissions,
         permissions_ca_sha256=permissions_sha256,
         domains=str(domains) if domains else None,
-        token=_token(state.token) if state.token else None,
-        permissions=_grants(state.permissions) if state.permissions else None,
+        token=_describe_token(state.token) if state.token else None,
+        permissions=_describe_grants(state.permissions) if state.permissions else None,
         permissions_bytes=state.permissions_bytes,
     )
 
 
-def _token(place: TokenUri) -> TokenPlace:
+def _describe_token(place: TokenUri) -> TokenPlace:
     return TokenPlace(place.token, place.object, place.pin_source or None)
 
 
@@ -742,7 +742,7 @@ def _subject_and_digest(certificate: x509.Certificate | None) -> tuple[str | Non
     return (subject_text(certificate.subject), digest(certificate)) if certificate else (None, None)
 
 
-def _certificate(certificate: x509.Certificate, now: datetime) -> CertificateFacts:
+def _describe_certificate(certificate: x509.Certificate, now: datetime) -> CertificateFacts:
     validity = validity_of(certificate)
     try:
         is_ca = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
@@ -763,15 +763,15 @@ def _certificate(certificate: x509.Certificate, now: datetime) -> CertificateFac
     )
 
 
-def _certificates(data: bytes, name: str, now: datetime) -> CertificateFile:
+def _describe_certificates(data: bytes, name: str, now: datetime) -> CertificateFile:
     """Describe the certificates of a PEM file, and the revocation list after them."""
     certificates = load_certificates(data, name)
-    first, *further = (_certificate(certificate, now) for certificate in certificates)
-    crl = _revocation_list(load_crl(data, name), now) if CRL_MARK in data else None
+    first, *further = (_describe_certificate(certificate, now) for certificate in certificates)
+    crl = _describe_revocation_list(load_crl(data, name), now) if CRL_MARK in data else None
     return CertificateFile(first, further or None, crl)
 
 
-def _revocation_list(crl: RevocationList, now: datetime) -> ListFacts:
+def _describe_revocation_list(crl: RevocationList, now: datetime) -> ListFacts:
     return ListFacts(
         issuer=subject_text(crl.list.issuer),
         number=crl.number,
@@ -782,7 +782,7 @@ def _revocation_list(crl: RevocationList, now: datetime) -> ListFacts:
     )
 
 
-def _signature(
+def _describe_signature(
     path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
 ) -> SignatureFacts:
     """Describe the signature of the signed document ``data`` at ``path``."""
@@ -805,7 +805,7 @@ def _signature(
     return SignatureFacts(signed=True, signature_verified=verified, signer=signer)
 
 
-def _signature_next_to(
+def _describe_signature_next_to(
     path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
 ) -> SignatureFacts:
     """Describe the signature of a Zenoh configuration, from the signed document next to it."""
@@ -813,7 +813,7 @@ def _signature_next_to(
     if signed == path or not signed.exists():
         return _NOT_SIGNED
     message = files.read(signed, "signed document")
-    signature = _signature(signed, message, now, authority, files)
+    signature = _describe_signature(signed, message, now, authority, files)
     if files.signed(message).text == data or signature.signer is None:
         return signature
     problem = f"{path.name} is not the document that {signed.name} signs"
@@ -821,12 +821,12 @@ def _signature_next_to(
     return signature._replace(signature_verified=False, signer=signer)
 
 
-def _document(
+def _describe_document(
     path: Path, document: bytes, signature: SignatureFacts, now: datetime
 ) -> DescribedPermissions | DescribedGovernance:
     if parse(document, "its content").find("domain_access_rules") is None:
         permissions = parse_permissions(document, "its content")
-        return DescribedPermissions(path, _grants(permissions, now), signature)
+        return DescribedPermissions(path, _describe_grants(permissions, now), signature)
     rules = [
         DomainRuleFacts(str(rule.domains), rule, rule.topic_access_rules)
         for rule in parse_governance(document, "its content").domain_access_rules
@@ -834,11 +834,11 @@ def _document(
     return DescribedGovernance(path, rules, signature)
 
 
-def _grants(permissions: Permissions, now: datetime | None = None) -> list[GrantFacts]:
-    return [_grant(grant, now) for grant in permissions.grants]
+def _describe_grants(permissions: Permissions, now: datetime | None = None) -> list[GrantFacts]:
+    return [_describe_grant(grant, now) for grant in permissions.grants]
 
 
-def _grant(grant: Grant, now: datetime | None) -> GrantFacts:
+def _describe_grant(grant: Grant, now: datetime | None) -> GrantFacts:
     return GrantFacts(
         name=grant.name,
         subject=grant.subject,
@@ -849,7 +849,7 @@ def _grant(grant: Grant, now: datetime | None) -> GrantFacts:
             RuleFacts(
                 qualifier="ALLOW" if rule.allow else "DENY",
                 domains=str(rule.domains),
-                rights=_by_kind(
+                rights=_rights_by_kind(
                     (right.kind, right.right, right.name) for right in ros_rights(rule)
                 ),
                 partitions=sorted(
@@ -862,7 +862,7 @@ def _grant(grant: Grant, now: datetime | None) -> GrantFacts:
     )
 
 
-def _by_kind(rights: Iterable[tuple[str, str, str]]) -> RightNames:
+def _rights_by_kind(rights: Iterable[tuple[str, str, str]]) -> RightNames:
     """Return names grouped by kind and right, from triples of kind, right and name."""
     table: dict[str, dict[str, list[str]]] = {}
     for kind, right, name in rights:
@@ -881,7 +881,7 @@ _ABOUT_THE_CONTENT = (
 )
 
 
-def _configuration(
+def _describe_configuration(
     path: Path, document: bytes, signature: SignatureFacts, now: datetime
 ) -> DescribedConfiguration:
     """Describe a Zenoh configuration; ``rights`` and ``domains`` only if sros wrote it.
@@ -909,13 +909,13 @@ def _configuration(
         ),
         made_by_sros=own is not None,
         domains=sorted(domains_of(own.access_control)) if own else [],
-        rights=_remote_rights(own) if own else [],
+        rights=_describe_remote_rights(own) if own else [],
         problems=_content_problems(path, now),
         signature=signature,
     )
 
 
-def _remote_rights(configuration: Configuration) -> list[RemoteFacts]:
+def _describe_remote_rights(configuration: Configuration) -> list[RemoteFacts]:
     """Return the rights that a configuration gives remote enclaves.
 
     In client mode, the remote is the router, which may send what the client may get, and the
@@ -925,7 +925,7 @@ def _remote_rights(configuration: Configuration) -> list[RemoteFacts]:
     remotes = []
     for remote in configuration.access_control.remotes:
         rules = (rule.mirrored() if is_client else rule for rule in remote.rules)
-        may = _by_kind((KIND_OF[right], right, name) for right, name in stated_names(rules))
+        may = _rights_by_kind((KIND_OF[right], right, name) for right, name in stated_names(rules))
         remotes.append(RemoteFacts(remote.common_name, is_client, may))
     return remotes
 

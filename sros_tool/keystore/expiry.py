@@ -123,16 +123,16 @@ class ExpiringEnclaves(NamedTuple):
 def expiring_enclaves(renewals: ExpiryCheck) -> ExpiringEnclaves:
     """Return the value that ``--json`` prints for enclaves that are due for renewal."""
 
-    def shown(lifetimes: Sequence[Lifetime]) -> list[DueEnclave]:
+    def due_enclave_values(lifetimes: Sequence[Lifetime]) -> list[DueEnclave]:
         return [
             DueEnclave(each.name, each.certificate.not_after, each.permissions.not_after)
             for each in lifetimes
         ]
 
     return ExpiringEnclaves(
-        shown(renewals.due),
+        due_enclave_values(renewals.due),
         [EnclaveProblem(enclave.name, str(enclave.error)) for enclave in renewals.unreadable],
-        shown(renewals.short_lived),
+        due_enclave_values(renewals.short_lived),
     )
 
 
@@ -271,4 +271,4 @@ def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
 
 def _elapsed(validity: Window, now: datetime, made_at: datetime | None) -> float:
     """Return the elapsed fraction of a validity, without its back-dating; above 1 after expiry."""
-    return 1 - (validity.not_after - now) / validity.life(made_at)
+    return 1 - (validity.not_after - now) / validity.lifetime(made_at)

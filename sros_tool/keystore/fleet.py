@@ -109,10 +109,10 @@ def checked_fleet(keystore: Keystore) -> Fleet | None:
 
 def edited_fleet(keystore: Keystore, ledger: Ledger) -> str:
     """Return a clause on how the fleet file differs from what sros wrote; "" if it does not."""
-    return _edited(ledger, _read(keystore))
+    return _edit_text(ledger, _read(keystore))
 
 
-def _edited(ledger: Ledger, data: bytes | None) -> str:
+def _edit_text(ledger: Ledger, data: bytes | None) -> str:
     # What somebody else adds to the ledger is not among the entries that are certain.
     last = next((entry for entry in reversed(ledger.certain) if entry.what == "fleet"), None)
     if last is None and any(entry.what == "fleet" for entry in ledger.entries):
@@ -275,7 +275,7 @@ def write_fleet(
     _refuse_shared(fleet)
     document = (_COMMENT + render_fleet(fleet)).encode()
     ledger = keystore.ledger_with("what", "fleet")
-    if not _edited(ledger, document) and _read(keystore):
+    if not _edit_text(ledger, document) and _read(keystore):
         return fleet, ()
     transaction.write(FLEET, document)
     digest = hashlib.sha256(document).hexdigest()
@@ -325,7 +325,7 @@ def refuse_stale_domains(
             )
 
 
-def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
+def left_enclave_notes(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
     """Yield a note for each robot that no longer has enclaves, or a router, that the keystore has.
 
     No two robots of ``after`` have an enclave in common, as `write_fleet` makes sure.
@@ -338,7 +338,7 @@ def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
             router = router_of(before, robot)
             kept.add(router)
             if has_enclave(root, router):
-                yield _lost_router(root, robot.name, router)
+                yield _lost_router_note(root, robot.name, router)
         names = (name for name in enclaves_of(before, robot) if name not in kept)
         if found := {name for name in names if has_enclave(root, name)}:
             left[robot.name] = found
@@ -356,7 +356,7 @@ def left_enclaves(root: Path, before: Fleet, after: Fleet) -> Iterator[Note]:
         )
 
 
-def _lost_router(root: Path, robot: str, router: str) -> Note:
+def _lost_router_note(root: Path, robot: str, router: str) -> Note:
     text = (
         f"the robot {robot} has no Zenoh router any more: its enclave {router} stays valid. Stop "
         f"the router, and take its enclave back: `sros revoke {quote(str(root))} {router}`."

@@ -297,7 +297,7 @@ class RobotStatus:
         return self.state is State.NONE or (self.state is State.CURRENT and not self.problems)
 
     @property
-    def heard(self) -> datetime | None:
+    def last_heard(self) -> datetime | None:
         """When the robot was certainly there last; None if it sent no confirmation."""
         if self.fetches and self.received and self.clock:
             return min(self.received, self.clock)
@@ -434,7 +434,7 @@ class FleetStatus:
             robot.robot
             for robot in self.robots
             if robot.enclaves
-            and (heard := robot.heard)
+            and (heard := robot.last_heard)
             and (max_age or robot.fetches)
             and now - heard > (max_age or _LONGEST_SILENCE)
         )
@@ -465,7 +465,7 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
     statuses = tuple(
         _status(robot, known, stages, unrecorded[robot.robot.name]) for robot in compared
     )
-    if older := known.older():  # there may be a later list, which it does not have
+    if older := known.age_clause():  # there may be a later list, which it does not have
         statuses = tuple(status.without_list() for status in statuses)
     return FleetStatus(
         root,
@@ -640,10 +640,12 @@ class _KeystoreFiles:
             for entry in entries:
                 if entry.name in CONFIRMED_FILES:
                     path = f"{folder}/{entry.name}"
-                    files[path] = self._linked(path, up) if entry.is_symlink() else self._file(path)
+                    files[path] = (
+                        self._linked_file(path, up) if entry.is_symlink() else self._file(path)
+                    )
         return files
 
-    def _linked(self, path: str, up: str) -> _KeystoreFile | None:
+    def _linked_file(self, path: str, up: str) -> _KeystoreFile | None:
         """Return the digests of the file that a link leads to; None if it cannot be read.
 
         ``up`` is the relative path from the link to the folder of all enclaves.
@@ -748,7 +750,7 @@ class _Known:
 
         return is_all_published(self._root, published, compared_robot.enclaves)
 
-    def older(self) -> str:
+    def age_clause(self) -> str:
         """Return why the keystore is older than its robots, as a clause; "" if nothing shows it."""
         entries = self._keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
         marks = [entry for entry in entries if entry.what in (RESTORED, "release")]
@@ -965,7 +967,7 @@ def _status(
         lacks_key=known.lacks_key(compared_robot) if different else (),
         is_locked_out=bool(compared_robot.enclaves) and certificates == {State.REVOKED},
     )
-    if not (different and status.fetches and known.reads_copy(compared_robot, status.heard)):
+    if not (different and status.fetches and known.reads_copy(compared_robot, status.last_heard)):
         return status
     text = (
         f"It sent a message long after release {status.published} was published, and has release "

@@ -202,7 +202,9 @@ def is_keystore(root: Path) -> bool:
             or any(search_enclaves(root))
         )
     except PermissionError as error:
-        raise _unreadable(root, [UnreadPath.of(error)], "Its enclaves cannot be listed.") from error
+        raise _unreadable_folder_error(
+            root, [UnreadPath.of(error)], "Its enclaves cannot be listed."
+        ) from error
 
 
 def has_authorities(root: Path) -> bool:
@@ -370,7 +372,9 @@ def enclave_names(root: Path, *, hidden: bool = False) -> tuple[str, ...]:
     """
     names, unread = search_enclaves(root, hidden=hidden)
     if unread:
-        raise _unreadable(root, unread, "Enclaves in it would be missing from the result.")
+        raise _unreadable_folder_error(
+            root, unread, "Enclaves in it would be missing from the result."
+        )
     return names
 
 
@@ -383,7 +387,9 @@ def enclaves_below(root: Path, name: str) -> tuple[str, ...]:
     top, start = os.fspath(root / ENCLAVES), os.fspath(enclave_path(root, name))
     names, unread = _search(top, start)
     if unread:
-        raise _unreadable(root, unread, "Enclaves in it would be missing from the result.")
+        raise _unreadable_folder_error(
+            root, unread, "Enclaves in it would be missing from the result."
+        )
     return tuple(enclave for enclave in names if enclave != name)
 
 
@@ -432,13 +438,15 @@ def _noting_unreadable(folders: Iterable[_Walked], unread: list[UnreadPath]) -> 
         for name in files:
             path = f"{folder}/{name}"
             if name.endswith(_FILE_TYPES) and not os.access(path, os.R_OK):
-                unread += _refused(path)
+                unread += _unread_path(path)
         yield folder, files
 
 
 def _refuse_unreadable(root: Path, unread: list[UnreadPath]) -> None:
     if unread:
-        raise _unreadable(root, unread, "Enclaves would keep their old files. Nothing was changed.")
+        raise _unreadable_folder_error(
+            root, unread, "Enclaves would keep their old files. Nothing was changed."
+        )
 
 
 def revoked_certificates(root: Path, known: Container[str] = ()) -> tuple[Path, ...]:
@@ -456,12 +464,12 @@ def revoked_certificates(root: Path, known: Container[str] = ()) -> tuple[Path, 
         return ()
     except OSError as error:
         effect = "Revoked certificates would be left out."
-        raise _unreadable(root, [UnreadPath.of(error)], effect) from error
+        raise _unreadable_folder_error(root, [UnreadPath.of(error)], effect) from error
     files = (folder / name / CERTIFICATE_FILE for name in places if name not in known)
     return tuple(name for name in files if os.path.lexists(name))
 
 
-def _refused(path: str) -> Iterator[UnreadPath]:
+def _unread_path(path: str) -> Iterator[UnreadPath]:
     """Yield the path if the system refuses to read it; a broken link counts as missing."""
     try:
         os.close(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC))
@@ -470,7 +478,9 @@ def _refused(path: str) -> Iterator[UnreadPath]:
             yield UnreadPath.of(error)
 
 
-def _unreadable(root: Path, unread: Sequence[UnreadPath], effect: str) -> KeystoreError:
+def _unreadable_folder_error(
+    root: Path, unread: Sequence[UnreadPath], effect: str
+) -> KeystoreError:
     first, more = unread[0], len(unread) - 1
     return KeystoreError(
         f"'{first.path}'{f' and {more} more' if more else ''} in keystore '{root}' cannot be read",
@@ -551,10 +561,10 @@ def check_keystore(root: Path) -> None:
             parent = next((path for path in root.parents[-2::-1] if not path.exists()), None)
             why = "It does not exist."
             why += f" Nor does '{parent}': its disk may not be mounted." if parent else ""
-        raise KeystoreError(f"'{root}' is not a valid keystore", why, _instead_of(root))
+        raise KeystoreError(f"'{root}' is not a valid keystore", why, _wrong_path_error(root))
 
 
-def _instead_of(root: Path) -> str:
+def _wrong_path_error(root: Path) -> str:
     """Return the remedy if ``root``, which is no keystore, was named as a keystore."""
     if around := keystore_around(root):
         return f"It is a folder in the keystore '{around}': name that keystore."
@@ -575,13 +585,17 @@ def similar_keystores(root: Path) -> list[Path]:
     """Return the keystores next to ``root`` whose names are similar, without regard to digits."""
     from difflib import get_close_matches  # for this alone, which is asked last
 
-    def letters(name: str) -> str:
+    def without_digits(name: str) -> str:
         return "".join(letter for letter in name if not letter.isdigit())
 
     with suppress(OSError, KeystoreError):
         siblings = [path.name for path in root.absolute().parent.iterdir() if path.is_dir()]
         names = get_close_matches(root.name, siblings, n=3, cutoff=0.75)
-        paths = [root.with_name(name) for name in names if letters(name) != letters(root.name)]
+        paths = [
+            root.with_name(name)
+            for name in names
+            if without_digits(name) != without_digits(root.name)
+        ]
         return [path for path in paths if is_keystore(path)]
     return []
 

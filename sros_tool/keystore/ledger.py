@@ -371,7 +371,7 @@ class LedgerFile:
         try:
             return index.names(parts) if index else None
         except IndexDamagedError:
-            return self.recorded_with(*parts) if self._restored() else None
+            return self.recorded_with(*parts) if self._restore_index() else None
 
     @property
     def is_indexed(self) -> bool:
@@ -416,7 +416,7 @@ class LedgerFile:
         """
         files = self._opened()
         if files.later:
-            raise _later_part(self.root, files.later)
+            raise _later_part_error(self.root, files.later)
         return files.part, files.state.st_size if files.state else 0
 
     def content(self) -> Iterator[bytes]:
@@ -443,7 +443,7 @@ class LedgerFile:
             try:
                 found = self._indexed_lines(files, terms)
             except IndexDamagedError:
-                if self._restored():
+                if self._restore_index():
                     continue
                 files, found = files._replace(ledger_index=None), None
             if found:
@@ -457,7 +457,7 @@ class LedgerFile:
                 return reading
             self._files = None
 
-    def _restored(self) -> bool:
+    def _restore_index(self) -> bool:
         """Remove a damaged index once, under the lock of the keystore, to make it again."""
         may_restore, self._may_restore, self._files = self._may_restore, False, None
         if may_restore:
@@ -520,13 +520,13 @@ class LedgerFile:
         """
         if files.ledger_index is None or files.head is None or terms is None:
             return None
-        from sros_tool.keystore.ledger_index import is_indexed, merged
+        from sros_tool.keystore.ledger_index import is_indexed, merged_postings
 
         if not all(is_indexed(*term) for term in terms):
             return None
         index, head = files.ledger_index, files.head
         terms = dict.fromkeys([*terms, ("what", "ca"), ("what", GAP)])
-        postings = merged(index.postings(*term) for term in terms)
+        postings = merged_postings(index.postings(*term) for term in terms)
         with _open(self.root, self._follow_link) or io.BytesIO() as file:
             for posting in postings:
                 if posting.digest not in self._entries:
@@ -565,13 +565,15 @@ class LedgerFile:
     def _lines(self, files: _Files, needed_text: bytes) -> _Lines:
         stated = files.head.lines if files.head else 0
         if files.lines is not None:
-            read = _remembered(files.lines, needed_text, stated, _MOST_LINES, _MOST_BYTES)
+            read = _read_remembered_lines(
+                files.lines, needed_text, stated, _MOST_LINES, _MOST_BYTES
+            )
         else:
             with _open(self.root, self._follow_link) or io.BytesIO() as file:
                 lines = self._every_line(file)
                 read = _read_lines(lines, needed_text, stated, _MOST_LINES, _MOST_BYTES)
         if read is None:
-            raise _too_large(self.root / LEDGER)
+            raise _too_large_error(self.root / LEDGER)
         return read
 
     # ── sealed parts ───────────────────────────────────────────────────────────────────────
@@ -590,7 +592,7 @@ class LedgerFile:
             with self._part(parts[-1]) as file:
                 before = _sealed_before(file)
             if before is None or before.number != parts[-1].number - 1:
-                raise _not_as_sealed(self.root, parts[-1])
+                raise _not_as_sealed_error(self.root, parts[-1])
             parts.append(before)
         for part in reversed(parts):
             digest = hashlib.sha256()
@@ -599,7 +601,7 @@ class LedgerFile:
                     digest.update(line)
                     yield line
             if digest.hexdigest() != part.sha256:
-                raise _not_as_sealed(self.root, part)
+                raise _not_as_sealed_error(self.root, part)
             after_part(ledger_part(part.number))
         yield from _lines_in(last_part)
 
@@ -652,7 +654,7 @@ class LedgerFile:
         recorded = [_Fault(entry.number, entry.reason) for entry in entries if entry.what == GAP]
         gaps = (at for at, entry in zip(numbers, entries, strict=True) if entry.what == GAP)
         last_recorded = max(gaps, default=0)
-        start = _first_of(self._authorities(), zip(numbers, entries, strict=True))
+        start = _first_certificate_of(self._authorities(), zip(numbers, entries, strict=True))
         every = [*recorded, *faults]
         last_fault = max((fault.line for fault in every), default=0)
         ledger = Ledger(
@@ -679,7 +681,7 @@ def _sealed_before(file: BinaryIO) -> Entry | None:
     return entry if entry and entry.what == SEALED else None
 
 
-def _not_as_sealed(root: Path, sealed: Entry) -> KeystoreError:
+def _not_as_sealed_error(root: Path, sealed: Entry) -> KeystoreError:
     return KeystoreError(
         f"{ledger_part(sealed.number)} is not the sealed part of the ledger of '{root}'",
         "It was changed, cut off or exchanged.",
@@ -705,7 +707,7 @@ def _later_than(root: Path, part: int, last: os.stat_result | None = None) -> st
     return ""
 
 
-def _later_part(root: Path, name: str) -> KeystoreError:
+def _later_part_error(root: Path, name: str) -> KeystoreError:
     return KeystoreError(
         f"'{root / name}' is a later part of the ledger than {LEDGER}",
         "An earlier ledger was put back, which lacks what the keystore issued and revoked since.",
@@ -828,7 +830,7 @@ def _read_lines(
 
 
 @lru_cache(maxsize=4)  # a verb asks several times
-def _remembered(
+def _read_remembered_lines(
     data: bytes, needed_text: bytes, stated: int, maximum: int, most_bytes: int
 ) -> _Lines | None:
     return _read_lines(_lines_in(io.BytesIO(data)), needed_text, stated, maximum, most_bytes)
@@ -861,17 +863,17 @@ def _open(root: Path, follow_link: bool, name: str = LEDGER) -> BinaryIO | None:
     path = root / name
     try:
         if follow_link:
-            return _checked(open_at_once(path))
+            return _checked_file(open_at_once(path))
         from sros_tool.folders import Folder  # a question does not load what writes
 
         with Folder(root) as folder:
             target = folder.link_target(name) or ""
-            return _checked(folder.open(target if SEALED_LEDGER.fullmatch(target) else name))
+            return _checked_file(folder.open(target if SEALED_LEDGER.fullmatch(target) else name))
     except FileNotFoundError:
         return None
     except (OSError, SrosError) as error:
         if isinstance(error, OSError) and error.errno == errno.EFBIG:
-            raise _too_large(path) from error
+            raise _too_large_error(path) from error
         raise KeystoreError(
             f"the ledger '{path}' cannot be read",
             f"{error.strerror}." if isinstance(error, OSError) else error.why or f"{error.what}.",
@@ -879,7 +881,7 @@ def _open(root: Path, follow_link: bool, name: str = LEDGER) -> BinaryIO | None:
         ) from error
 
 
-def _checked(file: BinaryIO) -> BinaryIO:
+def _checked_file(file: BinaryIO) -> BinaryIO:
     """Return ``file``; close it and raise OSError if it is too large or no regular file."""
     state, error = os.fstat(file.fileno()), None
     if not stat.S_ISREG(state.st_mode):
@@ -892,7 +894,7 @@ def _checked(file: BinaryIO) -> BinaryIO:
     return file
 
 
-def _too_large(path: Path) -> KeystoreError:
+def _too_large_error(path: Path) -> KeystoreError:
     root = path.parent
     return KeystoreError(
         f"the ledger '{path}' is too large",
@@ -957,7 +959,9 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _first_of(authorities: Iterable[x509.Certificate], entries: Iterable[tuple[int, Entry]]) -> int:
+def _first_certificate_of(
+    authorities: Iterable[x509.Certificate], entries: Iterable[tuple[int, Entry]]
+) -> int:
     """Return the number of the first line about the trusted CAs; 0 if a CA has no line."""
     wanted = {digest(authority) for authority in authorities}
     lines: dict[str, int] = {}

@@ -420,6 +420,6 @@ def _connect(path: Path, mode: str, *, is_new: bool = False) -> sqlite3.Connecti
     return connection
 
 
-def merged(postings: Iterable[Iterable[Posting]]) -> Sequence[Posting]:
+def merged_postings(postings: Iterable[Iterable[Posting]]) -> Sequence[Posting]:
     """Return postings of several terms in the order of their lines, each line once."""
     return sorted({posting.number: posting for some in postings for posting in some}.values())

@@ -23,7 +23,7 @@ from sros_tool.dds.decision.vendors import (
     Signers,
     Vendor,
     VendorTraits,
-    together,
+    joined_titles,
 )
 from sros_tool.errors import PkiError
 from sros_tool.faults import Fault
@@ -121,11 +121,11 @@ def vendor_problems(
     }
     faults = [
         fault
-        for fault in sorted(_faults(traits, state, moment), key=_when_met)
+        for fault in sorted(_faults(traits, state, moment), key=_check_order)
         if fault.file not in known or fault.fault in CRASHES
     ]
     if not faults:
-        return tuple(sorted(kept, key=_when_met))
+        return tuple(sorted(kept, key=_check_order))
     kept += [fault for fault in faults if _is_of_list(fault)]
     specific = [problem for problem in specific if not _is_of_list(problem)]
     faults = [fault for fault in faults if not _is_of_list(fault)]
@@ -139,10 +139,10 @@ def vendor_problems(
         kept += [problem for problem in specific if problem.file in files] or of_side
     if not any(problem.fault is Fault.KEY_ALGORITHM for problem in kept):
         kept += [fault for fault in faults if fault.file == KEY_FILE]
-    return tuple(sorted(kept, key=_when_met))
+    return tuple(sorted(kept, key=_check_order))
 
 
-def _when_met(problem: Problem) -> int:
+def _check_order(problem: Problem) -> int:
     """Return the sort key of a problem: the order in which a process notices problems."""
     if problem.fault in BEFORE_DDS:
         return 0
@@ -283,14 +283,14 @@ def _authority_fault(
 
     ``certificates`` are all certificates of the file, in order.
     """
-    trusted = _trusted(traits, certificates)
+    trusted = _trusted_certificates(traits, certificates)
     if not trusted:
         return _hash_fault(certificates[0]), Fault.SIGNATURE_HASH
     if traits.verifies_authorities and certificates[0] not in trusted:
         text = f"{_hash_fault(certificates[0])}, which crashes the process"
         return text, Fault.CA_CRASH
     if traits.verifies_authorities:
-        checks = _checks(traits) | Checks.STRICT
+        checks = _chain_checks(traits) | Checks.STRICT
         fault = chain_fault(certificates[0], trusted, moment=moment, checks=checks)
         if fault:
             return f"it is refused: {fault}", Fault.CA_CHAIN
@@ -311,14 +311,16 @@ def authority_refusals(
         if fault:
             refusals[vendor] = fault[0]
         elif role == IDENTITY:
-            trusted = _trusted(traits, certificates)
-            below = chain_fault(certificates[0], trusted, moment=moment, checks=_checks(traits))
+            trusted = _trusted_certificates(traits, certificates)
+            below = chain_fault(
+                certificates[0], trusted, moment=moment, checks=_chain_checks(traits)
+            )
             first = certificates[0]
             fits = _key_fits(traits, first.public_key(), pss=is_for_pss(first))
             key = "" if fits else "its key algorithm is not supported"
             refusals[vendor] = below or key
         elif traits.signers is Signers.CHAIN:
-            trusted = _trusted(traits, certificates)
+            trusted = _trusted_certificates(traits, certificates)
             refusals[vendor] = chain_fault(
                 certificates[0], trusted, moment=moment, checks=Checks.DOCUMENTS
             )
@@ -332,12 +334,12 @@ def refusals_text(refusals: Mapping[Vendor, str]) -> str:
         by_text.setdefault(text, []).append(vendor.title)
     clauses = []
     for text, named in by_text.items():
-        titles = together(named)
+        titles = joined_titles(named)
         verb = "refuses" if len(titles) == 1 else "refuse"
         clauses.append(
             f"{' and '.join(titles)} {verb} the certificates or documents of this CA: {text}"
         )
-    accepts = together(vendor.title for vendor in TESTED if vendor not in refusals)
+    accepts = joined_titles(vendor.title for vendor in TESTED if vendor not in refusals)
     if accepts:
         verb = "accepts" if len(accepts) == 1 else "accept"
         clauses.append(f"{' and '.join(accepts)} {verb} it")
@@ -351,7 +353,7 @@ def _signer_fault(
 
     ``certificates`` are all certificates of the permissions CA's file, in order.
     """
-    trusted = _trusted(traits, certificates)
+    trusted = _trusted_certificates(traits, certificates)
     if traits.signers is Signers.AUTHORITY:
         try:
             signed.verify(certificates[0])
@@ -378,7 +380,7 @@ def _signer_fault(
     return ""
 
 
-def _trusted(traits: VendorTraits, certificates: Certificates) -> Certificates:
+def _trusted_certificates(traits: VendorTraits, certificates: Certificates) -> Certificates:
     if traits.reads_first_authority:
         return certificates[:1]
     return tuple(dropwhile(lambda certificate: not _hash_fits(traits, certificate), certificates))
@@ -401,7 +403,7 @@ def _hash_fault(certificate: x509.Certificate) -> str:
     return f"{subject_text(certificate.subject)} is not signed with SHA-256"
 
 
-def _checks(traits: VendorTraits) -> Checks:
+def _chain_checks(traits: VendorTraits) -> Checks:
     return Checks.ROOT_SIGNATURE | Checks.POLICIES if traits.verifies_policies else Checks.NONE
 
 
@@ -417,7 +419,7 @@ def _identity_faults(
         pss = certificate.signature_algorithm_oid == SignatureAlgorithmOID.RSASSA_PSS
         text = "it is signed with RSA-PSS" if pss else "it is not signed with SHA-256"
         yield Problem(CERTIFICATE_FILE, text, Fault.SIGNATURE_HASH)
-    trusted = _trusted(traits, authorities)
+    trusted = _trusted_certificates(traits, authorities)
     with_keys = [(CERTIFICATE_FILE, certificate), *((IDENTITY_CA_FILE, ca) for ca in trusted[:1])]
     for file, holder in with_keys:
         pss = is_for_pss(holder)
@@ -436,7 +438,7 @@ def _identity_faults(
     if traits.expiry_overflows and remaining // _LONGEST_TIMER % 2:
         text = "it expires more than 292 years from now, which counts as expired, or crashes"
         yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_LASTS)
-    if fault := chain_fault(certificate, trusted, moment=moment, checks=_checks(traits)):
+    if fault := chain_fault(certificate, trusted, moment=moment, checks=_chain_checks(traits)):
         yield Problem(CERTIFICATE_FILE, fault, Fault.CERTIFICATE_ISSUER)
 
 
@@ -471,7 +473,7 @@ def _list_faults(
         return
     if not lists:
         return
-    chain, fault = build_chain(certificate, _trusted(traits, authorities), (), moment)
+    chain, fault = build_chain(certificate, _trusted_certificates(traits, authorities), (), moment)
     # A fault of the chain is reported already.
     refusal = (
         None

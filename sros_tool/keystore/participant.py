@@ -31,7 +31,7 @@ from sros_tool.dds.decision.vendors import (
     TESTED,
     Vendor,
     VendorTraits,
-    together,
+    joined_titles,
 )
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
@@ -165,11 +165,11 @@ def loaded_enclave(
         state,
         moment,
         key_elsewhere=state.key_on_robot,
-        portable=_portable(state.permissions, permissions),
+        portable=_portable_permissions(state.permissions, permissions),
     )
 
 
-def _portable(permissions: Permissions | None, document: bytes) -> Permissions | None:
+def _portable_permissions(permissions: Permissions | None, document: bytes) -> Permissions | None:
     """Return ``permissions`` if all vendors read the document in the same way; else None."""
     return permissions if permissions and canonical_permissions(permissions, document) else None
 
@@ -332,7 +332,9 @@ class VendorParticipant:
             )
         stopped = None if join.outcome.ok else join
         if stopped is None and self.access is not None:
-            stopped = self.access.governed(ROS_DISCOVERY_TOPIC)  # every ROS 2 node opens it
+            stopped = self.access.governance_refusal(
+                ROS_DISCOVERY_TOPIC
+            )  # every ROS 2 node opens it
         if stopped is None:
             return ()
         file = GOVERNANCE_FILE if stopped.reason in _OF_GOVERNANCE else PERMISSIONS_FILE
@@ -404,7 +406,7 @@ class EvaluatedEnclave(NamedTuple):
                 if any(cause.file == problem.file for cause in participant.causes())
             ]
             if titles and problem not in self.state.problems:
-                clauses.append(f"{problem} (refused by {' and '.join(together(titles))})")
+                clauses.append(f"{problem} (refused by {' and '.join(joined_titles(titles))})")
         return clauses
 
     @property
@@ -482,7 +484,7 @@ def _with_acceptance(
     titles: dict[bool, list[str]] = {True: [], False: []}
     for participant in participants:
         titles[problem not in participant.problems].append(participant.vendor.title)
-    accepting, refusing = (", ".join(together(titles[accepts])) for accepts in (True, False))
+    accepting, refusing = (", ".join(joined_titles(titles[accepts])) for accepts in (True, False))
     if problem.fault is not Fault.SIGNATURE or not accepting:
         return problem
     text = f"{problem.text}; accepted by {accepting}"

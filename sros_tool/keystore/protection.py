@@ -42,7 +42,7 @@ def contradictions(
         met = {
             other: None
             for topic in protected_topics(protection.kind, protection.name)
-            for meeting in names.meeting(topic)
+            for meeting in names.overlapping(topic)
             for other in signed[meeting]
         }
         for other in met:
@@ -116,19 +116,19 @@ class _Raising:
                 self.state(part)
             return
         base = self._value(deciding[topics[0]])
-        needed = self._raised(base, protection.level)
+        needed = self._raised_protection(base, protection.level)
         if needed == base:
             return
         for topic in topics:
-            self._refuse_parted(topic, protection)
+            self._refuse_partial_overlap(topic, protection)
         same = set(deciding.values())
         number = same.pop()
-        if number is not None and not same and self._means(number, topics):
+        if number is not None and not same and self._is_for_topics(number, topics):
             self._named[number] = replace(self._named[number], protection=needed)
         else:
             self._added.append(NamedProtection(protection.kind, protection.name, needed))
 
-    def _means(self, number: int, topics: Sequence[str]) -> bool:
+    def _is_for_topics(self, number: int, topics: Sequence[str]) -> bool:
         """Return whether an entry of the settings is for exactly these topics."""
         own = protected_topics(self._named[number].kind, self._named[number].name)
         return len(own) == len(topics) and all(
@@ -141,19 +141,21 @@ class _Raising:
         Entries for a part of the names are raised to the stated level.
         """
         wide: list[str] = []
-        for name in self._topics.meeting(topic):
+        for name in self._topics.overlapping(topic):
             number = self._owner[name]
             if covers(name, topic):
                 wide.append(name)
             elif covers(topic, name):
-                value = self._raised(self._value(number), protection.level)
+                value = self._raised_protection(self._value(number), protection.level)
                 self._named[number] = replace(self._named[number], protection=value)
-            elif self._raised(self._value(number), protection.level) != self._value(number):
+            elif self._raised_protection(self._value(number), protection.level) != self._value(
+                number
+            ):
                 raise self._overlap_error(name, protection)
         return self._owner[min(wide, key=self._rank.__getitem__)] if wide else None
 
-    def _refuse_parted(self, topic: str, protection: StatedProtection) -> None:
-        for name in self._topics.meeting(topic):
+    def _refuse_partial_overlap(self, topic: str, protection: StatedProtection) -> None:
+        for name in self._topics.overlapping(topic):
             if not covers(name, topic) and not covers(topic, name):
                 raise self._overlap_error(name, protection)
 
@@ -170,7 +172,7 @@ class _Raising:
     def _value(self, number: int | None) -> TopicProtection:
         return self._protection.default if number is None else self._named[number].protection
 
-    def _raised(self, protection: TopicProtection, level: Level) -> TopicProtection:
+    def _raised_protection(self, protection: TopicProtection, level: Level) -> TopicProtection:
         kinds = (protection.data, protection.metadata, self._protection.rtps)
         if max(map(_strength, kinds)) >= _strength(level):
             return protection
@@ -229,7 +231,7 @@ class _DomainRules:
     def levels(self, topic: str) -> Iterator[Level]:
         """Yield the levels of all rules that decide on some name of a topic expression."""
         for _, rule in sorted(
-            (self._rules[name] for name in self._names.meeting(topic)), key=lambda pair: pair[0]
+            (self._rules[name] for name in self._names.overlapping(topic)), key=lambda pair: pair[0]
         ):
             kinds: tuple[ProtectionKind, ...] = (
                 rule.data_protection_kind,

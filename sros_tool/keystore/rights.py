@@ -363,7 +363,7 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
             "require."
         )
         notes.append(Note("rights.zenoh-strangers", text))
-    if unclear := access.unclear():
+    if unclear := access.unclear_reason():
         notes.append(Note("rights.zenoh-conditions", f"{path}: {unclear}."))
     if document.namespace:
         text = f"{path}: it puts a namespace before the keys, which this answer ignores."
@@ -457,7 +457,7 @@ class _Reader:
             self.unverified.append(Note("rights.unsigned", text))
         permissions = parse_permissions(data, f"'{file}'")
         self.notes += [
-            Note(note.id, f"{label}: {note.text}") for note in _left_out(permissions.grants)
+            Note(note.id, f"{label}: {note.text}") for note in _left_out_notes(permissions.grants)
         ]
         grants = _first_of_each(permissions)
         self.documents.update(dict.fromkeys(grants, permissions))
@@ -499,7 +499,7 @@ def _enclave_of(grant: Grant) -> str:
     return match[1] if match else grant.name or grant.subject
 
 
-def _left_out(grants: Iterable[Grant]) -> Iterator[Note]:
+def _left_out_notes(grants: Iterable[Grant]) -> Iterator[Note]:
     """Yield notes on parts of grants that cannot be stated as rights in ROS terms."""
     seen: set[str] = set()
     for grant in grants:
@@ -619,7 +619,9 @@ def compare_sources(
         scope = second_source.scope if first_source.scope is None else first_source.scope
     difference = compare(first_source.rights, second_source.rights, scope)
     unanswered = (
-        _unanswered(first_source.rights, second_source.rights, difference) if scope is None else ()
+        _unanswered_rights(first_source.rights, second_source.rights, difference)
+        if scope is None
+        else ()
     )
     protections = _protection_differences(first_source, second_source)
     domains = _domain_differences(first_source, second_source, scope)
@@ -674,7 +676,7 @@ def _stated_domains(source: RightsSource) -> dict[str, str]:
     return {name: str(DomainSet.of(*of)) for name, of in ranges.items() if name not in every}
 
 
-def _unanswered(
+def _unanswered_rights(
     first_rights: Collection[Right], second_rights: Collection[Right], difference: RightsDifference
 ) -> list[Right]:
     """Return the ``second_rights`` to use a name that enclaves offer only in ``first_rights``.
@@ -827,7 +829,7 @@ class RecordedRights:
             self._looked_up[name] = _OfLedger(ledger, self._keystore)
         return self._looked_up[name]
 
-    def of(self, name: str, digest: str, grant: Grant) -> SignedRights:
+    def rights_to_sign(self, name: str, digest: str, grant: Grant) -> SignedRights:
         """Return the rights in an enclave's permissions, to sign them again.
 
         ``grant`` has the rights; ``name``, ``digest`` and errors are as for `policy`.
@@ -853,7 +855,7 @@ class RecordedRights:
             return self.last(name)
         return None
 
-    def unproven(self) -> dict[str, Entry]:
+    def unproven_entries(self) -> dict[str, Entry]:
         """Map enclaves to their last entries, if these are from before the hash chain."""
         of_all = self._whole_ledger
         if not of_all.unchained:

@@ -186,7 +186,7 @@ def _robots_enclaves(
         own = enclaves_of_robot(root, fleet, fleet.robots[name]) if name in fleet.robots else ()
         own += unrecorded[name].below if name in unrecorded else ()
         if not own:
-            if left := _named_after(keystore, name):
+            if left := _enclaves_named_after(keystore, name):
                 raise KeystoreError(
                     f"the fleet in keystore '{root}' gives no enclave to a robot {name}",
                     f"It has {_names_text(left)}: perhaps the robot left the fleet, or a group.",
@@ -202,7 +202,7 @@ def _robots_enclaves(
     return found
 
 
-def _named_after(keystore: Keystore, robot: str) -> list[str]:
+def _enclaves_named_after(keystore: Keystore, robot: str) -> list[str]:
     """Return the enclaves with the name of a robot as a part of their paths."""
     return [name for name in keystore.names if robot in name.split("/")[1:]]
 
@@ -215,7 +215,7 @@ _WHOLE_ALIKE = 0.9
 """Lowest similarity for a typo in a full name: names in a namespace have the same beginning."""
 
 
-def no_such_enclave(
+def missing_enclave_error(
     keystore: Keystore, name: str, existing_enclaves: Collection[str], *, may_create: bool = True
 ) -> SrosError:
     """Return the error for the missing enclave ``name``, with similar ``existing_enclaves``.
@@ -224,7 +224,7 @@ def no_such_enclave(
     """
     root = keystore.root
     if revocation := revocation_of(keystore, name):
-        return _was_revoked(root, revocation)
+        return _revoked_enclave_error(root, revocation)
     what = f"enclave {name} does not exist in keystore '{root}'"
     names = sorted(existing_enclaves)
     if below := [each for each in names if name and each.startswith(f"{name}/")]:
@@ -283,7 +283,7 @@ def revocation_of(keystore: Keystore, name: str) -> Entry | None:
     return next(kept, of_enclave[-1])
 
 
-def _was_revoked(root: Path, entry: Entry) -> SrosError:
+def _revoked_enclave_error(root: Path, entry: Entry) -> SrosError:
     reason = "" if entry.reason in ("", "unspecified") else f" ({entry.reason})"
     folder = root / REVOKED / entry.serial
     return KeystoreError(

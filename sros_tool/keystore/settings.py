@@ -100,15 +100,15 @@ class PresentSettings(NamedTuple):
         """The domains of the signed governance."""
         return self.governance.domains().closed()
 
-    def undone(self) -> Template:
-        """Return the settings without edits: those in the ledger, or else `base`.
+    def without_edits(self) -> Template:
+        """Return the settings without edits: those in the ledger, or else `settings_to_change`.
 
         Raises:
-            KeystoreError: as `base`.
+            KeystoreError: as `settings_to_change`.
         """
-        return self.recorded or self.base()
+        return self.recorded or self.settings_to_change()
 
-    def base(self) -> Template:
+    def settings_to_change(self) -> Template:
         """Return the settings to which a single change is applied.
 
         Raises:
@@ -210,15 +210,15 @@ def hand_edits(
     settings: tuple[str, ...] = ()
     unsigned: tuple[str, ...] = ()
     if present and recorded:
-        settings = tuple(_differences(recorded, present, "written by sros"))
+        settings = tuple(_difference_clauses(recorded, present, "written by sros"))
     if present and governance:
         stated = governance_for(present.protection, governance.domains().closed())
         if stated != governance:
-            unsigned = tuple(_unsigned(present, recorded, settings))
+            unsigned = tuple(_unsigned_clauses(present, recorded, settings))
     return HandEdits(settings, _governance_edit(keystore), unsigned)
 
 
-def _unsigned(
+def _unsigned_clauses(
     present: Template, recorded: Template | None, settings: Sequence[str]
 ) -> Iterator[str]:
     """Yield a clause if the signed governance is not what sros.toml states."""
@@ -226,7 +226,7 @@ def _unsigned(
         yield f"the signed governance differs from [protection] in {SETTINGS}"
 
 
-def _differences(old: Template, new: Template, origin: str) -> Iterator[str]:
+def _difference_clauses(old: Template, new: Template, origin: str) -> Iterator[str]:
     """Yield a clause for each key with different values; name and description do not count."""
     if old == new:
         return

@@ -158,19 +158,19 @@ def _template(values: object, name: str) -> Template:
         name=table.text("name", name),
         description=table.text("description", ""),
         separate_authorities=authorities.one_of("layout", ("separate", "single")) == "separate",
-        authority_name=_authority_name(authorities),
+        authority_name=_read_authority_name(authorities),
         authority_validity=authorities.span("validity"),
         certificate_validity=certificates.span("validity"),
         permissions_validity=permissions.span("validity"),
         default_permissions=permissions.one_of("default", (EVERYTHING, NODE_BASICS)),
-        protection=_protection(table.table("protection")),
-        identity_key=_key_place(authorities, "identity_key"),
-        permissions_key=_key_place(authorities, "permissions_key"),
+        protection=_read_protection(table.table("protection")),
+        identity_key=_read_key_place(authorities, "identity_key"),
+        permissions_key=_read_key_place(authorities, "permissions_key"),
         unique_subject=certificates.flag("unique_subject", False),
         revocation_validity=revocation.duration("validity", "10y"),
-        short_lived=tuple(_short_lived(table)),
-        zenoh=_zenoh(table.table("zenoh")) if table.has("zenoh") else None,
-        distributions=_distributions(table),
+        short_lived=tuple(_read_short_lived(table)),
+        zenoh=_read_zenoh(table.table("zenoh")) if table.has("zenoh") else None,
+        distributions=_read_distributions(table),
     )
     for part in (authorities, certificates, permissions, revocation, table):
         part.finish()
@@ -222,7 +222,7 @@ def render_template(template: Template) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _distributions(table: _Table) -> tuple[str, ...]:
+def _read_distributions(table: _Table) -> tuple[str, ...]:
     """Return the distributions that a template names, in the order of their release."""
     named = table.texts("distributions", [])
     for name in named:
@@ -231,7 +231,7 @@ def _distributions(table: _Table) -> tuple[str, ...]:
     return tuple(name for name in DISTRIBUTIONS if name in named)
 
 
-def _short_lived(table: _Table) -> Iterator[ShortLived]:
+def _read_short_lived(table: _Table) -> Iterator[ShortLived]:
     for entry in table.tables("enclaves"):
         validity = entry.duration("validity")
         for name in entry.texts("names"):
@@ -245,7 +245,7 @@ def _short_lived(table: _Table) -> Iterator[ShortLived]:
         entry.finish()
 
 
-def _zenoh(table: _Table) -> ZenohNetwork:
+def _read_zenoh(table: _Table) -> ZenohNetwork:
     from sros_tool.zenoh.configuration import (  # most keystores have none
         Mode,
         ZenohNetwork,
@@ -259,8 +259,8 @@ def _zenoh(table: _Table) -> ZenohNetwork:
         tuple(table.texts("listen", [])),
         Mode(table.one_of("mode", (Mode.CLIENT.value, Mode.PEER.value), usual.mode.value)),
         tuple(sorted(set(table.numbers("domains", MAX_DOMAIN)))),
-        tuple(_zenoh_routers(table.table("routers"))),
-        tuple(_crossing(table)),
+        tuple(_read_zenoh_routers(table.table("routers"))),
+        tuple(_read_crossing(table)),
     )
     names = network.router_names()
     for name in names:
@@ -282,7 +282,7 @@ def _zenoh(table: _Table) -> ZenohNetwork:
     return network
 
 
-def _zenoh_routers(tables: _Table) -> Iterator[ZenohRouter]:
+def _read_zenoh_routers(tables: _Table) -> Iterator[ZenohRouter]:
     """Yield the further routers of a Zenoh network, each with its enclaves."""
     from sros_tool.zenoh.configuration import ZenohRouter
 
@@ -293,7 +293,7 @@ def _zenoh_routers(tables: _Table) -> Iterator[ZenohRouter]:
             tuple(table.texts("endpoints")),
             tuple(table.texts("listen", [])),
             tuple(table.texts("enclaves")),
-            tuple(_crossing(table)),
+            tuple(_read_crossing(table)),
         )
         for pattern in router.enclaves:
             if not pattern.startswith("/") or set(pattern) & set("?[]"):
@@ -305,7 +305,7 @@ def _zenoh_routers(tables: _Table) -> Iterator[ZenohRouter]:
         yield router
 
 
-def _crossing(table: _Table) -> Iterator[str]:
+def _read_crossing(table: _Table) -> Iterator[str]:
     for name in table.texts("crossing", []):
         if not name.startswith("/") or expression_problem(name):
             raise _TemplateError(
@@ -378,7 +378,7 @@ def with_values(
     protection = table["protection"]
     for kind, name in [*dropped, *((rule.kind, rule.name) for rule in rules)]:
         entries = protection.get(kind, [])
-        left = [entry for entry in entries if not _means(entry["names"][0], name)]
+        left = [entry for entry in entries if not _match_same_names(entry["names"][0], name)]
         if (kind, name) in dropped and len(left) == len(entries):
             raise UsageError(
                 f"the {kind} {name} has no protection of its own",
@@ -387,7 +387,7 @@ def with_values(
             )
         protection[kind] = left
     for rule in rules:
-        typed = {key: _typed("", value) for key, value in rule.values}
+        typed = {key: _typed_value("", value) for key, value in rule.values}
         name = rule.name if rule.name.startswith("~") else expand(rule.name, "/", "")
         protection.setdefault(rule.kind, []).append({"names": [name], **typed})
     for key, value in values:
@@ -410,14 +410,14 @@ def with_values(
                 "",
                 "Name one such as protection.rtps, permissions.validity or permissions.default.",
             )
-        inner[last] = _typed(key, value)
+        inner[last] = _typed_value(key, value)
     try:
         return _template(table, template.name)
     except _TemplateError as error:
         raise UsageError(f"the settings would not be valid: {error}") from error
 
 
-def _means(one: str, other: str) -> bool:
+def _match_same_names(one: str, other: str) -> bool:
     """Return whether two name expressions in settings match the same names."""
     one, other = (expand(each, "/", "") for each in (one, other))
     return covers(one, other) and covers(other, one)
@@ -431,7 +431,7 @@ class NamedValues(NamedTuple):
     values: tuple[tuple[str, str], ...]
 
 
-def _typed(key: str, text: str) -> str | bool | list[str] | list[int]:
+def _typed_value(key: str, text: str) -> str | bool | list[str] | list[int]:
     if key in ("zenoh.endpoints", "zenoh.listen", "zenoh.crossing") or key.startswith(
         "zenoh.routers."
     ):
@@ -441,7 +441,7 @@ def _typed(key: str, text: str) -> str | bool | list[str] | list[int]:
     return {"true": True, "false": False}.get(text, text)
 
 
-def _authority_name(table: _Table) -> str:
+def _read_authority_name(table: _Table) -> str:
     name = table.text("name", "sros")
     if not 0 < len(name) <= _LONGEST_AUTHORITY_NAME or not name.isprintable():
         raise _TemplateError(
@@ -451,7 +451,7 @@ def _authority_name(table: _Table) -> str:
     return name
 
 
-def _key_place(table: _Table, key: str) -> str:
+def _read_key_place(table: _Table, key: str) -> str:
     place = table.text(key, "")
     try:
         refuse_pin(place)
@@ -482,7 +482,7 @@ _OF_DOMAIN: dict[str, Any] = {
 """The keys of [protection] for the whole domain, with their defaults."""
 
 
-def _protection(table: _Table) -> DomainProtection:
+def _read_protection(table: _Table) -> DomainProtection:
     values: dict[str, Any] = {}
     for name, usual in _OF_DOMAIN.items():
         is_flag = isinstance(usual, bool)
@@ -493,7 +493,7 @@ def _protection(table: _Table) -> DomainProtection:
             'protection.allow_unauthenticated_participants needs rtps = "NONE", because Fast DDS '
             "refuses to start otherwise"
         )
-    default = _topic_protection(table.table("default"), TopicProtection())
+    default = _read_topic_protection(table.table("default"), TopicProtection())
     named = []
     for item, kind in _KINDS.items():
         for entry in table.tables(item):
@@ -505,13 +505,13 @@ def _protection(table: _Table) -> DomainProtection:
                         f"{entry.path}.names has {name!r}, which is not a valid {item} name: "
                         f"{problem or 'it is private to a node.'}".rstrip(".")
                     )
-            protection = _topic_protection(entry, default)
+            protection = _read_topic_protection(entry, default)
             named += [NamedProtection(kind, name, protection) for name in names]
     table.finish()
     return replace(domain, default=default, named=tuple(named))
 
 
-def _topic_protection(table: _Table, default: TopicProtection) -> TopicProtection:
+def _read_topic_protection(table: _Table, default: TopicProtection) -> TopicProtection:
     values: dict[str, Any] = {}
     for field in fields(TopicProtection):
         if field.name in ("data", "metadata"):

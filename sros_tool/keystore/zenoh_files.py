@@ -73,7 +73,7 @@ from sros_tool.zenoh.access import (
     is_within,
     joined,
     joined_rights,
-    narrowed,
+    narrowed_rights,
 )
 from sros_tool.zenoh.configuration import (
     Configuration,
@@ -343,7 +343,7 @@ class Drifted:
     kind: Drift
 
 
-def drifted(
+def drifted_configurations(
     keystore: Keystore,
     wanted_documents: ZenohDocuments,
     authority: x509.Certificate,
@@ -431,7 +431,7 @@ def zenoh_drift(
     wanted = zenoh_documents(
         keystore, network, domains, authority, now, only_enclaves=only_enclaves, among=among
     )
-    files = drifted(keystore, wanted, authority, reader=reader)
+    files = drifted_configurations(keystore, wanted, authority, reader=reader)
     return ZenohDrift(files, wanted.left_out, wanted.nodes)
 
 
@@ -517,7 +517,7 @@ def zenoh_documents(
         return render_configuration(
             network.mode,
             listen,
-            _tls(network.router_of(name).endpoints),
+            _tls_endpoints(network.router_of(name).endpoints),
             _peers(name, router, between) if direct else (router,),
             revoked if direct else "",
         )
@@ -582,7 +582,7 @@ def _peers(name: str, router: RenderedRights, between: RightsBetween) -> list[Re
     return sorted(rendered, key=lambda rights: rights.name)
 
 
-def _tls(endpoints: Iterable[str]) -> tuple[str, ...]:
+def _tls_endpoints(endpoints: Iterable[str]) -> tuple[str, ...]:
     return tuple(f"tls/{endpoint}" for endpoint in endpoints)
 
 
@@ -612,7 +612,7 @@ def _router_files(
     for router in routers if network.routers else ():
         for names in filter(None, (network.crossing, router.crossing)):
             most = crossing_rules(names, domains)
-            together[router.name] = narrowed(together[router.name], most, GRAPH)
+            together[router.name] = narrowed_rights(together[router.name], most, GRAPH)
     between = RightsBetween(together.values())
     files = {}
     for router in routers:
@@ -623,7 +623,11 @@ def _router_files(
             if rights.rules and rights.common_name != router.name
         ]
         files[_router_path(router.name)] = render_configuration(
-            Mode.ROUTER, _tls(router.listening()), _tls(connects[router.name]), remotes, revoked
+            Mode.ROUTER,
+            _tls_endpoints(router.listening()),
+            _tls_endpoints(connects[router.name]),
+            remotes,
+            revoked,
         )
     return files
 
@@ -862,7 +866,7 @@ def _prove(
     control = AccessControl((remote,))
     passing = {right: control.passing(enclave, *use) for right, use in _PROOF.items()}
     tokens = control.passing(enclave, Flow.INGRESS, Message.LIVELINESS_TOKEN)
-    announced = _announced(tokens, enclave)
+    announced = _announced_names(tokens, enclave)
     foreign = announced is None
     check_meaning(foreign, False, f"that {enclave} announces nodes of another enclave")
     if _are_exactly(passing, stated_rights):
@@ -922,7 +926,7 @@ def _are_exactly(
     )
 
 
-def _announced(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str, str]] | None:
+def _announced_names(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str, str]] | None:
     """Return what graph tokens announce, as triples of domain, right and name.
 
     Right and name are "" for a node.  Returns None if a token is for another enclave.
@@ -938,7 +942,7 @@ def _announced(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str, str]
 
 
 def _to_announce(stated_rights: Mapping[int, Sequence[StatedRight]]) -> set[tuple[str, str, str]]:
-    """Return what an enclave may announce by its rights without wildcards, as `_announced` does."""
+    """Return what exact rights let an enclave announce, in the form of `_announced_names`."""
     return {(str(domain), "", "") for domain in stated_rights} | {
         (str(domain), right, name)
         for domain, rights in stated_rights.items()

@@ -21,7 +21,7 @@ from sros_tool.automata import Automaton, Letters, NameSet
 from sros_tool.dds.decision.access import AccessVerb, GrantedAccess, Refusal, choose_grant
 from sros_tool.dds.decision.documents import canonical_permissions, read_permissions_as
 from sros_tool.dds.decision.expressions import names_of
-from sros_tool.dds.decision.vendors import TESTED, DocumentReader, Style, Vendor, together
+from sros_tool.dds.decision.vendors import TESTED, DocumentReader, Style, Vendor, joined_titles
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, parse_permissions
 from sros_tool.errors import DocumentError, PolicyError
@@ -109,9 +109,9 @@ def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
         )
     rules = [rule for rule in grant.rules if domain in rule.domains.closed()]
     if not _is_plain(grant):
-        rules = _without_order(rules)
+        rules = _joined_if_unordered(rules)
         _check_vendors(source, grant, domain, rules)
-    rights = set(grant_rights(enclave, grant._replace(rules=_joined(rules))))
+    rights = set(grant_rights(enclave, grant._replace(rules=_joined_rules(rules))))
     raw = {right for right in rights if not right.name.startswith("/")}
     rights -= raw
     everything = {right for right in raw if right.name == "*" and right.qualifier is ALLOW}
@@ -179,7 +179,7 @@ class _Ordered(NamedTuple):
     denied: list[tuple[int, str]]
 
 
-def _without_order(rules: Sequence[Rule]) -> list[Rule]:
+def _joined_if_unordered(rules: Sequence[Rule]) -> list[Rule]:
     """Return rules with the same meaning whose denials come first, for the default partition.
 
     A right that an earlier rule denies completely is left out, and so is a denial after all rights
@@ -224,7 +224,7 @@ def _criteria(topics: tuple[str, ...]) -> tuple[Criteria, ...]:
     return (Criteria(topics),) if topics else ()
 
 
-def _joined(rules: Iterable[Rule]) -> tuple[Rule, ...]:
+def _joined_rules(rules: Iterable[Rule]) -> tuple[Rule, ...]:
     """Return one rule with all denials and one with all rights, if the order does not matter."""
     joined = []
     for allow in (False, True):
@@ -280,7 +280,7 @@ def _vendors_differ_error(
     are_alike = len({topic in decision.topics(verb) for decision in decisions.values()}) == 1
     if not are_alike or not denying:
         differing = "; ".join(
-            f"{reason} ({', '.join(together(of))})" for reason, of in reasons.items()
+            f"{reason} ({', '.join(joined_titles(of))})" for reason, of in reasons.items()
         )
         return PolicyError(
             f"{what}, because DDS vendors do not {'read its rules' if are_alike else 'decide'} "

@@ -152,7 +152,7 @@ class Issuer:
     def issue(self, subject: x509.Name, public: PublicKey, validity: Window) -> x509.Certificate:
         """Return a certificate that is not a CA; it expires no later than the CA."""
         return (
-            _builder(subject, self._name, public, validity.within(self._validity))
+            _builder(subject, self._name, public, validity.intersection(self._validity))
             .add_extension(_NOT_A_CA, critical=True)
             .add_extension(_LEAF_USAGE, critical=True)
             .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
@@ -233,7 +233,7 @@ def _first_certificate(
     for block in _blocks(data, what):
         if block.label in labels:
             return _certificate_in(block, what, settings)
-    why = f"It is not a PEM certificate: {pem_file.missing(data, 'CERTIFICATE')}."
+    why = f"It is not a PEM certificate: {pem_file.missing_block_reason(data, 'CERTIFICATE')}."
     raise PkiError(what, why, _RESTORE)
 
 
@@ -459,10 +459,10 @@ _EC = der.encode_oid("1.2.840.10045.2.1")
 def _key_algorithm(certificate: x509.Certificate) -> list[der.Value]:
     """Return the identifier and the parameters of the algorithm of a certificate's key."""
     parts = der.children(
-        der.first(_normalized(certificate, certificate.tbs_certificate_bytes)).content
+        der.first_value(_normalized(certificate, certificate.tbs_certificate_bytes)).content
     )
     key = parts[6 if parts[0].tag == der.CONTEXT_0 else 5]
-    return der.children(der.first(key.content).content)
+    return der.children(der.first_value(key.content).content)
 
 
 @lru_cache(maxsize=256)
@@ -472,7 +472,7 @@ def _algorithms(certificate: x509.Certificate) -> tuple[der.Value, der.Value]:
     OpenSSL compares them when it verifies the signature; it does not verify the signature of a
     self-signed CA (RFC 5280, 4.1.1.2).
     """
-    whole = der.first(
+    whole = der.first_value(
         _normalized(certificate, certificate.public_bytes(serialization.Encoding.DER))
     )
     signed, outer, _ = der.children(whole.content)
@@ -482,7 +482,7 @@ def _algorithms(certificate: x509.Certificate) -> tuple[der.Value, der.Value]:
 
 def _signed_algorithm(certificate: x509.Certificate) -> x509.ObjectIdentifier:
     inner, _ = _algorithms(certificate)
-    return x509.ObjectIdentifier(der.decode_oid(der.first(inner.content).content))
+    return x509.ObjectIdentifier(der.decode_oid(der.first_value(inner.content).content))
 
 
 @lru_cache(maxsize=256)
@@ -575,7 +575,7 @@ def _name_text(name: bytes) -> str:
     """Return a name (DER) as OpenSSL prints it, with the attributes of an RDN in their order."""
     return ",".join(
         "+".join(map(_attribute_text, reversed(der.children(rdn.content))))
-        for rdn in reversed(der.children(der.first(name).content))
+        for rdn in reversed(der.children(der.first_value(name).content))
     )
 
 

@@ -316,7 +316,7 @@ def _netscape_type(certificate: x509.Certificate) -> int | None:
     if not kinds:
         return None
     with suppress(PkiError):
-        value = der.first(kinds[0].public_bytes())
+        value = der.first_value(kinds[0].public_bytes())
         if value.tag == der.BIT_STRING and len(value.content) in (1, 2) and len(kinds) == 1:
             return (value.content + b"\0")[1]
     return -1

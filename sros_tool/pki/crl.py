@@ -157,7 +157,7 @@ def read_list(data: bytes, name: str) -> x509.CertificateRevocationList:
     Raises:
         PkiError: the list cannot be read; ``name`` names the file.
     """
-    with _reading(name, data):
+    with _reading_list(name, data):
         blocks = pem.blocks(data)
         return _read_block(next(block for block in blocks if block.label == _LABEL))
 
@@ -168,12 +168,12 @@ def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, 
     Raises:
         PkiError: a list, or a block before it, cannot be read; ``name`` names the file.
     """
-    with _reading(name, data):
+    with _reading_list(name, data):
         blocks = pem.blocks(data)
         return tuple(_read_block(block) for block in blocks if block.label == _LABEL)
 
 
-def _reading(name: str, data: bytes) -> AbstractContextManager[None]:
+def _reading_list(name: str, data: bytes) -> AbstractContextManager[None]:
     kind = "" if CRL_MARK in data else kind_of(data)
     why = f"It is not a PEM revocation list, but {kind}" if kind else "It is not a revocation list"
     return reading(
@@ -368,7 +368,7 @@ def list_refusal(
     ``chain`` leads to a self-signed CA, and is valid without lists.
     """
     certificate = chain[0]
-    found = _best(chain, lists, moment)
+    found = _best_list(chain, lists, moment)
     if found is None:
         name = subject_text(certificate.issuer)
         text = f"the revocation list of {name} is missing, and OpenSSL has another CA's list"
@@ -419,7 +419,7 @@ def _revokes(crl: x509.CertificateRevocationList, certificate: x509.Certificate)
     return False
 
 
-def _best(
+def _best_list(
     chain: Sequence[x509.Certificate], lists: Lists, moment: datetime
 ) -> tuple[x509.CertificateRevocationList, x509.Certificate, _Score] | None:
     """Return the list that OpenSSL uses for ``chain[0]``, with its issuer and score, or None.
@@ -540,10 +540,10 @@ def _is_in_scope(
     if point.full_name is None and point.relative_name is None:
         return True
     places = extension(certificate, x509.CRLDistributionPoints)
-    return any(_same_place(place, point) for place in places or () if _is_of(place, crl))
+    return any(_same_place(place, point) for place in places or () if _is_in_place(place, crl))
 
 
-def _is_of(place: x509.DistributionPoint, crl: x509.CertificateRevocationList) -> bool:
+def _is_in_place(place: x509.DistributionPoint, crl: x509.CertificateRevocationList) -> bool:
     if place.crl_issuer is None:
         return True
     names = [name.value for name in place.crl_issuer if isinstance(name, x509.DirectoryName)]
@@ -566,7 +566,7 @@ def _general_name(name: x509.GeneralName) -> object:
 def _all_reasons(certificate: x509.Certificate, crl: x509.CertificateRevocationList) -> bool:
     """Return whether the distribution points of a certificate cover all reasons to revoke it."""
     for place in extension(certificate, x509.CRLDistributionPoints) or ():
-        if _is_of(place, crl):
+        if _is_in_place(place, crl):
             return place.reasons is None or place.reasons >= _REASONS
     return True
 

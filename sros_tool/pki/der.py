@@ -54,7 +54,7 @@ def children(data: bytes) -> list[Value]:
     return values
 
 
-def first(data: bytes) -> Value:
+def first_value(data: bytes) -> Value:
     """Return the first value in ``data``; raise `PkiError` if there is none."""
     values = children(data)
     if not values:

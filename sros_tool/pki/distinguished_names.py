@@ -48,7 +48,7 @@ def canonical(name: x509.Name) -> tuple[bytes, ...]:
 @lru_cache(maxsize=256)  # a few CAs are compared with many certificates
 def canonical_der(name: bytes) -> tuple[bytes, ...]:
     """Return a name, given in DER, in the form of `canonical`."""
-    parts = der.children(der.first(name).content)
+    parts = der.children(der.first_value(name).content)
     return tuple(
         b"".join(sorted(_attribute(attribute) for attribute in der.children(part.content)))
         for part in parts
@@ -118,7 +118,7 @@ def read_name(name: x509.Name) -> None:
 def read_name_der(name: bytes) -> None:
     """Parse every part of a distinguished name in DER, as `read_name` does."""
     canonical_der(name)
-    for part in der.children(der.first(name).content):
+    for part in der.children(der.first_value(name).content):
         for attribute in der.children(part.content):
             oid, value = der.children(attribute.content)
             if (part.tag, attribute.tag, oid.tag) != (der.SET, der.SEQUENCE, der.OID):

@@ -129,7 +129,7 @@ def load_any_key(
         try:
             key = serialization.load_pem_private_key(pem, None, unsafe_skip_rsa_key_validation=True)
         except Exception as error:  # of many classes: see `reading`
-            raise _unreadable(name) from error
+            raise _unreadable_key_error(name) from error
     return _validated(key, name) if isinstance(key, rsa.RSAPrivateKey) else key
 
 
@@ -137,8 +137,10 @@ def is_key_for_pss(pem: bytes) -> bool:
     """Return whether the first key of a PEM file is for RSA-PSS alone (RFC 4055, 1.2)."""
     with suppress(PkiError, ValueError):
         block = next(pem_file.blocks(_key_block(pem, "")))
-        _, identifier, *_ = der.children(der.first(block.content).content)
-        return identifier.tag == der.SEQUENCE and der.first(identifier.content).content == _PSS
+        _, identifier, *_ = der.children(der.first_value(block.content).content)
+        return (
+            identifier.tag == der.SEQUENCE and der.first_value(identifier.content).content == _PSS
+        )
     return False
 
 
@@ -157,7 +159,7 @@ def check_key(content: bytes, label: str = "") -> None:
         raise ValueError("a key of another algorithm than its label says")
 
 
-def _unreadable(name: str, reason: str = "") -> PkiError:
+def _unreadable_key_error(name: str, reason: str = "") -> PkiError:
     why = f"It is not a PEM private key, or it is damaged{f': {reason}' if reason else ''}."
     return PkiError(f"the private key {name} cannot be read", why, "Restore it from a backup.")
 
@@ -182,17 +184,19 @@ def _key_block(data: bytes, name: str) -> bytes:
             elif block.label in _ALL_LABELS:
                 break
         else:
-            raise _unreadable(name, "" if damaged else pem_file.missing(data, "PRIVATE KEY"))
+            raise _unreadable_key_error(
+                name, "" if damaged else pem_file.missing_block_reason(data, "PRIVATE KEY")
+            )
     except PkiError as error:
-        raise error if error.why else _unreadable(name, error.what) from error
+        raise error if error.why else _unreadable_key_error(name, error.what) from error
     encrypted = block.headers.startswith(_TRADITIONAL)
     if block.headers and not encrypted:
-        raise _unreadable(name, "it has other PEM headers than those of an encrypted key")
+        raise _unreadable_key_error(name, "it has other PEM headers than those of an encrypted key")
     label, der_key = block.label, block.content
     if not encrypted:  # OpenSSL ignores what follows the key, and which form the label promises
         with suppress(PkiError):
             der_key, _ = der.split(block.content)
-            kinds = [part.tag for part in der.children(der.first(der_key).content)]
+            kinds = [part.tag for part in der.children(der.first_value(der_key).content)]
             if kinds[:2] == [der.INTEGER, der.SEQUENCE]:
                 label = KEY_LABELS[0]
     begin = [f"-----BEGIN {label}-----".encode(), *block.headers.splitlines()]
@@ -229,7 +233,7 @@ def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
     try:
         return key.private_numbers().private_key()
     except ValueError as error:
-        raise _unreadable(name) from error
+        raise _unreadable_key_error(name) from error
 
 
 _INITIAL_VALUE = re.compile(rb"^DEK-Info: *([^,\s]*),([0-9A-Fa-f]*)", re.MULTILINE)
@@ -243,12 +247,12 @@ def _check_derivation(pem: bytes, name: str) -> None:
     Source: RFC 5958, 3; RFC 8018, A; RFC 7914, 7.
     """
     if (found := _INITIAL_VALUE.search(pem)) and len(found[2]) < _HEX_DIGITS.get(found[1], 32):
-        raise _unreadable(name)  # `cryptography` panics
+        raise _unreadable_key_error(name)  # `cryptography` panics
     for block in _ENCRYPTED.findall(pem):
         try:
             scrypt, numbers = _derivation(block)
         except (ValueError, PkiError) as error:
-            raise _unreadable(name) from error
+            raise _unreadable_key_error(name) from error
         if scrypt:
             allowed = (
                 math.prod(numbers[:2]) <= _MAX_SCRYPT_MEMORY
@@ -272,7 +276,7 @@ def _derivation(block: bytes) -> tuple[bool, list[int]]:
     Raises:
         ValueError, PkiError: it is damaged.
     """
-    scheme = der.first(der.first(base64.b64decode(block)).content).content
+    scheme = der.first_value(der.first_value(base64.b64decode(block)).content).content
     scrypt = der.encode(der.OID, der.encode_oid(_SCRYPT)) in scheme
     return scrypt, list(_integers(scheme))
 

@@ -83,7 +83,7 @@ def read_as_text(data: bytes) -> bytes:
     return b"".join(lines)
 
 
-def missing(data: bytes, label: str) -> str:
+def missing_block_reason(data: bytes, label: str) -> str:
     """Return why OpenSSL finds no block with a label in a PEM file, as a clause."""
     if _NOT_AT_START.search(data):
         return (
@@ -231,7 +231,7 @@ def _kind_of_der(data: bytes) -> str:
     """Return the kind of a DER file, by its structure; "" if unknown."""
     try:
         whole, _ = der.split(data)
-        parts = der.children(der.first(der.normalized(whole)).content)
+        parts = der.children(der.first_value(der.normalized(whole)).content)
         tags = tuple(part.tag for part in parts)
         if tags[:1] == (der.OID,):
             return _OID_OF_MESSAGE.get(parts[0].content, "a message in DER")

@@ -161,7 +161,7 @@ def _now() -> bytes:
 def _signer_parts(certificate: x509.Certificate) -> tuple[bytes, bytes]:
     """Return a signer's certificate in DER, and its IssuerAndSerialNumber."""
     whole = certificate.public_bytes(Encoding.DER)
-    parts = der.children(der.first(certificate.tbs_certificate_bytes).content)
+    parts = der.children(der.first_value(certificate.tbs_certificate_bytes).content)
     serial, _, issuer = parts[parts[0].tag == der.CONTEXT_0 :][:3]
     return whole, der.encode(der.SEQUENCE, issuer.whole, serial.whole)
 
@@ -333,7 +333,7 @@ _Part = TypeVar("_Part", bytes, der.Value)
 _Read = TypeVar("_Read")
 
 
-def _remembered(read: Callable[[_Part], _Read]) -> Callable[[_Part], _Read]:
+def _cached(read: Callable[[_Part], _Read]) -> Callable[[_Part], _Read]:
     """Cache the parser's results for short parts, which are equal in all of a keystore's files."""
     remembered = lru_cache(maxsize=64)(read)
 
@@ -375,7 +375,7 @@ def _document(content: bytes) -> bytes:
     return document
 
 
-@_remembered
+@_cached
 def _media_type(header: bytes) -> tuple[bytes, Mapping[bytes, bytes]]:
     """Return the type in a MIME header, in lower case, and its parameters.
 
@@ -460,7 +460,7 @@ def _optional(values: list[der.Value], place: int, tag: int) -> list[der.Value]:
     return [values.pop(place)] if len(values) > place and values[place].tag == tag else []
 
 
-@_remembered
+@_cached
 def _digest_of(identifier: der.Value) -> hashes.HashAlgorithm | None:
     """Return the hash of an AlgorithmIdentifier, whose parameters OpenSSL ignores."""
     oid, *parameters = der.children(identifier.content)
@@ -491,7 +491,7 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     kind, *contained = der.children(encapsulated.content)
     if (kind.tag, kind.content) != (der.OID, _DATA):
         raise ValueError("not a signature of data")
-    inside = [_octets(value) for value in contained]
+    inside = [_octet_string(value) for value in contained]
     if len(inside) > 1 or (content is None and not inside):
         raise ValueError("several contents, or none")
     if content is None:
@@ -513,7 +513,7 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     )
 
 
-def _octets(octet_string: der.Value) -> bytes:
+def _octet_string(octet_string: der.Value) -> bytes:
     (octets,) = _parts(octet_string, der.OCTET_STRING)
     if octet_string.tag != der.CONTEXT_0:
         raise ValueError("no content")
@@ -548,7 +548,7 @@ def _signature(signer: der.Value) -> Signature:
     )
 
 
-@_remembered
+@_cached
 def _issuer_and_serial(identifier: der.Value) -> tuple[tuple[bytes, ...], int]:
     issuer, serial = _parts(identifier, der.SEQUENCE, der.INTEGER)
     read_name_der(issuer.whole)

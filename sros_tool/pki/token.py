@@ -135,7 +135,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         try:
             raw = self._private.sign(digest, mechanism=pkcs11.Mechanism.ECDSA)
         except (pkcs11.PKCS11Error, RuntimeError, OSError) as error:  # it was taken out
-            raise _unusable(self.place, error) from error
+            raise _unusable_token_error(self.place, error) from error
         half = len(raw) // 2
         return encode_dss_signature(
             int.from_bytes(raw[:half], "big"), int.from_bytes(raw[half:], "big")
@@ -185,17 +185,17 @@ def holds_token_key(uri: str, secrets: Secrets, *, named: bool) -> bool:
         UsageError: the URI is not valid, or its library must not be loaded.
         PkiError: the token cannot be used.
     """
-    return _holds(_usable_uri(uri, named=named), secrets)
+    return _holds_key(_usable_uri(uri, named=named), secrets)
 
 
-def _holds(parsed: TokenUri, secrets: Secrets) -> bool:
+def _holds_key(parsed: TokenUri, secrets: Secrets) -> bool:
     import pkcs11
 
     try:
         session = _session(parsed, secrets, write=False)
         return any(True for _ in session.get_objects({pkcs11.Attribute.LABEL: parsed.object}))
     except (pkcs11.PKCS11Error, RuntimeError, OSError) as error:
-        raise _unusable(parsed, error) from error
+        raise _unusable_token_error(parsed, error) from error
 
 
 def open_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
@@ -222,8 +222,8 @@ def make_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
         UsageError: no library is named.
         PkiError: the token cannot be used.
     """
-    usable = _usable(place, named=True)
-    return _open(usable, secrets, create=not _holds(usable, secrets))
+    usable = _with_library(place, named=True)
+    return _open(usable, secrets, create=not _holds_key(usable, secrets))
 
 
 def open_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
@@ -233,7 +233,7 @@ def open_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
         UsageError: no library is named.
         PkiError: the token cannot be used.
     """
-    return _open(_usable(place, named=False), secrets, create=False)
+    return _open(_with_library(place, named=False), secrets, create=False)
 
 
 def planned_key(place: TokenUri) -> TokenKey:
@@ -242,10 +242,10 @@ def planned_key(place: TokenUri) -> TokenKey:
 
 
 def _usable_uri(uri: str, *, named: bool) -> TokenUri:
-    return _usable(parse_token_uri(uri), named=named)
+    return _with_library(parse_token_uri(uri), named=named)
 
 
-def _usable(parsed: TokenUri, *, named: bool) -> TokenUri:
+def _with_library(parsed: TokenUri, *, named: bool) -> TokenUri:
     """Return the URI with the path of its library.
 
     Raises:
@@ -280,7 +280,7 @@ def _open(parsed: TokenUri, secrets: Secrets, *, create: bool) -> TokenKey:
             "Name a key of the token in the PKCS#11 URI (object=LABEL).",
         ) from error
     except (pkcs11.PKCS11Error, RuntimeError, OSError) as error:
-        raise _unusable(parsed, error) from error
+        raise _unusable_token_error(parsed, error) from error
     if not isinstance(loaded, ec.EllipticCurvePublicKey) or loaded.curve.name != "secp256r1":
         raise PkiError(
             f"the key {parsed.object!r} on the token {parsed.token!r} is not an EC prime256v1 key",
@@ -290,7 +290,7 @@ def _open(parsed: TokenUri, secrets: Secrets, *, create: bool) -> TokenKey:
     return TokenKey(private, loaded, parsed)
 
 
-def _unusable(parsed: TokenUri, error: Exception) -> PkiError:
+def _unusable_token_error(parsed: TokenUri, error: Exception) -> PkiError:
     return PkiError(
         f"the token {parsed.token!r} cannot be used",
         f"{type(error).__name__}{f': {error}' if str(error) else ''} ({parsed.module}).",

@@ -71,7 +71,7 @@ class TolerantName:
     def rdns(self) -> list[list[_Part]]:
         """The parts of the name (RDNs), a list of attributes each."""
         rdns = []
-        for rdn in der.children(der.first(self._data).content):
+        for rdn in der.children(der.first_value(self._data).content):
             pairs = [der.children(attribute.content) for attribute in der.children(rdn.content)]
             rdns.append(
                 [
@@ -109,7 +109,7 @@ class _Signed:
 
     def __init__(self, data: bytes) -> None:
         self._data = data
-        parts = _sequence(der.first(der.normalized(data)))
+        parts = _sequence(der.first_value(der.normalized(data)))
         signed, algorithm, signature = parts
         if signature.tag != der.BIT_STRING or not signature.content or signature.content[0] > 7:
             raise ValueError("its signature is not a BIT STRING")
@@ -172,7 +172,7 @@ class _TolerantCertificate(_Signed):
         parts = self._parts
         number = 0
         if parts[0].tag == der.CONTEXT_0:
-            number = der.integer(der.first(parts.pop(0).content))
+            number = der.integer(der.first_value(parts.pop(0).content))
         self.version = x509.Version.v1 if number == 0 else x509.Version.v3
         self.number = number + 1
         serial, _, issuer, validity, subject, key, *rest = parts
@@ -189,7 +189,7 @@ class _TolerantCertificate(_Signed):
         self._key = _public_key(key.whole)
         while rest and rest[0].tag in _UNIQUE_IDENTIFIERS:
             rest.pop(0)
-        values = _sequence(der.first(rest.pop(0).content)) if rest else []
+        values = _sequence(der.first_value(rest.pop(0).content)) if rest else []
         if rest:
             raise ValueError("its signed part has extra fields that a certificate does not have")
         self.extensions = _read(values, _in_certificate, _LOOSE_OF_CERTIFICATES)
@@ -232,7 +232,7 @@ class _TolerantList(_Signed):
         self.last_update_utc = dates[0]
         self.next_update_utc = dates[1] if len(dates) == 2 else None
         entries = _sequence(rest.pop(0)) if rest and rest[0].tag == der.SEQUENCE else []
-        values = _sequence(der.first(rest.pop(0).content)) if rest else []
+        values = _sequence(der.first_value(rest.pop(0).content)) if rest else []
         if rest:
             raise ValueError(
                 "its signed part has extra fields that a revocation list does not have"
@@ -601,7 +601,7 @@ def _basic_constraints(content: bytes) -> _LooseConstraints:
 
 
 def _key_usage(content: bytes) -> x509.KeyUsage:
-    value = der.first(content)
+    value = der.first_value(content)
     if value.tag != der.BIT_STRING or not value.content or value.content[0] > 7:
         raise ValueError("not a BIT STRING")
     bits = "".join(f"{octet:08b}" for octet in value.content[1:])
@@ -696,14 +696,14 @@ def _point(content: bytes) -> x509.ExtensionType | None:
 
 
 def _reason(content: bytes) -> x509.CRLReason:
-    value = der.first(content)
+    value = der.first_value(content)
     if value.tag != _ENUMERATED or not value.content:
         raise ValueError("not a reason")
     return x509.CRLReason(x509.ReasonFlags.unspecified)
 
 
 def _inside(content: bytes) -> list[der.Value]:
-    value = der.first(content)
+    value = der.first_value(content)
     if value.tag != der.SEQUENCE:
         raise ValueError("not a SEQUENCE")
     return der.children(value.content)

@@ -134,7 +134,7 @@ class Includer:
             self.use_content(file, read(file))
         self._bytes += self._sizes[file]
         if self._bytes > _MAX_BYTES:
-            raise _too_large(f"'{file}'", f"{_MAX_BYTES // 1024**2} MiB")
+            raise _too_large_error(f"'{file}'", f"{_MAX_BYTES // 1024**2} MiB")
         return self._documents[file]
 
     def use_content(self, file: Path, content: bytes) -> None:
@@ -206,7 +206,7 @@ class Includer:
                 continue
             self._elements += 1
             if self._elements > _MAX_ELEMENTS:
-                raise _too_large(_line(child, place), f"{_MAX_ELEMENTS} elements")
+                raise _too_large_error(_line(child, place), f"{_MAX_ELEMENTS} elements")
             yield child, place
 
     def _included(
@@ -286,7 +286,7 @@ class Includer:
         for depth, step in enumerate(steps):
             if depth:
                 found = (child for parent in found for child in self.children(*parent))
-            found = [child for child in found if _fits(child[0], step)]
+            found = [child for child in found if _matches_step(child[0], step)]
         if not found:
             raise PolicyError(
                 f"{where}: the xpointer {_short(pointer)} selects nothing",
@@ -338,7 +338,7 @@ def _check_instructions(root: etree._Element, file: Path) -> None:
             )
 
 
-def _fits(element: etree._Element, step: re.Match[str]) -> bool:
+def _matches_step(element: etree._Element, step: re.Match[str]) -> bool:
     if step["tag"] not in ("*", element.tag):
         return False
     value = element.get(step["attribute"]) if step["attribute"] else ""
@@ -353,7 +353,7 @@ def _short(text: str) -> str:
     return repr(text if len(text) <= 80 else f"{text[:80]}...")
 
 
-def _too_large(where: str, limit: str) -> PolicyError:
+def _too_large_error(where: str, limit: str) -> PolicyError:
     return PolicyError(
         f"{where}: the policy and its includes are too large",
         f"They have more than {limit}; a file counts each time it is included.",
@@ -435,8 +435,8 @@ class _Reader:
 
     def policy(self) -> Policy:
         root, place = self._root()
-        where = self._where(root, place)
-        self._attributes(root, place, required=("version",))
+        where = self._place_text(root, place)
+        self._check_attributes(root, place, required=("version",))
         version = root.get("version", "")
         if not _VERSION.match(version):
             raise PolicyError(
@@ -444,16 +444,16 @@ class _Reader:
                 f"sros reads version {VERSION} of the SROS2 policy format. {_EARLIER}"
                 if version == "0.1.0"
                 else f"sros reads version {VERSION} of the SROS2 policy format.",
-                self._how_to_convert()
+                self._conversion_remedy()
                 if version == "0.1.0"
                 else f'If the policy has that format, write version="{VERSION}".',
             )
-        blocks = self._children(root, place)
+        blocks = self._read_children(root, place)
         if len(blocks) == 1 and blocks[0][0].tag in _EARLIER_BLOCKS:
             raise PolicyError(
                 f"{where}: the policy has <{blocks[0][0].tag}> in place of <enclaves>",
                 f"That is an earlier format than the version {version} that the policy names.",
-                self._how_to_convert(),
+                self._conversion_remedy(),
             )
         blocks = [self._expect(child, at, "enclaves") for child, at in blocks]
         if len(blocks) != 1:
@@ -470,11 +470,13 @@ class _Reader:
                 remedy = "It is a fragment for other policies to include."
             elif root.tag in _EARLIER_ROOTS:
                 why += f" {_EARLIER}"
-                remedy = self._how_to_convert()
-            raise PolicyError(f"{self._where(root, place)}: the file is not a policy", why, remedy)
+                remedy = self._conversion_remedy()
+            raise PolicyError(
+                f"{self._place_text(root, place)}: the file is not a policy", why, remedy
+            )
         return root, place
 
-    def _how_to_convert(self) -> str:
+    def _conversion_remedy(self) -> str:
         shown = str(self._shown)
         new = self._shown.with_name(f"{self._shown.stem}.policy.xml")
         return f"Convert it with `sros policies --convert {quote(shown)} -o {quote(str(new))}`."
@@ -484,8 +486,8 @@ class _Reader:
     ) -> Policy:
         """Return the policy whose enclaves are the children of ``element``, named ``tag``."""
         enclaves: dict[str, Enclave] = {}
-        for child, at in self._children(element, place):
-            enclave = self._enclave(*self._expect(child, at, tag))
+        for child, at in self._read_children(element, place):
+            enclave = self._read_enclave(*self._expect(child, at, tag))
             if enclave.path in enclaves:
                 raise PolicyError(
                     f"{enclave.source}: the enclave {enclave.path} is defined twice",
@@ -503,25 +505,25 @@ class _Reader:
         read = tuple(replace(enclave, digest=digest) for enclave in enclaves.values())
         return Policy(read, version, str(self._shown), tuple(self._includer.fallbacks))
 
-    def _enclave(self, element: etree._Element, place: IncludedFile) -> Enclave:
-        self._attributes(element, place, required=("path",))
+    def _read_enclave(self, element: etree._Element, place: IncludedFile) -> Enclave:
+        self._check_attributes(element, place, required=("path",))
         path = element.get("path", "")
         self._owner = self._parts(path, element, place) or ()
         try:
             check_enclave_name(sample(self._owner) if self._owner else path)
         except InvalidNameError as error:
-            raise self._invalid(error, path, "enclave name", element, place) from error
+            raise self._invalid_name_error(error, path, "enclave name", element, place) from error
         blocks = tuple(
-            self._profiles(*self._expect(child, at, "profiles"))
-            for child, at in self._children(element, place)
+            self._read_profiles(*self._expect(child, at, "profiles"))
+            for child, at in self._read_children(element, place)
         )
         if not blocks:
             raise PolicyError(
-                f"{self._where(element, place)}: the enclave {path} has no <profiles>"
+                f"{self._place_text(element, place)}: the enclave {path} has no <profiles>"
             )
-        return Enclave(path, blocks, self._source(element, place))
+        return Enclave(path, blocks, self._source_of(element, place))
 
-    def _invalid(
+    def _invalid_name_error(
         self,
         error: InvalidNameError,
         written: str,
@@ -533,7 +535,7 @@ class _Reader:
 
         ``label`` is "enclave name" or "namespace".
         """
-        where = self._where(element, place)
+        where = self._place_text(element, place)
         if not has_placeholder(written):
             return PolicyError(f"{where}: {error.what}", error.why, error.remedy)
         remedy = ""
@@ -542,57 +544,61 @@ class _Reader:
             remedy = f"Write {' or '.join(map(_short, (*own, f'/{written}')))}."
         return PolicyError(f"{where}: {_short(written)} is not a valid {label}", error.why, remedy)
 
-    def _profiles(self, element: etree._Element, place: IncludedFile) -> Profiles:
-        self._attributes(element, place, optional=("type",))
+    def _read_profiles(self, element: etree._Element, place: IncludedFile) -> Profiles:
+        self._check_attributes(element, place, optional=("type",))
         profiles: list[Profile] = []
         metadata = ""
-        for child, at in self._children(element, place):
+        for child, at in self._read_children(element, place):
             if metadata:
-                raise PolicyError(f"{self._where(child, at)}: nothing may follow <metadata>")
+                raise PolicyError(f"{self._place_text(child, at)}: nothing may follow <metadata>")
             if child.tag == "metadata":
                 etree.strip_tags(child, etree.ProcessingInstruction)
                 metadata = etree.tostring(child, encoding="unicode", with_tail=False)
             else:
-                profiles += _absolute(self._profile(*self._expect(child, at, "profile")))
+                profiles += _absolute(self._read_profile(*self._expect(child, at, "profile")))
         if not profiles:
-            raise PolicyError(f"{self._where(element, place)}: <profiles> contains no <profile>")
+            raise PolicyError(
+                f"{self._place_text(element, place)}: <profiles> contains no <profile>"
+            )
         return Profiles(tuple(profiles), element.get("type", ""), metadata)
 
-    def _profile(self, element: etree._Element, place: IncludedFile) -> Profile:
-        self._attributes(element, place, required=("ns", "node"))
+    def _read_profile(self, element: etree._Element, place: IncludedFile) -> Profile:
+        self._check_attributes(element, place, required=("ns", "node"))
         node, ns = element.get("node", ""), element.get("ns", "")
         sampled = self._sample(node, element, place, several=False)
         try:
             found = check_namespace(self._sample(ns, element, place, several=False))
             ns = ns.removesuffix("/") if has_placeholder(ns) else found
         except InvalidNameError as error:
-            raise self._invalid(error, ns, "namespace", element, place) from error
+            raise self._invalid_name_error(error, ns, "namespace", element, place) from error
         if sampled and ("/" in sampled or "~" in sampled or expression_problem(sampled)):
             raise PolicyError(
-                f"{self._where(element, place)}: {_short(node)} is not a valid node name",
+                f"{self._place_text(element, place)}: {_short(node)} is not a valid node name",
                 expression_problem(sampled)
                 or "A node name has no '/' and no '~'; its namespace goes into ns=.",
             )
         groups = tuple(
             group
-            for child, at in self._children(element, place)
-            for group in self._groups(child, at, node)
+            for child, at in self._read_children(element, place)
+            for group in self._read_groups(child, at, node)
         )
-        return Profile(ns, node, groups, self._source(element, place))
+        return Profile(ns, node, groups, self._source_of(element, place))
 
-    def _groups(self, element: etree._Element, place: IncludedFile, node: str) -> Iterator[Group]:
+    def _read_groups(
+        self, element: etree._Element, place: IncludedFile, node: str
+    ) -> Iterator[Group]:
         """Yield the names of a group, split into groups with the same protection."""
         kind = tag_of(element)
         if kind not in RIGHTS:
             raise PolicyError(
-                f"{self._where(element, place)}: <profile> cannot contain <{kind}>",
+                f"{self._place_text(element, place)}: <profile> cannot contain <{kind}>",
                 f"It can contain only {', '.join(f'<{word}>' for word in RIGHTS)}.",
                 f'Write it in <{kind}s {RIGHTS[f"{kind}s"][0]}="ALLOW"> or '
                 f'<{kind}s {RIGHTS[f"{kind}s"][1]}="ALLOW">.'
                 if kind in _ITEMS
                 else "",
             )
-        self._attributes(element, place, optional=RIGHTS[kind])
+        self._check_attributes(element, place, optional=RIGHTS[kind])
         rights = []
         for right in RIGHTS[kind]:
             value = element.get(right)
@@ -600,40 +606,42 @@ class _Reader:
                 continue
             if value not in _QUALIFIERS:
                 raise PolicyError(
-                    f"{self._where(element, place)}: {right}={_short(value)} is not valid",
+                    f"{self._place_text(element, place)}: {right}={_short(value)} is not valid",
                     "A right is ALLOW or DENY.",
-                    f"Write {_allowing(right, value)}.",
+                    f"Write {_meant_attribute(right, value)}.",
                 )
             rights.append((right, _QUALIFIERS[value]))
         if not rights:
             raise PolicyError(
-                f"{self._where(element, place)}: <{kind}> neither allows nor denies anything",
+                f"{self._place_text(element, place)}: <{kind}> neither allows nor denies anything",
                 f"It has neither {'= nor '.join(RIGHTS[kind])}=.",
                 f'Write for example <{kind} {RIGHTS[kind][0]}="ALLOW">, or remove it.',
             )
         item = kind.removesuffix("s")
-        items = self._children(element, place)
+        items = self._read_children(element, place)
         named: dict[Level | None, list[tuple[str, int]]] = {}
         for child, at in items:
             name = self._name(*self._expect(child, at, item), node)
-            named.setdefault(self._protect(child, at), []).append((name, child.sourceline or 0))
+            named.setdefault(self._read_protection(child, at), []).append(
+                (name, child.sourceline or 0)
+            )
         if not named:
             raise PolicyError(
-                f"{self._where(element, place)}: <{kind}> names no {item}",
+                f"{self._place_text(element, place)}: <{kind}> names no {item}",
                 "",
                 f"Remove the element, or name one: <{item}>NAME</{item}>.",
             )
         whole = all(at.file == place.file for _, at in items)  # names can be included one by one
         for level, found in named.items():
             names, lines = tuple(name for name, _ in found), tuple(line for _, line in found)
-            source = self._source(element, place)
+            source = self._source_of(element, place)
             yield Group(kind, tuple(rights), names, level, source, lines if whole else ())
 
-    def _protect(self, element: etree._Element, place: IncludedFile) -> Level | None:
+    def _read_protection(self, element: etree._Element, place: IncludedFile) -> Level | None:
         """Return the protection level that the policy states for a name, or None."""
         if not len(element):
             return None
-        where = self._where(element, place)
+        where = self._place_text(element, place)
         only = element[0]
         if (
             len(element) > 1
@@ -659,7 +667,7 @@ class _Reader:
         return PROTECT[word]
 
     def _name(self, element: etree._Element, place: IncludedFile, node: str) -> str:
-        name = self._written(element)
+        name = self._written_name(element)
         sampled = self._sample(name, element, place, several=True)
         problem = expression_problem(sampled)
         if not problem and name.startswith("~") and not node:
@@ -667,7 +675,7 @@ class _Reader:
         if not problem and any(isinstance(child.tag, str) for child in element):
             problem = "It contains other elements."
         if problem:
-            where, tag = self._where(element, place), tag_of(element)
+            where, tag = self._place_text(element, place), tag_of(element)
             written = name.strip()
             meant = [written] if written else [str(value) for value in element.attrib.values()]
             valid = [text for text in meant if text != name and not expression_problem(text)]
@@ -678,10 +686,10 @@ class _Reader:
                 if valid or not written
                 else "",
             )
-        self._attributes(element, place)
+        self._check_attributes(element, place)
         return name
 
-    def _written(self, element: etree._Element) -> str:
+    def _written_name(self, element: etree._Element) -> str:
         """Return the text of an element with a name, as it is written."""
         return element.text or ""
 
@@ -710,7 +718,7 @@ class _Reader:
         """
         if not has_placeholder(text):
             return None
-        where = self._where(element, place)
+        where = self._place_text(element, place)
         try:
             parts = parts_of(text)
             if several is None:
@@ -727,13 +735,13 @@ class _Reader:
             NAME_THE_FLEET,
         )
 
-    def _children(
+    def _read_children(
         self, element: etree._Element, place: IncludedFile
     ) -> list[tuple[etree._Element, IncludedFile]]:
         for text in (element.text, *(child.tail for child in element)):
             if text and not text.isspace():
                 raise PolicyError(
-                    f"{self._where(element, place)}: <{tag_of(element)}> contains loose text",
+                    f"{self._place_text(element, place)}: <{tag_of(element)}> contains loose text",
                     f"{text.strip()[:40]!r} is between its elements.",
                 )
         return list(self._includer.children(element, place))
@@ -745,7 +753,7 @@ class _Reader:
             found = tag_of(element)
             elsewhere = f", or move it into <{found}s>" if found in _ITEMS else ""
             raise PolicyError(
-                f"{self._where(element, place)}: <{found}> found, but <{tag}> expected",
+                f"{self._place_text(element, place)}: <{found}> found, but <{tag}> expected",
                 "",
                 f"Write <{tag}> in its place{elsewhere}."
                 if tag in _ITEMS
@@ -753,7 +761,7 @@ class _Reader:
             )
         return element, place
 
-    def _attributes(
+    def _check_attributes(
         self,
         element: etree._Element,
         place: IncludedFile,
@@ -768,7 +776,7 @@ class _Reader:
                 and name not in optional
                 and not name.startswith(_XML_ATTRIBUTES)
             ):
-                where = self._where(element, place)
+                where = self._place_text(element, place)
                 known = ", ".join(f"{word}=" for word in (*required, *optional))
                 raise PolicyError(
                     f"{where}: <{tag_of(element)}> has no attribute {_short(name)}",
@@ -778,21 +786,21 @@ class _Reader:
         for name in required:
             if name not in present:
                 raise PolicyError(
-                    f"{self._where(element, place)}: <{tag_of(element)}> lacks its {name}=",
+                    f"{self._place_text(element, place)}: <{tag_of(element)}> lacks its {name}=",
                     "",
                     f"Write {_REQUIRED[name]}.",
                 )
 
-    def _source(self, element: etree._Element, place: IncludedFile) -> Source:
+    def _source_of(self, element: etree._Element, place: IncludedFile) -> Source:
         file = place.file
         shown = str(self._shown) if file == self._file else str(file)
         return Source(shown, element.sourceline or 0)
 
-    def _where(self, element: etree._Element, place: IncludedFile) -> str:
-        return str(self._source(element, place))
+    def _place_text(self, element: etree._Element, place: IncludedFile) -> str:
+        return str(self._source_of(element, place))
 
 
-def _allowing(right: str, value: str) -> str:
+def _meant_attribute(right: str, value: str) -> str:
     """Return the attribute that is meant where ``value`` is neither ALLOW nor DENY."""
     meant = value.strip().upper()
     words = [meant] if meant in _QUALIFIERS else list(_QUALIFIERS)
@@ -939,7 +947,7 @@ def with_node_rights(policy: Policy, folder: Path) -> Policy:
     """
     needed = read_policy(folder / "node.xml", _ONE_NODE.encode()).enclaves[0].all_profiles()[0]
 
-    def completed(profile: Profile) -> Profile:
+    def completed_profile(profile: Profile) -> Profile:
         present = {
             (right, expand(name, profile.ns, profile.node))
             for group in profile.groups
@@ -959,7 +967,7 @@ def with_node_rights(policy: Policy, folder: Path) -> Policy:
                 added.append(Group(group.kind, group.rights, lacking, group.protect))
         return replace(profile, groups=(*profile.groups, *added))
 
-    return with_profiles(policy, completed)
+    return with_profiles(policy, completed_profile)
 
 
 class _EarlierReader(_Reader):
@@ -973,13 +981,13 @@ class _EarlierReader(_Reader):
 
     def converted(self) -> ConvertedPolicy:
         root, place = self._root()
-        where = self._where(root, place)
+        where = self._place_text(root, place)
         if root.tag in _EARLIER_ROOTS:
             version, blocks = "", [(root, place)]
         else:
-            self._attributes(root, place, optional=("version",))
+            self._check_attributes(root, place, optional=("version",))
             version = root.get("version", "")
-            blocks = self._children(root, place)
+            blocks = self._read_children(root, place)
         tags = [tag_of(child) for child, _ in blocks]
         if _VERSION.match(version) and tags == ["enclaves"]:
             raise PolicyError(
@@ -1003,10 +1011,10 @@ class _EarlierReader(_Reader):
     def _enclaves_of_nodes(
         self, element: etree._Element, place: IncludedFile, left_out: list[Note]
     ) -> dict[str, Enclave]:
-        self._attributes(element, place, optional=("type",))
+        self._check_attributes(element, place, optional=("type",))
         enclaves: dict[str, Enclave] = {}
-        for child, at in self._children(element, place):
-            profile = self._profile(*self._expect(child, at, "profile"))
+        for child, at in self._read_children(element, place):
+            profile = self._read_profile(*self._expect(child, at, "profile"))
             name = expand(profile.node, profile.ns, "")
             why = ""
             try:
@@ -1043,8 +1051,8 @@ class _EarlierReader(_Reader):
                 text = f"{enclave.source}: {enclave.path} has no right at all, as before."
                 yield Note("convert.no-right", text)
 
-    def _written(self, element: etree._Element) -> str:
-        text = super()._written(element)
+    def _written_name(self, element: etree._Element) -> str:
+        text = super()._written_name(element)
         if len(text) < 2 or text[0] != "~" or text[1] == "/":
             return text
         self._private.append(text)

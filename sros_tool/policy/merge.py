@@ -31,7 +31,7 @@ from sros_tool.policy.model import (
     Level,
     Policy,
     Qualifier,
-    instances,
+    nodes_in_several_namespaces,
     stated_protections,
 )
 from sros_tool.policy.rights import (
@@ -40,7 +40,7 @@ from sros_tool.policy.rights import (
     Right,
     Rules,
     folded,
-    groupable,
+    group_rights,
     order,
     policy_rights,
 )
@@ -144,11 +144,11 @@ class _Planner:
         if right.qualifier is DENY:
             if self._file.cover(right):
                 return False
-            for allowed in folded(self._file.meeting(right._replace(qualifier=ALLOW))):
+            for allowed in folded(self._file.overlapping(right._replace(qualifier=ALLOW))):
                 self._contradictions.append(Contradiction(right, allowed, True))
             return True
         denial = right._replace(qualifier=DENY)
-        for denied in folded(self._file.meeting(denial)):
+        for denied in folded(self._file.overlapping(denial)):
             if not self._asked.cover(denied):  # otherwise both sides state this denial
                 self._contradictions.append(Contradiction(denied, right, False))
         return not (self._file.cover(right) or self._file.cover(denial))
@@ -165,7 +165,7 @@ class _Name:
 
 def _entries(found: dict[tuple[str, str], _Name]) -> Iterable[AddedName]:
     for (kind, _), name in found.items():
-        for qualifiers in groupable(name.rights):
+        for qualifiers in group_rights(name.rights):
             yield AddedName(kind, name.written, qualifiers, name.protect)
 
 
@@ -251,13 +251,15 @@ class EditedText:
         except (UnicodeError, LookupError):
             faithful = False
         if not faithful:
-            raise self._unsuitable(f"Its encoding {self._encoding} cannot be kept exactly.")
+            raise self._unsuitable_file_error(
+                f"Its encoding {self._encoding} cannot be kept exactly."
+            )
         self.root = self._elements(root)
         self.newline = "\r\n" if "\r\n" in self.text else "\n"
         self.unit = self._unit()
         self._edits: list[tuple[int, int, str]] = []
 
-    def _unsuitable(self, why: str) -> PolicyError:
+    def _unsuitable_file_error(self, why: str) -> PolicyError:
         return PolicyError(
             f"{self._name} cannot be edited in place",
             why,
@@ -276,7 +278,9 @@ class EditedText:
             elif mark["open"]:
                 node = next(nodes, None)
                 if node is None or etree.QName(node).localname != mark["open"].split(":")[-1]:
-                    raise self._unsuitable(f"<{mark['open']}> is not at the expected position.")
+                    raise self._unsuitable_file_error(
+                        f"<{mark['open']}> is not at the expected position."
+                    )
                 end = mark.end()
                 element = PlacedElement(node, mark.start(), end, end, end)
                 if stack:
@@ -285,7 +289,7 @@ class EditedText:
                 if not mark["empty"]:
                     stack.append(element)
         if top is None or stack or next(nodes, None) is not None:
-            raise self._unsuitable("Its elements are not at the expected positions.")
+            raise self._unsuitable_file_error("Its elements are not at the expected positions.")
         return top
 
     # ── layout of the text ────────────────────────────────────────────────────────────────
@@ -406,15 +410,15 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
         contradictions += plan.contradictions
         if plan.added:
             document = _Editor(document, path, before).add(plan.entries)
-            before = _proven(path, document, before, plan.added)
+            before = _checked_policy(path, document, before, plan.added)
             added += plan.added
         _check_protection(path, before, additions)
-    already = instances(first.enclaves)
+    already = nodes_in_several_namespaces(first.enclaves)
     several = (
         f"{enclave} has the node {node} in {first_few([profile.ns for profile in profiles], 3)}: "
         "each process in this enclave has the rights of all of them. Put the namespace into path=, "
         "too, to give each instance an enclave of its own."
-        for (enclave, node), profiles in instances(before.enclaves).items()
+        for (enclave, node), profiles in nodes_in_several_namespaces(before.enclaves).items()
         if already.get((enclave, node), ()) != profiles
     )
     shared = tuple(_shared_enclaves(first, policies, before))
@@ -449,7 +453,7 @@ def _nodes_text(nodes: Sequence[str]) -> str:
     return f"the node{'s' * (len(nodes) > 1)} {first_few(nodes, _SHOWN)}"
 
 
-def _proven(path: Path, document: bytes, before: Policy, added: Sequence[Right]) -> Policy:
+def _checked_policy(path: Path, document: bytes, before: Policy, added: Sequence[Right]) -> Policy:
     """Return the policy in ``document``; raise unless its rights are ``before`` plus ``added``."""
     try:
         after = read_policy(path, document)

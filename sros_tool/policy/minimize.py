@@ -38,7 +38,7 @@ from sros_tool.policy.rights import (
     Right,
     Rules,
     folded,
-    groupable,
+    group_rights,
     order,
     parts,
     policy_rights,
@@ -165,7 +165,7 @@ def _protected_as_before(before: Policy, after: Policy) -> Policy:
     names = {kind: Names(sorted(found)) for kind, found in left.items()}
     levels: dict[tuple[str, str], Level] = {}
     for kind, name, level in sorted(gone):
-        met = list(names[kind].meeting(name)) if kind in names else []
+        met = list(names[kind].overlapping(name)) if kind in names else []
         # A wildcard of others gets it only if nobody has the right to the name itself.
         for each in [e for e in met if covers(name, e)] or met:
             levels[kind, each] = max(level, levels.get((kind, each), level), key=list(Level).index)
@@ -197,7 +197,7 @@ class _KnownNames:
         """Return the known names of a kind (topics, services or actions)."""
         return self._names.get(kind, ())
 
-    def matched(self, kind: str, expression: str) -> Iterator[str]:
+    def matching_names(self, kind: str, expression: str) -> Iterator[str]:
         """Yield the known names that a wildcard matches."""
         names, prefix = self.of(kind), literal_prefix(expression)
         for name in names[bisect_left(names, prefix) :]:
@@ -241,15 +241,15 @@ class _Narrowing:
         """Return whether the enclave allows a right, or a part of the right's wildcard."""
         if self._is_allowed(part):
             return True
-        return is_expression(part.name) and self._rules.meet(part)
+        return is_expression(part.name) and self._rules.overlaps(part)
 
     def _is_observed(self, rule: Right) -> bool:
-        return self._use.meet(rule)
+        return self._use.overlaps(rule)
 
     def result(self) -> tuple[Enclave, EnclaveUse]:
         if not self._observed:
             return self._enclave, self._use_of({*self._stated}, ())
-        kept = {right for right in self._stated if self._stays(right)}
+        kept = {right for right in self._stated if self._is_unchanged(right)}
         wide = self._narrowed(kept)
         self._prove([*kept, *(right for wildcard in wide for right in wildcard.replacement)])
         replacements = {wildcard.rule: wildcard.replacement for wildcard in wide}
@@ -277,7 +277,7 @@ class _Narrowing:
 
     # ── rules that stay, and replacements of wildcards ─────────────────────────────────────
 
-    def _stays(self, rule: Right) -> bool:
+    def _is_unchanged(self, rule: Right) -> bool:
         """Return whether a rule stays unchanged: it is common, or was observed as written."""
         if rule in self._common:
             return True
@@ -287,7 +287,7 @@ class _Narrowing:
             is_expression(seen.name)
             and (seen.name == part.name or not covers(part.name, seen.name))
             for part in parts(rule)
-            for seen in self._use.meeting(part)
+            for seen in self._use.overlapping(part)
         )
 
     def _narrowed(self, kept_rights: set[Right]) -> tuple[WideRule, ...]:
@@ -301,19 +301,19 @@ class _Narrowing:
                 owners[part].append(rule)
         rules = Rules(wide)
 
-        def homes(right: Right) -> list[Right]:
-            met = [rule for part in rules.meeting(right) for rule in owners[part]]
+        def rules_that_state(right: Right) -> list[Right]:
+            met = [rule for part in rules.overlapping(right) for rule in owners[part]]
             return sorted(dict.fromkeys(met), key=lambda rule: rule.right != right.right)
 
         used: dict[Right, list[Right]] = defaultdict(list)
         for right in folded(self._in_use):
-            for rule in homes(right):
+            for rule in rules_that_state(right):
                 used[rule].append(right)
         others = Rules(kept_rights)
         needed = unfolded((*self._in_use, *self._common))
         replacement: dict[Right, list[Right]] = defaultdict(list)
         for right in folded(p for p in needed if self._is_allowed(p) and not others.cover(p)):
-            replacement[homes(right)[0]].append(right)
+            replacement[rules_that_state(right)[0]].append(right)
         return tuple(
             WideRule(
                 rule,
@@ -346,7 +346,7 @@ class _Narrowing:
         for right in rights:
             if is_expression(right.name):
                 wild = True
-                matched = self._names.matched(right.kind, right.name)
+                matched = self._names.matching_names(right.kind, right.name)
                 found.update((right.right, name) for name in matched)
             else:
                 found.add((right.right, right.name))
@@ -357,7 +357,9 @@ class _Narrowing:
         if not self._denied:
             return found
         return {
-            pair for pair in found if not self._rules.meet(Right(self._enclave.path, DENY, *pair))
+            pair
+            for pair in found
+            if not self._rules.overlaps(Right(self._enclave.path, DENY, *pair))
         }
 
     def _with_actions(self, found: set[_Pair], rules: Rules) -> set[_Pair]:
@@ -417,7 +419,7 @@ def _profile(
                     said.setdefault((each.kind, written, level), {})[each.right, ALLOW] = None
     groups: dict[tuple[str, GroupRights, Level | None], list[str]] = {}
     for (kind, name, level), rights in said.items():
-        for together in groupable(rights):
+        for together in group_rights(rights):
             groups.setdefault((kind, together, level), []).append(name)
     return replace(
         profile,
@@ -511,12 +513,12 @@ def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
     found: dict[Right, list[Right]] = defaultdict(list)
     for right in rights:
         if right.name.startswith("/") and not is_expression(right.name):
-            for expression in set(_wider(right.name)):
+            for expression in set(_wider_names(right.name)):
                 found[right._replace(name=expression)].append(right)
     return {rule: names for rule, names in found.items() if len(names) >= _FEWEST}
 
 
-def _wider(name: str) -> Iterator[str]:
+def _wider_names(name: str) -> Iterator[str]:
     """Yield wildcards that match a name: ``*`` after a namespace (not "/"), or for numbers."""
     tokens = name.split("/")[1:-1]
     for depth in range(1, len(tokens) + 1):

@@ -126,20 +126,24 @@ def in_namespace(policy: Policy, namespace: str) -> Policy:
     Names that are written with a ``/`` at their beginning stay.
     """
 
-    def below(path: str) -> str:
+    def path_below_namespace(path: str) -> str:
         return f"{namespace.rstrip('/')}/{path.lstrip('/')}".rstrip("/") or "/"
 
     enclaves = (
         replace(
-            enclave.with_profiles(lambda profile: replace(profile, ns=below(profile.ns))),
-            path=below(enclave.path),
+            enclave.with_profiles(
+                lambda profile: replace(profile, ns=path_below_namespace(profile.ns))
+            ),
+            path=path_below_namespace(enclave.path),
         )
         for enclave in policy.enclaves
     )
     return replace(policy, enclaves=tuple(enclaves))
 
 
-def instances(enclaves: Iterable[Enclave]) -> dict[tuple[str, str], tuple[Profile, ...]]:
+def nodes_in_several_namespaces(
+    enclaves: Iterable[Enclave],
+) -> dict[tuple[str, str], tuple[Profile, ...]]:
     """Map each enclave and node that has several namespaces to its profiles, one of each namespace.
 
     Nodes whose names have wildcards are left out.  An enclave may occur several times.

@@ -6,7 +6,7 @@ as the DDS vendors match.
 
 `overlap` and `covers` compare two expressions, `Names` searches many.  `common_name` compares any
 number, also with exceptions, and returns an example; it only considers valid absolute ROS names.
-`listed` writes an expression as several without ``?`` and sets of characters.
+`listed_expressions` writes an expression as several without ``?`` and sets of characters.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ class _Form:
         if piece not in self._covering:
             every = ~0
             for letter in piece:
-                every &= self._at(letter)
+                every &= self._bit_of_letter(letter)
             self._covering[piece] = every & (1 << len(self.pieces)) - 1 & ~self.stars
         return self._covering[piece]
 
@@ -163,11 +163,11 @@ class _Form:
         if piece not in self._meeting:
             positions = 0
             for letter in piece:
-                positions |= self._at(letter)
+                positions |= self._bit_of_letter(letter)
             self._meeting[piece] = positions
         return self._meeting[piece]
 
-    def _at(self, letter: str) -> int:
+    def _bit_of_letter(self, letter: str) -> int:
         if letter not in self._letters:
             self._letters[letter] = sum(
                 1 << i for i, piece in enumerate(self.pieces) if letter in piece
@@ -191,7 +191,7 @@ def _pieces(expression: str) -> _Pieces:
     for piece in _PIECE.finditer(expression):
         negated, members, literal = piece.groups()
         if literal is not None:
-            found.append(_one(literal))
+            found.append(_single_letter(literal))
         elif members is not None:
             chosen = _members(members)
             found.append(_ALPHABET - chosen if negated else chosen)
@@ -201,7 +201,7 @@ def _pieces(expression: str) -> _Pieces:
 
 
 @lru_cache(maxsize=_MANY)
-def _one(letter: str) -> frozenset[str]:
+def _single_letter(letter: str) -> frozenset[str]:
     return frozenset(letter)
 
 
@@ -268,28 +268,28 @@ class Names:
     def covering(self, name: str) -> Iterator[str]:
         """Yield the other expressions that cover ``name`` (see `covers`), in set order."""
         for wide in self._cover_candidates(name):
-            if wide != name and self._count_if_not(covers(wide, name), wide, name):
+            if wide != name and self._count_failure(covers(wide, name), wide, name):
                 yield wide
 
     def meets(self, name: str) -> bool:
         """Return whether an expression of the set overlaps with ``name``."""
         if is_expression(name):
             candidates = map(self._names.__getitem__, self._overlap_candidates(name))
-            return any(self._count_if_not(overlap(e, name), e, name) for e in candidates)
+            return any(self._count_failure(overlap(e, name), e, name) for e in candidates)
         return name in self._exact or (bool(self._wild) and any(self.covering(name)))
 
-    def meeting(self, name: str) -> Iterator[str]:
+    def overlapping(self, name: str) -> Iterator[str]:
         """Yield the expressions of the set that overlap with ``name``, in the order of the set."""
         if is_expression(name):
             for expression in map(self._names.__getitem__, sorted(self._overlap_candidates(name))):
-                if self._count_if_not(overlap(expression, name), expression, name):
+                if self._count_failure(overlap(expression, name), expression, name):
                     yield expression
             return
         if name in self._exact:
             yield name
         yield from self.covering(name)
 
-    def _count_if_not(self, fits: bool, one: str, other: str) -> bool:
+    def _count_failure(self, fits: bool, one: str, other: str) -> bool:
         """Return ``fits``; a comparison without result counts against the limit."""
         if not fits:
             self._limit.spend(len(one) + len(other))
@@ -333,7 +333,9 @@ class Names:
         if len(self._names) <= _FEW:
             return range(len(self._names))
         begin, end = literal_prefix(expression), _END.sub("", expression)[::-1]
-        return min(self._by_begin.compatible(begin), self._by_end.compatible(end), key=len)
+        return min(
+            self._by_begin.numbers_of_texts(begin), self._by_end.numbers_of_texts(end), key=len
+        )
 
     @cached_property
     def _by_begin(self) -> _Beginnings:
@@ -366,7 +368,7 @@ class _Beginnings:
                 self._open.setdefault(text, []).append(number)
         self._sizes = sorted({len(text) for text in self._open})
 
-    def compatible(self, begin: str) -> list[int]:
+    def numbers_of_texts(self, begin: str) -> list[int]:
         """Return the numbers of the texts that can begin with ``begin``."""
         first = bisect_left(self._texts, begin)
         numbers = self._numbers[first : bisect_left(self._texts, begin + _LAST, lo=first)]
@@ -467,7 +469,7 @@ class TooManyNames(Exception):  # noqa: N818 - the caller makes an error of it
     """An expression stands for too many names to list."""
 
 
-def listed(expression: str, maximum: int) -> list[str]:
+def listed_expressions(expression: str, maximum: int) -> list[str]:
     """Return expressions whose only wildcard is ``*`` and that match the same ROS names.
 
     A ``?`` is any character of ROS names.

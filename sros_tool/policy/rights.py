@@ -78,7 +78,7 @@ class Right(NamedTuple):
         writes = self.right == "publish"
         return DdsNames((self.name,) if writes else (), () if writes else (self.name,))
 
-    def opposite(self, enclave: str) -> Right:
+    def peer_right(self, enclave: str) -> Right:
         """Return the right that a peer enclave needs, such as subscribe for publish."""
         return self._replace(enclave=enclave, right=OTHER_SIDE[self.right])
 
@@ -101,7 +101,7 @@ GroupRights = tuple[tuple[str, Qualifier], ...]
 """The rights of a group with their qualifiers, in the order of `RIGHTS`."""
 
 
-def groupable(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
+def group_rights(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
     """Yield groups for ``rights`` to one name: two if a right is both allowed and denied."""
     ordered = sorted(rights, key=lambda right: (RIGHT_ORDER[right[0]], right[1]))
     if len({right for right, _ in ordered}) == len(ordered):
@@ -200,23 +200,23 @@ class Rules:
 
     def cover(self, right: Right) -> bool:
         """Return whether the set covers all of ``right``, an ALLOW or a DENY."""
-        return all(self._covering(part) for part in parts(right))
+        return all(self._covering_right(part) for part in parts(right))
 
-    def covering(self, right: Right) -> tuple[Right, ...]:
+    def covering_rights(self, right: Right) -> tuple[Right, ...]:
         """Return the rights that together cover ``right``, or () if it is not covered."""
-        found = [self._covering(part) for part in parts(right)]
+        found = [self._covering_right(part) for part in parts(right)]
         return tuple(dict.fromkeys(each for each in found if each)) if all(found) else ()
 
-    def meet(self, right: Right) -> bool:
+    def overlaps(self, right: Right) -> bool:
         """Return whether a right of the set has a name in common with ``right``."""
-        return any(self._at(part).meets(part.name) for part in parts(right))
+        return any(self._names_at(part).meets(part.name) for part in parts(right))
 
-    def meeting(self, right: Right) -> tuple[Right, ...]:
+    def overlapping(self, right: Right) -> tuple[Right, ...]:
         """Return the rights of the set that have a name in common with ``right``."""
         return tuple(
             Right(*part[:3], name)
             for part in parts(right)
-            for name in self._at(part).meeting(part.name)
+            for name in self._names_at(part).overlapping(part.name)
         )
 
     def allow(self, enclave: str, right: str, name: str) -> bool:
@@ -230,13 +230,13 @@ class Rules:
                 return False
         return True
 
-    def _at(self, part: Right) -> Names:
+    def _names_at(self, part: Right) -> Names:
         return self._names.get(part[:3], _NO_NAMES)
 
-    def _covering(self, part: Right) -> Right | None:
+    def _covering_right(self, part: Right) -> Right | None:
         if part in self._stated:
             return part
-        wide = next(self._at(part).covering(part.name), None)
+        wide = next(self._names_at(part).covering(part.name), None)
         return Right(*part[:3], wide) if wide else None
 
 
@@ -324,7 +324,7 @@ def compare(
     for rights, side in ((only_first, other), (only_second, one)):
         rules = Rules(side if rights else ())
         for right in rights:
-            if by := rules.covering(right):
+            if by := rules.covering_rights(right):
                 covered[right] = tuple(sorted(folded(by), key=order))
     return RightsDifference(only_first, only_second, covered)
 
@@ -436,8 +436,8 @@ def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
         node if covers(without, node) else without: None
         for service, nodes in offering.items()
         for name in denied
-        for without in _before(name, f"/{service}")
-        for node in nodes.meeting(without)
+        for without in _texts_before(name, f"/{service}")
+        for node in nodes.overlapping(without)
     }
     gone = filter(offers_none, candidates)
     return tuple(dict.fromkeys(node for full_name in gone for node in _nodes(full_name)))
@@ -456,7 +456,7 @@ def _full_names(name: str, service: str = "") -> Iterator[str]:
         yield name.removesuffix("/*")
 
 
-def _before(name: str, end: str) -> Iterator[str]:
+def _texts_before(name: str, end: str) -> Iterator[str]:
     """Yield expressions for all texts that, with ``end`` after them, ``name`` matches."""
     if not is_expression(name):
         if name.endswith(end):

@@ -206,7 +206,7 @@ class CommitFiles:
         if entry is None:
             return None
         if entry.mode not in FILES:
-            raise self._no_file(path, entry)
+            raise self._not_a_file_error(path, entry)
         return self._write(path, entry, self.repository.content(entry.id))
 
     def policies(self, path: str, *, placeholders: bool) -> list[Path]:
@@ -224,7 +224,7 @@ class CommitFiles:
         if entry.mode in FILES:
             return [self._policy(path, placeholders)]
         if entry.mode != FOLDER:
-            raise self._no_file(path, entry)
+            raise self._not_a_file_error(path, entry)
         folder = Revision(self.repository, self.name, self.commit, path)
         try:
             return [self._policy(policy.path, placeholders) for policy in folder.policies()]
@@ -242,13 +242,13 @@ class CommitFiles:
         if entry is None:
             return None
         if entry.mode != FOLDER:
-            raise self._no_file(path, entry)
+            raise self._not_a_file_error(path, entry)
         links: dict[str, TreeEntry] = {}
         plain: dict[str, TreeEntry] = {}
         for name, tree_entry in walk(self.repository, entry.id, maximum=_MOST_ENTRIES):
             where = f"{path}/{name}"
             if tree_entry.mode not in (*FILES, LINK):
-                raise self._no_file(where, tree_entry)
+                raise self._not_a_file_error(where, tree_entry)
             (links if tree_entry.mode == LINK else plain)[where] = tree_entry
         of_all = (tree_entry.id for tree_entry in (*plain.values(), *links.values()))
         sizes = self.repository.sizes(dict.fromkeys(of_all))
@@ -289,7 +289,7 @@ class CommitFiles:
         """Return the content of a file of ``files``, from the folder, without asking git again."""
         return (self.folder / path).read_bytes()
 
-    def differing(self, work_tree: Path) -> list[str]:
+    def differing_files(self, work_tree: Path) -> list[str]:
         """Return the files of this snapshot that differ from a work tree, or are missing there."""
         paths = []
         with Folder(work_tree) as folder:
@@ -303,10 +303,10 @@ class CommitFiles:
 
     def _policy(self, path: str, placeholders: bool) -> Path:
         revision = Revision(self.repository, self.name, self.commit, path)
-        place = self._nowhere(path)
+        place = self._place_of_missing(path)
 
         def read(file: Path) -> bytes:
-            where = str(file.relative_to(self._nowhere("")))
+            where = str(file.relative_to(self._place_of_missing("")))
             try:
                 content = revision.read(file)
             except MissingFileError:
@@ -328,7 +328,7 @@ class CommitFiles:
             read_policy(place, placeholders=placeholders, policy_files=read)
         return self.folder / path
 
-    def _nowhere(self, path: str) -> Path:
+    def _place_of_missing(self, path: str) -> Path:
         return Revision(self.repository, self.name, self.commit, path).place
 
     def _write(self, path: str, entry: TreeEntry, content: bytes) -> Path:
@@ -339,7 +339,7 @@ class CommitFiles:
             self.files[path] = entry
         return self.folder / path
 
-    def _no_file(self, path: str, entry: TreeEntry) -> DocumentError:
+    def _not_a_file_error(self, path: str, entry: TreeEntry) -> DocumentError:
         return DocumentError(
             f"'{path}' of {self.name} is {entry.kind}",
             "Links and submodules of a commit are not followed.",

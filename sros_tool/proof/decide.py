@@ -50,7 +50,14 @@ from sros_tool.proof.requirements import (
     RightNames,
     Widest,
 )
-from sros_tool.proof.worlds import Topics, TopicUser, World, named, shortest, valid_topics
+from sros_tool.proof.worlds import (
+    Topics,
+    TopicUser,
+    World,
+    names_of_expression,
+    shortest,
+    valid_topics,
+)
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS
 
 MOST_STEPS = 8_000_000
@@ -161,31 +168,31 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
     limit = limit or SearchLimit()
     match requirement:
         case Only() | Nobody():
-            witness = _not_alone(requirement, world, limit)
+            witness = _witness_against_only(requirement, world, limit)
         case Must():
-            witness = _not_able(requirement, world, limit)
+            witness = _witness_against_must(requirement, world, limit)
         case AtMost():
-            witness = _too_many(requirement, world, limit)
+            witness = _witness_against_at_most(requirement, world, limit)
         case Widest():
-            witness = _too_wide(requirement, world, limit)
+            witness = _witness_against_widest(requirement, world, limit)
         case NothingBut():
-            witness = _more_than(requirement, world, limit)
+            witness = _witness_against_nothing_but(requirement, world, limit)
         case NotBoth():
-            witness = _with_both(requirement, world, limit)
+            witness = _witness_against_not_both(requirement, world, limit)
         case Protected():
-            witness = _unprotected(requirement, world, limit)
+            witness = _witness_against_protected(requirement, world, limit)
         case Apart():
-            witness = _influence(requirement, world, limit)
+            witness = _witness_against_apart(requirement, world, limit)
         case _:
             raise AssertionError(requirement)
     if witness:
         _confirm(requirement, witness, world)
-    empty = tuple(_empty(requirement, world, limit))
-    always = "" if witness or empty else _always(requirement, world)
+    empty = tuple(_empty_list_clauses(requirement, world, limit))
+    always = "" if witness or empty else _why_never_fails(requirement, world)
     assumed = "" if witness else _assumed_protection(requirement, world, limit)
     kept = None
     if isinstance(requirement, Must) and not witness and world.crossing:
-        kept = _kept_from_others(requirement, world, limit)
+        kept = _use_kept_from_others(requirement, world, limit)
     return Verdict(requirement, witness, empty, always, assumed, kept)
 
 
@@ -271,7 +278,7 @@ def _use(enclave: str, right: str, part: _Part, topics: Topics, topic: str) -> U
     return Use(enclave, right, topics.ros_name(topic), topic, part.writes)
 
 
-def _better(use: Use) -> tuple[int, str, str]:
+def _use_order(use: Use) -> tuple[int, str, str]:
     """Return a sort key for uses that puts short names first."""
     return len(use.name), use.name, use.enclave
 
@@ -279,7 +286,9 @@ def _better(use: Use) -> tuple[int, str, str]:
 # ── who may do what ────────────────────────────────────────────────────────────────────────
 
 
-def _not_alone(requirement: Only | Nobody, world: World, limit: SearchLimit) -> Witness | None:
+def _witness_against_only(
+    requirement: Only | Nobody, world: World, limit: SearchLimit
+) -> Witness | None:
     allowed = requirement.enclaves if isinstance(requirement, Only) else ()
     return _first_of(_uses_of_rights(requirement.rights, world, limit, allowed))
 
@@ -291,7 +300,7 @@ def _uses_of_rights(
     left_out = _matching_enclaves(excluded, world.enclaves)
     uses: defaultdict[str, list[Use]] = defaultdict(list)
     for right, part, topics in _topics_of_rights(rights):
-        for met in world.side(part.writes).meeting(topics, limit):
+        for met in world.side(part.writes).users_of_topics(topics, limit):
             if met.enclave in left_out:
                 continue
             if topic := world.use(met, topics, limit):
@@ -303,16 +312,18 @@ def _first_of(uses: Mapping[str, Sequence[Use]]) -> Witness | None:
     """Return the shortest use as a witness, with a use of every other enclave."""
     if not uses:
         return None
-    best = min((use for own in uses.values() for use in own), key=_better)
+    best = min((use for own in uses.values() for use in own), key=_use_order)
     others = (
-        min(own, key=lambda use: ((use.right, use.name) != (best.right, best.name), _better(use)))
+        min(
+            own, key=lambda use: ((use.right, use.name) != (best.right, best.name), _use_order(use))
+        )
         for enclave, own in sorted(uses.items())
         if enclave != best.enclave
     )
     return Witness((best,), tuple((use,) for use in others))
 
 
-def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | None:
+def _witness_against_must(requirement: Must, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with the shortest name for which an enclave lacks a part of its right."""
     enclave = requirement.enclave
     lacking = []
@@ -332,12 +343,12 @@ def _not_able(requirement: Must, world: World, limit: SearchLimit) -> Witness | 
         for writes, topic in world.needed
         if not lacking and topic not in _own_topics(world, enclave, writes)
     ]
-    if not lacking or _is_elsewhere(world, enclave, limit):
+    if not lacking or _is_on_other_domain(world, enclave, limit):
         return None
-    return Witness((min(lacking, key=_better),))
+    return Witness((min(lacking, key=_use_order),))
 
 
-def _is_elsewhere(world: World, enclave: str, limit: SearchLimit) -> bool:
+def _is_on_other_domain(world: World, enclave: str, limit: SearchLimit) -> bool:
     """Return whether an enclave has rights in other ROS domains, and none in that of ``world``."""
 
     def has_rights(some: World) -> bool:
@@ -347,16 +358,16 @@ def _is_elsewhere(world: World, enclave: str, limit: SearchLimit) -> bool:
     return bool(world.elsewhere) and not has_rights(world) and any(map(has_rights, world.elsewhere))
 
 
-def _kept_from_others(requirement: Must, world: World, limit: SearchLimit) -> KeptUse | None:
+def _use_kept_from_others(requirement: Must, world: World, limit: SearchLimit) -> KeptUse | None:
     """Return a demanded use that does not reach enclaves at other routers that may receive it."""
     enclave = requirement.enclave
     for right, names in requirement.rights:
         for part, name in product(_parts_of(right), names):
             topics, own = part.topics(name), _own_topics(world, enclave, part.writes)
             others: dict[str, str] = {}
-            for met in world.side(not part.writes).meeting(topics, limit):
+            for met in world.side(not part.writes).users_of_topics(topics, limit):
                 ends = (enclave, met.enclave) if part.writes else (met.enclave, enclave)
-                crossing = world.between(*ends)
+                crossing = world.topics_between(*ends)
                 if crossing is None:
                     continue
                 if topic := world.example((own & met.names) - crossing, topics, limit):
@@ -375,7 +386,9 @@ def _own_topics(world: World, enclave: str, writes: bool) -> NameSet:
     return access.writes if writes else access.reads
 
 
-def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness | None:
+def _witness_against_at_most(
+    requirement: AtMost, world: World, limit: SearchLimit
+) -> Witness | None:
     """Return a witness with a name that more enclaves may use than the requirement allows.
 
     An enclave that may write one topic of an action can do a part of the action, so it counts.
@@ -387,7 +400,7 @@ def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness 
         for expression in names:
             holders: dict[str, list[tuple[_Part, TopicUser]]] = {}
             for part in _sufficient_parts(right):
-                for met in world.side(part.writes).meeting(part.topics(expression), limit):
+                for met in world.side(part.writes).users_of_topics(part.topics(expression), limit):
                     holders.setdefault(met.enclave, []).append((part, met))
             if len(holders) <= most:
                 continue
@@ -399,7 +412,7 @@ def _too_many(requirement: AtMost, world: World, limit: SearchLimit) -> Witness 
                 for enclave, parts in sorted(holders.items())
                 if (use := next(_uses_of(name, enclave, right, parts), None))
             ]
-            if not best or _better(uses[0]) < _better(best[0]):
+            if not best or _use_order(uses[0]) < _use_order(best[0]):
                 best, others = tuple(uses[: most + 1]), tuple(uses[most + 1 :])
     return Witness(best, tuple((use,) for use in others)) if best else None
 
@@ -457,7 +470,9 @@ def _shared_by(
     )
 
 
-def _too_wide(requirement: Widest, world: World, limit: SearchLimit) -> Witness | None:
+def _witness_against_widest(
+    requirement: Widest, world: World, limit: SearchLimit
+) -> Witness | None:
     """Return a witness with the shortest name that a wildcard allows beyond the requirement."""
     enclaves = sorted(_matching_enclaves(requirement.enclaves, world.enclaves))
     uses: defaultdict[str, list[Use]] = defaultdict(list)
@@ -481,7 +496,9 @@ _WRITTEN_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/rosout", "rt/paramete
 _READ_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/parameter_events"))
 
 
-def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Witness | None:
+def _witness_against_nothing_but(
+    requirement: NothingBut, world: World, limit: SearchLimit
+) -> Witness | None:
     """Return a witness with the shortest name for which an enclave has another right."""
     enclaves = sorted(_matching_enclaves(requirement.enclaves, world.enclaves))
     uses: defaultdict[str, list[Use]] = defaultdict(list)
@@ -501,31 +518,35 @@ def _more_than(requirement: NothingBut, world: World, limit: SearchLimit) -> Wit
     return _first_of(uses)
 
 
-def _with_both(requirement: NotBoth, world: World, limit: SearchLimit) -> Witness | None:
+def _witness_against_not_both(
+    requirement: NotBoth, world: World, limit: SearchLimit
+) -> Witness | None:
     """Return a witness with an enclave that has rights of both sets: its shortest use of each."""
     first, second = (
         _uses_of_rights(rights, world, limit) for rights in (requirement.first, requirement.second)
     )
     pairs = [
-        (min(first[enclave], key=_better), min(second[enclave], key=_better))
+        (min(first[enclave], key=_use_order), min(second[enclave], key=_use_order))
         for enclave in sorted(first.keys() & second.keys())
     ]
     if not pairs:
         return None
-    best = min(pairs, key=lambda pair: [_better(use) for use in pair])
+    best = min(pairs, key=lambda pair: [_use_order(use) for use in pair])
     return Witness(best, tuple(pair for pair in pairs if pair is not best))
 
 
-def _unprotected(requirement: Protected, world: World, limit: SearchLimit) -> Witness | None:
+def _witness_against_protected(
+    requirement: Protected, world: World, limit: SearchLimit
+) -> Witness | None:
     """Return a witness with the shortest name that is protected less than demanded."""
-    weak = world.weaker(requirement.level)
+    weak = world.weakly_protected(requirement.level)
     if weak is None:
         return None
     uses = []
     for topics in _topics_of_names(requirement.names):
         if topic := world.example(weak, topics, limit):
             uses.append(Use("", "", topics.ros_name(topic), topic, True))
-    return Witness((min(uses, key=_better),)) if uses else None
+    return Witness((min(uses, key=_use_order),)) if uses else None
 
 
 def _assumed_protection(requirement: Requirement, world: World, limit: SearchLimit) -> str:
@@ -554,7 +575,7 @@ def _topics_of_names(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
 # ── influence ──────────────────────────────────────────────────────────────────────────────
 
 
-def _influence(requirement: Apart, world: World, limit: SearchLimit) -> Witness | None:
+def _witness_against_apart(requirement: Apart, world: World, limit: SearchLimit) -> Witness | None:
     """Return a witness with a shortest chain from a source to a target, not through ``through``."""
     through = _matching_enclaves(requirement.through, world.enclaves)
     sources = sorted(_matching_enclaves(requirement.sources, world.enclaves) - through)
@@ -579,7 +600,9 @@ _OF_OTHER_KIND = {"call": "request", "request": "call", "execute": "reply", "rep
 """For a right to an action, the same right to a service, and the other way round."""
 
 
-def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterator[str]:
+def _empty_list_clauses(
+    requirement: Requirement, world: World, limit: SearchLimit
+) -> Iterator[str]:
     """Yield clauses on enclaves in a requirement that do not exist, and on names without users."""
     patterns: tuple[str, ...] = ()
     match requirement:
@@ -601,28 +624,30 @@ def _empty(requirement: Requirement, world: World, limit: SearchLimit) -> Iterat
             )
             for right, names in sides:
                 for name in names:
-                    if not _anybody(world, _sufficient_parts(right), name, limit):
+                    if not _is_used_by_anybody(world, _sufficient_parts(right), name, limit):
                         text = f"no enclave may {right} {_named_right(right, name)}"
                         other = _OF_OTHER_KIND.get(right, "")
-                        if other and _anybody(world, _sufficient_parts(other), name, limit):
+                        if other and _is_used_by_anybody(
+                            world, _sufficient_parts(other), name, limit
+                        ):
                             text += f", but some may {other} {_named_right(other, name)}"
                         yield text
         case Nobody():
             for right, names in requirement.rights:
                 other = OTHER_SIDE[right]
                 for name in names:
-                    if not _anybody(
+                    if not _is_used_by_anybody(
                         world, (*_sufficient_parts(other), *_sufficient_parts(right)), name, limit
                     ):
                         yield f"no enclave may use {_named_right(right, name)}"
         case Protected():
             for kind, name in requirement.names:
                 parts = [part for right in RIGHTS[kind] for part in _sufficient_parts(right)]
-                if not _anybody(world, parts, name, limit):
+                if not _is_used_by_anybody(world, parts, name, limit):
                     yield f"no enclave may use {kind.removesuffix('s')} {name}"
 
 
-def _always(requirement: Requirement, world: World) -> str:
+def _why_never_fails(requirement: Requirement, world: World) -> str:
     """Return why a requirement cannot fail with the present enclaves, as a clause, or "".
 
     A list with the names of all present enclaves is no such reason: enclaves may be added.
@@ -650,10 +675,12 @@ def _named_right(right: str, name: str) -> str:
     return f"{KIND_OF[right].removesuffix('s')} {name}"
 
 
-def _anybody(world: World, right_parts: Iterable[_Part], name: str, limit: SearchLimit) -> bool:
+def _is_used_by_anybody(
+    world: World, right_parts: Iterable[_Part], name: str, limit: SearchLimit
+) -> bool:
     """Return whether some enclave may use one of the DDS topics of a name."""
     for part in right_parts:
-        met = world.side(part.writes).meeting(part.topics(name), limit)
+        met = world.side(part.writes).users_of_topics(part.topics(name), limit)
         if any(meeting.stated for meeting in met) or any(
             world.use(meeting, part.topics(name), limit) for meeting in met
         ):
@@ -664,7 +691,7 @@ def _anybody(world: World, right_parts: Iterable[_Part], name: str, limit: Searc
 # ── the flow of information ────────────────────────────────────────────────────────────────
 
 _IGNORED = NameSet.union(
-    named(each)
+    names_of_expression(each)
     for each in (
         ROS_DISCOVERY_TOPIC,
         *(f"rt{name}" for name in OF_EVERY_NODE),
@@ -771,16 +798,16 @@ class _Flow:
                 for reader in self._world.readers_of(topic):
                     if reader == enclave or not is_new(reader):
                         continue
-                    crossing = self._world.between(enclave, reader)
+                    crossing = self._world.topics_between(enclave, reader)
                     if crossing is None or topic in crossing:
                         yield topic, reader
         if around is not None and not around.automata:
             return
-        for reader in self._world.side(False).perhaps_meeting(
+        for reader in self._world.side(False).possible_users(
             around.automata if around else None, self._limit
         ):
             if reader != enclave and is_new(reader):
-                shared = self._world.shared(enclave, reader, written, self._limit)
+                shared = self._world.shared_topic(enclave, reader, written, self._limit)
                 if shared:
                     yield shared, reader
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import ASSUMED, NOT_CROSSING, NOT_ON_ZENOH, VACUOUS, VIOLATED
-from sros_tool.dds.decision.vendors import together
+from sros_tool.dds.decision.vendors import joined_titles
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import (
     action_part,
@@ -47,7 +47,7 @@ class Step:
         """File and line of the right, or None."""
         return self.place.source if self.place else None
 
-    def does(self) -> str:
+    def action_text(self) -> str:
         """Return text such as ``publish /cmd_vel``, with the wildcard that allows it."""
         right, kind, name, by = self.drawn()
         shown = f"action {name}" if kind == "actions" else name
@@ -75,7 +75,7 @@ class Step:
 
     def text(self) -> str:
         """Return text such as ``/teleop may publish /cmd_vel by /cmd*``."""
-        return f"{self.use.enclave} may {self.does()}"
+        return f"{self.use.enclave} may {self.action_text()}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,10 +200,10 @@ def requirement_findings(requirements: Sequence[Requirement], system: System) ->
 
 def decided_findings(decided: Decided, system: System) -> list[Finding]:
     """Return the findings of decisions: broken requirements first, in order."""
-    findings = [_violated(violation) for violation in decided.violations]
-    findings += [_vacuous(requirement, why) for requirement, why in decided.vacuous]
+    findings = [_violation_finding(violation) for violation in decided.violations]
+    findings += [_vacuous_finding(requirement, why) for requirement, why in decided.vacuous]
     findings += [_assumption_finding(*each) for each in decided.assumed]
-    findings += [_not_crossing(*each) for each in decided.kept]
+    findings += [_not_crossing_finding(*each) for each in decided.kept]
     if system.left_out:
         error = system.left_out
         text = f"{error.what}: {error.why}" if error.why else error.what
@@ -215,7 +215,7 @@ def _text(violation: Violation) -> str:
     requirement = violation.requirement
     text = f"{_fact(violation)}, but {demand(requirement)}"
     if violation.worlds:
-        text += f"; with {', '.join(together(violation.worlds))} only"
+        text += f"; with {', '.join(joined_titles(violation.worlds))} only"
     if requirement.why:
         text += f": {requirement.why}"
     return text
@@ -227,7 +227,7 @@ def _subject(violation: Violation) -> str:
     return use.name if isinstance(violation.requirement, AtMost | Protected) else use.enclave
 
 
-def _violated(violation: Violation) -> Finding:
+def _violation_finding(violation: Violation) -> Finding:
     requirement, steps = violation.requirement, violation.steps
     first = next((step.source for step in steps if step.source), None) or requirement.source
     others = [step for other in violation.others for step in other]
@@ -238,7 +238,9 @@ def _violated(violation: Violation) -> Finding:
         if step.source
     ]
     own = requirement.source
-    related.append(RelatedPlace(f"required: {_titled(requirement)}", own.file, own.line or None))
+    related.append(
+        RelatedPlace(f"required: {_with_title(requirement)}", own.file, own.line or None)
+    )
     return VIOLATED.found(
         _subject(violation),
         _text(violation),
@@ -248,7 +250,7 @@ def _violated(violation: Violation) -> Finding:
     )
 
 
-def _titled(requirement: Requirement) -> str:
+def _with_title(requirement: Requirement) -> str:
     name = f"{requirement.name}: " if requirement.name else ""
     return f"{name}{demand(requirement)}"
 
@@ -264,38 +266,42 @@ def _fact(violation: Violation) -> str:
                 return "does not exist"
             if violation.idle:
                 return "cannot start with its present files; `sros check` shows why"
-            return f"may not {steps[0].does()}"
+            return f"may not {steps[0].action_text()}"
         case Protected():
             return "its messages are not"
         case AtMost():
-            return f"{_joined_steps(steps)}{_others(violation)}"
+            return f"{_joined_steps(steps)}{_other_violators(violation)}"
         case NotBoth():
-            return f"may {steps[0].does()} and {steps[1].does()}{_others(violation)}"
+            actions = f"{steps[0].action_text()} and {steps[1].action_text()}"
+            return f"may {actions}{_other_violators(violation)}"
         case _:
-            return f"may {steps[0].does()}{_others(violation)}"
+            return f"may {steps[0].action_text()}{_other_violators(violation)}"
 
 
 def _chain(steps: Sequence[Step]) -> str:
     """Return a chain of steps as text, such as ``/a -publish /x-> /b -publish /y-> /c``."""
     hops = zip(steps[::2], steps[1::2], strict=True)
     return " ".join(
-        (steps[0].use.enclave, *(f"-{step.does()}-> {heard.use.enclave}" for step, heard in hops))
+        (
+            steps[0].use.enclave,
+            *(f"-{step.action_text()}-> {heard.use.enclave}" for step, heard in hops),
+        )
     )
 
 
 def _joined_steps(steps: Sequence[Step]) -> str:
     """Return text such as ``/a and /b may publish /x``; different uses are listed one by one."""
-    if len({step.does() for step in steps}) > 1:
+    if len({step.action_text() for step in steps}) > 1:
         return _listed_names([step.text() for step in steps])
-    return f"{_listed_names([step.use.enclave for step in steps])} may {steps[0].does()}"
+    return f"{_listed_names([step.use.enclave for step in steps])} may {steps[0].action_text()}"
 
 
-def _others(violation: Violation) -> str:
+def _other_violators(violation: Violation) -> str:
     """Return clauses on the further enclaves that break a requirement; "" for none."""
     alike, differing = violation.alike, violation.differing
     text = f", and so may {_listed_names(alike)}" if alike else ""
     for steps in differing:
-        text += f"; {steps[0].use.enclave} may {' and '.join(step.does() for step in steps)}"
+        text += f"; {steps[0].use.enclave} may {' and '.join(step.action_text() for step in steps)}"
     more = len(violation.witness.others) - len(alike) - len(differing)
     return text + (f"; {more} more break it in their own ways" if more else "")
 
@@ -307,7 +313,7 @@ def _listed_names(names: Sequence[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def _vacuous(requirement: Requirement, why: Sequence[str]) -> Finding:
+def _vacuous_finding(requirement: Requirement, why: Sequence[str]) -> Finding:
     own = requirement.source
     text = f"{'; '.join(why)}: {demand(requirement)}"
     return VACUOUS.found(own.file, text, own.file, own.line)
@@ -319,7 +325,7 @@ def _assumption_finding(requirement: Requirement, name: str) -> Finding:
     return ASSUMED.found(own.file, text, own.file, own.line)
 
 
-def _not_crossing(requirement: Requirement, kept_use: KeptUse) -> Finding:
+def _not_crossing_finding(requirement: Requirement, kept_use: KeptUse) -> Finding:
     own, use, others = requirement.source, kept_use.use, _listed_names(kept_use.others)
     ends = f"from {use.enclave} to {others}" if use.writes else f"from {others} to {use.enclave}"
     text = f"{use.name} does not pass between routers {ends}: {demand(requirement)}"

@@ -25,8 +25,8 @@ from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain
 from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.grants import (
     ComparisonCrash,
-    also_fitting,
     certified_text,
+    other_fitting_enclaves,
     same_subject,
 )
 from sros_tool.dds.decision.matching import ExpressionIndex, matches
@@ -294,7 +294,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     before, after = _completed(base, head), _completed(head, base)
     worlds = _worlds(before, after)
     added = tuple(_gains(before, after, worlds, scope, limit))
-    lost = tuple(dict.fromkeys(_less(base, head, limit, rules=not added)))
+    lost = tuple(dict.fromkeys(_lost_protection(base, head, limit, rules=not added)))
     unclear = tuple(_not_compared(base, head))
     if unclear and not added and not lost:
         raise DocumentError(
@@ -307,7 +307,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     unknown = "only some enclaves are compared" if scope is not None else ""
     if None in sides:
         unknown = f"there are more than {_MOST_HOPS:,} hops between enclaves"
-    more = dict.fromkeys(_less(head, base, limit, rules=False))
+    more = dict.fromkeys(_lost_protection(head, base, limit, rules=False))
     return Growth(
         added,
         tuple(_gains(after, before, worlds, scope, limit)),
@@ -323,7 +323,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     )
 
 
-def _less(
+def _lost_protection(
     old: AccessSource, new: AccessSource, limit: SearchLimit, *, rules: bool
 ) -> Iterator[SettingChange]:
     """Yield changes that make ``new`` protect less than ``old``, or let more names pass.
@@ -432,7 +432,7 @@ def _zenoh_domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
     for side, other in ((base, head), (head, base)):
         domains.update(DomainSet.of((e, e)) for e in _domains_of_robots(side, other).values())
         if side.zenoh is None and side.kind != "policy":
-            domains.update(domain_set.closed() for domain_set in _granted(side))
+            domains.update(domain_set.closed() for domain_set in _domains_of_grants(side))
     return domains_of((*base.enforcers, *head.enforcers), domains) or (0,)
 
 
@@ -440,10 +440,10 @@ def _domains(base: AccessSource, head: AccessSource) -> tuple[int, ...]:
     """Return one domain for each group of domains with the same rules."""
     governances = (source.governance for source in (base, head) if source.governance)
     listed = {rule.domains for governance in governances for rule in governance.domain_access_rules}
-    return DomainSet.one_of_each_kind(listed, _granted(base) | _granted(head))
+    return DomainSet.one_of_each_kind(listed, _domains_of_grants(base) | _domains_of_grants(head))
 
 
-def _granted(side: AccessSource) -> set[DomainSet]:
+def _domains_of_grants(side: AccessSource) -> set[DomainSet]:
     """Return the sets of domains for which permissions have rules."""
     return {
         rule.domains
@@ -462,7 +462,7 @@ def _fitting_others(vendor: Vendor, *sides: AccessSource) -> _FittingOthers:
         }
         subjects = {name: side.subject_of(name) for name in granted}
         certified = {name: subject for name, subject in subjects.items() if subject}
-        by_side[id(side)] = also_fitting(vendor.traits, certified, granted)
+        by_side[id(side)] = other_fitting_enclaves(vendor.traits, certified, granted)
     return lambda side, enclave: by_side[id(side)].get(enclave, ())
 
 
@@ -562,10 +562,10 @@ def _access_by_rights(
         )
 
         def decide(verb: AccessVerb, topic: str) -> bool:
-            def any_of(some: Iterable[str]) -> bool:
+            def union_of_names(some: Iterable[str]) -> bool:
                 return any(matches(Style.FNMATCH, pattern, topic) for pattern in some)
 
-            return any_of(allowed[verb]) and not any_of(denied[verb])
+            return union_of_names(allowed[verb]) and not union_of_names(denied[verb])
 
         def topics(verb: AccessVerb) -> NameSet:
             given = names_of(Style.FNMATCH, allowed[verb]) - names_of(Style.FNMATCH, denied[verb])
@@ -638,7 +638,9 @@ def _each_gain(
                 before, after = (world.access(side, enclave, domain) for side in (old, new))
                 more = {verb: after.topics[verb] - before.topics[verb] for verb in _VERBS}
                 gained = False
-                for gain in _more(stated, enclave, more, (before, after), world, domain, limit):
+                for gain in _added_gains(
+                    stated, enclave, more, (before, after), world, domain, limit
+                ):
                     gained = True
                     yield gain
                 if not gained and after.joins and not before.joins:
@@ -647,7 +649,7 @@ def _each_gain(
                     )
 
 
-def _more(
+def _added_gains(
     stated_rights: _Stated,
     enclave: str,
     topics: Mapping[AccessVerb, NameSet],
@@ -677,7 +679,7 @@ class AccessByVendors:
     def __init__(self, source: AccessSource) -> None:
         self._stated = _Stated(source, source)
 
-    def added(
+    def gained_topics(
         self,
         enclave: str,
         before: Sequence[Access],
@@ -716,7 +718,7 @@ class AccessByVendors:
             )
             every = NameSet() if old == new else (new - old) & ROS_TOPICS
             topics[verb] = every | NameSet(exact)
-        yield from _more(self._stated, enclave, topics, sides, world, domain, SearchLimit())
+        yield from _added_gains(self._stated, enclave, topics, sides, world, domain, SearchLimit())
 
 
 def _joined_access(accesses: Sequence[Access]) -> _Access:
@@ -813,12 +815,12 @@ class _Stated:
         )  # often in several domains
         if key not in self._found:
             self._found[key] = list(
-                self._searched(enclave, verb, added_names, world, domain, limit)
+                self._searched_gains(enclave, verb, added_names, world, domain, limit)
             )
         for gain in self._found[key]:
             yield replace(gain, worlds=(world.title,), domains=(domain,))
 
-    def _searched(
+    def _searched_gains(
         self,
         enclave: str,
         verb: AccessVerb,
@@ -1072,7 +1074,7 @@ def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
     own = DomainSet.of(*((domain, domain) for domain in domains.values()))
     if side.kind != "policy":
         own = _certified_domains(side)
-    governance = _controlling(other.governance, own)
+    governance = _with_access_control(other.governance, own)
     if governance is None:
         known = DomainSet((*own.ranges, *_certified_domains(other).ranges)).closed()
         open_ended = {"policy"} >= {side.kind, other.kind}
@@ -1142,13 +1144,15 @@ def _certified_domains(side: AccessSource) -> DomainSet:
     ).closed()
 
 
-def _controlling(governance: Governance | None, more_domains: DomainSet) -> Governance | None:
+def _with_access_control(
+    governance: Governance | None, more_domains: DomainSet
+) -> Governance | None:
     """Return a governance that controls all access, also in the domains ``more_domains``."""
     if governance is None:
         return None
     strict = governance_for(strict_protection(), more_domains).domain_access_rules[0]
 
-    def controlling(rule: DomainRule) -> DomainRule:
+    def rule_with_control(rule: DomainRule) -> DomainRule:
         topics = tuple(
             replace(topic_rule, enable_read_access_control=True, enable_write_access_control=True)
             for topic_rule in rule.topic_access_rules
@@ -1162,7 +1166,7 @@ def _controlling(governance: Governance | None, more_domains: DomainSet) -> Gove
             topic_access_rules=topics,
         )
 
-    rules = tuple(map(controlling, governance.domain_access_rules))
+    rules = tuple(map(rule_with_control, governance.domain_access_rules))
     missing = [domain for domain in more_domains if domain not in governance.domains().closed()]
     if missing:
         rules += (replace(strict, domains=DomainSet.of(*((domain, domain) for domain in missing))),)

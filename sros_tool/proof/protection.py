@@ -33,7 +33,7 @@ from sros_tool.keystore.protection import contradictions
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.model import DomainProtection, Level, StatedProtection
 from sros_tool.proof.sources import AT, KEYSTORE_ITSELF, AccessSource, Trust
-from sros_tool.proof.worlds import ROS_TOPICS, named, valid_topics
+from sros_tool.proof.worlds import ROS_TOPICS, names_of_expression, valid_topics
 from sros_tool.proof.zenoh_settings import looser_settings
 from sros_tool.translate import governance_for, protected_topics
 from sros_tool.zenoh.configuration import ZenohNetwork
@@ -77,7 +77,7 @@ def _demanded_governance(
 def _payload_governance(governance: Governance) -> Governance:
     """Return a governance in which the protection of data is the strongest of all layers."""
 
-    def strongest(domain: DomainRule, topic: TopicRule) -> TopicRule:
+    def strongest_kind(domain: DomainRule, topic: TopicRule) -> TopicRule:
         kinds = (
             topic.data_protection_kind,
             topic.metadata_protection_kind,
@@ -92,7 +92,7 @@ def _payload_governance(governance: Governance) -> Governance:
             replace(
                 rule,
                 topic_access_rules=tuple(
-                    strongest(rule, topic_rule) for topic_rule in rule.topic_access_rules
+                    strongest_kind(rule, topic_rule) for topic_rule in rule.topic_access_rules
                 ),
             )
             for rule in governance.domain_access_rules
@@ -204,14 +204,14 @@ def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChan
     again: dict[int, list[str]] = defaultdict(list)
 
     @lru_cache(maxsize=8)  # most enclaves have the same lists
-    def lost(before: frozenset[tuple[str, int]], after: Trust) -> list[int]:
+    def lost_revocations(before: frozenset[tuple[str, int]], after: Trust) -> list[int]:
         gone = before - after.revoked
         return sorted(serial for authority, serial in gone if authority in after.authorities)
 
     for name in sorted(new.trusts):
         if old.scope is None or new.scope is not None or name in old.scope:
             before = old.trusts[name].revoked if name in old.trusts else all_revoked
-            for serial in lost(before, new.trusts[name]):
+            for serial in lost_revocations(before, new.trusts[name]):
                 again[serial].append(name)
     for serial in sorted(again)[:_MOST_SERIALS]:
         names = [each for each in again[serial] if each != KEYSTORE_ITSELF] or [KEYSTORE_ITSELF]
@@ -296,7 +296,11 @@ def _no_longer_stated(
         if example is not None:
             valid = names & _ABSOLUTE
             name = example if example in _ABSOLUTE else valid.example(limit) or example
-            less = "sign" if name in _set_of_names(_signed(later, protection.kind)) else "nothing"
+            less = (
+                "sign"
+                if name in _set_of_names(_names_of_kind(later, protection.kind))
+                else "nothing"
+            )
             yield SettingChange(
                 Effect.LOOSER,
                 f"protect {protection}",
@@ -306,19 +310,19 @@ def _no_longer_stated(
             )
 
 
-def _signed(stated_protections: Iterable[StatedProtection], kind: str) -> list[str]:
+def _names_of_kind(stated_protections: Iterable[StatedProtection], kind: str) -> list[str]:
     return [right.name for right in stated_protections if right.kind == kind]
 
 
 def _set_of_names(names: Iterable[str]) -> NameSet:
-    return NameSet.union(map(named, names))
+    return NameSet.union(map(names_of_expression, names))
 
 
 _ABSOLUTE = valid_topics("", "")
 """All absolute ROS names."""
 
 
-_ALL = named("*")
+_ALL = names_of_expression("*")
 
 
 def limits_crossing(side: AccessSource) -> bool:
@@ -433,7 +437,7 @@ def _newly_passing_name(before: _Crossing, after: _Crossing, limit: SearchLimit)
 def _names(crossing: _Crossing) -> NameSet:
     names = _ALL
     for expressions in crossing:
-        names &= NameSet.union(map(named, expressions))
+        names &= NameSet.union(map(names_of_expression, expressions))
     return names
 
 

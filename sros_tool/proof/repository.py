@@ -103,7 +103,7 @@ class Repository:
         """
         if not _HASH.match(name) and not name.startswith("refs/"):
             candidates = self._references(name)
-            there = f" There is {_either(candidates)}." if candidates else ""
+            there = f" There is {_candidates_text(candidates)}." if candidates else ""
             raise UsageError(
                 f"'{name}' is neither the full id of a commit nor a full reference",
                 f"A tag or branch of that name could stand for another commit.{there}",
@@ -116,7 +116,7 @@ class Repository:
                 "",
                 "Fetch the reference first; `git for-each-ref` shows the existing ones.",
             )
-        return self._peeled(digits, name)
+        return self._commit_id(digits, name)
 
     def commit(self, name: str) -> str:
         """Return the full commit id for a name such as ``main`` or ``HEAD~2``.
@@ -126,7 +126,7 @@ class Repository:
         """
         expression = _EXPRESSION.match(name)
         if not expression or name.startswith("-"):
-            raise _unknown(name)
+            raise _unknown_revision_error(name)
         base, rest = expression["name"], expression["rest"]
         if _HASH.match(base):
             found = base
@@ -137,7 +137,7 @@ class Repository:
             if len(candidates) > 1:
                 raise DocumentError(
                     f"the name '{base}' is ambiguous",
-                    f"It is {_either(candidates)}.",
+                    f"It is {_candidates_text(candidates)}.",
                     "Write the full name, such as refs/remotes/origin/main.",
                 )
             base, found = next(iter(candidates.items()), (base, ""))
@@ -146,8 +146,8 @@ class Repository:
             words = ("--verify", "--quiet", "--end-of-options", f"{start}{rest}^{{commit}}")
             found = self._ask("rev-parse", *words)
         if not found:
-            raise _unknown(name)
-        return self._peeled(found, name)
+            raise _unknown_revision_error(name)
+        return self._commit_id(found, name)
 
     def _candidates(self, name: str) -> dict[str, str]:
         """Return the ids of all references that a short name can stand for, by reference.
@@ -164,7 +164,8 @@ class Repository:
             wanted = f"refs/remotes/{name}"
             if candidates and wanted not in candidates:
                 raise DocumentError(
-                    f"'{name}' is {_either(candidates)}, but no branch of the remote '{remote}'",
+                    f"'{name}' is {_candidates_text(candidates)}, but no branch of the remote "
+                    f"'{remote}'",
                     "Anybody who may push tags or branches can create one with this name.",
                     f"Fetch '{wanted}', or write the full reference name.",
                 )
@@ -203,7 +204,7 @@ class Repository:
         targets = {name: digits for digits, _, name in map(_split_at_blank, lines.splitlines())}
         return {each: targets[each] for each in wanted if each in targets}
 
-    def _peeled(self, digits: str, name: str) -> str:
+    def _commit_id(self, digits: str, name: str) -> str:
         """Return the id of the commit that an object id names, directly or by annotated tags.
 
         ``name`` is the name that the user gave, for errors.
@@ -268,7 +269,7 @@ class Repository:
         """
         if not _HASH.match(merge):
             raise UsageError(f"'{merge}' is not the full id of a commit")
-        parents = self.parents(self._peeled(merge, merge))
+        parents = self.parents(self._commit_id(merge, merge))
         if len(parents) < 2:
             raise DocumentError(
                 f"the commit {merge} is not a merge",
@@ -601,7 +602,7 @@ def _program(path: str) -> str:
     return program
 
 
-def _unknown(name: str) -> DocumentError:
+def _unknown_revision_error(name: str) -> DocumentError:
     return DocumentError(
         f"git finds no revision '{name}'",
         "",
@@ -610,7 +611,7 @@ def _unknown(name: str) -> DocumentError:
     )
 
 
-def _either(candidates: Iterable[str]) -> str:
+def _candidates_text(candidates: Iterable[str]) -> str:
     return " and ".join(f"'{candidate}'" for candidate in candidates)
 
 

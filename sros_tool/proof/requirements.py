@@ -676,16 +676,16 @@ def _filled_words(text: object, used_placeholders: Iterable[Placeholder], robot:
     return text
 
 
-def _only(table: _Table) -> Only:
+def _read_only_requirement(table: _Table) -> Only:
     own = table.known(*KIND_OF, "enclaves")
     return Only(**own, rights=table.rights(), enclaves=table.enclaves("enclaves"))
 
 
-def _nobody(table: _Table) -> Nobody:
+def _read_nobody_requirement(table: _Table) -> Nobody:
     return Nobody(**table.known(*KIND_OF), rights=table.rights())
 
 
-def _must(table: _Table) -> Must:
+def _read_must_requirement(table: _Table) -> Must:
     own = table.known(*KIND_OF, "enclave")
     enclave = table.text("enclave")
     problem = expression_problem(enclave)
@@ -700,7 +700,7 @@ def _must(table: _Table) -> Must:
     return Must(**own, rights=table.rights(), enclave=enclave)
 
 
-def _at_most(table: _Table) -> AtMost:
+def _read_at_most_requirement(table: _Table) -> AtMost:
     own = table.known(*KIND_OF, "enclaves")
     most = table.values.get("enclaves")
     if type(most) is not int or not 0 < most < 2**31:
@@ -712,17 +712,17 @@ def _at_most(table: _Table) -> AtMost:
     return AtMost(**own, rights=table.rights(), most=most)
 
 
-def _widest(table: _Table) -> Widest:
+def _read_widest_requirement(table: _Table) -> Widest:
     own = table.known(*KIND_OF, "enclaves")
     return Widest(**own, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
 
 
-def _nothing_but(table: _Table) -> NothingBut:
+def _read_nothing_but_requirement(table: _Table) -> NothingBut:
     own = table.known(*KIND_OF, "enclaves")
     return NothingBut(**own, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
 
 
-def _not_both(table: _Table) -> NotBoth:
+def _read_not_both_requirement(table: _Table) -> NotBoth:
     rights: list[RightNames] = []
     own = table.known("first", "second")
     for key in ("first", "second"):
@@ -739,7 +739,7 @@ def _not_both(table: _Table) -> NotBoth:
     return NotBoth(**own, first=rights[0], second=rights[1])
 
 
-def _protected(table: _Table) -> Protected:
+def _read_protected_requirement(table: _Table) -> Protected:
     own = table.known(*RIGHTS, "level")
     level = table.values.get("level")
     if not isinstance(level, str) or level not in _LEVELS:
@@ -752,7 +752,7 @@ def _protected(table: _Table) -> Protected:
     return Protected(**own, names=names, level=_LEVELS[level])
 
 
-def _apart(table: _Table) -> Apart:
+def _read_apart_requirement(table: _Table) -> Apart:
     own = table.known("from", "to", "through")
     through = table.enclaves("through") if "through" in table.values else ()
     return Apart(
@@ -761,15 +761,15 @@ def _apart(table: _Table) -> Apart:
 
 
 _READERS: Mapping[str, Callable[[_Table], Requirement]] = {
-    Only.KIND: _only,
-    Nobody.KIND: _nobody,
-    Must.KIND: _must,
-    Protected.KIND: _protected,
-    Apart.KIND: _apart,
-    AtMost.KIND: _at_most,
-    Widest.KIND: _widest,
-    NothingBut.KIND: _nothing_but,
-    NotBoth.KIND: _not_both,
+    Only.KIND: _read_only_requirement,
+    Nobody.KIND: _read_nobody_requirement,
+    Must.KIND: _read_must_requirement,
+    Protected.KIND: _read_protected_requirement,
+    Apart.KIND: _read_apart_requirement,
+    AtMost.KIND: _read_at_most_requirement,
+    Widest.KIND: _read_widest_requirement,
+    NothingBut.KIND: _read_nothing_but_requirement,
+    NotBoth.KIND: _read_not_both_requirement,
 }
 
 

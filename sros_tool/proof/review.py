@@ -179,7 +179,7 @@ class Review:
     """The steps of a review, and clauses on what was not reviewed.
 
     ``base`` and ``head`` are full ids of commits; ``base`` is "" if nothing was compared. The files
-    were read in ``head_folder`` and ``base_folder``, whose paths `shown` removes from texts.
+    were read in ``head_folder`` and ``base_folder``, whose paths `with_shown_paths` removes.
     """
 
     base: str
@@ -202,7 +202,7 @@ class Review:
             dict.fromkeys(f for choice in chosen for f in (*choice.shown, *choice.accepted))
         )
 
-    def shown(self, text: str) -> str:
+    def with_shown_paths(self, text: str) -> str:
         """Return a text with file paths relative to the top of the repository."""
         base = f"git:{self.base[:12]}:"
         return text.replace(f"{self.head_folder}/", "").replace(f"{self.base_folder}/", base)
@@ -210,14 +210,16 @@ class Review:
     def shown_finding(self, finding: Finding) -> Finding:
         """Return a finding with file paths relative to the top of the repository."""
         related = tuple(
-            place._replace(text=self.shown(place.text), file=self.shown(place.file))
+            place._replace(
+                text=self.with_shown_paths(place.text), file=self.with_shown_paths(place.file)
+            )
             for place in finding.related
         )
         return finding._replace(
-            subject=self.shown(finding.subject),
-            text=self.shown(finding.text),
-            file=self.shown(finding.file),
-            own_remedy=self.shown(finding.own_remedy),
+            subject=self.with_shown_paths(finding.subject),
+            text=self.with_shown_paths(finding.text),
+            file=self.with_shown_paths(finding.file),
+            own_remedy=self.with_shown_paths(finding.own_remedy),
             related=related,
         )
 
@@ -403,7 +405,7 @@ class _Review:
             if file:
                 return read_fleet(file)
             if side is self.head:
-                raise self._missing(path)
+                raise self._missing_file_error(path)
         except SrosError as error:
             yield ReviewStep("files", path, _UNDECIDED, error)
         return None
@@ -417,7 +419,7 @@ class _Review:
             try:
                 files = side.policies(path, placeholders=fleet is not None)
                 if not files:
-                    raise self._missing(path)
+                    raise self._missing_file_error(path)
                 policies += [file for file in files if file not in policies]
             except (SrosError, OSError) as error:
                 known = error if isinstance(error, SrosError) else DocumentError(str(error))
@@ -431,7 +433,7 @@ class _Review:
             try:
                 folder = side.tree(path)
                 if not folder:
-                    raise self._missing(path)
+                    raise self._missing_file_error(path)
                 if not is_keystore(folder):
                     raise DocumentError(f"'{path}' is not a keystore", "It has no enclaves in it.")
                 keystores[path] = folder
@@ -440,7 +442,7 @@ class _Review:
                 yield ReviewStep("keystore", path, _UNDECIDED, known)
         return keystores
 
-    def _missing(self, path: str) -> DocumentError:
+    def _missing_file_error(self, path: str) -> DocumentError:
         """Return the error for a file that HEAD lacks, with a hint where it may have moved."""
         entry = self.base.entry(path) if self.base else None
         became = ""
@@ -516,7 +518,7 @@ class _Review:
         for path, entry in changed:
             if sizes.get(entry.id, 0) > _MOST_OUTSIDE and entry.mode in FILES:
                 lines.append(("changes and is too large to be reviewed", path))
-            if said := self._unseen(path, entry):
+            if said := self._hidden_entry_clause(path, entry):
                 lines.append((f"changes and is not reviewed: it is {said}", path))
                 status = _FOUND
         gone = [
@@ -606,7 +608,7 @@ class _Review:
         users = users_of(parts, there)
         return sorted(e for e in users if e not in files and is_whole_policy(there[e]))
 
-    def _unseen(self, path: str, entry: TreeEntry) -> str:
+    def _hidden_entry_clause(self, path: str, entry: TreeEntry) -> str:
         """Return a clause on a link or submodule at a path that may hide policies, or "".
 
         ``path`` is a path in HEAD.
@@ -682,7 +684,7 @@ class _Review:
             return
         if asked.repository.commit(_HEAD) != asked.head:
             yield "the commit that is checked out is not the reviewed commit"
-        elif differing := self.head.differing(top):
+        elif differing := self.head.differing_files(top):
             files = first_few([f"'{path}'" for path in differing], 3)
             yield f"the checkout differs from the reviewed commit: {files}"
 
@@ -738,7 +740,7 @@ class _Review:
                 if file:
                     files[path] = file
                 elif side is self.head:
-                    raise self._missing(path)
+                    raise self._missing_file_error(path)
             except SrosError as error:
                 yield ReviewStep("requirements", path, _UNDECIDED, error)
         return files
@@ -775,12 +777,14 @@ class _Review:
                 yield ReviewStep("requirements", subject, _UNDECIDED, known)
                 continue
             wanted = yield from _read(files, system.fleet)
-            earlier = yield from _read(base_files, partial(_still_there, before, system.fleet))
+            earlier = yield from _read(
+                base_files, partial(_without_left_robots, before, system.fleet)
+            )
             yield from self._step_result(
                 "requirements", subject, partial(_decided_requirements, wanted, system)
             )
             if dropped_requirements(earlier, wanted):
-                decide = partial(self._dropped, earlier, wanted, system)
+                decide = partial(self._dropped_step, earlier, wanted, system)
                 yield from self._step_result("requirements-before", subject, decide)
 
     def _keystore_fleet(self, path: str) -> Fleet | None:
@@ -788,7 +792,7 @@ class _Review:
         file = self.base.file(f"{path}/{FLEET}") if self.base else None
         return read_fleet(file) if file else None
 
-    def _dropped(
+    def _dropped_step(
         self,
         earlier: Sequence[Requirement],
         wanted_requirements: Sequence[Requirement],
@@ -895,7 +899,7 @@ def _decided_requirements(
     return _status(chosen), chosen
 
 
-def _still_there(before: Fleet | None, after: FleetSource) -> Fleet | None:
+def _without_left_robots(before: Fleet | None, after: FleetSource) -> Fleet | None:
     """Return the fleet ``before`` without the robots that left it.
 
     So a robot that leaves drops no requirement.  A group that lost all its robots still has them.

@@ -246,7 +246,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
         governance = _governance(path / GOVERNANCE_FILE) if has_one else None
         files = path / IDENTITY_CA_FILE, path / CRL_FILE
         trusts = _trusts(dict.fromkeys(source.scope or (), files), {})
-        certified = _certified(dict.fromkeys(source.scope or (), path))
+        certified = _certified_enclaves(dict.fromkeys(source.scope or (), path))
         return replace(
             side,
             governance=governance,
@@ -267,7 +267,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
         authorities=_authorities(folders.values()),
         trusts=_trusts(trusting, _expiries(path)),
         later=keystore.template if keystore.is_original else None,
-        certified=_certified(folders),
+        certified=_certified_enclaves(folders),
     )
     if not has_zenoh_files(path, hidden=True):
         return side
@@ -291,7 +291,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
     )
 
 
-def _certified(folders: Mapping[str, Path]) -> dict[str, CertifiedEnclave]:
+def _certified_enclaves(folders: Mapping[str, Path]) -> dict[str, CertifiedEnclave]:
     """Map the enclaves that have a certificate to its subject, name and key."""
     certified = {}
     for name, folder in folders.items():

@@ -99,8 +99,8 @@ def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Req
     for right in ("publish", "call", "request"):
         yield from _sole_holders(stated_rights, right)
     yield from _unused_services(stated_rights)
-    yield from _limits(stated_rights)
-    yield from _gates(worlds[0])
+    yield from _limit_requirements(stated_rights)
+    yield from _gate_requirements(worlds[0])
     for kind, pair in RIGHTS.items():
         if any(stated_rights.wild[right] or stated_rights.names(right) for right in pair):
             yield Protected(source=_NOWHERE, names=((kind, "/*"),), level=Level.ENCRYPT)
@@ -128,7 +128,7 @@ def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
         yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{each}",)),))
 
 
-def _limits(stated_rights: _Stated) -> Iterator[AtMost]:
+def _limit_requirements(stated_rights: _Stated) -> Iterator[AtMost]:
     """Yield limits for names that only few enclaves publish."""
     names: dict[int, list[str]] = defaultdict(list)
     for name in stated_rights.names("publish"):
@@ -139,7 +139,7 @@ def _limits(stated_rights: _Stated) -> Iterator[AtMost]:
             yield AtMost(source=_NOWHERE, rights=(("publish", tuple(names[count])),), most=count)
 
 
-def _gates(world: World) -> Iterator[Apart]:
+def _gate_requirements(world: World) -> Iterator[Apart]:
     """Yield requirements that some enclaves can be influenced only by way of one other enclave."""
     for target, sources in sorted(influencers(world, SearchLimit()).items()):
         if len(sources) == 1:

@@ -17,7 +17,7 @@ from shlex import quote
 
 from sros_tool.automata import NameSet
 from sros_tool.dds.decision.access import Access, AccessVerb, GovernedDomain
-from sros_tool.dds.decision.grants import also_fitting
+from sros_tool.dds.decision.grants import other_fitting_enclaves
 from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import TESTED, Style, Vendor
 from sros_tool.dds.domains import DomainSet
@@ -67,7 +67,7 @@ from sros_tool.proof.worlds import (
     domains_of,
     enforced_access,
     is_enforced,
-    named,
+    names_of_expression,
     ros_access,
     topics_of,
     zenoh_message,
@@ -179,11 +179,11 @@ def policy_system(
     refuse_fallbacks(policy)
     domains = DomainSet.of((domain, domain))
     rights = frozenset(right for right in policy_rights(policy) if right.qualifier is ALLOW)
-    stated = _stated([enclave.path for enclave in policy.enclaves], rights)
+    stated = _stated_topics([enclave.path for enclave in policy.enclaves], rights)
     protections = stated_protections(policy.enclaves)
     protection = (template or load_template(DEFAULT_TEMPLATE)).protection
     governance = governance_for(with_stated(protection, protections), domains)
-    demanded = None if template else _demanded(protections)
+    demanded = None if template else _demanded_topics(protections)
     subjects = {enclave.path: f"CN={enclave.path}" for enclave in policy.enclaves}
     unique = template is not None and template.unique_subject
     signed = {
@@ -204,7 +204,7 @@ def policy_system(
                 for name, permissions in signed.items()
             }
             granted = {} if unique else {name: (subject,) for name, subject in subjects.items()}
-            fitting_others = also_fitting(vendor.traits, subjects, granted)
+            fitting_others = other_fitting_enclaves(vendor.traits, subjects, granted)
             worlds.append(
                 _dds_world(vendor, access, stated, demanded=demanded, fitting_others=fitting_others)
             )
@@ -271,7 +271,7 @@ def _dds_world(
         writes, reads = ([getattr(e, side) for e in every] for side in ("writes", "reads"))
         return TopicAccess(NameSet.union(writes), NameSet.union(reads))
 
-    weak = _weak(each for accesses in access.values() for each in accesses)
+    weak = _weaker_topics(each for accesses in access.values() for each in accesses)
     if demanded is not None:
         weak[Level.ENCRYPT] |= demanded[Level.SIGN]
     return World(
@@ -291,7 +291,7 @@ def _dds_world(
 _RANK = {Level.NONE: 0, Level.SIGN: 1, Level.ENCRYPT: 2}
 
 
-def _weak(access: Iterable[Access]) -> dict[Level, NameSet]:
+def _weaker_topics(access: Iterable[Access]) -> dict[Level, NameSet]:
     """Map levels to the topics that the governance of at least one enclave protects less."""
     different = dict.fromkeys(each.protection() for each in access)
     return {
@@ -305,12 +305,14 @@ def _weak(access: Iterable[Access]) -> dict[Level, NameSet]:
     }
 
 
-def _demanded(protections: Iterable[StatedProtection]) -> dict[Level, NameSet]:
+def _demanded_topics(protections: Iterable[StatedProtection]) -> dict[Level, NameSet]:
     """Map each protection level to the topics for which a policy states this level."""
     topics: dict[Level, list[str]] = {level: [] for level in PROTECT.values()}
     for protection in protections:
         topics[protection.level] += protected_topics(protection.kind, protection.name)
-    return {level: NameSet.union(map(named, topic)) for level, topic in topics.items()}
+    return {
+        level: NameSet.union(map(names_of_expression, topic)) for level, topic in topics.items()
+    }
 
 
 def _strongest_protection(domain: DomainRule, rule: TopicRule) -> int:
@@ -323,7 +325,7 @@ def _strongest_protection(domain: DomainRule, rule: TopicRule) -> int:
     return max(_RANK[Level(kind.value.partition("_")[0])] for kind in kinds)
 
 
-def _stated(enclaves: Iterable[str], rights: Iterable[Right]) -> dict[str, TopicAccess]:
+def _stated_topics(enclaves: Iterable[str], rights: Iterable[Right]) -> dict[str, TopicAccess]:
     """Map enclaves to the topics that their rights name without wildcards.
 
     The topics that every node needs are included.
@@ -370,7 +372,7 @@ def _keystore_system(
     names = enclave_names(root, hidden=True)
     source = load_rights(keystore, hidden=True)
     rights = frozenset(right for right in source.rights if right.qualifier is ALLOW)
-    stated = _stated(names, rights)
+    stated = _stated_topics(names, rights)
     folders = {name: enclave_path(root, name) for name in names}
     # Without any key this is the public part of a keystore, and the keys are where it came from.
     public = not any(
@@ -419,7 +421,7 @@ def _keystore_system(
         )
     subjects = {name: enclave.subject for name, enclave in loaded.items() if enclave.subject}
     granting = {name: [each.subject for each in grant] for name, grant in grants.items()}
-    moments = {name: (at, *_later(name, grants.get(name, ()), at)) for name in names}
+    moments = {name: (at, *_later_moments(name, grants.get(name, ()), at)) for name in names}
     worlds = []
     for vendor, number in product(TESTED, domains):
         if only_enclaves and vendor.value not in only_enclaves:
@@ -443,7 +445,7 @@ def _keystore_system(
                 for loaded_enclave, moment in product(possible, moments[name])
             )
             access[name] = tuple(each for each in accesses if each is not None)
-        fitting_others = also_fitting(vendor.traits, subjects, granting)
+        fitting_others = other_fitting_enclaves(vendor.traits, subjects, granting)
         worlds.append(
             _dds_world(
                 vendor, access, stated, title=title, idle=idle, fitting_others=fitting_others
@@ -482,7 +484,7 @@ def _without_faults(
 _MOST_MOMENTS = 10
 
 
-def _later(name: str, grants: Iterable[Grant], moment: datetime) -> tuple[datetime, ...]:
+def _later_moments(name: str, grants: Iterable[Grant], moment: datetime) -> tuple[datetime, ...]:
     """Return a moment inside the validity of each grant that becomes valid later.
 
     Raises:
@@ -533,10 +535,10 @@ def _zenoh_worlds(
         title = "Zenoh" if len(domains) == 1 else f"Zenoh in domain {each}"
         crossing = Crossing(source.links.router_of, rules, each) if source.links else None
         enclaves = {*stated_access}.difference(source.routers)
-        yield _enforced(title, enforcers, enclaves, each, stated_access, crossing)
+        yield _zenoh_world(title, enforcers, enclaves, each, stated_access, crossing)
 
 
-def _enforced(
+def _zenoh_world(
     title: str,
     enforcers: Sequence[Enforcement],
     enclaves: Iterable[str],
@@ -576,7 +578,7 @@ class Places:
 
     def __init__(self, stated: Mapping[str, Iterable[Place]]) -> None:
         """Create an index of rights by enclave."""
-        self._stated = stated
+        self._stated_topics = stated
         self._by_enclave: dict[str, list[tuple[bool, str, Place]]] = {}
 
     @classmethod
@@ -588,7 +590,7 @@ class Places:
         """Return a right that permits a use, if possible one without wildcards, or None."""
         topics = self._by_enclave.get(use.enclave)
         if topics is None:
-            places = self._stated.get(use.enclave, ())
+            places = self._stated_topics.get(use.enclave, ())
             topics = self._by_enclave[use.enclave] = [
                 (*topic, place) for place in places for topic in topics_of(place.right)
             ]

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sros_tool.checks.keystores.enclaves import fault_remedy
-from sros_tool.checks.keystores.keystore import joined
+from sros_tool.checks.keystores.keystore import with_joined_findings
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.keystores.topic_names import names_without_wildcards
 from sros_tool.checks.keystores.vendors import (
@@ -40,7 +40,7 @@ from sros_tool.checks.upgrade import (
 )
 from sros_tool.dds.advisories import Advisory, known_vulnerabilities
 from sros_tool.dds.decision.access import Access, Outcome
-from sros_tool.dds.decision.grants import also_fitting
+from sros_tool.dds.decision.grants import other_fitting_enclaves
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.distributions import (
@@ -124,15 +124,15 @@ class DecidedFiles:
             name: [grant.subject for grant in permissions.grants]
             for name, permissions in self.source.permissions.items()
         }
-        return also_fitting(vendor.traits, subjects, granted)
+        return other_fitting_enclaves(vendor.traits, subjects, granted)
 
-    def decided(self) -> Iterator[tuple[str, LoadedEnclave]]:
+    def loaded_enclaves(self) -> Iterator[tuple[str, LoadedEnclave]]:
         """Yield names and files of the enclaves to decide on."""
         for name, enclave in self.enclaves.items():
             if self.chosen is None or name in self.chosen:
                 yield name, enclave
 
-    def only(self, enclaves: Iterable[str]) -> DecidedFiles:
+    def only_for(self, enclaves: Iterable[str]) -> DecidedFiles:
         """Return the same files, to decide only on ``enclaves``.
 
         The permissions of other enclaves still count.
@@ -240,12 +240,12 @@ def check_upgrade(
     findings: list[Finding] = []
     by_distribution = _present_distributions(files, present, here, later)
     for before, enclaves in by_distribution.items():
-        findings += _upgrade(files.only(enclaves), before, later, vendor)
+        findings += _upgrade_findings(files.only_for(enclaves), before, later, vendor)
         findings += _vulnerabilities(before, later, vendor, circumstances.advisories)
         if not files.keystore:
             findings += _rights_needed_after(path, circumstances, before, later)
     compared = {name for enclaves in by_distribution.values() for name in enclaves}
-    found = joined(list(dict.fromkeys(findings)))
+    found = with_joined_findings(list(dict.fromkeys(findings)))
     return UpgradeFindings(found, len(compared), len(files.enclaves))
 
 
@@ -275,14 +275,14 @@ def _present_distributions(
     return by_distribution
 
 
-def _upgrade(
+def _upgrade_findings(
     files: DecidedFiles, before: Distribution, after: Distribution, vendor: str
 ) -> Iterator[Finding]:
     for distribution in (before, after):
         if distribution.assumption:
             yield NOT_MEASURED.found(f"ROS 2 {distribution.title}", distribution.assumption)
     for old, new in _products(before, after, vendor):
-        yield from _not_tested(old, new)
+        yield from _untested_notes(old, new)
         for change in changes(files, old, new):
             kind = _KINDS[change.kind]
             yield kind.found(change.enclave, change.text, change.file, remedy=change.remedy)
@@ -351,12 +351,12 @@ def check_distributions(
     findings = []
     for names, enclaves in of_several.items():
         for before, after in _pairs([find_distribution(name) for name in names]):
-            for change in changes(files.only(enclaves), before, after):
+            for change in changes(files.only_for(enclaves), before, after):
                 kind = DISTRIBUTION_REFUSES if change.kind in (_LOSES, _JOINS) else DIFFER
                 findings.append(
                     kind.found(change.enclave, change.text, change.file, remedy=change.remedy)
                 )
-    return joined(findings)
+    return with_joined_findings(findings)
 
 
 def _pairs(distributions: Sequence[Distribution]) -> Iterator[tuple[Shipped, Shipped]]:
@@ -399,7 +399,7 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
         return
     by_vendors = AccessByVendors(files.source)
     fitting_others = {each.vendor: files.fitting_others(each.vendor) for each in (before, after)}
-    for name, enclave in files.decided():
+    for name, enclave in files.loaded_enclaves():
         numbers = files.domains(enclave)
         for number in numbers:
             context = JoinContext(number, files.at, files.zone)
@@ -478,7 +478,9 @@ def _changes_of_enclave(
     file = files.place(name, PERMISSIONS_FILE)
     for kind, one, other in ((_MORE, old, new), (_LESS, new, old)):
         gains = list(
-            by_vendors.added(name, one.access, other.access, other.shipped.vendor, domain, names)
+            by_vendors.gained_topics(
+                name, one.access, other.access, other.shipped.vendor, domain, names
+            )
         )
         if gains:
             accesses = first_few(list(dict.fromkeys(map(_words, gains))), _SHOWN, "; ", "; and ")
@@ -511,7 +513,7 @@ def _refusal(
     return DecisionChange(kind, name, text, files.place(name, cause.file), remedy)
 
 
-def _not_tested(before: Shipped, after: Shipped) -> Iterator[Finding]:
+def _untested_notes(before: Shipped, after: Shipped) -> Iterator[Finding]:
     for shipped in dict.fromkeys((before, after)):
         if not shipped.tested:
             same = before.vendor is after.vendor
@@ -524,7 +526,7 @@ def _nodes(files: DecidedFiles, before: Distribution, after: Distribution) -> It
     """Yield enclaves in which nodes start on only one of two distributions."""
     if has_type_descriptions(before.name) or files.keystore is None:
         return
-    for name, enclave in files.decided():
+    for name, enclave in files.loaded_enclaves():
         if enclave.state is None or not has_type_descriptions(after.name):
             continue
         starting = []
@@ -563,7 +565,7 @@ def _zenoh_findings(
         for right in source.rights
         if right.right == "publish" and right.qualifier is ALLOW and not is_expression(right.name)
         for domain in domains
-        if any(_drops(source.enforcers, right, domain, key) for key in more)
+        if any(_drops_below_name(source.enforcers, right, domain, key) for key in more)
     }
     if dropped:
         yield BUFFERS.found(files.file, f"for {first_few(sorted(dropped), _SHOWN)}")
@@ -573,7 +575,9 @@ _OF_EACH = "_buf/*"
 """Keys that rmw_zenoh uses for single subscriptions; they have no example without a wildcard."""
 
 
-def _drops(enforcers: Sequence[Enforcement], right: Right, domain: int, below: str) -> bool:
+def _drops_below_name(
+    enforcers: Sequence[Enforcement], right: Right, domain: int, below: str
+) -> bool:
     """Return whether messages of a right pass on the key of its name, but not on keys below it."""
     remote = Remote(right.enclave)
     messages = [

@@ -67,7 +67,7 @@ class Topics:
 
     def every(self) -> NameSet:
         """Return all these topics, even those that no ROS node would use."""
-        return named(self.expression)
+        return names_of_expression(self.expression)
 
     def valid(self) -> NameSet:
         """Return the topics whose names are valid in ROS."""
@@ -75,7 +75,7 @@ class Topics:
 
 
 @lru_cache(maxsize=65536)
-def named(expression: str) -> NameSet:
+def names_of_expression(expression: str) -> NameSet:
     """Return the names that an expression of a policy matches, on which all vendors agree."""
     return names_of(Style.FNMATCH, (expression,))
 
@@ -83,7 +83,7 @@ def named(expression: str) -> NameSet:
 @lru_cache(maxsize=65536)
 def _wild(expression: str) -> Automaton | None:
     """Return an automaton for an expression, or None if it has no wildcard."""
-    around = named(expression).around()
+    around = names_of_expression(expression).around()
     return next(iter(around.automata), None) if around else None
 
 
@@ -146,7 +146,7 @@ class Side:
         self._topics = sorted(self.exact)
         self._backwards = sorted(name[::-1] for name in self.exact)
 
-    def meeting(self, topics: Topics, limit: SearchLimit) -> list[TopicUser]:
+    def users_of_topics(self, topics: Topics, limit: SearchLimit) -> list[TopicUser]:
         """Return the enclaves that may use some of the topics, sorted.
 
         An enclave without ``stated`` topics may be listed wrongly: whether it may really use a
@@ -194,7 +194,7 @@ class Side:
             topics = (self._backwards[i][::-1] for i in backwards)
         return filter(automaton.matches, topics)
 
-    def perhaps_meeting(
+    def possible_users(
         self, automata: Collection[Automaton] | None, limit: SearchLimit
     ) -> list[str]:
         """Return the enclaves that may use a topic that the automata accept (None: any topic).
@@ -206,11 +206,11 @@ class Side:
         enclaves = set(self._any)
         for own in automata:
             if own not in self._met:
-                self._met[own] = self._meeting(own, limit)
+                self._met[own] = self._users_by_wildcard(own, limit)
             enclaves.update(self._met[own])
         return sorted(enclaves)
 
-    def _meeting(self, own: Automaton, limit: SearchLimit) -> frozenset[str]:
+    def _users_by_wildcard(self, own: Automaton, limit: SearchLimit) -> frozenset[str]:
         limit.spend(len(self._wild) // _OF_A_STEP)
         met: set[str] = set()
         for topic in self._accepted_topics(own, limit):
@@ -250,7 +250,7 @@ class Crossing:
         self._domain = domain
         self._passing: dict[tuple[str, str], NameSet] = {}
 
-    def between(self, writer: str, reader: str) -> NameSet | None:
+    def topics_between(self, writer: str, reader: str) -> NameSet | None:
         """Return the topics that can get from a writer to a reader; None for all (one router)."""
         sending, receiving = self.router_of.get(writer), self.router_of.get(reader)
         if sending is None or receiving is None or sending == receiving:
@@ -431,9 +431,9 @@ class World:
             self._readers_of[topic] = self._readers.users_of(topic)
         return self._readers_of[topic]
 
-    def between(self, writer: str, reader: str) -> NameSet | None:
+    def topics_between(self, writer: str, reader: str) -> NameSet | None:
         """Return the topics that can get from one enclave to another; None for all."""
-        return self.crossing.between(writer, reader) if self.crossing else None
+        return self.crossing.topics_between(writer, reader) if self.crossing else None
 
     def router_of(self, enclave: str) -> str:
         """Return the router that an enclave connects to; "" if there are not several routers."""
@@ -448,14 +448,16 @@ class World:
             self._written[enclave] = Written(names, around, exact)
         return self._written[enclave]
 
-    def shared(self, writer: str, reader: str, written: NameSet, limit: SearchLimit) -> str | None:
+    def shared_topic(
+        self, writer: str, reader: str, written: NameSet, limit: SearchLimit
+    ) -> str | None:
         """Return a topic in ``written`` that the reader may read and that gets to it, or None.
 
         ``written`` has to depend on the writer only.
         """
         if (writer, reader) not in self._shared:
             both = written & self._readers.of[reader]
-            crossing = self.between(writer, reader)
+            crossing = self.topics_between(writer, reader)
             both = both if crossing is None else both & crossing
             valid = (both & names for names in _VALID)
             example = next(
@@ -465,7 +467,7 @@ class World:
             self._shared[writer, reader] = example or both.example(limit, longest=self.longest)
         return self._shared[writer, reader]
 
-    def weaker(self, level: Level) -> NameSet | None:
+    def weakly_protected(self, level: Level) -> NameSet | None:
         """Return the topics that are protected less than a level demands; None for no topics."""
         return self._weak.get(level)
 
@@ -511,7 +513,7 @@ def ros_access(stated_rights: Iterable[StatedRight]) -> TopicAccess:
     names: dict[tuple[bool, str, bool], list[NameSet]] = defaultdict(list)
     for right in (right.right for right in stated_rights):
         for writes, topic in topics_of(right):
-            names[writes, topic[:2], right.qualifier is ALLOW].append(named(topic))
+            names[writes, topic[:2], right.qualifier is ALLOW].append(names_of_expression(topic))
 
     def side(writes: bool) -> NameSet:
         return NameSet.union(
@@ -538,7 +540,7 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
         first, *others = (enforcer.passing(remote, *each, of) for each in _USES[writes, begin])
         for other in others:
             first &= other
-        return first & named(f"{begin}/*{_ENDS[begin]}")
+        return first & names_of_expression(f"{begin}/*{_ENDS[begin]}")
 
     every = tuple(enforcers)
     return TopicAccess(

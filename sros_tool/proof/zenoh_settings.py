@@ -148,7 +148,7 @@ def unknown_settings(old: _Files, new: _Files) -> Iterator[str]:
     """Yield a clause for each setting that differs and whose effect sros does not know."""
     files: dict[str, list[str]] = defaultdict(list)
     for place, file in sorted(new.items()):
-        before = old[place].document if place in old else _usual(file.document.mode)
+        before = old[place].document if place in old else _default_configuration(file.document.mode)
         one, other = before.settings, file.document.settings
         for path in sorted({*one, *other, *file.document.unknown}):
             known = any(each.fullmatch(path) for each in (_COMPARED, _HARMLESS))
@@ -168,7 +168,10 @@ def _changes(
     ``place`` is the key of ``file``, by which the old file is looked up in ``old``.
     """
     known = old.get(place)
-    before, after = known.document if known else _usual(file.document.mode), file.document
+    before, after = (
+        known.document if known else _default_configuration(file.document.mode),
+        file.document,
+    )
     if file.signature != SIGNED and (known is None or known.signature == SIGNED):
         meaning = "anybody who can write the file states the rights and settings"
         yield "signature", SIGNED, file.signature, meaning
@@ -213,6 +216,6 @@ def _more_protocols(before: tuple[str, ...] | None, after: tuple[str, ...] | Non
 
 
 @lru_cache(maxsize=len(Mode))
-def _usual(mode: Mode) -> ConfigurationDocument:
+def _default_configuration(mode: Mode) -> ConfigurationDocument:
     """Return the configuration that sros writes for a mode, without endpoints and rules."""
     return parse_configuration(render_configuration(mode, (), (), ()), "as sros writes it")

@@ -147,12 +147,12 @@ def overlay(
     if kind == "use":
         unseen = frozenset(right.enclave for right in rights[0] - rights[1])
         unseen -= {right.enclave for right in rights[1]}
-        edges = [_neutral(edge, unseen) for edge in edges]
+        edges = [_neutral_edge(edge, unseen) for edge in edges]
     picture = _picture((first_source, second_source), edges, stated, known, context)
     return replace(
         picture,
         overlay=_OVERLAYS[kind],
-        differences=_unused(edges) if kind == "use" else _overlay_differences(*rights),
+        differences=_unused_rights(edges) if kind == "use" else _overlay_differences(*rights),
         enclaves=tuple(replace(e, observed=e.path not in unseen) for e in picture.enclaves),
     )
 
@@ -287,7 +287,7 @@ def _enclaves(
     described = {enclave.path: enclave for source in sources for enclave in source.enclaves}
     statements: dict[str, list[Statement]] = defaultdict(list)
     for right in sorted(stated_rights, key=order):
-        reaches = len(known_names.reached(right.kind, right.name))
+        reaches = len(known_names.matching_names(right.kind, right.name))
         statements[right.enclave].append(
             Statement(
                 right.qualifier, right.right, right.kind, right.name, reaches, stated_rights[right]
@@ -371,7 +371,7 @@ def _marked_rights(
     return edges
 
 
-def _neutral(edge: Edge, unseen: frozenset[str]) -> Edge:
+def _neutral_edge(edge: Edge, unseen: frozenset[str]) -> Edge:
     """Return ``edge`` marked BOTH if it is a denial, or its enclave is in ``unseen``."""
     neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
     return replace(edge, mark=OverlaySide.BOTH) if neutral else edge
@@ -398,7 +398,7 @@ def _overlay_differences(
     )
 
 
-def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
+def _unused_rights(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
     """Return rights that were allowed but never observed, or observed but not allowed.
 
     Rights that every node needs are left out.  The names that a wildcard matches are only counted:
@@ -444,11 +444,11 @@ class Known:
         self._matched: dict[tuple[str, str], tuple[str, ...]] = {}
         wild: dict[str, list[str]] = defaultdict(list)
         for part in sorted(unfolded(rights)):
-            if is_expression(part.name) and not self.reached(part.kind, part.name):
+            if is_expression(part.name) and not self.matching_names(part.kind, part.name):
                 wild[part.kind].append(part.name)
         self._open = {kind: _Wild(names) for kind, names in wild.items()}
 
-    def reached(self, kind: str, name: str) -> tuple[str, ...]:
+    def matching_names(self, kind: str, name: str) -> tuple[str, ...]:
         """Return the exact names of this kind that an expression matches."""
         if not is_expression(name):
             return (name,)
@@ -457,7 +457,7 @@ class Known:
             self._matched[key] = tuple(self._matching_names(kind, name))
         return self._matched[key]
 
-    def drawn(self, right: Right) -> tuple[str, ...]:
+    def names_to_draw(self, right: Right) -> tuple[str, ...]:
         """Return the names to draw for a right: exact names, and wildcards that match none.
 
         A wildcard that matches no exact name is drawn for each ALLOW that overlaps it, and for each
@@ -466,8 +466,8 @@ class Known:
         if not is_expression(right.name):
             return (right.name,)
         opened = self._open.get(right.kind)
-        wild = opened.drawn(right.qualifier, right.name) if opened else ()
-        return (*self.reached(right.kind, right.name), *wild)
+        wild = opened.names_to_draw(right.qualifier, right.name) if opened else ()
+        return (*self.matching_names(right.kind, right.name), *wild)
 
     def _matching_names(self, kind: str, expression: str) -> Iterable[str]:
         if kind == "actions":
@@ -489,11 +489,11 @@ class _Wild:
         self._names = Names(names)
         self._drawn: dict[tuple[Qualifier, str], tuple[str, ...]] = {}
 
-    def drawn(self, qualifier: Qualifier, name: str) -> tuple[str, ...]:
+    def names_to_draw(self, qualifier: Qualifier, name: str) -> tuple[str, ...]:
         """Return the wildcards that ``name`` overlaps (ALLOW), or that it covers (DENY)."""
         key = (qualifier, name)
         if key not in self._drawn:
-            meeting = self._names.meeting(name)
+            meeting = self._names.overlapping(name)
             self._drawn[key] = tuple(
                 other for other in meeting if qualifier is not DENY or covers(name, other)
             )
@@ -526,7 +526,7 @@ def _edges_of(
     topics: dict[tuple[str, str, str, str], _Found] = defaultdict(lambda: defaultdict(set))
     for stated in unfolded(rights):
         by = stated.name if is_expression(stated.name) else ""
-        for reached in known_names.drawn(stated):
+        for reached in known_names.names_to_draw(stated):
             # A wildcard drawn as a name is treated like an exact name.
             said = "" if reached == by else by
             topics[stated.enclave, stated.kind, stated.right, reached][stated.qualifier].add(said)
@@ -545,7 +545,7 @@ def _edges_of(
                 name,
                 right,
                 qualifier,
-                _by(by_qualifier[qualifier]),
+                _wildcards_used(by_qualifier[qualifier]),
                 common=qualifier is ALLOW and _is_common(name, needed[right]),
             )
         )
@@ -565,18 +565,20 @@ def _action_edges(
     for right, needed in _WHOLE.items():
         if needed <= members.keys():
             whole = {member for part in needed for member in members[part]}
-            yield Edge(enclave, "actions", action, right, qualifier, _by(whole, action=True))
+            yield Edge(
+                enclave, "actions", action, right, qualifier, _wildcards_used(whole, action=True)
+            )
             for part in needed:
                 remaining.pop(part, None)
     rest: dict[str, dict[str, set[str]]] = defaultdict(dict)
     for (right, inside), names in remaining.items():
         rest[right][inside] = names
     for right, halves in rest.items():
-        by = _by({text for said in halves.values() for text in said})
+        by = _wildcards_used({text for said in halves.values() for text in said})
         yield Edge(enclave, "actions", action, right, qualifier, by, tuple(sorted(halves)))
 
 
-def _by(names: set[str], *, action: bool = False) -> tuple[str, ...]:
+def _wildcards_used(names: set[str], *, action: bool = False) -> tuple[str, ...]:
     """Return the wildcards in ``names``; () if it contains "", which stands for the exact name."""
     if "" in names:
         return ()

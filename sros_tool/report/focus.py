@@ -41,10 +41,10 @@ from sros_tool.report.layout import (
     enclave_notes,
     frames_of,
     height_of,
-    linked,
+    linked_cards,
     names_card,
-    stacked,
-    wrapped,
+    stacked_cards,
+    wrapped_name,
 )
 from sros_tool.report.picture import (
     Bundle,
@@ -56,9 +56,9 @@ from sros_tool.report.picture import (
     Picture,
     Tie,
     WireLevel,
-    asks,
-    coarsened,
     fold,
+    is_question,
+    joined_by_senders,
 )
 from sros_tool.wording import counted, enumerated
 
@@ -75,7 +75,7 @@ _COMMANDS = ("send_goal", "cancel_goal")
 _NAMED = 3  # enclaves that a sentence names; of more it says the number
 
 
-def focused(
+def focused_picture(
     picture: Picture, sources: Sequence[PictureSource], words: Sequence[str], routers: int = 0
 ) -> Picture:
     """Return the part of a picture connected to the names or enclaves in ``words``.
@@ -207,14 +207,14 @@ def _may_write(edge: Edge) -> bool:
     """Return whether information goes from the enclave of an edge to its name."""
     if edge.right in _ONE_WAY:
         return edge.sends
-    return not (edge.right == "request" and asks(edge))
+    return not (edge.right == "request" and is_question(edge))
 
 
 def _may_read(edge: Edge) -> bool:
     """Return whether information goes from the name of an edge to its enclave."""
     if edge.right in _ONE_WAY:
         return not edge.sends
-    return not (edge.right == "reply" and asks(edge))
+    return not (edge.right == "reply" and is_question(edge))
 
 
 # ── answers ────────────────────────────────────────────────────────────────────────────────
@@ -262,7 +262,9 @@ class _System:
         kinds += [name.kind for name in self._picture.names if name.name == word]
         if not kinds:
             kinds = [
-                kind for kind in _VERBS if any(_meets(right, kind, word) for right in self._rights)
+                kind
+                for kind in _VERBS
+                if any(_overlaps_word(right, kind, word) for right in self._rights)
             ]
         if not kinds:
             known = (*enclaves, *(name.name for name in self._picture.names))
@@ -278,8 +280,8 @@ class _System:
     def focus(self, kind: str, name: str) -> Focus:
         """Return who may use a name and who influences its users, or the same for an enclave."""
         if kind == _ENCLAVE:
-            influencing = self._influences(self._network.influencing({name}))
-            influenced = self._influences(self._network.influenced({name}), 0)
+            influencing = self._influences(self._network.influencers_of({name}))
+            influenced = self._influences(self._network.influenced_by({name}), 0)
             sentence = (
                 f"{name} can influence {_counted_influences(influenced, 1)}, "
                 f"and {_counted_influences(influencing, 2)} can influence it"
@@ -290,7 +292,7 @@ class _System:
             frozenset(user for topic in topics for user in self._direct.users(side, topic))
             for side in ("publish", "subscribe")
         )
-        influencing = self._influences(self._network.influencing(senders))
+        influencing = self._influences(self._network.influencers_of(senders))
         open_to_all = senders != frozenset(
             user for topic in topics for user in self._by_permissions.users("publish", topic)
         )
@@ -361,7 +363,7 @@ class _System:
         return Name(kind, name, namespace_of(name), protection, is_expression(name))
 
 
-def _meets(right: Right, kind: str, word: str) -> bool:
+def _overlaps_word(right: Right, kind: str, word: str) -> bool:
     return right.kind == kind and right.qualifier is ALLOW and overlap(right.name, word)
 
 
@@ -389,10 +391,10 @@ def _sentence(
 ) -> str:
     """Return a sentence on who may use a name, and how many enclaves influence its senders."""
     sends, sender, receives = _VERBS[kind]
-    who = "every enclave" if open_to_all else _who(senders)
+    who = "every enclave" if open_to_all else _enclaves_text(senders)
     text = f"{who} may {sends} {name}"
     text += ", which the governance leaves open" if open_to_all else ""
-    text += f"; {_who(receivers)} may {receives} it"
+    text += f"; {_enclaves_text(receivers)} may {receives} it"
     if open_to_all or not senders:
         return text
     them = f"the {sender}" if len(senders) == 1 else f"these {sender}s"
@@ -411,7 +413,7 @@ def _counted_influences(influences: Sequence[Influence], direct: int) -> str:
     return text if near == len(influences) else f"{text} ({near} directly)"
 
 
-def _who(enclaves: Collection[str]) -> str:
+def _enclaves_text(enclaves: Collection[str]) -> str:
     """Return the paths of a few enclaves, or the number of many enclaves, in words."""
     if not enclaves:
         return "no enclave"
@@ -456,14 +458,14 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, with_places: bool = True) 
     )
     if not with_places:
         return scene
-    cards = stacked(
+    cards = stacked_cards(
         cards.values(), sorted({(link.source, link.target) for link in links}), draft.columns
     )
     return replace(
         scene,
         height=bottom_of(cards.values()),
         cards=tuple(cards.values()),
-        links=linked(cards, links),
+        links=linked_cards(cards, links),
         frames=tuple(frames_of(cards.values())),
     )
 
@@ -530,7 +532,7 @@ class _Draft:
         both = used[0] | used[1] if stage == 0 else used[0] & used[1]
         kept = [edge for side in sides for edge in side if (edge.kind, edge.name) in both]
         bundles: Iterable[Bundle] = fold(self._picture.names, kept)
-        bundles = coarsened(bundles) if len(tuple(bundles)) > _MOST_BUNDLES else bundles
+        bundles = joined_by_senders(bundles) if len(tuple(bundles)) > _MOST_BUNDLES else bundles
         middle = self._first + 2 * self._left - 1
         return _Stage(
             middle - 2 * stage,
@@ -578,7 +580,7 @@ class _Draft:
                 group = self._groups[node]
                 label = node.removeprefix(group.rstrip("/") + "/") or node
                 notes = list(noted.get(node, ()))
-            lines = wrapped(label, SIDE_LETTERS)
+            lines = wrapped_name(label, SIDE_LETTERS)
             yield Card(
                 id=f"{'s' if before else 'l'}{node}",
                 role="group" if node[0] == ":" else "enclave",

@@ -100,10 +100,10 @@ class Folding(NamedTuple):
         return replace(
             scene,
             cards=tuple(cards),
-            frames=tuple(self._titled(frame) for frame in scene.frames),
+            frames=tuple(self._with_folded_title(frame) for frame in scene.frames),
         )
 
-    def _titled(self, frame: Frame) -> Frame:
+    def _with_folded_title(self, frame: Frame) -> Frame:
         equal = next((units for units in self.equal if units.label in frame.title), None)
         if equal is None:
             return frame
@@ -224,7 +224,7 @@ class UnitNames:
             at = 0
             while at < len(pieces):
                 parts[-1] += "_" if at else ""
-                value, size = self._longest(pieces, at)
+                value, size = self._longest_unit_name(pieces, at)
                 if value:
                     named.append(value)
                     parts.append("")
@@ -234,7 +234,9 @@ class UnitNames:
         parts[-1] += text[end:]
         return UnitText(tuple(parts), tuple(named))
 
-    def _longest(self, pieces: Sequence[str], at: int) -> tuple[tuple[int, int] | None, int]:
+    def _longest_unit_name(
+        self, pieces: Sequence[str], at: int
+    ) -> tuple[tuple[int, int] | None, int]:
         """Return the unit with the longest name that begins at piece ``at``, and the name's length.
 
         The unit is its number and the number of the word in its ``values``, or None; the length is
@@ -268,11 +270,13 @@ class _Draft:
             classes = self._find_classes()
             if self._picture.focus:
                 # What goes from one robot to another one is at two stages of the flow.
-                classes = {n: units for n, units in classes.items() if self._apart(units[0])}
+                classes = {
+                    n: units for n, units in classes.items() if self._is_kept_apart(units[0])
+                }
             if classes:
                 self._classes = classes
                 return self._folded()
-        return _as_it_is(self._picture)
+        return _unfolded(self._picture)
 
     def _has_marks(self) -> bool:
         texts = (
@@ -351,7 +355,7 @@ class _Draft:
         named = self._named_by(usual)
         for unit, *others in classes.values():
             family = self._units[unit].family
-            near = family in usual and _alike(views[unit], views[usual[family]])
+            near = family in usual and _are_alike(views[unit], views[usual[family]])
             if not others and not (near and 2 * named[unit] <= sizes[family]):
                 self._symbols[unit] = -unit - 2
         before = [0] * len(views)
@@ -404,8 +408,8 @@ class _Draft:
         self._inside = {n: number for number, members in self._classes.items() for n in members}
         self._enclaves: dict[str, tuple[str, ...]] = {}
         self._names: dict[tuple[str, str], tuple[str, ...]] = {}
-        self._alike: dict[object, list[str]] | None = None
-        different, differing_parts = self._differing()
+        self._are_alike: dict[object, list[str]] | None = None
+        different, differing_parts = self._differing_units()
         edges = tuple(sorted(set(self._edges(differing_parts)), key=edge_order))
         picture = replace(
             self._picture,
@@ -432,7 +436,7 @@ class _Draft:
         domains = {self._domains_of[enclave] for enclave in enclaves if enclave in self._domains_of}
         return domains.pop() if len(domains) == 1 else ""
 
-    def _apart(self, unit: int) -> bool:
+    def _is_kept_apart(self, unit: int) -> bool:
         """Return whether a unit may not be drawn together with others."""
         symbol = self._symbols[unit]
         return not any(
@@ -462,14 +466,14 @@ class _Draft:
     def _per_unit(self, text: UnitText, colour: int) -> Iterator[str]:
         """Yield the text once for each unit of a class, with that unit's name."""
         for unit in self._classes[colour]:
-            yield text.fill(partial(self._instead, unit))
+            yield text.fill(partial(self._plain_word, unit))
 
-    def _instead(self, unit: int, _unit: int, position: int) -> str:
+    def _plain_word(self, unit: int, _unit: int, position: int) -> str:
         return self._word(unit, position)
 
     def _edges(self, differing_parts: Set[Edge | str]) -> Iterator[Edge]:
         """Yield the rights to draw: of drawn units, and of enclaves that belong to no unit."""
-        others = self._others()
+        others = self._other_units_text()
         for edge in self._picture.edges:
             unit = self._of.get(edge.enclave)
             if unit is not None and not self._is_drawn(unit):
@@ -494,7 +498,7 @@ class _Draft:
             return False
         return other in self._inside or unit in self._inside
 
-    def _others(self) -> Callable[[Edge, int, int, int], str]:
+    def _other_units_text(self) -> Callable[[Edge, int, int, int], str]:
         """Return a function that tells how many other units a right is for, as text."""
         others: dict[object, set[int]] = defaultdict(set)
         families: dict[int, list[int]] = defaultdict(list)
@@ -535,12 +539,12 @@ class _Draft:
         """Yield the real names that a drawn name with labels stands for."""
         if len(name.named) == 1 and name.units[0] in self._inside:
             return self._per_unit(name, self._inside[name.units[0]])
-        if self._alike is None:
-            self._alike = defaultdict(list)
+        if self._are_alike is None:
+            self._are_alike = defaultdict(list)
             for real in self._picture.names:
                 if (text := self._text(real.name)).named:
-                    self._alike[real.kind, self._text_form(text)].append(real.name)
-        return self._alike[kind, self._text_form(name)]
+                    self._are_alike[real.kind, self._text_form(text)].append(real.name)
+        return self._are_alike[kind, self._text_form(name)]
 
     def _text_form(self, text: UnitText) -> object:
         return text.form, tuple(self._symbols[unit] for unit in text.units)
@@ -583,7 +587,7 @@ class _Draft:
 
     # ── what differs ───────────────────────────────────────────────────────────────────────
 
-    def _differing(self) -> tuple[tuple[DifferentUnit, ...], Set[Edge | str]]:
+    def _differing_units(self) -> tuple[tuple[DifferentUnit, ...], Set[Edge | str]]:
         """Return the units that differ slightly from most units of their family.
 
         Also returns the drawn enclaves and rights in which they differ.
@@ -607,7 +611,7 @@ class _Draft:
         differing_parts: set[Edge | str] = set()
         for n in sorted(near, key=self._by_name):
             own, other = seen[n], seen[near[n]]
-            if _alike(own, other):
+            if _are_alike(own, other):
                 more = [what for key, what in own.items() if key not in other]
                 fewer = [what for key, what in other.items() if key not in own]
                 differing_parts.update(more)
@@ -656,12 +660,12 @@ def _classes(views: Sequence[Counter[object]], before: Sequence[int]) -> dict[in
     return classes
 
 
-def _alike(view: Collection[object], other: Collection[object]) -> bool:
+def _are_alike(view: Collection[object], other: Collection[object]) -> bool:
     """Return whether two drawings of units have at least half of their content in common."""
     return 2 * len(set(view).intersection(other)) >= max(len(view), len(other))
 
 
-def _as_it_is(picture: Picture) -> Folding:
+def _unfolded(picture: Picture) -> Folding:
     return Folding(picture, (), (), {}, {})
 
 
@@ -670,7 +674,7 @@ def _as_it_is(picture: Picture) -> Folding:
 
 def units_of(paths: Sequence[str], robots: Mapping[str, Robot]) -> list[DrawnUnit]:
     """Return the units of enclaves: their ``robots``, else what looks alike by its paths."""
-    return list(_robots(paths, robots) if robots else _guessed(paths))
+    return list(_robots(paths, robots) if robots else _guessed_units(paths))
 
 
 def name_order(name: str) -> tuple[object, ...]:
@@ -696,7 +700,7 @@ def _robots(paths: Iterable[str], robots: Mapping[str, Robot]) -> Iterator[Drawn
         yield DrawnUnit(name, "robot", 0, tuple(enclaves[name]), values, group)
 
 
-def _guessed(paths: Iterable[str]) -> Iterator[DrawnUnit]:
+def _guessed_units(paths: Iterable[str]) -> Iterator[DrawnUnit]:
     """Yield sibling namespaces or enclaves that contain nearly the same enclaves."""
     waiting = [_by_first((path[1:], path) for path in paths)]
     family = 0

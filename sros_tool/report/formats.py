@@ -342,7 +342,7 @@ def render_dot(picture: Picture, scene: Scene) -> str:
         '  node [shape=box, style=rounded, fontname="monospace", fontsize=11]',
         '  edge [fontname="sans-serif", fontsize=9, color="#5d7590"]',
     ]
-    cards = _once(scene)
+    cards = _node_cards(scene)
     clusters = _clusters(cards)
     for number, (title, members) in enumerate(clusters.items()):
         lines.append(f"  subgraph cluster_{number} {{ label={_quoted(title)}; style=rounded")
@@ -358,7 +358,7 @@ def render_dot(picture: Picture, scene: Scene) -> str:
 
 def render_mermaid(picture: Picture, scene: Scene) -> str:
     """Return the scene as a Mermaid flowchart."""
-    cards = _once(scene)
+    cards = _node_cards(scene)
     clusters = _clusters(cards)
     lines = ["---", f"title: {_yaml(_title(picture))}", "---", "flowchart LR"]
     for number, (title, members) in enumerate(clusters.items()):
@@ -444,7 +444,7 @@ def _title(picture: Picture) -> str:
     return ". ".join((picture.title, *picture.headlines))
 
 
-def _once(scene: Scene) -> Mapping[str, Card]:
+def _node_cards(scene: Scene) -> Mapping[str, Card]:
     """Map node ids to cards; the two cards of an enclave become one node."""
     cards: dict[str, Card] = {}
     for card in sorted(scene.cards, key=lambda card: (card.role, card.members, card.column)):

@@ -25,9 +25,9 @@ from sros_tool.report.picture import (
     Picture,
     Tie,
     WireLevel,
-    coarsened,
     fold,
     is_plain,
+    joined_by_senders,
     lack_text,
 )
 from sros_tool.wording import counted
@@ -253,7 +253,7 @@ def _scene(
     for edge in picture.edges:
         everybody[edge.kind, edge.name].add(owner(edge.enclave))
     draft = _Draft(picture, edges, owner, members, everybody)
-    scene = draft.placed(name, title) if with_places else draft.scene(name, title)
+    scene = draft.placed_scene(name, title) if with_places else draft.scene(name, title)
     shown = _count_real_names({(edge.kind, edge.name) for edge in edges}, drawn_as or {})
     hidden = (
         _count_real_names({(name.kind, name.name) for name in picture.names}, drawn_as or {})
@@ -300,25 +300,25 @@ class _Draft:
             else:
                 self._bundles.append(bundle)
         if len(self._bundles) > _MOST_BUNDLES:
-            self._bundles = list(coarsened(self._bundles))
+            self._bundles = list(joined_by_senders(self._bundles))
         self._ties: dict[tuple[str, str, Qualifier, bool, OverlaySide, bool, bool], set[str]]
         self._ties = defaultdict(set)
         for number, bundle in enumerate(self._bundles):
             for tie in bundle.ties:
-                if not self._looks(tie):
+                if not self._is_onlooker(tie):
                     side, names = f"{'s' if tie.sends else 'l'}{tie.node}", f"n{number}"
                     ends = (side, names) if tie.sends else (names, side)
                     marks = tie.mark, tie.violates, tie.differs
                     self._ties[*ends, tie.qualifier, bool(tie.by), *marks].add(tie.right)
 
-    def _looks(self, tie: Tie) -> bool:
+    def _is_onlooker(self, tie: Tie) -> bool:
         """Return whether a right is drawn as a letter on the card of the name, not as a line."""
         return is_plain(tie) and (tie.node, tie.right) in self._looking
 
     def _only_node(self, bundle: Bundle) -> str:
         """Return the only node, apart from onlookers, with a right to these names, or ""."""
-        looking = {tie.node for tie in bundle.ties if self._looks(tie)}
-        drawn = {tie.node for tie in bundle.ties if not self._looks(tie)}
+        looking = {tie.node for tie in bundle.ties if self._is_onlooker(tie)}
+        drawn = {tie.node for tie in bundle.ties if not self._is_onlooker(tie)}
         if not all(map(is_plain, bundle.ties)) or bundle.protection.open_text:
             return ""
         nodes = {node for name in bundle.names for node in self._everybody[bundle.kind, name]}
@@ -347,12 +347,12 @@ class _Draft:
             ),
         )
 
-    def placed(self, name: str, title: str) -> Scene:
+    def placed_scene(self, name: str, title: str) -> Scene:
         """Return the scene with the positions of all cards, links and frames."""
         scene = self.scene(name, title)
         cards = {card.id: card for card in scene.cards}
         lines = sorted({ends[:2] for ends in self._ties})
-        cards = stacked(cards.values(), lines, 3)
+        cards = stacked_cards(cards.values(), lines, 3)
         return replace(
             scene,
             height=bottom_of(cards.values()),
@@ -399,7 +399,7 @@ class _Draft:
             for reach in (_REACHES[right],)
             if other == node and SENDS[right] is sends
         ]
-        lines = wrapped(label, SIDE_LETTERS)
+        lines = wrapped_name(label, SIDE_LETTERS)
         return Card(
             id=side,
             role="group" if is_group else "enclave",
@@ -417,7 +417,7 @@ class _Draft:
     def _names_card(self, number: int, bundle: Bundle) -> Card:
         drawn = {tie.node for tie in bundle.ties}
         shared = len(self._everybody[bundle.kind, bundle.names[0]] - drawn) > 0
-        tags = {self._tags[tie.node, tie.right] for tie in bundle.ties if self._looks(tie)}
+        tags = {self._tags[tie.node, tie.right] for tie in bundle.ties if self._is_onlooker(tie)}
         x = MARGIN + _SIDE_WIDTH + _GUTTER
         notes = (_COMMON[bundle.kind],) if shared else ()
         card = names_card(f"n{number}", bundle, 1, notes)
@@ -426,7 +426,7 @@ class _Draft:
     # ── links ──────────────────────────────────────────────────────────────────────────────
 
     def _links(self, cards: Mapping[str, Card]) -> tuple[Link, ...]:
-        return linked(
+        return linked_cards(
             cards,
             [
                 Link(
@@ -513,7 +513,7 @@ def enclave_notes(picture: Picture) -> Mapping[str, tuple[str, ...]]:
 def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = ()) -> Card:
     """Return the card of a bundle, without x, y and width; ``more`` are additional notes."""
     titles, notes = _names_title(bundle)
-    lines = tuple(line for title in titles for line in wrapped(title, _NAMES_LETTERS))
+    lines = tuple(line for title in titles for line in wrapped_name(title, _NAMES_LETTERS))
     notes += more
     if bundle.protection.open_text:
         notes += (bundle.protection.open_text,)
@@ -551,7 +551,7 @@ def _common_namespace(names: Sequence[str]) -> str:
     return "/".join(found)
 
 
-def wrapped(text: str, letters: int) -> tuple[str, ...]:
+def wrapped_name(text: str, letters: int) -> tuple[str, ...]:
     """Split ``text`` at slashes or underscores into lines of at most ``letters`` characters."""
     lines = []
     while len(text) > letters:
@@ -569,7 +569,7 @@ def wrapped(text: str, letters: int) -> tuple[str, ...]:
 # ── positions ──────────────────────────────────────────────────────────────────────────
 
 
-def stacked(
+def stacked_cards(
     cards: Iterable[Card], lines: Sequence[tuple[str, str]], columns: int
 ) -> dict[str, Card]:
     """Return the cards with their y, by id, ordered by column and y.
@@ -594,7 +594,7 @@ def bottom_of(cards: Iterable[Card]) -> int:
     return max((card.y + card.height for card in cards), default=0) + MARGIN
 
 
-def linked(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link, ...]:
+def linked_cards(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link, ...]:
     """Return the links with their ends spread along the edges of the cards."""
     ports: dict[tuple[str, bool], list[tuple[float, int]]] = defaultdict(list)
     for number, link in enumerate(links):

@@ -55,7 +55,7 @@ def render_page(
         Template(_asset("view.html")).substitute(title=escape(picture.title), made=escape(made)),
         style,
         script,
-        _data(picture, scenes, drawn or picture),
+        _page_data(picture, scenes, drawn or picture),
     )
 
 
@@ -113,7 +113,7 @@ def _digest(text: str) -> str:
 # ── data ───────────────────────────────────────────────────────────────────────────────────
 
 
-def _data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[str, Any]:
+def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[str, Any]:
     """Return the data of the page's script, as values for JSON.
 
     Rights are grouped by names with equal rights (bundles), which takes less space than one entry
@@ -124,34 +124,34 @@ def _data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[s
         "overlay": as_plain(picture.overlay),
         "of_every_node": OF_EVERY_NODE,
         "join_needs_right": picture.join_needs_right,
-        "enclaves": [_enclave(enclave) for enclave in picture.enclaves],
-        "bundles": [_bundle(each) for each in fold(picture.names, picture.edges, apart=True)],
-        "scenes": [_scene(each) for each in scenes],
+        "enclaves": [_enclave_json(enclave) for enclave in picture.enclaves],
+        "bundles": [_bundle_json(each) for each in fold(picture.names, picture.edges, apart=True)],
+        "scenes": [_scene_json(each) for each in scenes],
         "equal": as_plain(picture.equal),
-        "rows": [_row(each) for each in fold(drawn.names, drawn.edges)],
+        "rows": [_row_json(each) for each in fold(drawn.names, drawn.edges)],
         "differences": as_plain(picture.differences),
         "validities": as_plain(picture.validities),
         "findings": as_plain(picture.findings),
     }
 
 
-def _enclave(enclave: PicturedEnclave) -> dict[str, Any]:
+def _enclave_json(enclave: PicturedEnclave) -> dict[str, Any]:
     """Return an enclave as JSON; of its rights, only those to names with wildcards."""
     wild = [
-        _with_deny(as_plain(statement))
+        _with_denial_flag(as_plain(statement))
         for statement in enclave.statements
         if is_expression(statement.name)
     ]
     return {**as_plain(enclave), "statements": wild, "domains": enclave.domains}
 
 
-def _with_deny(value: dict[str, Any]) -> dict[str, Any]:
+def _with_denial_flag(value: dict[str, Any]) -> dict[str, Any]:
     value["deny"] = value.pop("qualifier") != ALLOW
     return value
 
 
-def _bundle(bundle: Bundle) -> dict[str, Any]:
-    ties = [_with_deny(as_plain(tie)) for tie in bundle.ties]
+def _bundle_json(bundle: Bundle) -> dict[str, Any]:
+    ties = [_with_denial_flag(as_plain(tie)) for tie in bundle.ties]
     for tie in ties:
         tie["enclave"] = tie.pop("node")
         del tie["differs"]
@@ -166,7 +166,7 @@ def _bundle(bundle: Bundle) -> dict[str, Any]:
     }
 
 
-def _row(bundle: Bundle) -> dict[str, Any]:
+def _row_json(bundle: Bundle) -> dict[str, Any]:
     """Return a row of the table of names: who may send, who may receive, who is denied."""
     ties = [tie for tie in bundle.ties if tie.qualifier is ALLOW]
     return {
@@ -183,10 +183,10 @@ def _row(bundle: Bundle) -> dict[str, Any]:
     }
 
 
-def _scene(scene: Scene) -> dict[str, Any]:
+def _scene_json(scene: Scene) -> dict[str, Any]:
     value: dict[str, Any] = as_plain(scene)
     value["cards"] = _table(value["cards"])
-    value["links"] = _table([_with_deny(link) for link in value["links"]])
+    value["links"] = _table([_with_denial_flag(link) for link in value["links"]])
     return value
 
 
@@ -232,7 +232,7 @@ def _sentence(text: str) -> str:
 
 def _demo_head(result: Json) -> str:
     rows = result["rows"]
-    good, skipped = _good(rows), sum(row["observed"] == _SKIPPED for row in rows)
+    good, skipped = _number_as_expected(rows), sum(row["observed"] == _SKIPPED for row in rows)
     not_tried = sum(len(_not_tried(scenario)) for scenario in result["scenarios"])
     opened = sum(bool(row.get("open_because")) and not row.get("open_here") for row in rows)
     here = sum(bool(row.get("open_here")) for row in rows)
@@ -278,7 +278,7 @@ def _demo_head(result: Json) -> str:
     )
 
 
-def _good(rows: Sequence[Json]) -> int:
+def _number_as_expected(rows: Sequence[Json]) -> int:
     """Return the number of rows that were run and had the expected result."""
     return sum(bool(row["as_expected"]) and row["observed"] != _SKIPPED for row in rows)
 
@@ -291,7 +291,7 @@ def _not_tried(scenario: Json) -> Sequence[str]:
 
 def _demo_scenario(scenario: Json) -> str:
     rows = scenario["rows"]
-    good = _good(rows)
+    good = _number_as_expected(rows)
     parts = [f"<section><h2>{escape(scenario['title'])}</h2>"]
     if scenario.get("cast"):
         members = (

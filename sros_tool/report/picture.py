@@ -170,7 +170,7 @@ def lack_text(kind: str, lacks: Lack) -> str:
     return f"nobody may {sends if lacks is Lack.SENDER else receives}"
 
 
-def asks(name: Name | Edge) -> bool:
+def is_question(name: Name | Edge) -> bool:
     """Return whether a name is a service whose requests change nothing (`QUESTIONS` of reach)."""
     return name.kind == "services" and name.name.endswith(_ASKED)
 
@@ -600,7 +600,7 @@ def fold(
     bundles = defaultdict(list)
     for name in names:
         if name_ties := ties.get((name.kind, name.name)):
-            asking = apart and asks(name)
+            asking = apart and is_question(name)
             bundles[name.kind, name.protection, frozenset(name_ties), asking, name.lacks].append(
                 name.name
             )
@@ -618,7 +618,7 @@ def fold(
     return tuple(sorted(folded, key=lambda bundle: (_KINDS.index(bundle.kind), bundle.names)))
 
 
-def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
+def joined_by_senders(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
     """Return bundles joined if they have the same senders, whoever receives their names.
 
     Denials and differences stay separate, because users look for them.

@@ -94,7 +94,7 @@ def sample_of(
         for n in of_right & few.keys():
             if len(of_right) > 1:
                 return everything
-            named[n].add(right._replace(name=_hidden(right.name, units[n], names)))
+            named[n].add(right._replace(name=_without_unit_names(right.name, units[n], names)))
     equal: dict[object, list[int]] = defaultdict(list)
     for n, number in few.items():
         equal[number, frozenset(named[n])].append(n)
@@ -134,7 +134,8 @@ def _digest_of(
     texts = {path: _signed_text(keystore, path) for path in enclaves}
     hidden = [
         hashlib.sha256(
-            f"{_hidden(path, unit, names)}\n{_hidden(_UNIQUE.sub('', text), unit, names)}".encode()
+            f"{_without_unit_names(path, unit, names)}\n"
+            f"{_without_unit_names(_UNIQUE.sub('', text), unit, names)}".encode()
         )
         for path, text in texts.items()
         if text and not any(mark in text for mark in _MARKS)
@@ -144,15 +145,15 @@ def _digest_of(
     return hashlib.sha256(b"".join(sorted(each.digest() for each in hidden))).hexdigest()
 
 
-def _hidden(text: str, unit: DrawnUnit, names: UnitNames) -> str:
+def _without_unit_names(text: str, unit: DrawnUnit, names: UnitNames) -> str:
     """Return a text with a mark in place of the unit's names, one for each of its ``values``."""
     for word in sorted(unit.values, key=len, reverse=True):
         if word in names.words:
-            text = _replaced(text, word, _MARKS[names.words[word][1]])
+            text = _with_mark(text, word, _MARKS[names.words[word][1]])
     return text
 
 
-def _replaced(text: str, word: str, mark: str) -> str:
+def _with_mark(text: str, word: str, mark: str) -> str:
     """Return a text with a mark in place of a word that stands between no letters and digits.
 
     It is faster than a regular expression, which would be compiled for each of many robots.

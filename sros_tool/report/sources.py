@@ -56,7 +56,7 @@ from sros_tool.report.compose import (
     union,
     with_requirements,
 )
-from sros_tool.report.focus import focused
+from sros_tool.report.focus import focused_picture
 from sros_tool.report.folding import Folding, name_order, units_of
 from sros_tool.report.formats import render_mermaid
 from sros_tool.report.layout import scenes_of
@@ -159,7 +159,7 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
         picture = replace(picture, findings=(*picture.findings, finding))
     if drawing.focus:
         routers = max(_routers(source.keystore) for source in read)
-        picture = focused(picture, read, drawing.focus, routers)
+        picture = focused_picture(picture, read, drawing.focus, routers)
     if drawing.requirements:
         picture = _with_requirements(picture, drawing.requirements, drawing, read[0].keystore)
     folding = Folding.of(picture, robots)
@@ -228,7 +228,7 @@ def _read(path: Path, fleet: Fleet | None, drawing: Drawing) -> PictureSource:
         )
     except SrosError:
         findings = []
-    pictured = [_pictured(finding, {finding.subject}) for finding in findings]
+    pictured = [_pictured_finding(finding, {finding.subject}) for finding in findings]
     return _with_findings(source, path, pictured)
 
 
@@ -286,7 +286,7 @@ def drawn_difference(
         changed.setdefault(right.kind, set()).add(right.name)
     names = {kind: Names(sorted(members)) for kind, members in changed.items()}
 
-    def side(title: str, source: RightsSource) -> PictureSource:
+    def titled_source(title: str, source: RightsSource) -> PictureSource:
         used = frozenset(
             right
             for right in source.rights
@@ -295,7 +295,12 @@ def drawn_difference(
         return PictureSource(SourceTitle(title, source.kind), used, scope=source.scope)
 
     context = Context(common_rights())
-    picture = overlay(side("before", first_source), side("after", second_source), "change", context)
+    picture = overlay(
+        titled_source("before", first_source),
+        titled_source("after", second_source),
+        "change",
+        context,
+    )
     scenes = scenes_of(picture, with_places=False)
     scene = next((scene for scene in scenes if scene.id == "all"), scenes[0])
     text = render_mermaid(picture, scene)
@@ -395,12 +400,12 @@ def _with_requirements(
     )
     requirements = Requirements(len(wanted) - len(violations), violations, assumed)
     paths = {enclave.path for enclave in picture.enclaves}
-    pictured = tuple(_pictured(finding, paths) for finding in findings)
+    pictured = tuple(_pictured_finding(finding, paths) for finding in findings)
     picture = replace(picture, findings=(*picture.findings, *pictured))
     return with_requirements(picture, requirements)
 
 
-def _pictured(finding: Finding, enclaves: Container[str]) -> PicturedFinding:
+def _pictured_finding(finding: Finding, enclaves: Container[str]) -> PicturedFinding:
     """Return a finding for the picture; if its subject is not an enclave, the text names it."""
     known = finding.subject in enclaves
     about = "" if known or finding.subject == finding.file else finding.subject

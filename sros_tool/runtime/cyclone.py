@@ -119,14 +119,16 @@ class Participant:
 
     def __init__(self, domain: int, enclave: Path | None = None) -> None:
         self._library = load_cyclone()
-        properties = {} if enclave is None else _secured(self._library, enclave)
+        properties = {} if enclave is None else _security_qos(self._library, enclave)
         with _qos(self._library) as qos:
             for name, value in properties.items():
                 self._library.api.dds_qset_prop(qos, name.encode(), value.encode())
             self._library.log.clear()
             handle = self._library.api.dds_create_participant(domain, qos, None)
         if handle < 0:
-            raise self._failure(handle, f"cannot join domain {domain}", secured=enclave is not None)
+            raise self._dds_error(
+                handle, f"cannot join domain {domain}", secured=enclave is not None
+            )
         self.handle: int = handle
         self.domain = domain
 
@@ -176,7 +178,7 @@ class Participant:
         """
         qget = self._library.api.dds_qget_prop
 
-        def told(address: int) -> tuple[str, int]:
+        def participant_and_process(address: int) -> tuple[str, int]:
             sample = ctypes.cast(address, ctypes.POINTER(_ParticipantSample)).contents
             values = []
             for name in (b"__Hostname", b"__Pid"):
@@ -186,13 +188,17 @@ class Participant:
             is_here = values[0] == socket.gethostname() and values[1].isdecimal()
             return bytes(sample.key[:12]).hex(), int(values[1]) if is_here else 0
 
-        return {of: pid for of, pid in self._discovered(_BUILTIN_PARTICIPANTS, told) if pid}
+        return {
+            of: pid
+            for of, pid in self._discovered(_BUILTIN_PARTICIPANTS, participant_and_process)
+            if pid
+        }
 
     def _discovered(self, topic: int, copy: Callable[[int], _Value]) -> list[_Value]:
         """Return the samples of a topic on what was discovered."""
         reader = self._library.api.dds_create_reader(self.handle, topic, None, None)
         if reader < 0:
-            raise self._failure(reader, "cannot read what was discovered")
+            raise self._dds_error(reader, "cannot read what was discovered")
         try:
             return _take_samples(self._library, reader, 1000, copy)
         finally:
@@ -245,15 +251,15 @@ class Participant:
                 self.handle, ctypes.byref(descriptor), topic.encode(), None, None
             )
             if made < 0:
-                raise self._failure(made, f"cannot create topic {topic}")
+                raise self._dds_error(made, f"cannot create topic {topic}")
             create = api.dds_create_writer if kind == "writer" else api.dds_create_reader
             handle: int = create(self.handle, made, qos, None)
         if handle < 0:
             api.dds_delete(made)
-            raise self._failure(handle, f"cannot create a {kind} on {topic}")
+            raise self._dds_error(handle, f"cannot create a {kind} on {topic}")
         return handle
 
-    def _failure(self, code: int, what: str, *, secured: bool = False) -> DdsError:
+    def _dds_error(self, code: int, what: str, *, secured: bool = False) -> DdsError:
         from sros_tool.runtime.vendor_log import participant_refusal
 
         messages = self._library.log.messages()
@@ -361,7 +367,7 @@ def security_properties(enclave: Path, plugins: Path | None) -> dict[str, str]:
     return properties
 
 
-def _secured(library: CycloneLibrary, enclave: Path) -> dict[str, str]:
+def _security_qos(library: CycloneLibrary, enclave: Path) -> dict[str, str]:
     if library.plugins is None:
         raise UnavailableError(
             "cannot secure a participant with Cyclone DDS",

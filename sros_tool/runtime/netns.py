@@ -196,7 +196,7 @@ class RowNetwork:
             _enter(self._back)
 
     @contextmanager
-    def entered(self) -> Iterator[None]:
+    def in_network(self) -> Iterator[None]:
         """Move this thread into the network of the row, until the end of the context."""
         if not self.own:
             yield

@@ -281,7 +281,7 @@ class ProcessTable:
                 closed.append(UnseenProcess(pid, (), "/proc hides it", speaks=False))
             except OSError:  # it has ended
                 continue
-        waiting = self._waiting(processes)
+        waiting = self._waiting_processes(processes)
         return RunningProcesses(
             tuple(process for process in processes if process.pid not in waiting),
             (
@@ -345,7 +345,7 @@ class ProcessTable:
         finally:
             os.close(root)
 
-    def _waiting(self, processes: list[Process]) -> set[int]:
+    def _waiting_processes(self, processes: list[Process]) -> set[int]:
         """Return the ids of processes that only wait for another, which uses ROS 2 or DDS.
 
         An example is ``timeout 60 sros run KEYSTORE ENCLAVE -- talker --ros-args``: no library of
@@ -935,7 +935,7 @@ def _loaded_enclave(
             for path, state in own
             if state.st_mtime_ns < state.st_ctime_ns
         },
-        writable=_writable(own, user),
+        writable=_writable_folder_clause(own, user),
         here=here,
         folders=(folder_of_keystore, _identity(folders)),
     )
@@ -948,7 +948,7 @@ def _reason(error: OSError) -> str:
     return error.strerror or str(error)
 
 
-def _writable(folders: list[tuple[str, os.stat_result]], user: int) -> str:
+def _writable_folder_clause(folders: list[tuple[str, os.stat_result]], user: int) -> str:
     """Return a clause on a folder that other users can change than root, ``user`` and the owner."""
     trusted = frozenset({0, user, folders[0][1].st_uid})
     for path, state in folders:

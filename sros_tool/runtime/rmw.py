@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.distributions import ROS_DISTRO, Distribution, sourced
+from sros_tool.distributions import ROS_DISTRO, Distribution, sourced_distribution
 from sros_tool.errors import SrosError
 
 RMW = "RMW_IMPLEMENTATION"
@@ -166,9 +166,9 @@ def vendor_here(
     elif distribution is None:  # the RMWs that are installed are those of this machine
         rmw = next(filter(vendor_of, rmw_implementations(environment)), "")
         why = f"{rmw} is installed here" if rmw else ""
-    why += _without_security(rmw, environment) if distribution is None else ""
+    why += _lacks_security(rmw, environment) if distribution is None else ""
     vendor = vendor_of(rmw) or Vendor.FAST
-    distribution = distribution or sourced(environment.get(ROS_DISTRO))
+    distribution = distribution or sourced_distribution(environment.get(ROS_DISTRO))
     shipped = distribution.of_product(vendor.traits.product) if distribution else None
     if distribution is None or shipped is None:
         return vendor, why or "the default of ROS 2 Jazzy"
@@ -195,12 +195,12 @@ def chosen_vendor(
 
 def shipped_vendor(rmw: str, environment: Mapping[str, str]) -> Vendor | None:
     """Return the vendor of an RMW as `vendor_of`, in the release that $ROS_DISTRO ships."""
-    vendor, distribution = vendor_of(rmw), sourced(environment.get(ROS_DISTRO))
+    vendor, distribution = vendor_of(rmw), sourced_distribution(environment.get(ROS_DISTRO))
     shipped = distribution.of_product(vendor.traits.product) if vendor and distribution else None
     return shipped.vendor if shipped else vendor
 
 
-def _without_security(rmw: str, environment: Mapping[str, str]) -> str:
+def _lacks_security(rmw: str, environment: Mapping[str, str]) -> str:
     if not built_without_security(rmw, environment):
         return ""
     return ", built without security: it enforces nothing"

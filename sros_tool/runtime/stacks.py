@@ -134,7 +134,9 @@ def rclpy_stacks(probe: ProbeEnclave) -> Iterator[Stack]:
 
 def cyclone_stack(probe: ProbeEnclave) -> Stack:
     """Try the libddsc that sros uses (`sros_tool.runtime.cyclone`), and return the result."""
-    stack = _probed(Stack("Cyclone DDS (libddsc)", "cyclone", "Cyclone DDS"), "cyclone", probe)
+    stack = _with_probe_result(
+        Stack("Cyclone DDS (libddsc)", "cyclone", "Cyclone DDS"), "cyclone", probe
+    )
     if not stack.version and "cannot find Cyclone DDS" in stack.evidence:
         evidence = stack.evidence.removeprefix(_UNTRIED)
         stack = stack._replace(present=False, enforces=None, evidence=evidence)
@@ -147,7 +149,7 @@ def _cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
     spec = importlib.util.find_spec("cyclonedds")
     if spec is None:
         return stack._replace(present=False)
-    stack = _probed(stack, "cyclonedds", probe)
+    stack = _with_probe_result(stack, "cyclonedds", probe)
     if stack.enforces is None and stack.where and not _has_plugins(Path(stack.where)):
         evidence = (
             "a secured participant fails, and the package has no libdds_security_*.so."
@@ -169,7 +171,7 @@ def _probe_rmw(probe: ProbeEnclave, rmw: str) -> Stack:
     if below := middleware_of(rmw):
         variables |= below.explains
     stack = Stack(f"rclpy with {rmw or 'its default RMW'}", "rmw", "", rmw=rmw)
-    stack = _probed(stack, "rclpy", probe, variables)
+    stack = _with_probe_result(stack, "rclpy", probe, variables)
     if below and below.name == "Zenoh":
         return _with_release(stack)
     return stack._replace(advice="" if stack.enforces else ROS_ADVICE)
@@ -195,7 +197,7 @@ def _without_rclpy() -> Stack:
     return Stack("rclpy", "rmw", "", present=False, advice=advice)
 
 
-def _probed(
+def _with_probe_result(
     stack: Stack, kind: str, probe: ProbeEnclave, variables: Mapping[str, str] | None = None
 ) -> Stack:
     """Return ``stack`` with the result of a probe of the given kind."""
@@ -297,8 +299,8 @@ def judge(run: ProbeRun, allowed: str, denied: str) -> ProbeVerdict:
     text = "\n".join([run.output, *(event.text for event in run.events)])
     if lacking := missing_security(text):
         return ProbeVerdict(False, f"a secured participant fails: {lacking}")
-    if not _happened(run.events, EventKind.READY, ProcessStage.PARTICIPANT):
-        return _untried(_why_not_joined(run, text))
+    if not _has_event(run.events, EventKind.READY, ProcessStage.PARTICIPANT):
+        return _untried_verdict(_why_not_joined(run, text))
     answers = {
         event.text.partition("\n")[0]: event
         for event in run.events
@@ -306,12 +308,14 @@ def judge(run: ProbeRun, allowed: str, denied: str) -> ProbeVerdict:
     }
     wanted = answers.get(f"writer {allowed}")
     if wanted is None or wanted.kind is not EventKind.READY:
-        return _untried(f"even the allowed writer on {allowed} failed. {_reason(wanted, run)}")
+        return _untried_verdict(
+            f"even the allowed writer on {allowed} failed. {_reason(wanted, run)}"
+        )
     asked = [f"writer {denied}", f"reader {denied}"]
     for question in asked:
         answer = answers.get(question)
         if answer is None:
-            return _untried(f"no answer about the {question}. {_ending(run)}")
+            return _untried_verdict(f"no answer about the {question}. {_exit_text(run)}")
         if answer.kind is EventKind.READY:
             return ProbeVerdict(
                 False, f"it created a {question}, which its permissions do not allow"
@@ -319,7 +323,7 @@ def judge(run: ProbeRun, allowed: str, denied: str) -> ProbeVerdict:
     refusals = [_refusal(answers[question], run, denied) for question in asked]
     if not all(refusals):
         reason = _reason(answers[asked[0]], run)
-        return _untried(
+        return _untried_verdict(
             f"endpoints on {denied} failed, but not because security refused them. {reason}"
         )
     return ProbeVerdict(
@@ -346,11 +350,11 @@ def _why_not_joined(run: ProbeRun, text: str) -> str:
 
 def _reason(event: Event | None, run: ProbeRun) -> str:
     if event is None:
-        return _ending(run)
+        return _exit_text(run)
     return " ".join(event.text.split())
 
 
-def _ending(run: ProbeRun) -> str:
+def _exit_text(run: ProbeRun) -> str:
     if run.status is None:
         return "The probe process gave no answer in time."
     if run.status < 0:
@@ -359,7 +363,7 @@ def _ending(run: ProbeRun) -> str:
     return f"The probe process ended with status {run.status}. {' '.join(last)}".strip()
 
 
-def _happened(events: Sequence[Event], kind: EventKind, stage: ProcessStage) -> bool:
+def _has_event(events: Sequence[Event], kind: EventKind, stage: ProcessStage) -> bool:
     return any(event.kind is kind and event.stage is stage for event in events)
 
 
@@ -370,7 +374,7 @@ def _first(events: Sequence[Event], kind: EventKind) -> Event | None:
 _UNTRIED = "could not be tried: "
 
 
-def _untried(why: str) -> ProbeVerdict:
+def _untried_verdict(why: str) -> ProbeVerdict:
     return ProbeVerdict(None, f"{_UNTRIED}{why}")
 
 

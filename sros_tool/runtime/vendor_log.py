@@ -67,7 +67,7 @@ class LogText(NamedTuple):
     refuses: Refused | None = None
 
 
-def _text(
+def _log_text(
     name: str,
     vendor: Vendor | None,
     pattern: str,
@@ -159,102 +159,102 @@ _ASK_FOR_TOPIC = (
 
 LOG_TEXTS: tuple[LogText, ...] = (
     # ── rcl and the RMWs ───────────────────────────────────────────────────────────────────
-    _text(
+    _log_text(
         "not-built-in", _ROS, r"doesn't have the security libraries|compile Fast DDS using the"
         r"|-DSECURITY=ON|security (?:is )?not supported|compiled without security",
         "this DDS was built without DDS Security, so no secured node can start with it",
         "Use the ROS 2 packages of the distribution; `sros doctor` shows which DDS enforces.",
         refuses=Refused.ALL_SECURITY,
     ),
-    _text(
+    _log_text(
         "keystore-inside", _ROS,
         r"SECURITY ERROR: directory '(?P<keystore>[^']*)/enclaves/enclaves(?:/[^']*)?' does not",
         "ROS_SECURITY_KEYSTORE names the folder `enclaves` of {keystore}, and has to name the "
         "keystore",
         "Set it to the folder of the keystore: `sros env KEYSTORE ENCLAVE` prints all variables.",
     ),
-    _text(
+    _log_text(
         "enclave-missing", _ROS,
         r"rcl: SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
         "the enclave's folder {path} does not exist: ROS_SECURITY_KEYSTORE or the enclave's name "
         "is wrong", "Correct it: `sros list_enclaves KEYSTORE` shows the names.",
     ),
-    _text(
+    _log_text(
         "runs-unsecured", _ROS, r"SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
         "the enclave's folder {path} does not exist, and as ROS_SECURITY_STRATEGY is not exactly "
         "Enforce, the node RUNS UNSECURED",
         "Start it with `sros run`, which runs it secured or not at all.",
     ),
-    _text(
+    _log_text(
         "keystore-unset", _ROS, r"failed to initialize rcl: error not set",
         "security is on, and ROS_SECURITY_KEYSTORE is unset or empty",
         "Set it to the folder of the keystore: `sros env KEYSTORE ENCLAVE` prints all variables.",
     ),
-    _text(
+    _log_text(
         "files-missing", _ROS, r"couldn't find all security files",
         "a file of the enclave is missing or a broken link; the message does not say which",
         "`sros explain KEYSTORE ENCLAVE join` names the file and the command that restores it; on "
         "a robot, export the enclave again.", _FILES,
         refuses=Refused.PARTICIPANT,
     ),
-    _text(
+    _log_text(
         "enclave-missing", _ROS,
         r"SECURITY ERROR: unable to find a folder matching the (?:\w+ )?name '(?P<path>[^']*)'",
         "the keystore has no folder for the enclave {path}",
         "Correct the name: `sros list_enclaves KEYSTORE` shows all names.",
     ),
-    _text(
+    _log_text(
         "not-started", _ROS, r"Unable to (?:run the command|print the environment): (?P<why>.+)",
         "sros did not start the process: {why}",
         "Repair what the line names, and start the process again.",
     ),
     # ── Cyclone DDS, meeting peers ─────────────────────────────────────────────────────────
-    _text(
+    _log_text(
         "peer-refused", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed: "
         r"Certificate not valid: error: (?P<why>[^;]+)",
         "a PEER was refused, not this process: its certificate is not accepted ({why}); if the CAs "
         "differ, the peer logs the same message or nothing",
         _PEERS,
     ),
-    _text(
+    _log_text(
         "peer-handshake", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed"
         r"|FSM: handshake (?:failed|timeout)|handshake \(lguid=\S+ rguid=\S+\) failed",
         "a PEER failed to authenticate: most often its key.pem is not the key of its cert.pem, "
         "which Cyclone DDS does not check for its own enclave; or it runs another DDS or version",
         "Run `sros verify` or `sros inspect` on the enclave of every peer.", (Fault.KEY_MISMATCH,),
     ),
-    _text(
+    _log_text(
         "peer-governance", _CYCLONE, r"security_attributes mismatch",
         "a PEER was refused: its governance has other protection than the governance of this "
         "process. The processes have enclaves of different keystores, or one was started before "
         "the governance changed",
         f"{_PEERS} It also shows the governance. Export the enclaves again, and restart both.",
     ),
-    _text(
+    _log_text(
         "peer-unsecured", _CYCLONE, r"Non secure remote (?:reader|writer) \S+ is not allowed"
         r"|from unauthenticated participant|downgrade participant \S+ to non-secure",
         "a PEER was refused: it runs without DDS Security, or is not authenticated yet",
         "Start the peer in its enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`.",
     ),
-    _text(
+    _log_text(
         "peer-permissions", _CYCLONE, rf"{_PEER_OF_CYCLONE} permissions from plugin: "
         r"Permissions validity period (?:expired|has not started)",
         "a PEER was refused: by the clock of this host its permissions have expired or are not "
         "valid yet", _RENEW_PEER,
     ),
-    _text(
+    _log_text(
         "peer-signature", _CYCLONE,
         rf"{_PEER_OF_CYCLONE} permissions from plugin: .*(?:PKCS7|SMIME)",
         f"a PEER was refused: {_OTHER_SIGNER}",
         "Restart all processes together after stage 2 of `sros rotate_ca`. If this continues: "
         f"{_PEERS}",
     ),
-    _text(
+    _log_text(
         "peer-refused", _CYCLONE, rf"{_PEER_OF_CYCLONE} permissions from plugin: (?P<why>\w.+)",
         "a PEER was refused, not this process: its permissions are not accepted ({why})", _PEERS,
     ),
     # ── Cyclone DDS, starting ──────────────────────────────────────────────────────────────
-    _text(
+    _log_text(
         "plugin", _CYCLONE, r"Could not load (?:Authentication|Access Control|Cryptographic|"
         r"security)\b|Could not find the function: \S+|security plugin (?:library path|init "
         r"function|finalize function) is undefined"
@@ -264,119 +264,119 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "Install Cyclone DDS with its plugins, as the distribution packages it; `sros doctor` "
         "shows whether it enforces.",
     ),
-    _text(
+    _log_text(
         "property", _CYCLONE, r"required security property (?P<property>\S+) missing",
         "the program secures its participant without naming {property}",
         "Start it through an RMW of ROS 2, in an enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`.",
     ),
-    _text(
+    _log_text(
         "certificate-expired", _CYCLONE, r"Certificate not valid: error: certificate has expired",
         "the certificate of the enclave or of its identity CA has expired; the message "
         "does not say which",
         _RENEW, (Fault.CERTIFICATE_EXPIRED, Fault.CA_EXPIRED),
     ),
-    _text(
+    _log_text(
         "certificate-not-yet-valid", _CYCLONE, r"Certificate not valid: error: certificate is not "
         r"yet valid", "the certificate of the enclave or of its identity CA is not valid yet",
         "Set the clock of the host.", (Fault.CERTIFICATE_NOT_YET_VALID, Fault.CA_NOT_YET_VALID),
     ),
-    _text(
+    _log_text(
         "certificate-issuer", _CYCLONE, r"Certificate not valid: error: unable to get "
         r"(?:local )?issuer certificate|Certificate not valid: error: self.signed",
         "the certificate was not issued by the identity CA next to it",
         "Use the files of one keystore together.", (Fault.CERTIFICATE_ISSUER,),
     ),
-    _text(
+    _log_text(
         "revoked", _CYCLONE, r"Certificate not valid: error: certificate revoked",
         "the certificate of the enclave is revoked",
         "Revoked enclaves are refused on purpose. To use the enclave again, create it with a new "
         "key: `sros create_enclave KEYSTORE ENCLAVE`.",
         (Fault.REVOKED,),
     ),
-    _text(
+    _log_text(
         "crl-expired", _CYCLONE, r"Certificate not valid: error: CRL (?:has expired|is not yet)",
         "the CRL has expired or is not valid yet, so that every participant is refused",
         "Sign it again: `sros crl KEYSTORE --refresh`.",
         (Fault.CRL_EXPIRED, Fault.CRL_NOT_YET_VALID),
     ),
-    _text(
+    _log_text(
         "crl-unreadable", _CYCLONE, r"Failed to read CRL",
         "crl.pem is not a CRL, so that every participant is refused",
         "Sign it again: `sros crl KEYSTORE --refresh`.", (Fault.CRL_MALFORMED,),
     ),
-    _text(
+    _log_text(
         "key-encrypted", _CYCLONE, r"Failed to parse certificate: .*(?:bad decrypt|empty password)",
         "key.pem is encrypted, and DDS does not ask for a passphrase (the message wrongly says "
         "certificate)",
         "Store key.pem without a passphrase, mode 0600.", (Fault.KEY_ENCRYPTED,),
     ),
-    _text(
+    _log_text(
         "pem-unreadable", _CYCLONE, r"Failed to parse (?:certificate|private key)"
         r"|Certificate is invalid: ",
         "a certificate or key.pem is not a PEM file (the message says certificate for all)",
         "Restore the file.", (Fault.CERTIFICATE_MALFORMED, *_KEY, *_FILES),
     ),
-    _text(
+    _log_text(
         "signature", _CYCLONE, r"PKCS7_signatureVerify:digest failure",
         "governance.p7s or permissions.p7s was changed after it was signed",
         _SIGN_ONE, _SIGNATURE,
     ),
-    _text(
+    _log_text(
         "signer", _CYCLONE, r"PKCS7_verify:certificate verify error",
         "governance.p7s or permissions.p7s was signed by another CA than the permissions CA "
         "next to it", f"Use the files of one keystore together. {_SIGN_ONE}", _SIGNATURE,
     ),
-    _text(
+    _log_text(
         "not-signed", _CYCLONE, r"SMIME_read_ASN1_ex:no content type|SMIME_read_ASN1",
         "governance.p7s or permissions.p7s is plain XML or damaged, and not a signed document",
         _SIGN_ONE, _SIGNATURE,
     ),
-    _text(
+    _log_text(
         "permissions-expired", _CYCLONE, r"Permissions validity period expired(?P<when>[^)]*\))?",
         "the permissions have expired", _RENEW, (Fault.PERMISSIONS_EXPIRED,),
     ),
-    _text(
+    _log_text(
         "permissions-not-yet-valid", _CYCLONE, r"Permissions validity period has not started",
         "the permissions are not valid yet", "Set the clock of the host.",
         (Fault.PERMISSIONS_NOT_YET_VALID,),
     ),
-    _text(
+    _log_text(
         "permissions-subject", _CYCLONE, r"Subject name is invalid",
         "the permissions have no grant for the subject of this certificate: they belong to another "
         "enclave, or to an earlier certificate", _SIGN, (Fault.PERMISSIONS_SUBJECT,),
     ),
-    _text(
+    _log_text(
         "domain", _CYCLONE, r"Could not find domain (?P<domain>\d{1,9}) in governance",
         "the governance is not for domain {domain}",
         _SET_DOMAIN, (Fault.GOVERNANCE_DOMAIN,),
         refuses=Refused.PARTICIPANT,
     ),
-    _text(
+    _log_text(
         "malformed", _CYCLONE, r"Can not parse (?P<what>governance|permissions) file",
         "Cyclone DDS does not accept the {what} document, although it is signed correctly",
         "Generate it with sros; `sros check` reports what vendors read differently.",
         _DOCUMENT,
     ),
-    _text(
+    _log_text(
         "file-missing", _CYCLONE, r"File could not be found, opened or is empty, path: "
         r"(?P<path>\S+)",
         "the file {path} is missing, empty or not readable", "Restore it.", _FILES,
     ),
-    _text(
+    _log_text(
         "peer-refused", _CYCLONE, r"Remote secure participant \S+ not allowed"
         r"|Plugin does not allow remote participant|Could not authenticate_peer_credential_token"
         r"|Could not get remote participant \S+ permissions",
         "a PEER was refused, not this process; another line, of this process or of the peer, says "
         "why", _PEERS, weak=1,
     ),
-    _text(
+    _log_text(
         "participant", _CYCLONE, r"rmw_create_node: failed to create (?:DomainParticipant|domain)",
         "the process could not join its domain, and this line does not say whether DDS Security, "
         "the network interface or the domain is the reason: Cyclone DDS says it in an earlier "
         "line, on standard error", _CHECK, _ALL, weak=2,
     ),
     # ── Fast DDS, meeting peers ────────────────────────────────────────────────────────────
-    _text(
+    _log_text(
         "peer-permissions-ca", _FAST,
         rf"{_REFUSED_PEER}Remote participant PermissionsCA differs from local",
         "a PEER was refused: it has another permissions CA than this process. The processes have "
@@ -384,12 +384,12 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "other after it",
         _PEERS + " Restart both after each stage of `sros rotate_ca KEYSTORE`.",
     ),
-    _text(
+    _log_text(
         "peer-version", _FAST, r"Remote participant PermissionsCA algorithm differs from local",
         "a PEER was refused: it runs another version of Fast DDS, or its permissions CA has "
         "another type of key", "Run one version of Fast DDS on all hosts of the robot.",
     ),
-    _text(
+    _log_text(
         "peer-permissions", _FAST,
         rf"{_REFUSED_PEER}Remote participant doesn't found in its permissions file",
         "a PEER was refused: by the clock and the time zone of this host its permissions have "
@@ -397,18 +397,18 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "Compare clocks and time zones of both hosts: Fast DDS reads dates in local time. "
         f"{_RENEW_PEER}",
     ),
-    _text(
+    _log_text(
         "peer-signature", _FAST, rf"{_REFUSED_PEER}Cannot read as PKCS7 the permissions file",
         f"a PEER was refused: {_OTHER_SIGNER}",
         f"Restart this process, and then the peer. If this continues: {_PEERS}",
     ),
-    _text(
+    _log_text(
         "peer-malformed", _FAST,
         r"Error validating remote permissions for \S+ \(Malformed permissions file",
         "a PEER was refused: Fast DDS does not accept its permissions, although signed correctly",
         "Generate them again with sros: `sros create_permission KEYSTORE ENCLAVE POLICY`.",
     ),
-    _text(
+    _log_text(
         "peer-domain", _FAST, r"Error checking remote participant"
         r"|Not found a rule allowing to use the domain_id.*check_remote_participant"
         r"|check_remote_participant.*Not found a rule allowing to use the domain_id",
@@ -416,13 +416,13 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "Sign the peer's permissions again, with this domain: `sros create_permission KEYSTORE "
         "ENCLAVE POLICY` takes the domains of the keystore.",
     ),
-    _text(
+    _log_text(
         "peer-refused", _FAST, r"Error validating remote permissions for"
         r"|Remote participant doesn't sent the signed permissions|Not receive remote permissions",
         "a PEER was refused, not this process: its permissions did not arrive or were not accepted",
         _PEERS,
     ),
-    _text(
+    _log_text(
         "crypto", _FAST, r"\[SECURITY_CRYPTO (?:Error|Warning)\]|EVP_(?:De|En)crypt|AESGCMGMAC"
         r"|(?:Invalid|Malformed) Crypto(?:Token|Handle)|in fastcdr trying to (?:de)?"
         r"(?:serialize|cipher)",
@@ -431,28 +431,28 @@ LOG_TEXTS: tuple[LogText, ...] = (
         f"If this continues, restart both sides. {_PEERS}",
     ),
     # ── Fast DDS, starting ─────────────────────────────────────────────────────────────────
-    _text(
+    _log_text(
         "identity", _FAST, r"SECURITY\s*Error\]\s*->\s*Function validate_local_identity"
         r"|PKIDH::validate_local_identity :\s*\Z",
         "the identity is refused, and the message gives no reason: the certificate or its CA is "
         "out of date, from another CA, damaged or revoked, or crl.pem is out of date or damaged",
         _CHECK, (*_CERTIFICATE, Fault.CERTIFICATE_MALFORMED, *_CA, *_CRL),
     ),
-    _text(
+    _log_text(
         "ca", _FAST, r"Error '(?P<number>\d+)' verifying CA certificate"
         r"(?: for \S.*?: (?P<why>[a-z][\w ,()-]*?))?(?= \(\S+:\d+\)|\Z)",
         "the first certificate of a CA's file is not accepted (OpenSSL's error {number}: {why})",
         _CHECK, (*_CA, Fault.CERTIFICATE_MALFORMED),
         refuses=Refused.PARTICIPANT,
     ),
-    _text(
+    _log_text(
         "key-mismatch", _FAST, r"Error verifying private key",
         "key.pem is not the key of cert.pem",
         "Restore the key, or give the enclave a new one: `sros renew KEYSTORE ENCLAVE --new-key`.",
         (Fault.KEY_MISMATCH,),
         refuses=Refused.PARTICIPANT,
     ),
-    _text(
+    _log_text(
         "token", _FAST, r"Error opening the private key \w+=|Error retrieving 'pkcs11' engine"
         r"|Error initializing the HSM provider library|Error setting the PIN in the 'pkcs11'",
         "the key is on a PKCS#11 token that Fast DDS cannot use: the token, OpenSSL's engine "
@@ -460,54 +460,54 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "`sros verify DIR --tokens` asks the token for the key.", (Fault.TOKEN_URI,),
         refuses=Refused.PARTICIPANT,
     ),
-    _text(
+    _log_text(
         "key-unreadable", _FAST, r"Error obtaining private key",
         "key.pem is encrypted, damaged or empty", "Store it as PEM without a passphrase.",
         (*_KEY, *_FILES),
         refuses=Refused.PARTICIPANT,
     ),
-    _text(
+    _log_text(
         "file-missing", _FAST, r"OpenSSL library cannot read file (?P<path>\S+)",
         "the file {path} is missing or not readable", _READABLE, _FILES, unseen=_READABLE,
     ),
-    _text(
+    _log_text(
         "file-missing", _FAST, r"Cannot (?:read|find) file file://(?P<path>\S+)",
         "the file {path} is missing or not readable", _READABLE, _FILES, unseen=_READABLE,
     ),
-    _text(
+    _log_text(
         "signature", _FAST, r"PKCS7 data verification failed",
         "governance.p7s or permissions.p7s was changed, or signed by another CA than the "
         "permissions CA next to it; the message does not say which",
         _SIGN_ONE, _SIGNATURE,
         refuses=Refused.PARTICIPANT,
     ),
-    _text(
+    _log_text(
         "not-signed", _FAST, r"Input data has not PKCS7 S/MIME format",
         "governance.p7s or permissions.p7s is not a signed document: plain XML, or damaged; the "
         "message does not say which", _SIGN_ONE, _SIGNATURE,
         refuses=Refused.PARTICIPANT,
     ),
-    _text(
+    _log_text(
         "grant", _FAST, r"Not found the identity subject name in permissions file",
         "one of three causes: the permissions have expired, are not valid yet, or have no grant "
         "for this subject name. Fast DDS reads their dates in the local time of the host",
         _CHECK, _GRANT,
         refuses=Refused.PARTICIPANT,
     ),
-    _text(
+    _log_text(
         "domain-of-permissions", _FAST, r"Not found a rule allowing to use the domain_id",
         "the permissions are not for the domain of this process", _SET_DOMAIN,
         (Fault.PERMISSIONS_DOMAIN,),
         refuses=Refused.PARTICIPANT,
     ),
-    _text(
+    _log_text(
         "domain", _FAST, r"Not found topic access rule for topic (?P<topic>[^\s)]+)",
         "the governance has no rule for the topic in the domain of this process: most often "
         "because it does not list that domain (ROS_DOMAIN_ID)", _SET_DOMAIN,
         (Fault.GOVERNANCE_DOMAIN,),
         refuses=Refused.TOPIC,
     ),
-    _text(
+    _log_text(
         "malformed", _FAST, r"Malformed (?P<what>permissions|governance) file"
         r"|Error loading (?:Permissions|Governance) XML|XMLPARSER\s*Error\].*Function "
         r"parse_(?:grant|rule|criteria|permissions|domain|topic|participant|governance)",
@@ -516,25 +516,25 @@ LOG_TEXTS: tuple[LogText, ...] = (
         _DOCUMENT,
         refuses=Refused.PARTICIPANT,
     ),
-    _text(
+    _log_text(
         "partition", _FAST, r"partition not found in rule",
         "a rule names the topic, but not the partitions of this publisher or subscriber",
         "Leave partitions out of permissions; sros never writes them.",
         refuses=Refused.TOPIC,
     ),
-    _text(
+    _log_text(
         "endpoint-gone", _FAST, r"Cannot find (?:local|remote) (?:reader|writer|participant)\b",
         "a message could not be protected, because its writer, its reader or the peer is not known "
         "yet or has just gone: seen when a process starts or ends",
         "Do nothing if it stops. If this continues, restart the process and its peers.", weak=1,
     ),
     # ── messages that follow others ────────────────────────────────────────────────────────
-    _text(
+    _log_text(
         "plugin-unset", _FAST, r"Authentication plugin not configured. Security will be disabled",
         "the process RUNS UNSECURED: it has no enclave",
         "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND`, secured or not at all.",
     ),
-    _text(
+    _log_text(
         "participant", _FAST, r"Error while configuring security plugin"
         r"|Participant is not allowed with its own permissions file"
         r"|SecurityManager::init :\s*\Z|Cryptography plugin not configured",
@@ -542,7 +542,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "of ROS_SECURITY_LOG_FILE, and neither is in this log", _CHECK_OR_FILE, _ALL,
         unseen=_FILE, weak=1,
     ),
-    _text(
+    _log_text(
         "participant", _FAST, r"Cannot create participant due to initialization error"
         r"|Problem creating RTPSParticipant|failed to create participant",
         "the process may not join, and this log gives no reason: Fast DDS 2.6 and 2.9 log "
@@ -550,7 +550,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "standard output or in the file of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL,
         unseen=_FILE, weak=2,
     ),
-    _text(
+    _log_text(
         "service", _ROS, r"(?:could not|failed to) create (?:service|client)"
         r"|create_(?:service|client)\(\) failed",
         "the permissions deny a service or client, and this message does not name it. If the node "
@@ -559,44 +559,44 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "Compare the node's name and namespace with the policy's profile (ns, node); the line that "
         "names the topic is on standard output or in the file of ROS_SECURITY_LOG_FILE.", weak=2,
     ),
-    _text(
+    _log_text(
         "endpoint", _ROS, r"Not Allowed By Security", _DENIED_ENDPOINT, _ASK_FOR_TOPIC,
         weak=3,
         refuses=Refused.TOPIC,
     ),
-    _text(
+    _log_text(
         "endpoint", _ROS, r"invalid allocator|Problem creating associated (?:Reader|Writer)"
         r"|(?:could not|failed to) create (?:publisher|subscription|topic)"
         r"|create_(?:publisher|subscription)\(\) could not create",
         _DENIED_ENDPOINT, _ASK_FOR_TOPIC, weak=3,
     ),
     # ── denied topics: nearby lines show the denied right and the node ─────────────────────
-    _text(
+    _log_text(
         # Matched only at the start of a word, for speed: a line may be one very long word.
         "topic-denied", _FAST, r"(?<![^\s(])(?P<topic>[^\s(]+) topic "
         r"(?P<how>not found in allow|denied by deny) rule",
         refuses=Refused.TOPIC,
     ),
-    _text(
+    _log_text(
         "topic-denied", _CYCLONE,
         r"(?:Local topic permission denied|Writer is not permitted|Reader is not permitted): "
         r"(?P<topic>\S+) (?P<how>denied by default rule|found in deny_rule)",
         refuses=Refused.TOPIC,
     ),
-    _text(  # the nodes of `sros demo`
+    _log_text(  # the nodes of `sros demo`
         "topic-denied", _CYCLONE,
         r"cannot create (?:topic|a (?:writer|reader) on) (?P<topic>\S+)\. "
         r"(?P<how>Not Allowed By Security)",
         refuses=Refused.TOPIC,
     ),
     # ── refusals without a cause ───────────────────────────────────────────────────────────
-    _text("refusal", _FAST, r"validate_local_identity|verifying CA certificate",
+    _log_text("refusal", _FAST, r"validate_local_identity|verifying CA certificate",
           refuses=Refused.PARTICIPANT),
-    _text("refusal", _CYCLONE, r"Error occurred while validating local (?:permission|identity)"
+    _log_text("refusal", _CYCLONE, r"Error occurred while validating local (?:permission|identity)"
           r"|validate_local_identity", refuses=Refused.PARTICIPANT),
-    _text("refusal", _FAST, r"topic (?:not found in allow|denied by deny) rule",
+    _log_text("refusal", _FAST, r"topic (?:not found in allow|denied by deny) rule",
           refuses=Refused.TOPIC),
-    _text("refusal", _CYCLONE, r"denied by default rule|found in deny_rule",
+    _log_text("refusal", _CYCLONE, r"denied by default rule|found in deny_rule",
           refuses=Refused.TOPIC),
 )  # fmt: skip
 """All known log texts, in order: the first text that matches a line counts."""
@@ -655,7 +655,7 @@ _NAMED = (
     "ROS_SECURITY_ENCLAVE_OVERRIDE or `--ros-args --enclave`. Do not create an enclave /: every "
     "process that names none would run in it."
 )
-NO_ENCLAVE = _text(
+NO_ENCLAVE = _log_text(
     "no-enclave", _ROS, "",
     "no enclave is named for this process, so it looked for the files of the enclave /, and the "
     "keystore has none",
@@ -663,7 +663,7 @@ NO_ENCLAVE = _text(
     refuses=Refused.PARTICIPANT,
 )  # fmt: skip
 """The meaning of `files-missing` in a process that named no enclave."""
-RUNS_OPEN = _text(
+RUNS_OPEN = _log_text(
     "runs-open", _ROS, "",
     "no enclave is named for this process: unless the keystore has an enclave /, it RUNS UNSECURED "
     "if ROS_SECURITY_STRATEGY is not exactly Enforce, without any further message; with Enforce it "

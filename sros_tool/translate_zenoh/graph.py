@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from sros_tool.names import NODE_SERVICES, is_expression
 from sros_tool.policy.model import ALLOW
-from sros_tool.policy.patterns import Names, TooManyNames, covers, listed, overlap
+from sros_tool.policy.patterns import Names, TooManyNames, covers, listed_expressions, overlap
 from sros_tool.policy.rights import (
     CHANGING_NODES,
     NodeName,
@@ -195,7 +195,7 @@ class _Tokens:
 def _listed_expressions(name: str) -> list[str]:
     """Return expressions with ``*`` as only wildcard; a single wider one if there are too many."""
     try:
-        return listed(name, _MOST_TOKENS)
+        return listed_expressions(name, _MOST_TOKENS)
     except TooManyNames:  # the keys of the name cannot be listed either, and are refused
         return []
 
@@ -369,14 +369,22 @@ def example_token(
         if key.startswith(begin) and key.split("/")[5:7] == [_NODE, _part(enclave)]
     ]
     tokens = [
-        "/".join((f"{begin}zid/0/0", _NODE, _part(enclave), _any_as(name, ns), _any_as(name, node)))
+        "/".join(
+            (
+                f"{begin}zid/0/0",
+                _NODE,
+                _part(enclave),
+                _wildcard_like(name, ns),
+                _wildcard_like(name, node),
+            )
+        )
         for name in ("node", *ascii_lowercase)
         for ns, node in places or [["%", "node"]]
     ]
     return next(filter(passes, tokens), tokens[0])
 
 
-def _any_as(name: str, part: str) -> str:
+def _wildcard_like(name: str, part: str) -> str:
     """Return an example of what a chunk of a liveliness token's key expression matches.
 
     The example is ``name`` if the chunk ``part`` is only a wildcard, else the chunk without its

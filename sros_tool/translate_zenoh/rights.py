@@ -34,7 +34,7 @@ from sros_tool.policy.patterns import (
     Names,
     TooManyNames,
     covers,
-    listed,
+    listed_expressions,
     overlap,
 )
 from sros_tool.policy.rights import (
@@ -167,7 +167,7 @@ def remote_of(
             for flow, messages, history in _MESSAGES[right] if keys else ():
                 rules.append(AccessRule(flow, messages, below if history else keys))
                 if difference:
-                    of = difference.below(_ADVANCED) if history else difference
+                    of = difference.keys_below(_ADVANCED) if history else difference
                     made_of.setdefault((flow, messages), []).append(of)
     return RemoteRights(enclave, joined(rules), {place: tuple(of) for place, of in made_of.items()})
 
@@ -273,7 +273,7 @@ def _allowed_keys(
             continue
         for name, place in (*places.items(), *never.items()):
             if _NO_KEY.search(name):
-                raise _no_key(name, place)
+                raise _untranslatable_name_error(name, place)
         denials = Names(never)
         exact = {
             tuple(name[1:].split("/"))
@@ -282,7 +282,7 @@ def _allowed_keys(
         }
         wild = {name: place for name, place in places.items() if is_expression(name)}
         difference = Difference(str(domain), end, _forms(wild), _forms(never))
-        names = _with_what_is_below(exact | _names_of(difference, right, wild, never))
+        names = _with_keys_below(exact | _names_of(difference, right, wild, never))
         keys = tuple([canonical((str(domain), *name)) + end for name in names])
         # Names of which one is now within a wildcard's expression are part of what makes that.
         made_of = difference._replace(allowed=difference.allowed | exact.difference(names))
@@ -317,16 +317,16 @@ def _names_of(
         except CannotSubtract as error:
             if error.denied:
                 why = "for text between two wildcards there is no such list"
-                raise _cannot_deny(right, name, denying, wide, place, why) from None
+                raise _untranslatable_denial_error(right, name, denying, wide, place, why) from None
     why = f"that takes more than {MOST_EXPRESSIONS} key expressions here"
     wide, place = min(allowed.items(), key=lambda item: (len(item[0]), item[0]))
     for name, denying in denied.items():
         if overlap(name, wide):
-            raise _cannot_deny(right, name, denying, wide, place, why)
-    raise _too_many(wide, place)
+            raise _untranslatable_denial_error(right, name, denying, wide, place, why)
+    raise _too_many_error(wide, place)
 
 
-def _cannot_deny(
+def _untranslatable_denial_error(
     right: str, denied: str, denying: Source, wide: str, allowing: Source, why: str
 ) -> PolicyError:
     allows = f"line {allowing.line} of '{allowing.file}' allows" if allowing.line else "they allow"
@@ -338,7 +338,7 @@ def _cannot_deny(
     )
 
 
-def _with_what_is_below(names: frozenset[Chunks] | set[Chunks]) -> set[Chunks] | frozenset[Chunks]:
+def _with_keys_below(names: frozenset[Chunks] | set[Chunks]) -> set[Chunks] | frozenset[Chunks]:
     """Return the same names, with one expression for a name and all names below it."""
     below = ("*", ANY_CHUNKS)
     if not any(name[-1] == ANY_CHUNKS for name in names):
@@ -356,15 +356,15 @@ def _names_of_expression(name: str, place: Source) -> list[str]:
         PolicyError: they take more than `MOST_EXPRESSIONS`.
     """
     try:
-        names = listed(name, MOST_EXPRESSIONS)
+        names = listed_expressions(name, MOST_EXPRESSIONS)
     except TooManyNames:
         names = []
     if not 0 < sum(map(_number_of_chunks, names)) <= MOST_EXPRESSIONS:
-        raise _too_many(name, place)
+        raise _too_many_error(name, place)
     return names
 
 
-def _no_key(name: str, place: Source) -> PolicyError:
+def _untranslatable_name_error(name: str, place: Source) -> PolicyError:
     return PolicyError(
         f"{place}: the name {name} cannot be expressed in Zenoh",
         "A key of Zenoh has no '#' and no '$', and no empty part.",
@@ -372,7 +372,7 @@ def _no_key(name: str, place: Source) -> PolicyError:
     )
 
 
-def _too_many(name: str, place: Source) -> PolicyError:
+def _too_many_error(name: str, place: Source) -> PolicyError:
     return PolicyError(
         f"{place}: the name {name} cannot be expressed in Zenoh",
         "A key expression of Zenoh has no '?' and no set of characters, and a list of all names "
@@ -484,7 +484,7 @@ def rights_in_rules(access: Enforcement) -> RightsInRules:
         for enclave in subject.cert_common_names or ():
             names.add(enclave)
             for rule in access.rules_of(subject.id):
-                for right, key in _uses(rule):
+                for right, key in _right_keys(rule):
                     qualifier = ALLOW if rule.allows else DENY
                     of_key, chunk = ros_names(key), key.partition("/")[0]
                     domain = int(chunk) if _DOMAIN.fullmatch(chunk) and chunk != "*" else None
@@ -496,7 +496,7 @@ def rights_in_rules(access: Enforcement) -> RightsInRules:
     return RightsInRules(in_domains, frozenset(names), tuple(sorted(left_out)))
 
 
-def _uses(rule: AclRule) -> Iterator[tuple[str, str]]:
+def _right_keys(rule: AclRule) -> Iterator[tuple[str, str]]:
     """Yield pairs of a right and a key expression that a rule allows or denies."""
     for (flow, message), right in _USE.items():
         if flow in rule.flows and message in rule.messages:
@@ -687,7 +687,7 @@ def _rights_of_subject(
                 if not all(others.any(key, includes) for key in _keys_of(domain, name))
             )
             of_subject.append(StatedName(right, name, domain, lacks))
-        unsaid += [(right, key) for key in names_of.unsaid()]
+        unsaid += [(right, key) for key in names_of.keys_without_name()]
         denied += [(right, key) for key in taken]
     order = sorted(
         of_subject, key=lambda stated: (RIGHT_ORDER[stated.right], stated.name, stated.domain)
@@ -770,7 +770,7 @@ class _Names:
             for key in _keys_of(domain, name)
         )
 
-    def unsaid(self) -> list[str]:
+    def keys_without_name(self) -> list[str]:
         """Return the key expressions that no name expresses completely."""
         said = _ByPrefix(dict.fromkeys(self._said), self._limit)
         return [

@@ -156,7 +156,7 @@ class AccessControl:
             and message in rule.messages
             and _include(rule.key_expressions, key)
         ]
-        return _decided(applying, (own.common_name,))
+        return _decide_by_rules(applying, (own.common_name,))
 
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
         """Return the key expressions that rules allow; denials are not subtracted."""
@@ -219,7 +219,7 @@ _NO_SUBJECT = "no subject matches, and the default is DENY"
 _NO_RULE_AT_ALL = "no rule is in force, and the default is DENY"
 
 
-def _decided(
+def _decide_by_rules(
     applicable_rules: Sequence[tuple[bool, str]], subjects: tuple[str, ...]
 ) -> AccessDecision:
     """Return the decision of the rules that apply to a message: if any rule denies, it is denied.
@@ -266,11 +266,11 @@ def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
 def _joined_keys(keys: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
     if len(keys) == 1 and len(keys[0]) > _FEW:
         return tuple(sorted(keys[0]))
-    return _needed(frozenset(key for some_keys in keys for key in some_keys))
+    return _needed_keys(frozenset(key for some_keys in keys for key in some_keys))
 
 
 @lru_cache(maxsize=16)  # several messages of a right have the same keys
-def _needed(keys: frozenset[str]) -> tuple[str, ...]:
+def _needed_keys(keys: frozenset[str]) -> tuple[str, ...]:
     return tuple(KeyExpressions(keys).needed())
 
 
@@ -379,7 +379,7 @@ def _added_keys(some: tuple[str, ...], others: tuple[str, ...]) -> tuple[str, ..
     return tuple(sorted({*some, *others})) if some else others
 
 
-def narrowed(rights: RemoteRights, most: Iterable[AccessRule], kept: str) -> RemoteRights:
+def narrowed_rights(rights: RemoteRights, most: Iterable[AccessRule], kept: str) -> RemoteRights:
     """Return the part of some rights that the rules ``most`` allow as well.
 
     Keys that begin with ``kept`` are not narrowed: in keys of the graph, names of nodes and topics
@@ -568,7 +568,7 @@ class Enforcement:
             name for subject in self.subjects for name in subject.cert_common_names or ()
         )
 
-    def unclear(self) -> str:
+    def unclear_reason(self) -> str:
         """Return why the common name alone does not decide what passes, as a clause, or ""."""
         for subject in self.subjects:
             stated = {name for name in PROPERTIES if getattr(subject, name) is not None}
@@ -637,9 +637,11 @@ class Enforcement:
                 denying += denied
             elif allowed or self.allows_by_default:
                 why = f"rule {allowed[0]} allows it" if allowed else "the default is ALLOW"
-                return AccessDecision(True, _once(allowed), subjects, why)
+                return AccessDecision(True, _unique_ids(allowed), subjects, why)
         if denying:
-            return AccessDecision(False, _once(denying), subjects, f"rule {denying[0]} denies it")
+            return AccessDecision(
+                False, _unique_ids(denying), subjects, f"rule {denying[0]} denies it"
+            )
         return AccessDecision(False, (), subjects, _NO_RULE)
 
     def key_expressions_of(self, rule: str) -> tuple[str, ...]:
@@ -698,7 +700,7 @@ class Enforcement:
             values = (getattr(subject, name) or (None,) for name in PROPERTIES)
             for combination in product(*values):
                 ids_of.setdefault(combination, []).append(subject.id)
-        return {values: _once(subjects) for values, subjects in ids_of.items()}
+        return {values: _unique_ids(subjects) for values, subjects in ids_of.items()}
 
     @cached_property
     def _rules_of(self) -> Mapping[str, tuple[AclRule, ...]]:
@@ -753,5 +755,5 @@ class Enforcement:
         ]
 
 
-def _once(ids: Iterable[str]) -> tuple[str, ...]:
+def _unique_ids(ids: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(ids))

@@ -125,7 +125,7 @@ class ZenohNetwork:
         }
         for first, second in combinations(self.every_router(), 2):
             for listening, connecting in ((first, second), (second, first)):
-                if reachable := _far(listening):
+                if reachable := _endpoints_for_others(listening):
                     connections[connecting.name] += reachable[:1]
                     break
             else:
@@ -206,7 +206,8 @@ def render_configuration(
 ) -> bytes:
     """Return what `Configuration.render` does, from the rendered rights of all remote enclaves."""
     control = _control([*rights], once=settings is SettingsEdition.RULES_ONCE)
-    return f"{_rest(mode, listen, connect, revoked, settings)}{_CONTROL}{control}".encode()
+    rest = _text_without_control(mode, listen, connect, revoked, settings)
+    return f"{rest}{_CONTROL}{control}".encode()
 
 
 _CONTROL = ',\n "access_control": {\n'
@@ -237,7 +238,7 @@ def _control(every: Sequence[RenderedRights], *, once: bool) -> str:
 
 
 @lru_cache
-def _rest(
+def _text_without_control(
     mode: Mode,
     listen: tuple[str, ...],
     connect: tuple[str, ...],
@@ -314,10 +315,12 @@ _PERMISSIONS = {True: "allow", False: "deny"}
 
 def render_rights(remote: RemoteRights) -> RenderedRights:
     """Return the rules of a remote enclave as the files have them."""
-    return RenderedRights(remote.common_name, tuple([_rendered(rule) for rule in remote.rules]))
+    return RenderedRights(
+        remote.common_name, tuple([_rendered_rule(rule) for rule in remote.rules])
+    )
 
 
-def _rendered(rule: AccessRule) -> str:
+def _rendered_rule(rule: AccessRule) -> str:
     return (
         f'"permission": "{_PERMISSIONS[rule.allows]}", "flows": ["{rule.flow}"], '
         f'"messages": {_listed(rule.messages)}, "key_exprs": {_listed(rule.key_expressions)}}}'
@@ -383,7 +386,7 @@ class RenderedReader:
             sections = _SECTIONS.fullmatch(control)
             if not mark or not sections:
                 return None
-            found, rights = self._beginning(beginning), self._of_all(sections)
+            found, rights = self._parse_without_rules(beginning), self._of_all(sections)
             settings = found.settings
             if settings is not SettingsEdition.FEW and _control(rights, once=True) == control:
                 settings = SettingsEdition.RULES_ONCE
@@ -396,15 +399,15 @@ class RenderedReader:
         except (ValueError, KeyError, IndexError, TypeError, RecursionError):
             return None
 
-    def beginning(self, data: bytes) -> Configuration | None:
+    def configuration_without_rules(self, data: bytes) -> Configuration | None:
         """Return a configuration without its rules, or None if sros did not write the file."""
         try:
             text, mark, _ = data.decode().partition(_CONTROL)
-            return self._beginning(text) if mark else None
+            return self._parse_without_rules(text) if mark else None
         except (ValueError, KeyError, IndexError, TypeError, RecursionError):
             return None
 
-    def _beginning(self, text: str) -> Configuration:
+    def _parse_without_rules(self, text: str) -> Configuration:
         """Return mode and endpoints of a configuration.
 
         Raises:
@@ -418,7 +421,7 @@ class RenderedReader:
             editions = [
                 edition
                 for edition in SettingsEdition
-                if _rest(mode, listen, connect, revoked, edition) == text
+                if _text_without_control(mode, listen, connect, revoked, edition) == text
             ]
             self._beginnings[text] = Configuration(
                 mode, listen, connect, AccessControl(()), revoked, editions[0]
@@ -455,7 +458,7 @@ class RenderedReader:
                 tuple(stated["key_exprs"]),
                 stated["permission"] == _PERMISSIONS[True],
             )
-            if _rendered(rule) != text:
+            if _rendered_rule(rule) != text:
                 raise ValueError("not as it is rendered")
             self._rules[text] = rule
         return self._rules[text]
@@ -535,7 +538,7 @@ def _check_routers(network: ZenohNetwork) -> None:
         check_network(ZenohNetwork(router.name, router.endpoints, router.listening(), network.mode))
 
 
-def _far(router: ZenohRouter) -> tuple[str, ...]:
+def _endpoints_for_others(router: ZenohRouter) -> tuple[str, ...]:
     """Return the endpoints at which processes of other hosts reach a router."""
     listens = {_host_and_port(endpoint)[0] for endpoint in router.listening()}
     far = tuple(

@@ -107,7 +107,7 @@ def route(
     return source, router, target
 
 
-def publication(route: Route, key: str, subscribed_key: str = "") -> Delivery:
+def deliver_sample(route: Route, key: str, subscribed_key: str = "") -> Delivery:
     """Return the delivery of a published sample along the route ``route``.
 
     ``key`` is the key of the sample, perhaps with wildcards; ``subscribed_key`` is the key of the
@@ -124,7 +124,7 @@ def publication(route: Route, key: str, subscribed_key: str = "") -> Delivery:
     )
 
 
-def call(route: Route, key: str, served_key: str = "", reply_key: str = "") -> Delivery:
+def deliver_query(route: Route, key: str, served_key: str = "", reply_key: str = "") -> Delivery:
     """Return the delivery of a query along the route ``route``, and of the reply.
 
     ``key`` is the key of the query; ``served_key`` is the key of the queryable, and ``reply_key``
@@ -142,7 +142,7 @@ def call(route: Route, key: str, served_key: str = "", reply_key: str = "") -> D
     )
 
 
-def token(
+def deliver_token(
     route: Route, key: str, asked_key: str, message: Message = Message.DECLARE_LIVELINESS_SUBSCRIBER
 ) -> Delivery:
     """Return the delivery of a liveliness token along the route ``route``, to a watching process.

@@ -293,7 +293,7 @@ class _Section:
     path: str
     value: Json5Object
 
-    def refused(
+    def invalid_value_error(
         self, member: str, problem: str, error: type[DocumentError] = DocumentError
     ) -> DocumentError:
         line = self.value.lines.get(member, self.value.line)
@@ -307,7 +307,7 @@ class _Section:
     def section(self, member: str) -> _Section:
         value = self.value.get(member, Json5Object(self.value.line))
         if not isinstance(value, Json5Object):
-            raise self.refused(member, "is not an object", _object_error_class(value))
+            raise self.invalid_value_error(member, "is not an object", _object_error_class(value))
         return _Section(self.name, f"{self.path}/{member}".lstrip("/"), value)
 
     def boolean(self, member: str, default: bool, *, nullable: bool = True) -> bool:
@@ -315,13 +315,13 @@ class _Section:
         if value is None and nullable:
             return default
         if not isinstance(value, bool):
-            raise self.refused(member, "is neither true nor false")
+            raise self.invalid_value_error(member, "is neither true nor false")
         return value
 
     def text(self, member: str) -> str | None:
         value = self.value.get(member)
         if value is not None and not isinstance(value, str):
-            raise self.refused(member, "is not a text")
+            raise self.invalid_value_error(member, "is not a text")
         return value
 
     def choice(self, member: str, kind: type[_E]) -> _E | None:
@@ -333,20 +333,22 @@ class _Section:
             return kind(text)
         except ValueError:
             known = ", ".join(choice.value for choice in kind)
-            raise self.refused(member, f"is {text[:40]!r}, and none of: {known}") from None
+            raise self.invalid_value_error(
+                member, f"is {text[:40]!r}, and none of: {known}"
+            ) from None
 
     def texts(self, member: str) -> tuple[str, ...] | None:
         value = self.value.get(member)
         if value is None:
             return None
         if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
-            raise self.refused(member, "is not a list of texts")
+            raise self.invalid_value_error(member, "is not a list of texts")
         return tuple(value)
 
     def needed_texts(self, member: str) -> tuple[str, ...]:
         texts = self.texts(member)
         if not texts:
-            raise self.refused(member, "is missing or empty")
+            raise self.invalid_value_error(member, "is missing or empty")
         return texts
 
     def choices(self, member: str, kind: type[_E]) -> tuple[_E, ...] | None:
@@ -354,7 +356,7 @@ class _Section:
         if texts is None:
             return None
         if not texts:
-            raise self.refused(member, "is empty")
+            raise self.invalid_value_error(member, "is empty")
         return tuple(dict.fromkeys(self._chosen(member, text, kind) for text in texts))
 
     def sections(self, member: str) -> tuple[_Section, ...] | None:
@@ -366,17 +368,19 @@ class _Section:
         ):
             elements = value if isinstance(value, list) else ()
             inner = next((element for element in elements if isinstance(element, list)), None)
-            raise self.refused(member, "is not a list of objects", _object_error_class(inner))
+            raise self.invalid_value_error(
+                member, "is not a list of objects", _object_error_class(inner)
+            )
         return tuple(
             _Section(self.name, f"{self.path}/{member}[{number}]", element)
             for number, element in enumerate(value)
         )
 
-    def only(self, known: Collection[str]) -> None:
-        for member in self.unknown(known):
-            raise self.refused(member[:40], "is not a setting that sros knows")
+    def check_members(self, known: Collection[str]) -> None:
+        for member in self.unknown_members(known):
+            raise self.invalid_value_error(member[:40], "is not a setting that sros knows")
 
-    def unknown(self, known: Collection[str]) -> Iterator[str]:
+    def unknown_members(self, known: Collection[str]) -> Iterator[str]:
         return (member for member in self.value if member not in known)
 
 
@@ -389,12 +393,15 @@ def _configuration(root: _Section, name: str) -> ConfigurationDocument:
     admin = root.section("adminspace")
     permissions = admin.section("permissions")
     shared = root.section("transport").section("shared_memory")
-    unknown = [*root.unknown(_SECTIONS), *(f"{tls.path}/{name}" for name in tls.unknown(_TLS))]
+    unknown = [
+        *root.unknown_members(_SECTIONS),
+        *(f"{tls.path}/{name}" for name in tls.unknown_members(_TLS)),
+    ]
     return ConfigurationDocument(
         name,
         mode,
-        _endpoints(root.section("listen"), mode, _LISTEN[mode]),
-        _endpoints(root.section("connect"), mode, ()),
+        _read_endpoints(root.section("listen"), mode, _LISTEN[mode]),
+        _read_endpoints(root.section("connect"), mode, ()),
         link.texts("protocols"),
         TlsOptions(
             tls.boolean("enable_mtls", False),
@@ -409,31 +416,33 @@ def _configuration(root: _Section, name: str) -> ConfigurationDocument:
         permissions.boolean("read", True, nullable=False),
         permissions.boolean("write", False, nullable=False),
         root.text("namespace"),
-        _enforcement(root.section("access_control")),
+        _read_enforcement(root.section("access_control")),
         tuple(unknown),
         dict(_settings(root.value, "")),
         dict(_lines(root.value, "")),
     )
 
 
-def _endpoints(
+def _read_endpoints(
     section: _Section, mode: Mode, default: tuple[str, ...]
 ) -> tuple[ZenohEndpoint, ...]:
     """Return the endpoints of a section, which may state different endpoints for each mode."""
     if isinstance(section.value.get("endpoints"), Json5Object):
         section = section.section("endpoints")
-        section.only([mode.value for mode in Mode])
+        section.check_members([mode.value for mode in Mode])
         endpoints = section.texts(mode.value) or ()
     elif "endpoints" in section.value:
         stated = section.texts("endpoints")
         if stated is None:
-            raise section.refused("endpoints", "is null")
+            raise section.invalid_value_error("endpoints", "is null")
         endpoints = stated
     else:
         endpoints = default
     for endpoint in endpoints:
         if not all(endpoint.partition("/")):
-            raise section.refused("", f"has {endpoint[:80]!r}, which is not PROTOCOL/ADDRESS")
+            raise section.invalid_value_error(
+                "", f"has {endpoint[:80]!r}, which is not PROTOCOL/ADDRESS"
+            )
     return tuple(map(ZenohEndpoint, endpoints))
 
 
@@ -442,16 +451,16 @@ class _Permission(StrEnum):
     DENY = "deny"
 
 
-def _enforcement(section: _Section) -> Enforcement:
-    section.only(("enabled", "default_permission", "rules", "subjects", "policies"))
+def _read_enforcement(section: _Section) -> Enforcement:
+    section.check_members(("enabled", "default_permission", "rules", "subjects", "policies"))
     enabled = section.boolean("enabled", False, nullable=False)
     default = section.choice("default_permission", _Permission)
     lists = {member: section.sections(member) for member in ("rules", "subjects", "policies")}
     if enabled and (missing := [member for member, value in lists.items() if value is None]):
-        raise section.refused("", f"is on without the list {missing[0]!r}")
-    rules = tuple(map(_rule, lists["rules"] or ()))
-    subjects = tuple(map(_subject, lists["subjects"] or ()))
-    policies = tuple(map(_policy, lists["policies"] or ()))
+        raise section.invalid_value_error("", f"is on without the list {missing[0]!r}")
+    rules = tuple(map(_read_rule, lists["rules"] or ()))
+    subjects = tuple(map(_read_subject, lists["subjects"] or ()))
+    policies = tuple(map(_read_policy, lists["policies"] or ()))
     enforcement = Enforcement(enabled, default is _Permission.ALLOW, rules, subjects, policies)
     if enabled:
         _check_ids(section, enforcement)
@@ -459,25 +468,27 @@ def _enforcement(section: _Section) -> Enforcement:
     return enforcement
 
 
-def _id(section: _Section) -> str:
+def _read_id(section: _Section) -> str:
     text = section.text("id")
     if not text or not text.strip():
-        raise section.refused("id", "is missing or empty")
+        raise section.invalid_value_error("id", "is missing or empty")
     return text
 
 
-def _rule(section: _Section) -> AclRule:
-    section.only(("id", "permission", "flows", "messages", "key_exprs"))
+def _read_rule(section: _Section) -> AclRule:
+    section.check_members(("id", "permission", "flows", "messages", "key_exprs"))
     permission = section.choice("permission", _Permission)
     messages = section.choices("messages", Message)
     if permission is None or messages is None:
-        raise section.refused("", f"has no {'messages' if permission else 'permission'!r}")
+        raise section.invalid_value_error(
+            "", f"has no {'messages' if permission else 'permission'!r}"
+        )
     keys = section.needed_texts("key_exprs")
     for key in keys:
         if problem := expression_problem(key):
-            raise section.refused("key_exprs", f"has {key[:80]!r}: {problem}")
+            raise section.invalid_value_error("key_exprs", f"has {key[:80]!r}: {problem}")
     return AclRule(
-        _id(section),
+        _read_id(section),
         permission is _Permission.ALLOW,
         section.choices("flows", Flow) or tuple(Flow),
         messages,
@@ -486,23 +497,27 @@ def _rule(section: _Section) -> AclRule:
     )
 
 
-def _subject(section: _Section) -> AclSubject:
-    section.only(("id", *PROPERTIES))
+def _read_subject(section: _Section) -> AclSubject:
+    section.check_members(("id", *PROPERTIES))
     values = {name: section.texts(name) for name in PROPERTIES}
     for member, value in values.items():
         if value is not None and not all(text.strip() for text in value or ("",)):
-            raise section.refused(member, "is empty, or has an empty value")
+            raise section.invalid_value_error(member, "is empty, or has an empty value")
     for protocol in values["link_protocols"] or ():
         if protocol not in _LINK_PROTOCOLS:
-            raise section.refused("link_protocols", f"has the unknown protocol {protocol[:40]!r}")
+            raise section.invalid_value_error(
+                "link_protocols", f"has the unknown protocol {protocol[:40]!r}"
+            )
     for zid in values["zids"] or ():
         if not _ZID.fullmatch(zid):
-            raise section.refused("zids", f"has {zid[:40]!r}, which is not a session id")
-    return AclSubject(_id(section), **values, line=section.value.line)
+            raise section.invalid_value_error(
+                "zids", f"has {zid[:40]!r}, which is not a session id"
+            )
+    return AclSubject(_read_id(section), **values, line=section.value.line)
 
 
-def _policy(section: _Section) -> AclPolicy:
-    section.only(("id", "rules", "subjects"))
+def _read_policy(section: _Section) -> AclPolicy:
+    section.check_members(("id", "rules", "subjects"))
     section.text("id")
     return AclPolicy(section.needed_texts("rules"), section.needed_texts("subjects"))
 
@@ -512,12 +527,12 @@ def _check_ids(section: _Section, enforcement: Enforcement) -> None:
     for member, elements in (("rules", enforcement.rules), ("subjects", enforcement.subjects)):
         ids = [element.id for element in elements]
         if twice := next(_repeated(ids), None):
-            raise section.refused(member, f"has the id {twice[:80]!r} twice")
+            raise section.invalid_value_error(member, f"has the id {twice[:80]!r} twice")
         for policy in enforcement.policies:
             named: tuple[str, ...] = getattr(policy, member)
             for missing in set(named) - set(ids):
                 text = f"names {missing[:80]!r}, which is not in {member}"
-                raise section.refused("policies", text)
+                raise section.invalid_value_error("policies", text)
 
 
 def _check_size(section: _Section, enforcement: Enforcement) -> None:

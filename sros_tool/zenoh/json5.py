@@ -153,7 +153,7 @@ class _Reader:
     def whole(self) -> Any:
         value = self._value(_MOST_DEPTH)
         if self._now.kind != "end":
-            raise self._unexpected()
+            raise self._unexpected_error()
         return value
 
     def _take(self) -> _Token:
@@ -175,7 +175,7 @@ class _Reader:
         if token.kind == "word" and token.text in _WORDS:
             return _WORDS[token.text]
         self._now = token
-        raise self._unexpected()
+        raise self._unexpected_error()
 
     def _object(self, line: int, depth: int) -> Json5Object:
         value = Json5Object(line)
@@ -185,13 +185,13 @@ class _Reader:
             if name in value:
                 raise Json5Error(f"{name!r} is named twice", token.line)
             if self._take_mark(":") is None:
-                raise self._unexpected()
+                raise self._unexpected_error()
             value[name] = self._value(depth - 1)
             value.lines[name] = token.line
             if self._take_mark(",") is None:
                 break
         if self._take_mark("}") is None:
-            raise self._unexpected()
+            raise self._unexpected_error()
         return value
 
     def _list(self, depth: int) -> list[Any]:
@@ -201,17 +201,17 @@ class _Reader:
             if self._take_mark(",") is None:
                 break
         if self._take_mark("]") is None:
-            raise self._unexpected()
+            raise self._unexpected_error()
         return value
 
     def _take_mark(self, mark: str) -> _Token | None:
         return self._take() if self._now.text == mark else None
 
-    def _unexpected(self) -> Json5Error:
-        return _unexpected(self._now)
+    def _unexpected_error(self) -> Json5Error:
+        return _unexpected_error(self._now)
 
 
-def _unexpected(token: _Token) -> Json5Error:
+def _unexpected_error(token: _Token) -> Json5Error:
     found = f"unexpected {token.text[:40]!r}" if token.kind != "end" else "it ends too early"
     return Json5Error(found, token.line)
 
@@ -221,7 +221,7 @@ def _name_of(token: _Token) -> str:
         return _unescaped(token.text[1:-1], token.line)
     if token.kind == "word":
         return _unescaped(token.text, token.line)
-    raise _unexpected(token)
+    raise _unexpected_error(token)
 
 
 def _unescaped(text: str, line: int) -> str:

@@ -182,7 +182,7 @@ def _includes(wide: str, narrow: str) -> bool:
 
 def sequence_includes(wide: Sequence[str], narrow: Sequence[str]) -> bool:
     """Return whether the chunks ``wide`` include all keys of the chunks ``narrow``."""
-    reached = _onward({0}, wide)
+    reached = _with_skipped_wildcards({0}, wide)
     for chunk in narrow:
         following = set()
         for at in reached:
@@ -192,11 +192,11 @@ def sequence_includes(wide: Sequence[str], narrow: Sequence[str]) -> bool:
                 following.add(at)
             elif _chunk_includes(wide[at], chunk):
                 following.add(at + 1)
-        reached = _onward(following, wide)
+        reached = _with_skipped_wildcards(following, wide)
     return len(wide) in reached
 
 
-def _onward(positions: set[int], wide: Sequence[str]) -> set[int]:
+def _with_skipped_wildcards(positions: set[int], wide: Sequence[str]) -> set[int]:
     """Return positions in ``wide``, with the ones after each ``**``: it may stand for nothing."""
     places = set(positions)
     for at in sorted(positions):
@@ -219,7 +219,7 @@ def _chunk_includes(wide: str, narrow: str) -> bool:
     return has_parts(narrow.replace(ANY_PART, "\0"), wide.split(ANY_PART))
 
 
-def widest(expression: str) -> str:
+def widest_expression(expression: str) -> str:
     """Return the expression in which ``**`` replaces all chunks but those that begin with ``@``."""
     chunks = expression.split("/")
     return canonical(chunk if chunk.startswith("@") else ANY_CHUNKS for chunk in chunks)
@@ -349,7 +349,7 @@ def _common_parts(
     """
 
     @cache
-    def following(at: int, there: int) -> frozenset[tuple[str, ...]]:
+    def common_sequences_from(at: int, there: int) -> frozenset[tuple[str, ...]]:
         left, right = one[at : at + 1], other[there : there + 1]
         if not left and not right:
             return frozenset({()})
@@ -357,21 +357,29 @@ def _common_parts(
         first, second = (members[0] if members else "" for members in (left, right))
         if first == many == second:
             # One of them stands for no more than the other, which goes on.
-            for rest in following(at + 1, there) | following(at, there + 1):
+            for rest in common_sequences_from(at + 1, there) | common_sequences_from(at, there + 1):
                 sequences.add(rest if rest[:1] == (many,) else (many, *rest))
         elif many in (first, second):
-            sequences |= following(at + 1, there) if first == many else following(at, there + 1)
+            sequences |= (
+                common_sequences_from(at + 1, there)
+                if first == many
+                else common_sequences_from(at, there + 1)
+            )
             if left and right:
-                more = following(at, there + 1) if first == many else following(at + 1, there)
+                more = (
+                    common_sequences_from(at, there + 1)
+                    if first == many
+                    else common_sequences_from(at + 1, there)
+                )
                 sequences |= {(member, *rest) for member in meet(first, second) for rest in more}
         elif left and right:
-            more = following(at + 1, there + 1)
+            more = common_sequences_from(at + 1, there + 1)
             sequences |= {(member, *rest) for member in meet(first, second) for rest in more}
         if len(sequences) > _MOST_COMMON:
             raise TooManyExpressions
         return frozenset(sequences)
 
-    return set(following(0, 0))
+    return set(common_sequences_from(0, 0))
 
 
 # ── the keys as sets of names ──────────────────────────────────────────────────────────────

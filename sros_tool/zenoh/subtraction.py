@@ -99,7 +99,7 @@ def _subtract(wide: Chunks, denied: Iterable[Chunks]) -> set[Chunks]:
         return set()
     left: set[Chunks] = set()
     for part in _parts(wide, without):
-        left |= _less(
+        left |= _remaining_keys(
             part, frozenset(expression for expression in without if _keys_meet(expression, part))
         )
         _check_number(len(left))
@@ -177,11 +177,11 @@ def _parts(wide: Chunks, denied: Iterable[Chunks]) -> Iterator[Chunks]:
         end = max(fixed, *(len(last) for _, last in wild), 0) - len(after)
         _check_number(max(begin, 1) * max(end, 1))
         for number in range(begin):
-            yield from _parts((*before, *_any(number), *between, *after), denied)
-        most = (*before, *_any(begin), ANY_CHUNKS, *between[:-1])
+            yield from _parts((*before, *_any_chunks(number), *between, *after), denied)
+        most = (*before, *_any_chunks(begin), ANY_CHUNKS, *between[:-1])
         for number in range(end):
-            yield from _parts((*most, *_any(number), *after), denied)
-        yield (*most, ANY_CHUNKS, *_any(end), *after)
+            yield from _parts((*most, *_any_chunks(number), *after), denied)
+        yield (*most, ANY_CHUNKS, *_any_chunks(end), *after)
         return
     begin = max((_to_last_named(first) for first, _ in wild), default=0)
     end = max((_to_last_named(last[::-1]) for _, last in wild), default=0)
@@ -190,11 +190,17 @@ def _parts(wide: Chunks, denied: Iterable[Chunks]) -> Iterator[Chunks]:
     enough = max(shortest + begin, len(before) + begin + end, fixed + 1)
     _check_number(enough)
     for number in range(enough - shortest):
-        yield (*before, *_any(number), *after)
-    yield (*before, *_any(begin), ANY_CHUNKS, *_any(enough - shortest - begin), *after)
+        yield (*before, *_any_chunks(number), *after)
+    yield (
+        *before,
+        *_any_chunks(begin),
+        ANY_CHUNKS,
+        *_any_chunks(enough - shortest - begin),
+        *after,
+    )
 
 
-def _any(number: int) -> Chunks:
+def _any_chunks(number: int) -> Chunks:
     return (ANY_CHUNK,) * number
 
 
@@ -204,7 +210,7 @@ def _to_last_named(chunks: Chunks) -> int:
 
 
 @lru_cache(maxsize=_FEW)
-def _less(wide: Chunks, denied: frozenset[Chunks]) -> frozenset[Chunks]:
+def _remaining_keys(wide: Chunks, denied: frozenset[Chunks]) -> frozenset[Chunks]:
     """Return expressions for the keys of ``wide`` without ``denied``.
 
     Each denied expression shares keys with ``wide``.
@@ -233,7 +239,7 @@ def _by_length(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
         raise CannotSubtract(min(named or denied))
     least = min(len(expression) - 1 for expression in denied if ANY_CHUNKS in expression)
     lengths = {len(expression) for expression in denied if ANY_CHUNKS not in expression}
-    return frozenset(_any(number) for number in range(least) if number not in lengths)
+    return frozenset(_any_chunks(number) for number in range(least) if number not in lengths)
 
 
 def _by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
@@ -244,7 +250,7 @@ def _by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]
     first, rest = wide[0], wide[1:]
     tails: dict[str, set[Chunks]] = {}
     for expression in denied:
-        for chunk, tail in _openings(expression):
+        for chunk, tail in _first_chunks(expression):
             if common_chunks(first, chunk) and _keys_meet(tail, rest):
                 tails.setdefault(chunk, set()).add(tail)
     always = {chunk for chunk in tails if _matches(chunk, first)}
@@ -253,7 +259,7 @@ def _by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]
     kinds: dict[Chunks, set[frozenset[str]]] = {}
     for kind in _kinds(first, some):
         behind = frozenset(tail for chunk in kind | always for tail in tails[chunk])
-        for remainder in _less(rest, behind):
+        for remainder in _remaining_keys(rest, behind):
             kinds.setdefault(remainder, set()).add(kind)
     left = set()
     for remainder, matched in kinds.items():
@@ -262,10 +268,10 @@ def _by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]
     return frozenset(left)
 
 
-def _openings(expression: Chunks) -> Iterator[tuple[str, Chunks]]:
+def _first_chunks(expression: Chunks) -> Iterator[tuple[str, Chunks]]:
     """Yield each first chunk that an expression may have, with the chunks after it."""
     if expression and expression[0] == ANY_CHUNKS:
-        yield from _openings(expression[1:])
+        yield from _first_chunks(expression[1:])
         yield ANY_CHUNK, expression
     elif expression:
         yield expression[0], expression[1:]
@@ -407,7 +413,9 @@ class _Letters:
         if any(_matches(_chunk(chunk), _chunk(wide)) for chunk in denied):
             return ()
         if not wide.startswith("*"):
-            return (_Place(read + wide[0], wide[1:], _after(wide[0], denied), _LETTERS),)
+            return (
+                _Place(read + wide[0], wide[1:], _rest_after_letter(wide[0], denied), _LETTERS),
+            )
         starred = [chunk for chunk in denied if chunk.startswith("*")]
         if starred and all(chunk in starred or "*" not in chunk for chunk in denied):
             self._keep_backwards(read, wide, denied)
@@ -428,7 +436,7 @@ class _Letters:
         begins = not self.backwards and not read
         for letter in letters:
             if not (begins and letter in digits):
-                yield _Place(read + letter, wide, _after(letter, denied), letters)
+                yield _Place(read + letter, wide, _rest_after_letter(letter, denied), letters)
 
     def _keep_backwards(self, read: str, wide: str, denied: tuple[str, ...]) -> None:
         if self.backwards:
@@ -452,7 +460,7 @@ def _overlap(first: str, second: str) -> bool:
     return chunks_intersect(_chunk(first), _chunk(second))
 
 
-def _after(letter: str, chunks: Iterable[str]) -> tuple[str, ...]:
+def _rest_after_letter(letter: str, chunks: Iterable[str]) -> tuple[str, ...]:
     """Return the rest of each chunk after a letter was read."""
     rests = []
     for chunk in chunks:
@@ -480,7 +488,7 @@ def _joined_expressions(expressions: set[Chunks]) -> set[Chunks]:
     while longer := [expression for expression in joined if _one_shorter(expression) in joined]:
         joined -= {_one_shorter(expression) for expression in longer}
         joined.difference_update(longer)
-        joined |= {_or_shorter(expression) for expression in longer}
+        joined |= {_with_shorter(expression) for expression in longer}
     wild = {
         _around_wildcards(expression) for expression in joined if expression.count(ANY_CHUNKS) == 1
     }
@@ -524,7 +532,7 @@ def _one_shorter(chunks: Chunks) -> Chunks | None:
     return (*chunks[: at - 1], *chunks[at + 1 :]) if at and chunks[at - 1] == ANY_CHUNK else None
 
 
-def _or_shorter(chunks: Chunks) -> Chunks:
+def _with_shorter(chunks: Chunks) -> Chunks:
     at = chunks.index(ANY_CHUNKS)
     return (*chunks[: at - 1], *chunks[at:])
 
@@ -551,13 +559,15 @@ class Difference(NamedTuple):
         """
         return subtract_all(self.allowed, self.denied)
 
-    def below(self, end: str) -> Difference:
+    def keys_below(self, end: str) -> Difference:
         """Return the keys with ``end`` behind each key of this difference."""
         return self._replace(end=f"{self.end}/{end}")
 
     def include(self, name: str) -> bool:
         """Return whether the difference has a name without wildcards, such as ``robot/chatter``."""
-        return _searched(self.allowed).include(name) and not _searched(self.denied).include(name)
+        return _search_index(self.allowed).include(name) and not _search_index(self.denied).include(
+            name
+        )
 
     def include_all(self, begin: str, name: Chunks, end: str) -> bool:
         """Return whether the difference has all keys of an expression; False may be wrong."""
@@ -591,7 +601,7 @@ def _common_end(one: str, other: str) -> str | None:
 
 
 @lru_cache(maxsize=_FEW)
-def _searched(expressions: frozenset[Chunks]) -> KeyExpressions:
+def _search_index(expressions: frozenset[Chunks]) -> KeyExpressions:
     return KeyExpressions("/".join(chunks) for chunks in expressions)
 
 

@@ -594,13 +594,13 @@ def test_renewal_is_asked_for_in_the_last_third_of_a_certificate(home: Home, r1:
 def test_the_life_of_a_certificate_begins_when_it_was_made() -> None:
     """Its validity begins a day earlier, which would be all the life of one for an hour."""
     made = datetime(2027, 1, 2, tzinfo=UTC)
-    assert Window(made - BACKDATE, made + timedelta(hours=1)).life() == timedelta(hours=1)
-    assert Window(made, made + timedelta(hours=4)).life() == timedelta(hours=4)  # another CA's
+    assert Window(made - BACKDATE, made + timedelta(hours=1)).lifetime() == timedelta(hours=1)
+    assert Window(made, made + timedelta(hours=4)).lifetime() == timedelta(hours=4)  # another CA's
     longer = Window(made, made + timedelta(hours=30))
-    assert longer.life() == timedelta(hours=6)
-    assert longer.life(made + timedelta(minutes=1)) == timedelta(hours=29, minutes=59)
+    assert longer.lifetime() == timedelta(hours=6)
+    assert longer.lifetime(made + timedelta(minutes=1)) == timedelta(hours=29, minutes=59)
     for wrong in (made - timedelta(days=9), made + timedelta(days=9)):
-        assert timedelta(hours=6) <= longer.life(wrong) <= timedelta(hours=30)
+        assert timedelta(hours=6) <= longer.lifetime(wrong) <= timedelta(hours=30)
 
 
 def test_how_long_a_certificate_has_been_here_tells_when_it_was_made(home: Home, r1: Robot) -> None:

@@ -266,7 +266,7 @@ def test_a_kill_at_any_write_leaves_whole_metadata(
     made_publisher: Home, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """New releases and new keys of three roles: robots get the old release, or the new one."""
-    put = publishing._put
+    put = publishing._put_file
 
     def publish_killed(at: int) -> int:
         """Publish, killed ``at`` a write, and again; return the number of writes before."""
@@ -283,7 +283,7 @@ def test_a_kill_at_any_write_leaves_whole_metadata(
             writes += 1
 
         with monkeypatch.context() as patched, suppress(_Killed):
-            patched.setattr(publishing, "_put", killed)
+            patched.setattr(publishing, "_put_file", killed)
             home.publish(rotate=("timestamp", "snapshot", "targets", "root"))
         then, written = robot.gets(), writes
         assert home.robot().gets() == then
@@ -316,7 +316,7 @@ def test_a_kill_after_the_keystore_changed_keeps_the_number(
 def test_a_disk_that_is_full_after_the_keystore_changed(
     publisher: Home, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    put, robot = publishing._put, publisher.robot()
+    put, robot = publishing._put_file, publisher.robot()
     before = robot.gets()
 
     def full(folder: Folder, path: str, data: bytes) -> None:
@@ -326,7 +326,7 @@ def test_a_disk_that_is_full_after_the_keystore_changed(
 
     publisher.run("renew", "ks", "/r1/base")
     with monkeypatch.context() as patched:
-        patched.setattr(publishing, "_put", full)
+        patched.setattr(publishing, "_put_file", full)
         with pytest.raises(KeystoreError, match=r"No space left on device\. Robots find either"):
             publisher.publish()
     assert robot.gets() == before

@@ -13,7 +13,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import by_cause
 from sros_tool.checks.registry import FindingFilter
 from sros_tool.dds.decision.access import Access, GovernedDomain
-from sros_tool.dds.decision.vendors import TESTED, Signers, Vendor, together
+from sros_tool.dds.decision.vendors import TESTED, Signers, Vendor, joined_titles
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.reader import Keystore, open_enclave
@@ -173,7 +173,7 @@ def test_permissions_that_an_enclave_signed_for_itself(tmp_path: Path) -> None:
     assert "keystore.one-authority" in ended.out
     assert "enclave.signer-no-ca" in ended.out
     assert "the enclave gave itself these rights" in ended.out
-    refusing = together(each.title for each in TESTED if each.traits.signers is Signers.LISTED)
+    refusing = joined_titles(each.title for each in TESTED if each.traits.signers is Signers.LISTED)
     taken = f"accepted by Fast DDS 2.9.1, Cyclone DDS 0.10, refused by {', '.join(refusing)}"
     assert taken in ended.out
     ended = sros("check", root, "--vendor", "cyclonedds")

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.keystores.issued import OLD_PERMISSIONS
-from sros_tool.checks.keystores.keystore import joined, keystore_findings
+from sros_tool.checks.keystores.keystore import keystore_findings, with_joined_findings
 from sros_tool.checks.kind import NOTE, Finding
-from sros_tool.dds.decision.vendors import FAST_DDS, together
+from sros_tool.dds.decision.vendors import FAST_DDS, joined_titles
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.lifecycle.create import create_keystore
 from sros_tool.keystore.reader import Keystore
@@ -181,7 +181,7 @@ def test_a_new_keystore_that_others_can_replace_is_noted(
     assert ("keystore.replaceable" in sros("verify", folder / "other").out) is noted
 
 
-(LATER,) = together(vendor.title for vendor in FAST_DDS if vendor.traits.refuses_open_rtps)
+(LATER,) = joined_titles(vendor.title for vendor in FAST_DDS if vendor.traits.refuses_open_rtps)
 
 
 @pytest.mark.parametrize(
@@ -294,5 +294,5 @@ def test_a_remedy_for_several_enclaves_names_all_of_them() -> None:
         for name in names
     ]
     for number, shown in ((1, "/a"), (2, "/a /b"), (4, "ENCLAVE...")):
-        (named,) = joined(found[:number])
+        (named,) = with_joined_findings(found[:number])
         assert named.remedy == remedy.format(shown, "/a"), named

@@ -36,14 +36,14 @@ DIFFERENT = [
 
 @pytest.mark.parametrize(("one", "other"), NEAR)
 def test_near(one: str, other: str) -> None:
-    assert NearNames([one, "/x"]).near(other) == [one]
-    assert NearNames([other, "/x"]).near(one) == [other]
+    assert NearNames([one, "/x"]).similar_names(other) == [one]
+    assert NearNames([other, "/x"]).similar_names(one) == [other]
 
 
 @pytest.mark.parametrize(("one", "other"), DIFFERENT)
 def test_different(one: str, other: str) -> None:
-    assert NearNames([one]).near(other) == []
-    assert NearNames([other]).near(one) == []
+    assert NearNames([one]).similar_names(other) == []
+    assert NearNames([other]).similar_names(one) == []
 
 
 @pytest.mark.parametrize(
@@ -58,8 +58,8 @@ def test_different(one: str, other: str) -> None:
     ],
 )
 def test_a_namespace_more_or_less(one: str, other: str, near: bool) -> None:
-    assert NearNames([one, "/x/y"]).in_other_namespace(other) == [one] * near
-    assert NearNames([other, "/x/y"]).in_other_namespace(one) == [other] * near
+    assert NearNames([one, "/x/y"]).same_name_elsewhere(other) == [one] * near
+    assert NearNames([other, "/x/y"]).same_name_elsewhere(one) == [other] * near
 
 
 OTHER = '</profile><profile ns="/" node="_b">'

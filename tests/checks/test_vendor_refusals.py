@@ -16,7 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import ERROR, WARNING, Finding
-from sros_tool.dds.decision.vendors import TESTED, Signers, together
+from sros_tool.dds.decision.vendors import TESTED, Signers, joined_titles
 from sros_tool.errors import PkiError
 from sros_tool.faults import ORIGINAL_KEYSTORE, Fault
 from sros_tool.keystore.delivery.robot import RequestAnswer, check_answer, seal
@@ -29,10 +29,10 @@ from tests.checks.keystore_cases import IS_CA, TOPIC_RULE
 from tests.support.harness import sros
 from tests.support.long_form import some
 
-(STRICT,) = together(each.title for each in TESTED if each.traits.verifies_authorities)
+(STRICT,) = joined_titles(each.title for each in TESTED if each.traits.verifies_authorities)
 """The vendors that verify a CA file when they load it."""
 LISTED = " and ".join(
-    together(each.title for each in TESTED if each.traits.signers is Signers.LISTED)
+    joined_titles(each.title for each in TESTED if each.traits.signers is Signers.LISTED)
 )
 """The vendors that take signers only from the file of the permissions CA."""
 

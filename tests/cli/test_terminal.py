@@ -88,7 +88,7 @@ def test_the_time_that_is_left_is_shown(monkeypatch: pytest.MonkeyPatch) -> None
 
     said = on_terminal(work)
     assert re.search(r"signing 50 of 150 \.\.\. \d+ s, about \d+ s left", said), said
-    assert [showing._rounded(each) for each in (1.2, 119.4, 121, 3600)] == [
+    assert [showing._duration_text(each) for each in (1.2, 119.4, 121, 3600)] == [
         "1 s", "119 s", "2 min", "60 min",
     ]  # fmt: skip
 
@@ -113,7 +113,7 @@ def test_a_question_is_not_overwritten(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(showing, "_FIRST", 0.01)
 
     def work() -> None:
-        with showing.progress("signing"), showing.paused():
+        with showing.progress("signing"), showing.without_progress():
             os.write(2, b"Passphrase: ")
             time.sleep(0.1)
 

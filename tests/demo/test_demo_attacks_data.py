@@ -118,7 +118,7 @@ def test_every_forgery_is_used_and_has_a_folder_of_its_own() -> None:
     forges = {each.forge for each in undefended} | (forged - undefended)
     names = {each.__name__ for each in forges if callable(each)}
     assert len(public_functions("copy")) > 25
-    assert names - {"_unchanged"} == public_functions("copy")
+    assert names - {"_forge_nothing"} == public_functions("copy")
     templates = {each.template.__name__ for each in undefended}
     assert templates - {"_same_template"} == public_functions("template")
     folders = [name_of(each) for each in forged]  # type: ignore[arg-type]
@@ -130,7 +130,7 @@ def test_every_template_and_vendor_has_an_expectation(row: Row) -> None:
     """A variant must fit the claim that it changes; `Row.under` raises where it does not."""
     subsets = chain.from_iterable(combinations(Condition, size) for size in range(4))
     for conditions in subsets:
-        chosen = row.expected_under(frozenset(conditions))
+        chosen = row.with_expected_status(frozenset(conditions))
         assert chosen.claims[0].expected is chosen.expected
 
 

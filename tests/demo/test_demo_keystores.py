@@ -71,7 +71,7 @@ def test_in_a_sound_keystore_nothing_is_open_and_the_widest_is_tried(place: Plac
     assert user.cast["widest publisher"] not in ("/camera", "/eye/viewer", "/odd/other")
     assert [row.name for row in user.rows] == list(WIDEST)
     rows = [*ATTACKS.rows, *user.rows]
-    assert [row.name for row in rows if user.opened(row, user.topic) is not row] == []
+    assert [row.name for row in rows if user.row_if_allowed(row, user.topic) is not row] == []
     assert (user.enclaves, user.elsewhere, user.not_tried) == (7, 0, ())
 
 
@@ -85,11 +85,11 @@ def test_what_the_files_of_a_keystore_open_is_expected_to_be_open(name: str, pla
     weak.weaken(place)
     user = opened(place.root)
     rows = [*ATTACKS.rows, *user.rows]
-    found = {row.name: row for row in rows if user.opened(row, user.topic) is not row}
+    found = {row.name: row for row in rows if user.row_if_allowed(row, user.topic) is not row}
     by_files = weak.broken if "wild" in name or "everything" in name else ()
     assert set(found) == BY_RIGHTS.intersection(by_files)
     for row in found.values():
-        open_row = user.opened(row, user.topic)
+        open_row = user.row_if_allowed(row, user.topic)
         assert open_row.expected in (RowStatus.HEARD, RowStatus.ANSWERED)
         assert open_row.claims[0].expected is open_row.expected
         assert " by *" in open_row.open_because or "/image" in open_row.open_because
@@ -107,7 +107,7 @@ def test_one_wide_enclave_is_cast_however_many_are_narrow(place: Place) -> None:
     assert wide == ["widest publisher", "widest subscriber", "widest client", "widest server"]
     assert user.why["widest publisher"] == "may publish /image by a wildcard"
     (row,) = (each for each in user.rows if each.name == WIDEST[0])
-    assert user.opened(row, "/image").open_because == (
+    assert user.row_if_allowed(row, "/image").open_because == (
         "the permissions of /odd/victim allow it to publish /image by *"
     )
 
@@ -116,7 +116,7 @@ def test_a_right_by_name_that_everybody_has_is_open_too(tmp_path: Path) -> None:
     both = f"{publish('/image')}{HEARS}"
     user = opened(make_keystore(tmp_path, {"/a": both, "/b": both, "/c": publish("/x")}))
     (row,) = (each for each in ATTACKS.rows if each.name == "a talker listens")
-    assert user.opened(row, "/image").open_because == (
+    assert user.row_if_allowed(row, "/image").open_because == (
         "the permissions of /a allow it to subscribe /image"
     )
 

@@ -90,7 +90,7 @@ def test_an_attacker_in_another_enclave_obeys_no_rules_of_its_own() -> None:
 
 def test_rows_of_one_world_share_their_processes() -> None:
     rows = joined(ZENOH_SCENARIOS).rows
-    groups = [[rows[index] for index in group] for group in program.worlds(rows)]
+    groups = [[rows[index] for index in group] for group in program.groups_of_rows(rows)]
     assert sorted(row.name for group in groups for row in group) == sorted(ROWS)
     for group in groups:
         world = together(group)

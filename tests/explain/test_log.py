@@ -883,9 +883,9 @@ def test_how_often_files_are_read_is_not_for_the_log_to_choose(
     (tmp_path / "log").write_text("".join(lines))
     read: list[str] = []
 
-    def opened(opening: Keystore, name: str, *, at: datetime) -> LoadedEnclave:
+    def opened(opening: Keystore, name: str, *, moment: datetime) -> LoadedEnclave:
         read.append(name)
-        return load_enclave_of(opening, name, moment=at)
+        return load_enclave_of(opening, name, moment=moment)
 
     def refuse(_file: LedgerFile, *_asked: str) -> Ledger:
         raise AssertionError("the ledger was read")

@@ -23,7 +23,7 @@ from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
     Confirmation,
     Received,
-    keep,
+    keep_confirmation,
     last_confirmation,
     render_confirmation,
 )
@@ -178,7 +178,7 @@ def test_two_at_once(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transaction, "_LOCK_SECONDS", 0.0)
     (home.folder / "said").write_bytes(render_confirmation(home.said("r1", NOW, sequence=None)))
     home.send("r1")
-    kept = keep
+    kept = keep_confirmation
     refused = []
 
     def meanwhile(root: Path, received: Received) -> str:
@@ -190,7 +190,7 @@ def test_two_at_once(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
         return kept(root, received)
 
     with monkeypatch.context() as patched:
-        patched.setattr(collecting, "keep", meanwhile)
+        patched.setattr(collecting, "keep_confirmation", meanwhile)
         assert home.of("r1").outcome == "kept"
     assert refused == [(2, True)]
     assert home.of("r1").outcome == "unchanged" and not [*home.root.rglob(".sros-lock")]
@@ -200,10 +200,10 @@ def test_two_at_once(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_inbox_that_is_moved_away_meanwhile(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     def meanwhile(root: Path, received: Received) -> str:
         home.inbox.rename(home.folder / "elsewhere")
-        return keep(root, received)
+        return keep_confirmation(root, received)
 
     home.send("r1")
-    monkeypatch.setattr(collecting, "keep", meanwhile)
+    monkeypatch.setattr(collecting, "keep_confirmation", meanwhile)
     assert home.of("r1").outcome == "kept"
 
 
@@ -742,9 +742,9 @@ def test_one_request_that_cannot_be_signed_does_not_make_as_many_changes_as_robo
 ) -> None:
     tried: list[list[str]] = []
 
-    def certify(*_: object, only: list[str], **_more: object) -> SimpleNamespace:
-        tried.append(only)
-        if "/r33/base" in only:
+    def certify(*_: object, only_enclaves: list[str], **_more: object) -> SimpleNamespace:
+        tried.append(only_enclaves)
+        if "/r33/base" in only_enclaves:
             raise KeystoreError("it is the key of another enclave")
         return SimpleNamespace(notes=(), changes=())
 

@@ -173,7 +173,7 @@ def test_two_robots_in_one_enclave() -> None:
 def test_too_many_names_are_refused_before_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
     fleet = Fleet.of(Robot(f"r{i}", f"/r{i}") for i in range(1000))
     text = enclave("/d", " ".join(f"{{robots}}/t{i}" for i in range(300)))
-    made = FleetPolicy._several
+    made = FleetPolicy._filled_names
     count = 0
 
     def counted(*arguments: Any) -> tuple[str, ...]:
@@ -182,7 +182,7 @@ def test_too_many_names_are_refused_before_they_are_made(monkeypatch: pytest.Mon
         count += len(names)
         return names
 
-    monkeypatch.setattr(FleetPolicy, "_several", counted)
+    monkeypatch.setattr(FleetPolicy, "_filled_names", counted)
     with pytest.raises(PolicyError, match="more than 200000 names"):
         expanded(text, fleet)
     assert count == 201_000

@@ -16,7 +16,7 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from sros_tool.cli import fleet as fleet_verbs
-from sros_tool.cli.fleet import ComparedFleet, _facts, _joined, _lines, _robot_names
+from sros_tool.cli.fleet import ComparedFleet, _facts, _joined_durations, _lines, _robot_names
 from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
     RobotDds,
@@ -594,9 +594,9 @@ def test_robots_are_named_by_group_and_by_neighbors_of_one_name() -> None:
 
 def test_texts_that_differ_in_durations_are_one() -> None:
     texts = {"p1": "it is 3 min 28 s late at {robot}", "p2": "it is 59 s late at {robot}"}
-    assert _joined(texts) == "it is 59 s to 3 min 28 s late at {robot}"
-    assert _joined({"p1": texts["p1"]}) == "it is 3 min 28 s late at p1"
-    assert _joined(dict.fromkeys(texts, texts["p2"])) == "it is 59 s late at {robot}"
+    assert _joined_durations(texts) == "it is 59 s to 3 min 28 s late at {robot}"
+    assert _joined_durations({"p1": texts["p1"]}) == "it is 3 min 28 s late at p1"
+    assert _joined_durations(dict.fromkeys(texts, texts["p2"])) == "it is 59 s late at {robot}"
 
 
 def test_robots_that_differ_in_their_names_share_a_line(field: Field) -> None:

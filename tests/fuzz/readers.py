@@ -21,7 +21,7 @@ from sros_tool.errors import SrosError
 from sros_tool.explain.denials import propose, read_denials
 from sros_tool.explain.log import explain_log
 from sros_tool.keystore.confirmation import (
-    keep,
+    keep_confirmation,
     last_confirmation,
     locked_confirmations,
     receive,
@@ -261,7 +261,7 @@ def _confirmation(data: bytes, place: Place) -> None:
     received = receive(data, "r7", "drawn", now=NOW)
     (place.keystore / "fleet.toml").write_text('enclaves = ["/{robot}"]\n[robots.r7]\n')
     with locked_confirmations(place.keystore):
-        keep(place.keystore, received)
+        keep_confirmation(place.keystore, received)
     kept = last_confirmation(place.keystore, "r7")
     assert kept and kept.confirmation == received.confirmation
     found = fleet_status(Keystore(place.keystore)).with_overdue(NOW, timedelta(days=1))

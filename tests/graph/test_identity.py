@@ -5,7 +5,7 @@ from __future__ import annotations
 from cryptography import x509
 
 from sros_tool.graph.learn import learn
-from sros_tool.graph.observe import identified
+from sros_tool.graph.observe import with_certified_enclaves
 from sros_tool.pki.certificates import common_name, identity_of
 from tests.graph.graphs import graph, node
 
@@ -37,7 +37,7 @@ def test_nodes_with_the_enclave_in_a_variable_are_told_apart() -> None:
         node("/listener", "subscribe chatter", participant=LISTENER, enclave="/"),
         node("/viewer", "subscribe chatter", participant=UNSECURED, enclave="/"),
     )
-    found = {each.name: each.enclaves for each in identified(seen, ENCLAVES).nodes}
+    found = {each.name: each.enclaves for each in with_certified_enclaves(seen, ENCLAVES).nodes}
     assert found == {
         "talker": ("/talker_listener/talker",),
         "listener": ("/talker_listener/listener",),
@@ -47,7 +47,7 @@ def test_nodes_with_the_enclave_in_a_variable_are_told_apart() -> None:
 
 def test_what_a_node_announces_counts_less_than_its_certificate() -> None:
     seen = graph(node("/talker", "publish chatter", participant=TALKER, enclave="/boss"))
-    (found,) = identified(seen, ENCLAVES).nodes
+    (found,) = with_certified_enclaves(seen, ENCLAVES).nodes
     assert found.enclaves == ("/talker_listener/talker",)
 
 
@@ -57,7 +57,7 @@ def test_a_secured_node_of_unknown_enclave_is_left_out_and_said() -> None:
         node("/other", "publish x", participant="ff" * 12, enclave="/"),
         node("/named", "publish y", participant="ee" * 12, enclave="/named"),
     )
-    learned = learn(identified(seen, ENCLAVES))
+    learned = learn(with_certified_enclaves(seen, ENCLAVES))
     assert {each.enclave for each in learned.profiles} == {"/talker_listener/talker", "/named"}
     (note,) = learned.notes
     assert note.id == "graph.unknown-enclave"

@@ -88,12 +88,12 @@ def test_includes_and_groups_say_together_what_was_seen(parts: CommonParts) -> N
 
 def test_every_part_can_be_read(parts: CommonParts) -> None:
     assert set(parts.rights) == set(PARTS)
-    assert "common/node/types.xml" in parts.to_copy(["common/node.xml"])
+    assert "common/node/types.xml" in parts.files_to_copy(["common/node.xml"])
 
 
 def test_parts_that_are_there_are_not_copied(tmp_path: Path) -> None:
     shutil.copytree(policies_dir() / "common", tmp_path / "common")
-    assert common_parts(tmp_path, policies_dir()).to_copy(PARTS) == {}
+    assert common_parts(tmp_path, policies_dir()).files_to_copy(PARTS) == {}
 
 
 def test_a_part_that_its_owner_has_changed_counts_as_it_is(tmp_path: Path) -> None:

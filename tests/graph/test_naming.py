@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.graph.learn import is_tool, is_tool_name, stable_name, written
+from sros_tool.graph.learn import is_tool, is_tool_name, name_as_written, stable_name
 from sros_tool.names import expand
 from tests.graph.graphs import node
 
@@ -29,7 +29,7 @@ from tests.graph.graphs import node
     ],
 )
 def test_written(fqn: str, ns: str, node: str, text: str) -> None:
-    assert written(fqn, ns, node) == text
+    assert name_as_written(fqn, ns, node) == text
     assert expand(text, ns, node) == fqn
 
 

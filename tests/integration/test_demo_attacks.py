@@ -82,7 +82,7 @@ def test_every_attack_ends_as_expected(
     assert not [row for row in result["rows"] if not row["as_expected"]]
     assert status == 0
     holding = conditions(backend, load_template("production"), "rt/chatter")
-    rows = [row.expected_under(holding) for row in ATTACKS.rows if is_played(row)]
+    rows = [row.with_expected_status(holding) for row in ATTACKS.rows if is_played(row)]
     assert [row["name"] for row in result["rows"]] == [row.name for row in rows]
     skipped = {row["name"]: row["detail"] for row in result["rows"] if row["observed"] == "skipped"}
     if ISOLATION.isolated and os.geteuid() == 0:
@@ -174,7 +174,7 @@ def test_the_network_of_a_row_ends_with_it() -> None:
     def work(_tell: Any) -> tuple[int, int, bool, bool]:
         here = Path("/proc/self/ns/net").stat().st_ino
         network = RowNetwork(own=True)
-        with network.entered():
+        with network.in_network():
             there = Path("/proc/thread-self/ns/net").stat().st_ino
             child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
         network.close()

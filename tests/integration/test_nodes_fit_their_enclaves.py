@@ -147,7 +147,8 @@ class Casting:
 def castings(scenario: Scenario, folder: Path) -> Iterator[Casting]:
     template = load_template("production")
     rows = tuple(
-        row.expected_under(conditions(BACKEND, template, "rt/chatter")) for row in scenario.rows
+        row.with_expected_status(conditions(BACKEND, template, "rt/chatter"))
+        for row in scenario.rows
     )
     spec = KeystoreSpec(TOPIC, DomainSet.of((DOMAIN, DOMAIN)), template, datetime.now(UTC))
     keystores = create_keystores(folder, replace(scenario, rows=rows), spec)

@@ -19,7 +19,13 @@ import zenoh.ext
 
 from sros_tool.zenoh.access import Enforcement, Flow, Message
 from sros_tool.zenoh.configuration import Mode
-from sros_tool.zenoh.delivery import ZenohProcess, call, publication, route, token
+from sros_tool.zenoh.delivery import (
+    ZenohProcess,
+    deliver_query,
+    deliver_sample,
+    deliver_token,
+    route,
+)
 from sros_tool.zenoh.document import parse_configuration
 from tests.integration.zenoh_world import PAUSE, drawn_rule, until, world
 
@@ -155,15 +161,15 @@ def predicted(
     back = there[::-1]
     said: dict[str, set[int]] = {kind: set() for kind in KINDS}
     for number, case in enumerate(cases):
-        asked = call(there, case.asked, case.declared, case.announced)
+        asked = deliver_query(there, case.asked, case.declared, case.announced)
         told = {
-            "publish": publication(there, case.asked, case.declared).arrives,
+            "publish": deliver_sample(there, case.asked, case.declared).arrives,
             "call": asked.arrives,
             "answer": asked.answered,
-            "ask the graph" if case.asks else "watch": token(
+            "ask the graph" if case.asks else "watch": deliver_token(
                 back, case.announced, case.watched, asking_with(case)
             ).arrives,
-            "history": call(back, f"{case.kept}/@adv/**", reply_key=case.kept).answered,
+            "history": deliver_query(back, f"{case.kept}/@adv/**", reply_key=case.kept).answered,
         }
         for kind, arrives in told.items():
             if arrives:

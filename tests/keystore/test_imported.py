@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from sros_tool.dds.decision.vendors import TESTED, Signers, Vendor, together
+from sros_tool.dds.decision.vendors import TESTED, Signers, Vendor, joined_titles
 from sros_tool.errors import UsageError
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem
@@ -191,7 +191,7 @@ def test_vendors_that_refuse_a_permissions_ca_are_named(
 ALL = {*TESTED}
 STRICT = {vendor for vendor in TESTED if vendor.traits.verifies_authorities}
 """The vendors that verify a CA file when they load it."""
-(STRICT_TITLE,) = together(vendor.title for vendor in TESTED if vendor in STRICT)
+(STRICT_TITLE,) = joined_titles(vendor.title for vendor in TESTED if vendor in STRICT)
 
 
 @pytest.mark.parametrize(

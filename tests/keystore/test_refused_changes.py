@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision.vendors import TESTED, Vendor, together
+from sros_tool.dds.decision.vendors import TESTED, Vendor, joined_titles
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.issuing.acceptance import refusals, refuse_stopping
 from sros_tool.keystore.layout import CRL, enclave_path, list_enclaves
@@ -119,7 +119,7 @@ def test_a_list_that_every_vendor_refuses_is_not_signed(
     ended = sros(*(word.format(corporate) for word in words))
     assert ended.status == 2, ended
     assert "no node could start in /a, /b" in ended.err
-    titles = enumerated(together(vendor.title for vendor in TESTED))
+    titles = enumerated(joined_titles(vendor.title for vendor in TESTED))
     assert f"{titles} refuse their files" in ended.err
     assert "cRLSign" in ended.err and "Nothing was changed." in ended.err
     remedy = f"sros rotate_ca {corporate} --identity --identity-key URI --finish"

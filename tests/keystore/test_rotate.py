@@ -555,9 +555,9 @@ def test_death_at_every_step(stage: RotationStage | None, tmp_path: Path) -> Non
 
 
 def shape_after_tidy(root: Path) -> tuple[object, ...]:
-    from sros_tool.keystore.transaction.transaction import tidy
+    from sros_tool.keystore.transaction.transaction import recover_keystore
 
-    tidy(root)
+    recover_keystore(root)
     return shape(root)
 
 

@@ -792,7 +792,7 @@ def test_a_stage_of_an_unknown_format_is_refused_and_not_touched(
     before = snapshot(keystore)
     for verb in (
         lambda: create_enclaves(keystore, ["/new"], now=NOW),
-        lambda: transaction.tidy(keystore),
+        lambda: transaction.recover_keystore(keystore),
     ):
         with pytest.raises(KeystoreError, match=r"this version of sros.*version of sros that"):
             verb()

@@ -571,7 +571,9 @@ def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_pa
         edit_again = snapshot(root)
         assert edit_again != edited
         return
-    update_keystore(root, present_settings(Keystore(root)).undone(), now=LATER, replace_edits=True)
+    update_keystore(
+        root, present_settings(Keystore(root)).without_edits(), now=LATER, replace_edits=True
+    )
     assert {each: (root / each).read_bytes() for each in clean} == clean
     assert finding not in found(root)
     edit(root)

@@ -100,10 +100,10 @@ def test_any_bytes_are_der_or_an_error(data: bytes) -> None:
     assert b"".join(value.whole for value in values) == data
     assert all(value.whole.endswith(value.content) for value in values)
     if values:
-        assert der.first(data) == values[0]
+        assert der.first_value(data) == values[0]
     else:
         with pytest.raises(PkiError):
-            der.first(data)
+            der.first_value(data)
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def rsa_key_of(bits: int) -> bytes:
 def demanding(before: int, after: int, *words: str) -> bytes:
     """A key that openssl encrypted, with one number of its derivation replaced."""
     made = openssl("pkcs8", "-topk8", *words, "-passout", "pass:abc", data=key_pem(KEYS["EC"]))
-    content = der.first(base64.b64decode(b"".join(made.splitlines()[1:-1]))).content
+    content = der.first_value(base64.b64decode(b"".join(made.splitlines()[1:-1]))).content
     scheme, data = der.children(content)
 
     def replaced(value: der.Value) -> bytes:

@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 from hypothesis import strategies as st
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import Grant, Permissions, outside
+from sros_tool.dds.permissions import Grant, Permissions, portability_problems
 from sros_tool.names import dds_names
 from sros_tool.policy.model import RIGHTS, Enclave, Group, Policy, Profile, Profiles, Qualifier
 from sros_tool.policy.patterns import Names
@@ -124,7 +124,7 @@ def portable_permissions(now: datetime) -> st.SearchStrategy[Permissions]:
         return permissions_for(enclave, subject=f"CN={path}", validity=validity, domains=DOMAINS)
 
     def fits(permissions: Permissions) -> bool:
-        notes = outside(permissions, 0, lambda names: Names(names).meets)
+        notes = portability_problems(permissions, 0, lambda names: Names(names).meets)
         allows = any(rule.allow for rule in permissions.grants[0].rules)
         return allows and all(identity == "portable.character-set" for identity, _ in notes)
 

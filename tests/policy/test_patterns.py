@@ -17,7 +17,7 @@ from sros_tool.policy.patterns import (
     Names,
     TooManyNames,
     covers,
-    listed,
+    listed_expressions,
     literal_prefix,
     matches,
     overlap,
@@ -134,9 +134,9 @@ def test_many_expressions(names: list[str], asked: str) -> None:
             assert list(found.covering(asked)) == [e for e in covering if is_expression(e)]
             met = [e for e in known if plainly_overlap(e, asked)]
             assert found.meets(asked) == bool(met)
-            assert sorted(found.meeting(asked)) == sorted(met)
+            assert sorted(found.overlapping(asked)) == sorted(met)
             if is_expression(asked):
-                assert list(found.meeting(asked)) == met
+                assert list(found.overlapping(asked)) == met
 
 
 ALIKE = {
@@ -182,7 +182,7 @@ NAMES = ("/a", "/b", "/ab", "/az", "/a9", "/a/b", "/aab", "/ac", "/a9b", "/bZ", 
     [("/a", 1), ("/a*", 1), ("/a?", 63), ("/a?b", 64), ("/[ab][!a-z]", 2 * 37), ("/[a/]b", 1)],
 )
 def test_choices_of_characters_are_listed(expression: str, count: int) -> None:
-    found = listed(expression, 4096)
+    found = listed_expressions(expression, 4096)
     assert len(found) == count
     for name in NAMES:
         if name not in ("/a/b",):  # a "/" in a set stands for itself
@@ -190,7 +190,7 @@ def test_choices_of_characters_are_listed(expression: str, count: int) -> None:
 
 
 def test_too_many_choices_are_refused() -> None:
-    assert len(listed("/[a-h][a-h]", 64)) == 64
+    assert len(listed_expressions("/[a-h][a-h]", 64)) == 64
     for expression in ("/[a-h][a-i]", "/???", "/" + "?" * 900):
         with pytest.raises(TooManyNames):
-            listed(expression, 64)
+            listed_expressions(expression, 64)

@@ -19,7 +19,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, validity_of
 from sros_tool.pki.crl import load_crl, sign_crl
 from sros_tool.pki.keys import load_key
-from sros_tool.proof.worlds import Side, Topics, named
+from sros_tool.proof.worlds import Side, Topics, names_of_expression
 from tests.support.harness import copy_of, sros
 
 POLICY = """<policy version="0.2.0"><enclaves>
@@ -549,11 +549,11 @@ def test_a_name_without_letters_is_compared(tmp_path: Path) -> None:
 
 def test_wildcards_that_are_compared_count() -> None:
     """A policy of many wildcards and many requirements must not take hours."""
-    wild = {f"/e{each}": named(f"rt/{each}*") for each in range(1000)}
+    wild = {f"/e{each}": names_of_expression(f"rt/{each}*") for each in range(1000)}
     side, topics = Side(wild), Topics("rt", "/x*", "")
     for ask in (
-        lambda limit: side.meeting(topics, limit),
-        lambda limit: side.perhaps_meeting([Automaton.sequence([None])], limit),
+        lambda limit: side.users_of_topics(topics, limit),
+        lambda limit: side.possible_users([Automaton.sequence([None])], limit),
     ):
         with pytest.raises(DocumentError, match="too many wildcards"):
             ask(SearchLimit(100))

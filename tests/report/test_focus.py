@@ -15,7 +15,7 @@ from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.rights import Right
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network
 from sros_tool.report.compose import PictureSource, compose
-from sros_tool.report.focus import FocusFlow, flow_scene, focused
+from sros_tool.report.focus import FocusFlow, flow_scene, focused_picture
 from sros_tool.report.formats import render_dot, render_mermaid
 from sros_tool.report.picture import Picture, SourceTitle
 from tests.report.pictures import HOSTILE, MOBILE_ROBOT, group, hostile_permissions, source_of
@@ -26,7 +26,7 @@ MUX = "/mobile_robot/velocity_mux"
 
 def seen(folder: Path, enclaves: dict[str, str], *words: str) -> Picture:
     source = source_of(folder, enclaves)
-    return focused(compose(source), [source], words)
+    return focused_picture(compose(source), [source], words)
 
 
 def value(*words: object) -> dict[str, Any]:
@@ -188,12 +188,12 @@ def test_every_enclave_of_an_answer_is_drawn_and_linked(
     known = {each.path for each in picture.enclaves} | {each.name for each in picture.names}
     if word not in known:
         return
-    picture = focused(picture, [source], [word])
+    picture = focused_picture(picture, [source], [word])
     flow = FocusFlow.of(picture)
     network = Network(rights, excluded=OF_EVERY_NODE, questions=QUESTIONS)
     for each in picture.focus:
         starts = {each.name} if each.kind == "enclave" else set(each.senders)
-        far = {path: len(hops) + 1 for path, hops in network.influencing(starts).items()}
+        far = {path: len(hops) + 1 for path, hops in network.influencers_of(starts).items()}
         assert {one.enclave: one.hops for one in each.influencing} == far
     scene = flow_scene(picture, 9)
     drawn = {(card.id[0] == "s", path) for card in scene.cards for path in card.members}

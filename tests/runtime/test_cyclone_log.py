@@ -42,7 +42,7 @@ def test_a_full_domain_without_multicast_says_how_to_have_more_participants() ->
     )
     participant = object.__new__(Participant)
     participant._library = cast(CycloneLibrary, library)
-    error = participant._failure(-1, "cannot join domain 7")
+    error = participant._dds_error(-1, "cannot join domain 7")
     assert "<MaxAutoParticipantIndex>100" in error.remedy and "--backend rclpy" in error.remedy
     library.log.messages = lambda: ["no such interface"]
-    assert participant._failure(-1, "cannot join domain 7").remedy == ""
+    assert participant._dds_error(-1, "cannot join domain 7").remedy == ""

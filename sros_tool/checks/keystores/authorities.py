@@ -137,7 +137,7 @@ def _authority_findings(
     for finding in key_findings(certificate, subject, file, what=f"{name} has"):
         if finding.kind is not KEY_ALGORITHM or not signs_documents:
             yield finding
-    yield from _extensions(certificate, subject, name, file)
+    yield from _extension_findings(certificate, subject, name, file)
 
 
 def key_findings(
@@ -156,7 +156,7 @@ def key_findings(
         yield SIGNATURE_HASH.found(subject, f"{what} a signature with {name}", file)
 
 
-def _extensions(
+def _extension_findings(
     certificate: x509.Certificate, subject: str, name: str, file: str
 ) -> Iterator[Finding]:
     if denies_issuing(certificate):
@@ -354,15 +354,15 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
             if role not in keystore.authorities and path not in unread:
                 text = f"there is no certificate of the {role} CA"
                 yield CA_MISSING.found(f"{role} CA", text, keystore.shown(path))
-    yield from _records(keystore)
+    yield from _record_findings(keystore)
     seen: set[bytes] = set()
     for role, chain in keystore.authorities.items():
         fingerprint = chain[0].fingerprint(hashes.SHA256())
         if fingerprint not in seen:
             seen.add(fingerprint)
             yield from _authority(keystore, role, chain)
-    yield from _shared_ca(keystore)
-    yield from _revocation_list(keystore)
+    yield from _shared_ca_findings(keystore)
+    yield from _revocation_list_findings(keystore)
 
 
 _SHOWN, _MOST_LEFT = 5, 20
@@ -371,7 +371,7 @@ robots.
 """
 
 
-def _left_enclaves(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]:
+def _left_enclave_findings(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]:
     from sros_tool.fleet.robots import left_robot_of
 
     robots: dict[str, list[str]] = {}
@@ -398,7 +398,7 @@ def _is_served(keystore: CheckedKeystore) -> bool:
     return bool(keystore.settings and is_ca_service(keystore.settings.identity_key))
 
 
-def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
+def _record_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Yield findings about the settings and the ledger, which only sros writes."""
     settings, ledger = ((keystore.root / name).exists() for name in (SETTINGS, LEDGER))
     if ledger and not settings:
@@ -413,7 +413,7 @@ def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
         clause = f"{FLEET} {keystore.fleet_edited}"
         yield FLEET_EDITED.found("fleet", clause, keystore.shown(FLEET))
     if keystore.fleet:
-        yield from _left_enclaves(keystore, keystore.fleet)
+        yield from _left_enclave_findings(keystore, keystore.fleet)
     for clause in edits.unsigned:
         yield NOT_AS_SETTINGS.found("settings", clause, file)
     file = keystore.shown(LEDGER)
@@ -421,7 +421,7 @@ def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
         yield LEDGER_DAMAGED.found("ledger", gap, file)
     if count := keystore.ledger.unchained:
         yield LEDGER_UNCHAINED.found("ledger", f"{count} lines have no chain", file)
-        unproven = RecordedRights(keystore.opened, keystore.ledger).unproven()
+        unproven = RecordedRights(keystore.opened, keystore.ledger).unproven_entries()
         if names := [name for name in keystore.names if name in unproven]:
             yield LEDGER_UNPROVEN.found("ledger", some_names(names), file)
 
@@ -442,19 +442,21 @@ def _authority(
     for weak in filter(None, map(weakness, chain)):
         yield WEAK.found(subject, weak, file)
     yield from _authority_findings(role, chain, keystore.now, subject, file)
-    yield from _key(keystore, role, certificate)
+    yield from _ca_key_findings(keystore, role, certificate)
 
 
-def _key(keystore: CheckedKeystore, role: str, certificate: x509.Certificate) -> Iterator[Finding]:
+def _ca_key_findings(
+    keystore: CheckedKeystore, role: str, certificate: x509.Certificate
+) -> Iterator[Finding]:
     path = keystore.root / ca_key(role)
     if not path.exists():
-        yield from _key_elsewhere(keystore, role)
+        yield from _external_key_findings(keystore, role)
         return
     try:
         pem = keystore.opened.read(path, "key")
         key = load_key(pem, f"'{path}'", _locked)
     except _LockedError:
-        yield from _few_rounds(role, path, pem)
+        yield from _weak_derivation_findings(role, path, pem)
         return
     except SrosError as error:
         yield UNREADABLE.found(f"{role} CA key", f"{error.what}. {error.why}", str(path))
@@ -465,7 +467,7 @@ def _key(keystore: CheckedKeystore, role: str, certificate: x509.Certificate) ->
         yield CA_MISMATCH.found(f"{role} CA", text, str(path))
 
 
-def _key_elsewhere(keystore: CheckedKeystore, role: str) -> Iterator[Finding]:
+def _external_key_findings(keystore: CheckedKeystore, role: str) -> Iterator[Finding]:
     settings = keystore.settings
     place = (
         {IDENTITY: settings.identity_key}.get(role, settings.permissions_key) if settings else ""
@@ -475,10 +477,10 @@ def _key_elsewhere(keystore: CheckedKeystore, role: str) -> Iterator[Finding]:
         with suppress(OSError):  # it may be on a medium that is not there now
             yield from key_mode_findings(str(path), path.stat().st_mode)
         with suppress(SrosError):
-            yield from _few_rounds(role, path, keystore.opened.read(path, "key"))
+            yield from _weak_derivation_findings(role, path, keystore.opened.read(path, "key"))
 
 
-def _few_rounds(role: str, path: Path, pem: bytes) -> Iterator[Finding]:
+def _weak_derivation_findings(role: str, path: Path, pem: bytes) -> Iterator[Finding]:
     if text := few_rounds(pem):
         old, new = quote(str(path)), quote(f"{path}.new")
         remedy = f"Run `openssl pkcs8 -topk8 -scrypt -in {old} -out {new} && mv {new} {old}`."
@@ -493,7 +495,7 @@ def _locked() -> str:
     raise _LockedError
 
 
-def _shared_ca(keystore: CheckedKeystore) -> Iterator[Finding]:
+def _shared_ca_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     certificates = [chain[0] for chain in keystore.authorities.values()]
     if len(certificates) == 2:
         yield from shared_ca_findings(
@@ -531,7 +533,7 @@ def _separation(keystore: CheckedKeystore) -> str:
     return "Run `sros rotate_ca KEYSTORE --permissions --next`." if len(files) > 1 else ""
 
 
-def _revocation_list(keystore: CheckedKeystore) -> Iterator[Finding]:
+def _revocation_list_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     crl = keystore.crl
     if crl is None:
         return

@@ -25,11 +25,11 @@ from sros_tool.dds.decision.vendors import (
     TESTED,
     Moments,
     Vendor,
-    together,
+    joined_titles,
 )
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
-from sros_tool.dds.permissions import Criteria, Grant, Rule, outside
+from sros_tool.dds.permissions import Criteria, Grant, Rule, portability_problems
 from sros_tool.errors import SrosError
 from sros_tool.keystore.fleet import EnclaveDomains
 from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_XML
@@ -229,19 +229,19 @@ def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
         return
     name, file = enclave.name, enclave.file("permissions.p7s")
     size = enclave.state.permissions_bytes
-    if any(outside(permissions, size, lambda names: Names(names).meets)):
-        from sros_tool.checks.policies import outside_findings
+    if any(portability_problems(permissions, size, lambda names: Names(names).meets)):
+        from sros_tool.checks.policies import portability_findings
 
-        yield from outside_findings(permissions, size, name, file)
+        yield from portability_findings(permissions, size, name, file)
     if len(permissions.grants) > 1:
         yield SEVERAL_GRANTS.found(name, f"it has {len(permissions.grants)} grants", file)
     for grant in permissions.grants:
         yield from _form_findings(grant, name, file)
     if own := grant_of(enclave):
-        yield from _times(enclave, own, file)
+        yield from _validity_findings(enclave, own, file)
         yield from _order_findings(own, name, file)
         yield from check_topic_names(enclave, own, file)
-        yield from _domains(enclave, own, file)
+        yield from _domain_findings(enclave, own, file)
 
 
 def _domain_problems(domains: DomainSet) -> Iterator[str]:
@@ -312,7 +312,7 @@ def _is_default(partition: str) -> bool:
     return not partition.strip("* \t\r\n")
 
 
-def _times(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
+def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
     now, window = enclave.keystore.now, grant.validity
     if not window.contains(now):
         return
@@ -348,13 +348,13 @@ def _order_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
     }
     for index, rule in enumerate(grant.rules):
         if rule.allow:
-            yield from _hidden(stated, rule, index, name, file)
+            yield from _unreachable_rule_findings(stated, rule, index, name, file)
             continue
         for direction in _DIRECTIONS:
             allowed = stated[direction, True]
             late: dict[str, list[str]] = {}
             for topic in _topics(getattr(rule, direction)):
-                if met := allowed.meeting(topic, index):
+                if met := allowed.earlier_overlapping(topic, index):
                     late.setdefault(met, []).append(topic)
             for met, topics in late.items():
                 text = (
@@ -364,7 +364,7 @@ def _order_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
                 yield NO_EFFECT.found(name, f"{text}allows {met}", file)
 
 
-def _hidden(
+def _unreachable_rule_findings(
     stated: Mapping[tuple[str, bool], _Topics], rule: Rule, index: int, name: str, file: str
 ) -> Iterator[Finding]:
     """Yield a finding if earlier deny rules deny topics that a rule allows."""
@@ -372,7 +372,7 @@ def _hidden(
     left = 0
     for direction in _DIRECTIONS:
         for topic in _topics(getattr(rule, direction)):
-            if by := stated[direction, False].covering(topic, index):
+            if by := stated[direction, False].earlier_covering(topic, index):
                 hidden.setdefault(by, {}).setdefault(direction, []).append(topic)
             else:
                 left += 1
@@ -400,16 +400,16 @@ class _Topics:
                     self._places.setdefault(topic, []).append(index)
         self._names = Names(self._places, limit)
 
-    def covering(self, topic: str, index: int) -> str:
+    def earlier_covering(self, topic: str, index: int) -> str:
         """Return a topic expression in a rule before ``index`` that covers ``topic``, or ""."""
         found = (topic,) if topic in self._places else ()
-        return self._earlier(chain(found, self._names.covering(topic)), index)
+        return self._first_earlier(chain(found, self._names.covering(topic)), index)
 
-    def meeting(self, topic: str, index: int) -> str:
+    def earlier_overlapping(self, topic: str, index: int) -> str:
         """Return a topic expression in a rule before ``index`` that overlaps ``topic``, or ""."""
-        return self._earlier(self._names.meeting(topic), index)
+        return self._first_earlier(self._names.overlapping(topic), index)
 
-    def _earlier(self, topics: Iterable[str], index: int) -> str:
+    def _first_earlier(self, topics: Iterable[str], index: int) -> str:
         """Return the first of ``topics`` in an earlier rule that has a domain of rule ``index``."""
         for topic in topics:
             for place in self._places[topic]:
@@ -426,7 +426,7 @@ def _topics(criteria: tuple[Criteria, ...]) -> list[str]:
     return [topic for criterion in criteria for topic in criterion.topics]
 
 
-def _domains(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
+def _domain_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
     governed = enclave.state.domains()
     if governed is None:
         return
@@ -676,7 +676,7 @@ def governance_findings(
                 yield kind.found(subject, f"the range {problem}", file)
 
 
-def _unauthenticated(rule: DomainRule, vendors: Sequence[Vendor]) -> tuple[FindingKind, str]:
+def _unauthenticated_text(rule: DomainRule, vendors: Sequence[Vendor]) -> tuple[FindingKind, str]:
     """Return the kind and the text of the finding about participants without a certificate."""
     kind = UNAUTHENTICATED_KEPT_OUT
     clauses: dict[str, list[str]] = {}
@@ -694,7 +694,7 @@ def _unauthenticated(rule: DomainRule, vendors: Sequence[Vendor]) -> tuple[Findi
             clause = "they are kept out, as RTPS messages are protected"
         clauses.setdefault(clause, []).append(vendor.title)
     return kind, "; ".join(
-        f"on {' and '.join(together(titles))} {clause}" for clause, titles in clauses.items()
+        f"on {' and '.join(joined_titles(titles))} {clause}" for clause, titles in clauses.items()
     )
 
 
@@ -726,7 +726,7 @@ def _domain_rule(rule: DomainRule, vendors: Sequence[Vendor]) -> Iterator[tuple[
     for attribute, text in _open_attributes(rule):
         kind = _OPEN[attribute]
         if kind is UNAUTHENTICATED:
-            kind, reach = _unauthenticated(rule, vendors)
+            kind, reach = _unauthenticated_text(rule, vendors)
             text = f"{text}: {reach}"
         yield kind, text
 

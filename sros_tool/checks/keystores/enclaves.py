@@ -256,32 +256,32 @@ def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
         yield WAITS.found(enclave.name, "its certificate is missing", enclave.file(REQUEST))
         return
     yield from _check_loading(enclave)
-    yield from _weak(enclave)
+    yield from _weakness_findings(enclave)
     if place := enclave.state.token:
-        yield from _on_token(enclave, place)
+        yield from _token_findings(enclave, place)
     grant = grant_of(enclave)
     if certificate := enclave.state.certificate:
-        yield from _certificate(enclave, certificate)
-        yield from _expiry(enclave, certificate, grant)
+        yield from _certificate_findings(enclave, certificate)
+        yield from _expiry_findings(enclave, certificate, grant)
     if grant:
-        yield from _rights(enclave, grant)
+        yield from _rights_findings(enclave, grant)
     state = enclave.state
     known = len(enclave.keystore.authorities) > 1  # then `check_authorities` compares them
     if not known and state.identity_ca and state.permissions_ca:
         file = enclave.file("identity_ca.cert.pem")
         cas = (state.identity_ca, state.permissions_ca)
         yield from shared_ca_findings(enclave.keystore, *cas, file)
-    yield from _copies(enclave)
+    yield from _copy_findings(enclave)
 
 
-def _weak(enclave: CheckedEnclave) -> Iterator[Finding]:
+def _weakness_findings(enclave: CheckedEnclave) -> Iterator[Finding]:
     """Yield findings about weak cryptography of an enclave; the CAs are checked elsewhere."""
     for file, text in weaknesses(enclave.state):
         if not enclave.keystore.is_original or file not in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):
             yield WEAK.found(enclave.name, text, enclave.file(file))
 
 
-def _on_token(enclave: CheckedEnclave, place: TokenUri) -> Iterator[Finding]:
+def _token_findings(enclave: CheckedEnclave, place: TokenUri) -> Iterator[Finding]:
     """Yield findings about a key on a token, without opening the token."""
     name, file = enclave.name, enclave.file(KEY_URI_FILE)
     yield ON_TOKEN.found(name, f"its key is {place.object!r} on the token {place.token!r}", file)
@@ -305,7 +305,9 @@ def grant_of(enclave: CheckedEnclave) -> Grant | None:
     return None
 
 
-def _certificate(enclave: CheckedEnclave, certificate: x509.Certificate) -> Iterator[Finding]:
+def _certificate_findings(
+    enclave: CheckedEnclave, certificate: x509.Certificate
+) -> Iterator[Finding]:
     name, file = enclave.name, enclave.file("cert.pem")
     # Other PKIs have names of their own, which no vendor compares with the folder.
     said = common_name_of(certificate.subject)
@@ -331,7 +333,7 @@ def _certificate(enclave: CheckedEnclave, certificate: x509.Certificate) -> Iter
         yield NOT_UNIQUE.found(name, text, file)
 
 
-def _expiry(
+def _expiry_findings(
     enclave: CheckedEnclave, certificate: x509.Certificate, grant: Grant | None
 ) -> Iterator[Finding]:
     now, validity = enclave.keystore.now, validity_of(certificate)
@@ -353,7 +355,7 @@ def _expiry(
 _EXPIRED = (Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED)
 
 
-def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
+def _rights_findings(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
     file, keystore = enclave.file("permissions.p7s"), enclave.keystore
     if allows_everything(grant):
         text = "the permissions allow publishing and subscribing every topic"
@@ -400,7 +402,7 @@ def _lasts_at_least(chosen_validity: Span, length: timedelta) -> bool:
     return not isinstance(chosen_validity, timedelta) or length <= chosen_validity + BACKDATE
 
 
-def _copies(enclave: CheckedEnclave) -> Iterator[Finding]:
+def _copy_findings(enclave: CheckedEnclave) -> Iterator[Finding]:
     xml, signed = enclave.folder / "permissions.xml", enclave.state.permissions_document
     if signed and xml.is_file() and _plain_file(enclave, xml) != plain(signed):
         text = "permissions.xml differs from the content of permissions.p7s"

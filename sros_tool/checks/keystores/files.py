@@ -254,11 +254,11 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
     kept: list[str] = []
     for folder, why in replaceable_on_the_way(keystore.root, trusted):
         yield REPLACEABLE.found(str(folder), why, str(folder))
-    yield from _writers(root, state, trusted)
+    yield from _writer_findings(root, state, trusted)
     links = _Links(root)
     if names is None:
-        yield from _hidden_enclaves(keystore)
-        yield from _below(root, keystore, links, trusted, kept)
+        yield from _hidden_enclave_findings(keystore)
+        yield from _folder_findings(root, keystore, links, trusted, kept)
         if kept and not (keystore.is_original and _has_links(keystore)):
             yield HOME_OR_ROBOT.found(root, f"it has {some_names(kept)}", root)
         return
@@ -266,13 +266,13 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
     for name in names:
         folder = Path(enclave_folder(name))
         passed |= {folder, *folder.parents} - {Path()}
-        yield from _below(os.path.join(root, folder), keystore, links, trusted, kept)
+        yield from _folder_findings(os.path.join(root, folder), keystore, links, trusted, kept)
     for folder in sorted(passed):
         path = os.path.join(root, folder)
-        yield from _writers(path, Path(path).stat(), trusted)
+        yield from _writer_findings(path, Path(path).stat(), trusted)
 
 
-def _hidden_enclaves(keystore: CheckedKeystore) -> Iterator[Finding]:
+def _hidden_enclave_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     for name in hidden_enclaves(keystore.root):
         folder = str(enclave_path(keystore.root, name))
         yield HIDDEN_ENCLAVE.found(name, "its folder or one above it begins with a dot", folder)
@@ -287,7 +287,7 @@ def _has_links(keystore: CheckedKeystore) -> bool:
     return not any(map(os.path.lexists, files)) or any(map(os.path.islink, files))
 
 
-def _below(
+def _folder_findings(
     start: str,
     keystore: CheckedKeystore,
     links: _Links,
@@ -308,14 +308,14 @@ def _below(
         folders.sort()
         if STAGE in folders:
             folders.remove(STAGE)
-            yield _interrupted(Path(parent), root)
+            yield _interrupted_change_finding(Path(parent), root)
         for name in folders:
             path = os.path.join(parent, name)
             info = os.lstat(path)
             if stat.S_ISLNK(info.st_mode):
                 yield from links.check(path)
                 continue
-            yield from _writers(path, info, trusted_users)
+            yield from _writer_findings(path, info, trusted_users)
             yield from _open_folder(path, root, info.st_mode, original)
         if parent == root and AGENT in folders:
             folders.remove(AGENT)  # of `sros agent`, closed to others
@@ -326,21 +326,21 @@ def _below(
             if stat.S_ISLNK(info.st_mode):
                 yield from links.check(path)
                 continue
-            yield from _writers(path, info, trusted_users)
+            yield from _writer_findings(path, info, trusted_users)
             if path in keys:
                 yield from key_mode_findings(path, info.st_mode)
             elif name in _KNOWN and inside.startswith(ENCLAVES) and name != KEY_FILE:
                 if name == KEY_URI_FILE or name.endswith("_ca.cert.pem"):
                     with suppress(OSError):  # `check_enclave` reports an unreadable one
                         if _holds_key(keystore, path, info):
-                            yield from _other(keystore, path, info, original)
+                            yield from _stray_file_findings(keystore, path, info, original)
             elif keystore.looks_like_original and _is_kept(keystore, path, info):
                 kept_names.append(os.path.relpath(path, root))
                 yield from key_mode_findings(path, info.st_mode)
             else:
-                yield from _other(keystore, path, info, original)
+                yield from _stray_file_findings(keystore, path, info, original)
     for error in unread:
-        yield _unread(error, root)
+        yield _unread_path_finding(error, root)
 
 
 def _mounted(key: str) -> str:
@@ -359,13 +359,13 @@ def _mounted(key: str) -> str:
     return os.fspath(path.parent / inside / path.name) if mounted else key
 
 
-def _unread(error: OSError, root: str) -> Finding:
+def _unread_path_finding(error: OSError, root: str) -> Finding:
     path = os.fsdecode(error.filename)
     remedy = UnreadPath.of(error).remedy(Path(root))
     return UNREADABLE.found(path, str(error.strerror), path, remedy=remedy)
 
 
-def _interrupted(parent: Path, root: str) -> Finding:
+def _interrupted_change_finding(parent: Path, root: str) -> Finding:
     from sros_tool.folders import Folder
     from sros_tool.keystore.transaction.stage import check_interrupted
 
@@ -390,7 +390,9 @@ def _open_folder(path: str, root: str, mode: int, original: bool) -> Iterator[Fi
         yield FOLDER_OPEN.found(path, text, path, remedy=remedy)
 
 
-def _writers(path: str, info: os.stat_result, trusted_users: frozenset[int]) -> Iterator[Finding]:
+def _writer_findings(
+    path: str, info: os.stat_result, trusted_users: frozenset[int]
+) -> Iterator[Finding]:
     if info.st_mode & stat.S_IWOTH:
         text = f"its mode is {stat.S_IMODE(info.st_mode):04o}"
         remedy = f"Run `chmod o-w {quote(path)}`."
@@ -473,7 +475,7 @@ def _is_kept(keystore: CheckedKeystore, path: str, info: os.stat_result) -> bool
         return False  # reported as one that cannot be read
 
 
-def _other(
+def _stray_file_findings(
     keystore: CheckedKeystore, path: str, info: os.stat_result, original: bool
 ) -> Iterator[Finding]:
     """Yield findings about a file that belongs to no enclave, such as a misplaced key."""
@@ -483,7 +485,7 @@ def _other(
     try:
         holds_key = _holds_key(keystore, path, info)
     except OSError as error:
-        yield _unread(error, root)
+        yield _unread_path_finding(error, root)
         return
     if holds_key:
         yield from key_mode_findings(path, info.st_mode)

@@ -192,7 +192,9 @@ def summary_of(enclave: CheckedEnclave) -> EnclaveSummary | None:
         if enclave.state.governance and not enclave.keystore.governance
         else "",
         len(certificate.subject.rdns) > 1,
-        tuple(_trusted(enclave.state.files.get(name, b"")) for name in _AUTHORITY_FILES),
+        tuple(
+            _trusted_fingerprints(enclave.state.files.get(name, b"")) for name in _AUTHORITY_FILES
+        ),
         _list_number(enclave),
     )
 
@@ -221,7 +223,7 @@ def _number_if_signed(data: bytes, authority: bytes) -> int:
 
 
 @lru_cache(maxsize=8)
-def _trusted(data: bytes) -> frozenset[str]:
+def _trusted_fingerprints(data: bytes) -> frozenset[str]:
     """Return fingerprints of the certificates in a CA file; empty if unreadable."""
     try:
         return fingerprints(data)
@@ -233,9 +235,9 @@ def check_issued(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
     """Yield findings from comparing enclaves with each other, the ledger and the policies."""
-    for (_, serial), names in _twice(((t.issuer, t.serial), t.name) for t in summaries):
+    for (_, serial), names in _shared_values(((t.issuer, t.serial), t.name) for t in summaries):
         yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial:x}")
-    for _, names in _twice((summary.key, summary.name) for summary in summaries):
+    for _, names in _shared_values((summary.key, summary.name) for summary in summaries):
         yield KEY_TWICE.found(", ".join(names), "their certificates have the same public key")
     # A subject with a unique part matches no other one.
     plain = {summary.name for summary in summaries if not summary.unique}
@@ -252,20 +254,20 @@ def check_issued(
 
         if text := within_root(load_rights(keystore.opened).rights):
             yield ROOT_ENCLAVE.found("/", text, str(keystore.opened.folder("/")))
-    yield from _trust(keystore, summaries)
-    yield from _exported_governance(keystore, summaries)
-    yield from _lists(keystore, summaries)
-    yield from _ledger(keystore, summaries)
+    yield from _trust_findings(keystore, summaries)
+    yield from _exported_governance_findings(keystore, summaries)
+    yield from _revocation_list_findings(keystore, summaries)
+    yield from _ledger_findings(keystore, summaries)
     if keystore.policies:
         wanted = {enclave.path for policy in keystore.policies for enclave in policy.enclaves}
         for name in sorted(wanted.difference(keystore.names)):
             yield NOT_IN_KEYSTORE.found(
                 name, "the keystore does not have this enclave", str(keystore.root)
             )
-        yield from _less_protected(keystore)
+        yield from _lower_protection_findings(keystore)
 
 
-def _less_protected(keystore: CheckedKeystore) -> Iterator[Finding]:
+def _lower_protection_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Yield findings about names that the governance protects less than a policy demands."""
     stated = stated_protections(
         enclave for policy in keystore.policies for enclave in policy.enclaves
@@ -283,14 +285,16 @@ def _less_protected(keystore: CheckedKeystore) -> Iterator[Finding]:
         )
 
 
-def _twice(pairs: Iterable[tuple[_Key, str]]) -> Iterator[tuple[_Key, list[str]]]:
+def _shared_values(pairs: Iterable[tuple[_Key, str]]) -> Iterator[tuple[_Key, list[str]]]:
     found: dict[_Key, list[str]] = defaultdict(list)
     for key, name in pairs:
         found[key].append(name)
     return ((key, names) for key, names in found.items() if len(names) > 1)
 
 
-def _trust(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
+def _trust_findings(
+    keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
+) -> Iterator[Finding]:
     """Yield findings about enclaves that have no CA in common with the keystore.
 
     In an export, the CAs of most enclaves count instead.  During a rotation an enclave trusts the
@@ -314,7 +318,7 @@ def _trust(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> It
                 yield AUTHORITIES_DIFFER.found(summary.name, text, place)
 
 
-def _exported_governance(
+def _exported_governance_findings(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
     """Yield findings about exported enclaves whose governance differs from the first enclave's."""
@@ -326,7 +330,9 @@ def _exported_governance(
             yield GOVERNANCE_DIFFERS.found(copy.name, text, file)
 
 
-def _lists(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
+def _revocation_list_findings(
+    keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
+) -> Iterator[Finding]:
     """Yield findings about enclaves whose revocation list is not the newest list of their CA."""
     for issuer in dict.fromkeys(summary.issuer for summary in summaries):
         enclaves = [summary for summary in summaries if summary.issuer == issuer]
@@ -356,7 +362,9 @@ def _lists(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> It
                 )
 
 
-def _ledger(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
+def _ledger_findings(
+    keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
+) -> Iterator[Finding]:
     entries = keystore.ledger.entries
     if not entries:
         return

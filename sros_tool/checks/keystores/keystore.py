@@ -145,7 +145,7 @@ def keystore_findings(
         asked = asked if len(stated) < len(names) else asked_vendors(tuple(union))
     about_authorities = list(check_authorities(keystore))
     first, common = _governing(keystore, names)
-    about_governance = list(_governance(keystore, first, asked))
+    about_governance = list(_governance_findings(keystore, first, asked))
 
     def work(
         share: Sequence[str],
@@ -202,8 +202,10 @@ def keystore_findings(
         ]
         found += findings_in(parts, distribution)
     real_root = os.path.realpath(root)
-    located = (_at_real_file(finding, root, real_root) for finding in found)
-    found = with_causes(joined([_with_names(finding, keystore) for finding in located]))
+    located = (_with_real_file(finding, root, real_root) for finding in found)
+    found = with_causes(
+        with_joined_findings([_with_enclave_names(finding, keystore) for finding in located])
+    )
     if not keystore.is_original:
         return found
     return _with_cause_of_expiry(_with_cause_of_ros2(found, opened), root)
@@ -244,7 +246,7 @@ def _enclave_findings(
     yield from zenoh_files.check_own_zenoh(enclave)
 
 
-def joined(findings: Sequence[Finding]) -> list[Finding]:
+def with_joined_findings(findings: Sequence[Finding]) -> list[Finding]:
     """Return findings; those that a shared file or a keystore setting causes are joined."""
     together: dict[tuple[object, ...], list[Finding]] = {}
     for finding in findings:
@@ -252,7 +254,7 @@ def joined(findings: Sequence[Finding]) -> list[Finding]:
         file = "" if finding.id in _OF_SEVERAL_FILES else finding.file
         place = (finding.accepted,) if one else (file, finding.line, finding.text)
         together.setdefault((finding.id, *place), []).append(finding)
-    return [_joined(group) for group in together.values()]
+    return [_joined_finding(group) for group in together.values()]
 
 
 def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, bytes]:
@@ -270,7 +272,7 @@ def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, by
     return "", common
 
 
-def _governance(
+def _governance_findings(
     keystore: CheckedKeystore, name: str, vendors: Sequence[Vendor]
 ) -> Iterator[Finding]:
     """Yield the findings in the governance of an enclave, or of a keystore without enclaves."""
@@ -289,7 +291,7 @@ def _governance(
         yield from governance_findings(keystore, governance, file, vendors)
 
 
-def _at_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
+def _with_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
     """Return the finding with the path of the shared file instead of an enclave's link to it."""
     if "/enclaves/" not in finding.file or finding.id.startswith("keystore.link"):
         return finding
@@ -311,7 +313,7 @@ _OF_SEVERAL = re.compile(
 """The begin of a command that takes several enclaves, and its first enclave."""
 
 
-def _with_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
+def _with_enclave_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
     """Return the finding with KEYSTORE and ENCLAVE in its remedy replaced by their names.
 
     The remedy for an export says that commands which sign have to run in the original keystore.
@@ -328,7 +330,7 @@ def _with_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
     return finding if remedy == finding.remedy else finding._replace(own_remedy=remedy)
 
 
-def _joined(group: list[Finding]) -> Finding:
+def _joined_finding(group: list[Finding]) -> Finding:
     subjects = list(dict.fromkeys(finding.subject for finding in group))
     if len(subjects) == 1:
         return group[0]

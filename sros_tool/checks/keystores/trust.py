@@ -62,7 +62,7 @@ def _certificates(data: bytes) -> _Certificates:
     return load_certificates(data, "the certificate of a CA")
 
 
-def strangers(
+def stranger_findings(
     targets: Mapping[str, tuple[Keystore, Sequence[str]]], *, on_zenoh: bool = False
 ) -> Iterator[Finding]:
     """Yield findings about keystores and exports of which no two enclaves accept each other.
@@ -84,7 +84,7 @@ def strangers(
     # What each target is apart from, and in which roles; targets with the same are one group.
     apart: dict[str, dict[str, tuple[int, ...]]] = {shown: {} for shown in parties}
     for one, other in combinations(parties, 2):
-        if refused := _refused(parties[one], parties[other], roles):
+        if refused := _refused_roles(parties[one], parties[other], roles):
             apart[one][other] = apart[other][one] = refused
     groups: dict[tuple[tuple[str, tuple[int, ...]], ...], list[str]] = defaultdict(list)
     for same in alike.values():
@@ -99,7 +99,9 @@ def strangers(
             yield STRANGERS.found(others[0], text, others[0])
 
 
-def _refused(some: Sequence[_Party], others: Sequence[_Party], roles: range) -> tuple[int, ...]:
+def _refused_roles(
+    some: Sequence[_Party], others: Sequence[_Party], roles: range
+) -> tuple[int, ...]:
     """Return the roles in which all pairs of enclaves refuse each other; () if one pair does not.
 
     It is () without a readable enclave, too.

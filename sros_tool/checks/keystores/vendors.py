@@ -17,7 +17,7 @@ from sros_tool.checks.keystores.opened import CheckedEnclave
 from sros_tool.checks.keystores.topic_names import NO_ROS_NAME, has_invalid_characters, is_for_ros
 from sros_tool.checks.kind import ERROR, WARNING, Cause, Finding, FindingKind, some_names
 from sros_tool.dds.decision.access import Access, AccessVerb, Outcome
-from sros_tool.dds.decision.vendors import TESTED, Vendor, together
+from sros_tool.dds.decision.vendors import TESTED, Vendor, joined_titles
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.distributions import Distribution, shipped_title
@@ -149,7 +149,7 @@ class EnclaveEvaluation(NamedTuple):
     def titles(self, vendors: Sequence[Vendor]) -> list[str]:
         """Return the titles of vendors, with the distributions that ship them."""
         if not self.distributions:
-            return together(vendor.title for vendor in vendors)
+            return joined_titles(vendor.title for vendor in vendors)
         return [shipped_title(vendor, self.distributions) for vendor in vendors]
 
 
@@ -193,14 +193,14 @@ def check_vendors(
     ``known_findings`` are the other findings about the enclave and its CAs.
     """
     for domain, made in evaluation.by_domain.items():
-        if findings := list(_refusals(evaluation, made, known_findings)):
+        if findings := list(_refusal_findings(evaluation, made, known_findings)):
             yield from findings
             return
         # Vendors decide alike on usual names in a document as sros writes it, and each topic costs.
         if evaluation.portable and not any(_is_about_rules(finding) for finding in known_findings):
             continue
         ids = {finding.id for finding in known_findings}
-        if findings := list(_different_rights(evaluation, made, domain, ids)):
+        if findings := list(_different_rights_findings(evaluation, made, domain, ids)):
             yield from findings
             return
 
@@ -225,7 +225,7 @@ _MOST_DOMAINS = 8
 # ── who refuses it ─────────────────────────────────────────────────────────────────────────
 
 
-def _refusals(
+def _refusal_findings(
     evaluation: EnclaveEvaluation,
     participants: Mapping[Vendor, VendorParticipant],
     known_findings: Collection[Finding],
@@ -314,7 +314,7 @@ _BLANKS = "portable.blanks"
 _SHOWN = 3
 
 
-def _different_rights(
+def _different_rights_findings(
     evaluation: EnclaveEvaluation,
     participants: Mapping[Vendor, VendorParticipant],
     domain: int,
@@ -461,7 +461,9 @@ def check_starting(
         running = [participant for participant in made.values() if not participant.causes()]
         # Vendors decide alike on a document as sros writes it.
         asked = running[:1] if evaluation.portable and not has_denials else running
-        denials = [_denial(participant, grant, described=described) for participant in asked]
+        denials = [
+            _ordinary_node_denial(participant, grant, described=described) for participant in asked
+        ]
         if not denials or None in denials:
             continue
         worst = max(filter(None, denials), key=lambda denial: len(denial.text))
@@ -494,7 +496,9 @@ def _states_all(grant: Grant) -> bool:
     )
 
 
-def _denial(participant: VendorParticipant, grant: Grant, *, described: bool) -> _Denial | None:
+def _ordinary_node_denial(
+    participant: VendorParticipant, grant: Grant, *, described: bool
+) -> _Denial | None:
     """Return the endpoints that an ordinary node needs and a vendor denies, or None.
 
     ``described`` says that nodes offer ~/get_type_description (since ROS 2 Iron).

@@ -335,7 +335,7 @@ class _GrantRules:
             if entry.criteria == passed:
                 continue  # only the first matching topic of a criteria counts
             passed = entry.criteria
-            fits = self._fits(entry, wanted)
+            fits = self._matches_partitions(entry, wanted)
             if fits or self._traits.topic_decides or not entry.expression:
                 return entry.verdict(fits=fits)
         return self._otherwise
@@ -347,7 +347,7 @@ class _GrantRules:
             return self._otherwise
         return self._entries[position].verdict(fits=True)
 
-    def crash(self, topic: str) -> RuleVerdict | None:
+    def crash_verdict(self, topic: str) -> RuleVerdict | None:
         """Return the verdict if a topic crashes a process that reads all its criteria, or None."""
         passed = 0
         for position in self._index.matching(topic):
@@ -362,14 +362,14 @@ class _GrantRules:
         return all(entry.allow and entry.expression for entry in self._entries)
 
     def safe_names(self) -> NameSet:
-        """Return the topics for which `crash` finds no crash."""
+        """Return the topics for which `crash_verdict` finds no crash."""
         from sros_tool.automata import NameSet
 
         groups = groupby(self._entries, key=lambda entry: entry.criteria)
-        crashing = [self._crashing(list(group)) for _, group in groups]
+        crashing = [self._crashing_topics(list(group)) for _, group in groups]
         return _every_topic() - NameSet.union(filter(None, crashing))
 
-    def _crashing(self, group: Sequence[_Entry]) -> NameSet | None:
+    def _crashing_topics(self, group: Sequence[_Entry]) -> NameSet | None:
         """Return the topics on which a criteria crashes the process; None if it never does.
 
         An empty ``<topic>`` crashes the process, unless an earlier ``<topic>`` of the criteria
@@ -385,13 +385,13 @@ class _GrantRules:
         rules: list[tuple[NameSet, bool]] = []
         for _, entries in groupby(self._entries, key=lambda entry: entry.criteria):
             group = list(entries)
-            fits = self._fits(group[0], _DEFAULT_PARTITION)
+            fits = self._matches_partitions(group[0], _DEFAULT_PARTITION)
             if fits or self._traits.topic_decides:
                 rules += [
                     (names, allowed and fits) for names, allowed in self._decisions_by_topic(group)
                 ]
                 continue
-            if crashing := self._crashing(group):
+            if crashing := self._crashing_topics(group):
                 rules.append((crashing, False))
         return NameSet.first(rules, self._otherwise.allowed)
 
@@ -415,7 +415,7 @@ class _GrantRules:
         texts = tuple([_usable_expression(self._traits, entry.expression) for entry in entries])
         return _cached_names(self._traits.style, texts)
 
-    def _fits(self, entry: _Entry, wanted: tuple[str, ...]) -> bool:
+    def _matches_partitions(self, entry: _Entry, wanted: tuple[str, ...]) -> bool:
         style, named = self._traits.style, entry.partitions
         if entry.allow:
             if wanted is _DEFAULT_PARTITION is named:
@@ -668,7 +668,7 @@ class GrantedAccess:
     @cached_property
     def own(self) -> dict[AccessVerb, _GrantRules]:
         """The rules as the participant itself applies them."""
-        return {verb: self.deciding(self._own_rules, verb) for verb in _ENDPOINTS}
+        return {verb: self.deciding_rules(self._own_rules, verb) for verb in _ENDPOINTS}
 
     @cached_property
     def peers(self) -> dict[AccessVerb, _GrantRules]:
@@ -677,11 +677,11 @@ class GrantedAccess:
         if self._own_rules is self.rules and not relays:
             return self.own
         return {
-            AccessVerb.PUBLISH: self.deciding(self.rules, AccessVerb.PUBLISH),
-            AccessVerb.SUBSCRIBE: self.deciding(self.rules, AccessVerb.SUBSCRIBE, *relays),
+            AccessVerb.PUBLISH: self.deciding_rules(self.rules, AccessVerb.PUBLISH),
+            AccessVerb.SUBSCRIBE: self.deciding_rules(self.rules, AccessVerb.SUBSCRIBE, *relays),
         }
 
-    def deciding(self, rules: Sequence[NumberedRule], *verbs: str) -> _GrantRules:
+    def deciding_rules(self, rules: Sequence[NumberedRule], *verbs: str) -> _GrantRules:
         """Return the rules that decide on the verbs, in order."""
         return _GrantRules(self._traits, rules, self.otherwise, *verbs)
 
@@ -733,7 +733,7 @@ class Access:
         """Return the decision on a DataReader: whether it is created, and peers match it."""
         return self._endpoint(AccessVerb.SUBSCRIBE, topic, partitions)
 
-    def governed(self, topic: str) -> Decision | None:
+    def governance_refusal(self, topic: str) -> Decision | None:
         """Return the decision if the governance forbids all endpoints of ``topic``, or None."""
         rule = self._governed.topic_rule(topic)
         if rule is None:
@@ -779,7 +779,7 @@ class Access:
         return tuple((names, domain, rule) for names, rule in self._governed.names_by_rule())
 
     def _kind_of(self, verb: AccessVerb, rule: TopicRule) -> _Kind:
-        """Return what decides on access to the topics of a topic rule; it agrees with `_ruled`."""
+        """Return what decides on access to a topic rule's topics, as `_decision_by_rules` does."""
         if self._traits.crashes_on_empty_texts and not rule.topic_expression.strip():
             return _Kind.NOTHING
         writes, reads = rule.enable_write_access_control, rule.enable_read_access_control
@@ -821,14 +821,14 @@ class Access:
     @cached_property
     def _either(self) -> _GrantRules:
         """The grant's rules for both directions in one list, to decide on creating a topic."""
-        return self._granted.deciding(self._granted.rules, *_ENDPOINTS)
+        return self._granted.deciding_rules(self._granted.rules, *_ENDPOINTS)
 
     def _creation(self, verb: AccessVerb, topic: str) -> RuleVerdict:
         """Return the verdict on creating a topic, which has to precede an endpoint for ``verb``."""
         if not self._traits.asks_both_directions:
             return self._either.ask_topic(topic)
         directions = sorted(_ENDPOINTS, key=lambda endpoint: endpoint is not verb)
-        crashes = (self._own[direction].crash(topic) for direction in directions)
+        crashes = (self._own[direction].crash_verdict(topic) for direction in directions)
         verdicts = [self._own[direction].ask_topic(topic) for direction in directions]
         allowed = (verdict for verdict in verdicts if verdict.allowed)
         return next(filter(None, crashes), None) or next(allowed, verdicts[0])
@@ -852,7 +852,7 @@ class Access:
             return self._answer(
                 Outcome.DENIED, "invalid-name", f"{topic!r} is not a valid topic name"
             )
-        decision = self._ruled(verb, topic, partitions)
+        decision = self._decision_by_rules(verb, topic, partitions)
         longest = traits.longest_topic_name
         if decision.outcome.ok and longest is not None and len(topic.encode()) > longest:
             text = f"no peer matches a topic whose name has more than {longest} bytes"
@@ -863,11 +863,13 @@ class Access:
             )
         return decision
 
-    def _ruled(self, verb: AccessVerb, topic: str, partitions: tuple[str, ...]) -> Decision:
+    def _decision_by_rules(
+        self, verb: AccessVerb, topic: str, partitions: tuple[str, ...]
+    ) -> Decision:
         """Return the decision by governance and grant for a participant that starts."""
         join, traits = self._join, self._traits
         rule = self._governed.topic_rule(topic)
-        if stopped := self.governed(topic):
+        if stopped := self.governance_refusal(topic):
             return stopped
         assert rule is not None
         writes, reads = rule.enable_write_access_control, rule.enable_read_access_control

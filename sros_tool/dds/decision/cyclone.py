@@ -178,9 +178,9 @@ class _Reader:
         return _decoded(content.partition("\0")[0])
 
     def _unescaped(self, text: str) -> str:
-        return _REFERENCE.sub(self._referred, text) if "&" in text else text
+        return _REFERENCE.sub(self._referenced_character, text) if "&" in text else text
 
-    def _referred(self, match: re.Match[str]) -> str:
+    def _referenced_character(self, match: re.Match[str]) -> str:
         word = (match[1] or "").removesuffix(";")
         if word in _ENTITIES:
             return _ENTITIES[word]
@@ -240,7 +240,7 @@ def read_governance(xml: bytes) -> Governance:
     rules = parent.all("domain_rule") if parent else []
     if not rules:
         raise UnreadableError("it has no <domain_rule>")
-    return Governance(tuple(_domain_rule(rule) for rule in rules))
+    return Governance(tuple(_read_domain_rule(rule) for rule in rules))
 
 
 def read_permissions(xml: bytes) -> Permissions:
@@ -255,7 +255,7 @@ def read_permissions(xml: bytes) -> Permissions:
     grants = parent.all("grant") if parent else []
     if not grants:
         raise UnreadableError("it has no <grant>")
-    return Permissions(tuple(_grant(grant) for grant in grants))
+    return Permissions(tuple(_read_grant(grant) for grant in grants))
 
 
 class _Node:
@@ -317,7 +317,7 @@ def _check_skipped(element: XmlElement) -> None:
 # ── values ─────────────────────────────────────────────────────────────────────────────────
 
 
-def _number(node: _Node) -> int:
+def _read_number(node: _Node) -> int:
     if not node.text:
         return 0
     if not _INTEGER.match(node.text):
@@ -337,16 +337,16 @@ def _number(node: _Node) -> int:
     return number
 
 
-def _flag(node: _Node) -> bool:
+def _read_flag(node: _Node) -> bool:
     word = node.text.lower()
     if word not in ("", "true", "false", "0", "1"):
         raise UnreadableError(f"<{node.tag}> holds {node.text!r} instead of true or false")
     return word in ("true", "1")
 
 
-def _value(node: _Node, attribute: Attribute) -> Value:
+def _read_value(node: _Node, attribute: Attribute) -> Value:
     if attribute.is_flag:
-        return _flag(node)
+        return _read_flag(node)
     if node.text and node.text not in attribute.values:
         raise UnreadableError(
             f"<{node.tag}> holds {node.text!r}, which is not a protection kind there"
@@ -355,17 +355,17 @@ def _value(node: _Node, attribute: Attribute) -> Value:
     return ProtectionKind(node.text or str(attribute.values[-1]))
 
 
-def _domains(node: _Node | None) -> DomainSet:
+def _read_domains(node: _Node | None) -> DomainSet:
     if node is None:
         return DomainSet((DomainRange(None, None),))
     ranges = []
     for child in node.all("id", "id_range"):
         if child.tag == "id":
-            number = _number(child)
+            number = _read_number(child)
             ranges.append(DomainRange(number, number))
             continue
         ends = [child.last("min"), child.last("max")]
-        first, last = (None if end is None else _number(end) for end in ends)
+        first, last = (None if end is None else _read_number(end) for end in ends)
         ranges.append(DomainRange(first, last))
     return DomainSet(tuple(ranges))
 
@@ -373,11 +373,11 @@ def _domains(node: _Node | None) -> DomainSet:
 # ── governance ─────────────────────────────────────────────────────────────────────────────
 
 
-def _domain_rule(node: _Node) -> DomainRule:
+def _read_domain_rule(node: _Node) -> DomainRule:
     domains, topics = node.last("domains"), node.last("topic_access_rules")
     if domains is None:
         raise UnreadableError("a <domain_rule> lacks its <domains>")
-    read = _domains(domains)
+    read = _read_domains(domains)
     if not read.ranges:
         raise UnreadableError("<domains> is empty")
     for part in read.ranges:
@@ -390,38 +390,40 @@ def _domain_rule(node: _Node) -> DomainRule:
         raise UnreadableError("a <domain_rule> has no topic rules")
     return DomainRule(
         domains=read,
-        topic_access_rules=tuple(_topic_rule(rule) for rule in rules),
-        **_values(node, DomainRule),
+        topic_access_rules=tuple(_read_topic_rule(rule) for rule in rules),
+        **_read_values(node, DomainRule),
     )
 
 
-def _topic_rule(node: _Node) -> TopicRule:
+def _read_topic_rule(node: _Node) -> TopicRule:
     expression = node.last("topic_expression")
     return TopicRule(
-        topic_expression=expression.text if expression else "", **_values(node, TopicRule)
+        topic_expression=expression.text if expression else "", **_read_values(node, TopicRule)
     )
 
 
-def _values(node: _Node, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
+def _read_values(node: _Node, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for attribute in attributes(rule):
         child = node.last(attribute.name)
         if child is None and attribute.default is None:
             raise UnreadableError(f"a <{node.tag}> lacks its <{attribute.name}>")
-        values[attribute.name] = attribute.default if child is None else _value(child, attribute)
+        values[attribute.name] = (
+            attribute.default if child is None else _read_value(child, attribute)
+        )
     return values
 
 
 # ── permissions ────────────────────────────────────────────────────────────────────────────
 
 
-def _grant(node: _Node) -> Grant:
+def _read_grant(node: _Node) -> Grant:
     subject, validity = node.last("subject_name"), node.last("validity")
     begin = validity.last("not_before") if validity else None
     end = validity.last("not_after") if validity else None
     if not (subject and subject.text and begin and begin.text and end and end.text):
         raise UnreadableError("a <grant> lacks its <subject_name> or its <validity>")
-    rules = tuple(_rule(child) for child in node.all("allow_rule", "deny_rule"))
+    rules = tuple(_read_rule(child) for child in node.all("allow_rule", "deny_rule"))
     default = node.last("default")
     word = None if default is None else default.text
     return Grant(
@@ -435,15 +437,16 @@ def _grant(node: _Node) -> Grant:
     )
 
 
-def _rule(node: _Node) -> Rule:
+def _read_rule(node: _Node) -> Rule:
     publish, subscribe = (
-        tuple(_criteria(child) for child in node.all(verb)) for verb in ("publish", "subscribe")
+        tuple(_read_criteria(child) for child in node.all(verb))
+        for verb in ("publish", "subscribe")
     )
     allow = node.tag == "allow_rule"
-    return Rule(allow, _domains(node.last("domains")), publish, subscribe)
+    return Rule(allow, _read_domains(node.last("domains")), publish, subscribe)
 
 
-def _criteria(node: _Node) -> Criteria:
+def _read_criteria(node: _Node) -> Criteria:
     topics, partitions = node.last("topics"), node.last("partitions")
     return Criteria(
         tuple(topic.text for topic in topics.all("topic")) if topics else (),

@@ -53,12 +53,12 @@ class _Reader:
     def __init__(self, xml: bytes) -> None:
         # Signed documents have these line ends; each character stands for a byte.
         canonical = xml.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n").decode("latin-1")
-        self._text = canonical.partition("\0")[0].lstrip(_BLANKS).removeprefix(_MARK)
+        self._read_text = canonical.partition("\0")[0].lstrip(_BLANKS).removeprefix(_MARK)
         self._index = 0
 
     def root(self) -> XmlElement:
         document = XmlElement("")
-        if not self._text:
+        if not self._read_text:
             raise self._error("it is empty")
         self._read_into(document)
         if not document.elements:
@@ -66,11 +66,11 @@ class _Reader:
         return document.elements[0]
 
     def _error(self, why: str) -> UnreadableError:
-        line = self._text.count("\r\n", 0, self._index) + 1
+        line = self._read_text.count("\r\n", 0, self._index) + 1
         return UnreadableError(f"its XML is malformed: {why} (line {line})")
 
     def _read_into(self, document: XmlElement) -> None:
-        text = self._text
+        text = self._read_text
         stack = [document]
         while found := _TEXT.match(text, self._index):
             children = stack[-1].children
@@ -104,12 +104,12 @@ class _Reader:
             raise self._error("it ends with text")
 
     def _need_more(self, index: int) -> None:
-        if index >= len(self._text):
+        if index >= len(self._read_text):
             raise self._error("it ends with <")
 
     def _take_special(self, stack: list[XmlElement]) -> None:
         """Read a declaration, comment, CDATA or anything else that begins with ``<?`` or ``<!``."""
-        text, children = self._text, stack[-1].children
+        text, children = self._read_text, stack[-1].children
         begin, end = next(each for each in _SPECIAL if text.startswith(each[0], self._index))
         start = self._index + len(begin)
         stop = text.find(end, start)
@@ -152,7 +152,7 @@ def _plain(text: str) -> str:
             taken, into = _LINE_END.match(text, index)[0], "\n"  # type: ignore[index]
         elif taken == "&":
             match = _REFERENCE.match(text, index)
-            character = _referred(match) if match else None
+            character = _referenced_character(match) if match else None
             if match and character is not None:
                 taken, into = match[0], character
             elif text[index + 1 :] == "#":
@@ -165,7 +165,7 @@ def _plain(text: str) -> str:
     return _decoded("".join(written[:place]).partition("\0")[0])
 
 
-def _referred(match: re.Match[str]) -> str | None:
+def _referenced_character(match: re.Match[str]) -> str | None:
     """Return the bytes of a character reference such as ``&amp;``, or None if it is malformed."""
     if match[2]:
         return _ENTITIES[match[2]]
@@ -194,21 +194,26 @@ _TRUE, _FALSE = ("true", "True", "TRUE"), ("false", "False", "FALSE")
 def read_governance(xml: bytes) -> Governance:
     """Return the governance in ``xml``; raise `UnreadableError` if Fast DDS refuses it."""
     root = read(xml)
-    parent = _first(root, "domain_access_rules")
+    parent = _first_child(root, "domain_access_rules")
     if root.children[-1] is not parent:
         # A comment there is refused too.
         raise UnreadableError("something follows <domain_access_rules>")
-    return Governance(tuple(_domain_rule(element) for element in _all(parent, "domain_rule")))
+    return Governance(
+        tuple(_read_domain_rule(element) for element in _children_named(parent, "domain_rule"))
+    )
 
 
 def read_permissions(xml: bytes) -> Permissions:
     """Return the permissions in ``xml``; raise `UnreadableError` if Fast DDS refuses them."""
     return Permissions(
-        tuple(_grant(element) for element in _all(_first(read(xml), "permissions"), "grant"))
+        tuple(
+            _read_grant(element)
+            for element in _children_named(_first_child(read(xml), "permissions"), "grant")
+        )
     )
 
 
-def _first(root: XmlElement, name: str) -> XmlElement:
+def _first_child(root: XmlElement, name: str) -> XmlElement:
     if root.name != "dds":
         raise UnreadableError("its root is not <dds>")
     children = root.elements
@@ -219,7 +224,7 @@ def _first(root: XmlElement, name: str) -> XmlElement:
     return children[0]
 
 
-def _all(parent: XmlElement, name: str) -> list[XmlElement]:
+def _children_named(parent: XmlElement, name: str) -> list[XmlElement]:
     """Return the children of ``parent``, which all have to be named ``name``.
 
     Raises:
@@ -274,7 +279,7 @@ class _Sequence:
 # ── texts ──────────────────────────────────────────────────────────────────────────────────
 
 
-def _text(element: XmlElement) -> str | None:
+def _read_text(element: XmlElement) -> str | None:
     """Return the text of an element if its first node is text (comments aside), else None."""
     for child in element.children:
         if child is not NodeMark.COMMENT:
@@ -282,14 +287,14 @@ def _text(element: XmlElement) -> str | None:
     return None
 
 
-def _required(element: XmlElement) -> str:
-    text = _text(element)
+def _read_required_text(element: XmlElement) -> str:
+    text = _read_text(element)
     if text is None:
         raise UnreadableError(f"<{element.name}> is empty")
     return text
 
 
-def _first_text(element: XmlElement) -> str:
+def _read_first_text(element: XmlElement) -> str:
     """Return the text of a number or flag, which has to be the first node of its element.
 
     Raises:
@@ -301,8 +306,8 @@ def _first_text(element: XmlElement) -> str:
     return first
 
 
-def _number(element: XmlElement) -> int:
-    match = _INTEGER.match(_first_text(element))
+def _read_number(element: XmlElement) -> int:
+    match = _INTEGER.match(_read_first_text(element))
     if not match:
         raise UnreadableError(f"<{element.name}> does not hold a number")
     return _integer(match) % 2**32
@@ -317,8 +322,8 @@ def _integer(match: re.Match[str]) -> int:
     return min(number, 2**64 - 1) if match[2][0] != "-" or number >= 2**64 else -number
 
 
-def _flag(element: XmlElement) -> bool:
-    text = _first_text(element)
+def _read_flag(element: XmlElement) -> bool:
+    text = _read_first_text(element)
     if found := _INTEGER.match(text):
         return _integer(found) != 0
     if text not in _TRUE + _FALSE:
@@ -326,10 +331,10 @@ def _flag(element: XmlElement) -> bool:
     return text in _TRUE
 
 
-def _value(element: XmlElement, attribute: Attribute) -> Value:
+def _read_value(element: XmlElement, attribute: Attribute) -> Value:
     if attribute.is_flag:
-        return _flag(element)
-    text = _required(element)
+        return _read_flag(element)
+    text = _read_required_text(element)
     if text not in list(ProtectionKind):
         raise UnreadableError(f"<{element.name}> holds {text!r}, which is not a protection kind")
     if text not in attribute.values:
@@ -339,15 +344,15 @@ def _value(element: XmlElement, attribute: Attribute) -> Value:
     return ProtectionKind(text)
 
 
-def _domains(element: XmlElement) -> DomainSet:
+def _read_domains(element: XmlElement) -> DomainSet:
     ranges = []
     for child in element.elements:
         match child.name:
             case "id":
-                number = _number(child)
+                number = _read_number(child)
                 ranges.append(DomainRange(number, number))
             case "id_range":
-                ranges.append(_range(child))
+                ranges.append(_read_range(child))
             case other:
                 raise UnreadableError(f"<domains> holds <{other}>")
     if not ranges:
@@ -355,32 +360,34 @@ def _domains(element: XmlElement) -> DomainSet:
     return DomainSet(tuple(ranges))
 
 
-def _range(element: XmlElement) -> DomainRange:
+def _read_range(element: XmlElement) -> DomainRange:
     ends = element.elements
     if ends and ends[0].name == "max":
-        return DomainRange(None, _number(ends[0]))
+        return DomainRange(None, _read_number(ends[0]))
     if not ends or ends[0].name != "min":
         raise UnreadableError("<id_range> begins with neither <min> nor <max>")
-    first = _number(ends[0])
+    first = _read_number(ends[0])
     bounded = len(ends) > 1 and ends[1].name == "max"
-    return DomainRange(first, _number(ends[1]) if bounded else None)
+    return DomainRange(first, _read_number(ends[1]) if bounded else None)
 
 
 # ── governance ─────────────────────────────────────────────────────────────────────────────
 
 
-def _domain_rule(element: XmlElement) -> DomainRule:
+def _read_domain_rule(element: XmlElement) -> DomainRule:
     take = _Sequence(element)
-    domains = _domains(take.next("domains"))
+    domains = _read_domains(take.next("domains"))
     values = _values(take, DomainRule)
-    rules = tuple(map(_topic_rule, _all(take.next("topic_access_rules"), "topic_rule")))
+    rules = tuple(
+        map(_read_topic_rule, _children_named(take.next("topic_access_rules"), "topic_rule"))
+    )
     take.end()
     return DomainRule(domains=domains, topic_access_rules=rules, **values)
 
 
-def _topic_rule(element: XmlElement) -> TopicRule:
+def _read_topic_rule(element: XmlElement) -> TopicRule:
     take = _Sequence(element)
-    expression = _text(take.next("topic_expression"))
+    expression = _read_text(take.next("topic_expression"))
     if expression is None:
         raise UnreadableError("<topic_expression> is empty", missing=True)
     rule = TopicRule(topic_expression=expression, **_values(take, TopicRule))
@@ -393,7 +400,7 @@ def _values(sequence: _Sequence, rule: type[DomainRule | TopicRule]) -> dict[str
     for attribute in attributes(rule):
         left_out = attribute.default is not None and not sequence.is_next(attribute.name)
         values[attribute.name] = (
-            attribute.default if left_out else _value(sequence.next(attribute.name), attribute)
+            attribute.default if left_out else _read_value(sequence.next(attribute.name), attribute)
         )
     return values
 
@@ -401,35 +408,37 @@ def _values(sequence: _Sequence, rule: type[DomainRule | TopicRule]) -> dict[str
 # ── permissions ────────────────────────────────────────────────────────────────────────────
 
 
-def _grant(element: XmlElement) -> Grant:
+def _read_grant(element: XmlElement) -> Grant:
     name = element.attributes.get("name")
     if name is None:
         raise UnreadableError("a <grant> has no name")
     take = _Sequence(element)
-    subject = _required(take.next("subject_name"))
-    not_before, not_after = _validity(take.next("validity"))
-    rules = tuple(_rule(xml_element) for xml_element in take.while_named("allow_rule", "deny_rule"))
-    default = _required(take.next("default"))
+    subject = _read_required_text(take.next("subject_name"))
+    not_before, not_after = _read_validity(take.next("validity"))
+    rules = tuple(
+        _read_rule(xml_element) for xml_element in take.while_named("allow_rule", "deny_rule")
+    )
+    default = _read_required_text(take.next("default"))
     if default not in ("ALLOW", "DENY"):
         raise UnreadableError(f"<default> holds {default!r}")
     return Grant(name, subject, not_before, not_after, rules, default == "ALLOW")
 
 
-def _validity(element: XmlElement) -> tuple[str, str]:
+def _read_validity(element: XmlElement) -> tuple[str, str]:
     take = _Sequence(element)
-    begin = _required(take.next("not_before"))
-    end = _text(take.next("not_after"))
+    begin = _read_required_text(take.next("not_before"))
+    end = _read_text(take.next("not_after"))
     if end is None:
         raise UnreadableError("<not_after> is empty", missing=True)
     return begin, end
 
 
-def _rule(element: XmlElement) -> Rule:
+def _read_rule(element: XmlElement) -> Rule:
     take = _Sequence(element)
-    domains = _domains(take.next("domains"))
+    domains = _read_domains(take.next("domains"))
     verbs: dict[str, list[Criteria]] = {"publish": [], "subscribe": [], "relay": []}
     for child in take.while_named(*verbs):
-        verbs[child.name].append(_criteria(child))
+        verbs[child.name].append(_read_criteria(child))
     take.end()
     return Rule(
         element.name == "allow_rule",
@@ -440,15 +449,21 @@ def _rule(element: XmlElement) -> Rule:
     )
 
 
-def _criteria(element: XmlElement) -> Criteria:
+def _read_criteria(element: XmlElement) -> Criteria:
     topics: list[str] = []
     partitions: list[str] = []
     for child in element.elements:
         match child.name:
             case "topics":
-                topics += [_required(xml_element) for xml_element in _all(child, "topic")]
+                topics += [
+                    _read_required_text(xml_element)
+                    for xml_element in _children_named(child, "topic")
+                ]
             case "partitions":
-                partitions += [_partition(xml_element) for xml_element in _all(child, "partition")]
+                partitions += [
+                    _read_partition(xml_element)
+                    for xml_element in _children_named(child, "partition")
+                ]
             case "data_tags":
                 pass
             case other:
@@ -456,8 +471,8 @@ def _criteria(element: XmlElement) -> Criteria:
     return Criteria(tuple(topics), tuple(partitions))
 
 
-def _partition(element: XmlElement) -> str:
-    text = _text(element)
+def _read_partition(element: XmlElement) -> str:
+    text = _read_text(element)
     if text is None and element.children:
         raise UnreadableError("<partition> holds something other than text")
     return text or ""

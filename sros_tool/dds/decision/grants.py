@@ -33,7 +33,7 @@ def same_subject(rule: Subjects, granted_subject: str, certified_subject: str) -
     return _COMPARE[rule](granted_subject, certified_subject)
 
 
-def also_fitting(
+def other_fitting_enclaves(
     traits: VendorTraits, certified: Mapping[str, str], granted: Mapping[str, Collection[str]]
 ) -> dict[str, tuple[str, ...]]:
     """Map each enclave to the other enclaves whose permissions also fit its certificate.
@@ -78,11 +78,11 @@ def certified_text(traits: VendorTraits, subject: str) -> str:
     return subject.encode()[: traits.longest_subject].decode(errors="surrogateescape")
 
 
-def _exact(granted_subject: str, certified_subject: str) -> bool:
+def _same_attributes(granted_subject: str, certified_subject: str) -> bool:
     return _attributes(granted_subject) == _attributes(certified_subject)
 
 
-def _whole_attributes(granted_subject: str, certified_subject: str) -> bool:
+def _same_parts(granted_subject: str, certified_subject: str) -> bool:
     """Return whether subjects are equal, split at commas and without blanks around parts.
 
     Escaped commas split as well.  A part of less than three bytes keeps some of its blanks, and
@@ -132,7 +132,7 @@ _BEFORE = {
 """Maps a character to a pattern for the text before it, outside of escapes and quotes."""
 
 
-def _any_order(granted_subject: str, certified_subject: str) -> bool:
+def _same_in_any_order(granted_subject: str, certified_subject: str) -> bool:
     ours, theirs = _types_and_values(granted_subject), _types_and_values(certified_subject)
     first_values: dict[str, str] = {}
     for kind, value in theirs:
@@ -195,7 +195,7 @@ def _plain_subject(text: str) -> str:
 _SEPARATORS = re.compile(r"[,/|]")
 
 
-def _subset(
+def _has_granted_parts(
     granted_subject: str, certified_subject: str, *, normalize: Callable[[str], str] = str
 ) -> bool:
     parts = [normalize(part) for part in _SEPARATORS.split(granted_subject) if part]
@@ -227,11 +227,11 @@ _PLAIN_PARTS: dict[Subjects, Callable[[str], str]] = {
 """How each rule that splits subjects reads the parts."""
 
 _COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
-    Subjects.EXACT: _exact,
-    Subjects.WHOLE_ATTRIBUTES: _whole_attributes,
-    Subjects.ANY_ORDER: _any_order,
-    Subjects.SUBSET: _subset,
-    Subjects.TRIMMED_SUBSET: partial(_subset, normalize=_without_blanks),
+    Subjects.EXACT: _same_attributes,
+    Subjects.WHOLE_ATTRIBUTES: _same_parts,
+    Subjects.ANY_ORDER: _same_in_any_order,
+    Subjects.SUBSET: _has_granted_parts,
+    Subjects.TRIMMED_SUBSET: partial(_has_granted_parts, normalize=_without_blanks),
 }
 
 
@@ -259,9 +259,9 @@ def read_moment(rule: Moments, text: str, zone: tzinfo) -> float | None:
     """
     match rule:
         case Moments.LOCAL:
-            return _local(text, zone)
+            return _local_time(text, zone)
         case Moments.CYCLONE:
-            return _cyclone(text)
+            return _cyclone_time(text)
         case Moments.STANDARD:
             try:
                 return parse_iso(text).timestamp()
@@ -269,7 +269,7 @@ def read_moment(rule: Moments, text: str, zone: tzinfo) -> float | None:
                 return None
 
 
-def _local(text: str, zone: tzinfo) -> float | None:
+def _local_time(text: str, zone: tzinfo) -> float | None:
     match = _LOCAL.match(text)
     if not match or (match[6] is None and match.end() < len(text)):
         return None
@@ -289,7 +289,7 @@ def _local(text: str, zone: tzinfo) -> float | None:
     return timegm(wall.timetuple()) - offset.total_seconds()
 
 
-def _cyclone(text: str) -> float:
+def _cyclone_time(text: str) -> float:
     match = _CYCLONE.match(text)
     if not match:
         return -inf

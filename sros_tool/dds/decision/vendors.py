@@ -413,7 +413,7 @@ def words_of(vendors: Iterable[Vendor]) -> list[str]:
     return [*words, *(vendor.value for vendor in left)]
 
 
-def together(titles: Iterable[str]) -> list[str]:
+def joined_titles(titles: Iterable[str]) -> list[str]:
     """Return titles of vendors, with the releases of one product joined into one title.
 
     All tested releases become the name of the product, and some of them a title such as ``Fast

@@ -139,7 +139,7 @@ def read_scenario(path: Path) -> Scenario:
     """
     content = read_bytes(path, "scenario")
     data = read_toml(content, f"the scenario '{path}'", "Correct the file.")
-    return _scenario(_Table(path, content.decode().splitlines(), "", 0, data))
+    return _read_scenario(_Table(path, content.decode().splitlines(), "", 0, data))
 
 
 class _Table(NamedTuple):
@@ -213,7 +213,7 @@ class _Table(NamedTuple):
         return start + 1
 
 
-def _scenario(table: _Table) -> Scenario:
+def _read_scenario(table: _Table) -> Scenario:
     table.check_keys()
     try:
         policy = read_policy(table.path.parent / table.text("policy"))
@@ -221,18 +221,18 @@ def _scenario(table: _Table) -> Scenario:
         raise table.error("policy", str(error)) from error
     parties: dict[str, Party] = {}
     for party_table in table.tables("party"):
-        party = _party(party_table, policy)
+        party = _read_party(party_table, policy)
         file = party.name.replace(" ", "_")
         if any(name.replace(" ", "_") == file for name in parties):
             raise party_table.error("name", f"there are two parties {party.name!r}")
         parties[party.name] = party
     rules = Rules(policy_rights(policy))
-    rows = tuple(_row(row_table, parties, rules) for row_table in table.tables("row"))
+    rows = tuple(_read_row(row_table, parties, rules) for row_table in table.tables("row"))
     title = table.text("title", table.path.stem)
     return Scenario(table.path.stem, title, rows, policy=lambda _topic: policy)
 
 
-def _party(table: _Table, policy: Policy) -> Party:
+def _read_party(table: _Table, policy: Policy) -> Party:
     name = table.text("name")
     if not _NAME.fullmatch(name):
         problem = f"{name!r} is not the name of a party"
@@ -251,10 +251,10 @@ def _party(table: _Table, policy: Policy) -> Party:
         topic = check_topic(topic) if topic else ""
     except SrosError as error:
         raise table.error("topic", str(error)) from error
-    return Party(name, role, _identity(table, policy), topic)
+    return Party(name, role, _read_identity(table, policy), topic)
 
 
-def _identity(table: _Table, policy: Policy) -> Identity:
+def _read_identity(table: _Table, policy: Policy) -> Identity:
     enclave = table.text("enclave", "")
     word = table.text("keystore", OWN)
     keystores = {keystore.value: keystore for keystore in SoundKeystore}
@@ -284,10 +284,10 @@ def _identity(table: _Table, policy: Policy) -> Identity:
     return Identity(keystores[word], enclave, tuple(variables.items()))
 
 
-def _row(table: _Table, parties: Mapping[str, Party], rules: Rules) -> Row:
+def _read_row(table: _Table, parties: Mapping[str, Party], rules: Rules) -> Row:
     name = table.text("name")
-    claims = _claims(table, "claim", parties)
-    controls = _claims(table, "control", parties)
+    claims = _read_claims(table, "claim", parties)
+    controls = _read_claims(table, "control", parties)
     if not claims:
         raise table.error("name", f"the row {name!r} has no claim", _EXAMPLE)
     _check_controls(table, claims, controls, parties, rules)
@@ -303,15 +303,15 @@ def _row(table: _Table, parties: Mapping[str, Party], rules: Rules) -> Row:
     )
 
 
-def _claims(table: _Table, key: str, parties: Mapping[str, Party]) -> tuple[Claim, ...]:
+def _read_claims(table: _Table, key: str, parties: Mapping[str, Party]) -> tuple[Claim, ...]:
     claims = table.data.get(key, [])
     claims = [claims] if isinstance(claims, dict) else claims
     if not isinstance(claims, list):
         raise table.error(key, f"{key} is not a table", _EXAMPLE)
-    return tuple(_claim(table, key, claim, parties) for claim in claims)
+    return tuple(_read_claim(table, key, claim, parties) for claim in claims)
 
 
-def _claim(table: _Table, key: str, claim: Any, parties: Mapping[str, Party]) -> Claim:
+def _read_claim(table: _Table, key: str, claim: Any, parties: Mapping[str, Party]) -> Claim:
     if not isinstance(claim, dict):
         raise table.error(key, f"{claim!r} is not a table", _EXAMPLE)
     expected = claim.get("expected")
@@ -354,10 +354,10 @@ def _check_controls(
     rules: Rules,
 ) -> None:
     """Raise `DocumentError` if a row expects silence and no claim that something works."""
-    happening = [claim for claim in (*claims, *controls) if _happens(claim)]
+    happening = [claim for claim in (*claims, *controls) if _expects_success(claim)]
     for claim in claims:
         heard = claim.relation is Relation.HEARS
-        if _happens(claim) or any(not heard or e.talker == claim.talker for e in happening):
+        if _expects_success(claim) or any(not heard or e.talker == claim.talker for e in happening):
             continue
         who = f"a listener hears {claim.talker}" if claim.talker else "something works"
         remedy = "Add a control, such as a permitted listener that hears the same talker."
@@ -388,7 +388,7 @@ def _may_speak(party: Party, rules: Rules) -> bool:
     return rules.allow(party.identity.enclave, right[party.role], party.topic)
 
 
-def _happens(claim: Claim) -> bool:
+def _expects_success(claim: Claim) -> bool:
     """Return whether a claim expects that something works, not silence or a refusal."""
     return claim.holds and claim.relation is not Relation.IS_REFUSED
 

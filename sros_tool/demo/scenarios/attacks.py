@@ -69,7 +69,7 @@ def _victims(attacker: Identity, defence_removed: str) -> KeystoreChoice:
     return attacker.keystore if defence_removed and attacker.keystore is not None else OWN
 
 
-def _injection(
+def _injection_row(
     name: str,
     attacker: Identity,
     expected: RowStatus,
@@ -101,12 +101,14 @@ def _injection(
     )
 
 
-def _tampered(name: str, expected: RowStatus, mechanism: str, victims: KeystoreChoice) -> Row:
+def _tampered_files_row(
+    name: str, expected: RowStatus, mechanism: str, victims: KeystoreChoice
+) -> Row:
     """Return a row in which an unsecured attacker talks to a listener with changed files.
 
     The listener may fail to start; the control is another listener with unchanged files.
     """
-    row = _injection(name, UNSECURED, expected, mechanism, victims=victims)
+    row = _injection_row(name, UNSECURED, expected, mechanism, victims=victims)
     attacker, listener, _ = row.parties
     talker, untouched = talker_and_listener(OWN)
     untouched = replace(untouched, name="untouched listener")
@@ -117,7 +119,7 @@ def _tampered(name: str, expected: RowStatus, mechanism: str, victims: KeystoreC
     )
 
 
-def _succeeds(
+def _successful_injection_row(
     name: str, attacker: Identity, defence_removed: str, victims: KeystoreChoice | None = None
 ) -> Row:
     """Return a row in which the listener hears the attacker, because a defence is removed.
@@ -125,12 +127,12 @@ def _succeeds(
     The files of the attacker are valid.
     """
     mechanism = "an attacker with valid files is heard"
-    return _injection(
+    return _injection_row(
         name, attacker, RowStatus.HEARD, mechanism, defence_removed=defence_removed, victims=victims
     )
 
 
-def _listening(
+def _listening_row(
     name: str,
     attacker: Identity,
     expected: RowStatus,
@@ -156,7 +158,7 @@ def _listening(
     )
 
 
-def _discovering(
+def _discovery_row(
     name: str,
     attacker: Identity,
     expected: RowStatus,
@@ -192,12 +194,12 @@ def _discovering(
     )
 
 
-def _on_service(role: Role, identity: Identity, name: str = "") -> Party:
+def _service_party(role: Role, identity: Identity, name: str = "") -> Party:
     """Return a client or server of the service; with a ``name``, it is the attacker."""
     return Party(name or role.value, role, identity, SERVICE, intruder=bool(name))
 
 
-def _calling(
+def _call_row(
     name: str, attacker: Identity, expected: RowStatus, mechanism: str, *, defence_removed: str = ""
 ) -> Row:
     """Return a row that shows whether a service answers the attacker."""
@@ -207,9 +209,9 @@ def _calling(
         expected,
         mechanism,
         (
-            _on_service(Role.CLIENT, attacker, _ATTACKER),
-            _on_service(Role.SERVER, Identity(victims, "server")),
-            _on_service(Role.CLIENT, Identity(victims, "client")),
+            _service_party(Role.CLIENT, attacker, _ATTACKER),
+            _service_party(Role.SERVER, Identity(victims, "server")),
+            _service_party(Role.CLIENT, Identity(victims, "client")),
         ),
         (answered(_ATTACKER, "server").expecting(expected),),
         (answered("client", "server"),),
@@ -219,19 +221,19 @@ def _calling(
     )
 
 
-def _posing_as_server(
+def _false_server_row(
     name: str, attacker: Identity, expected: RowStatus, mechanism: str, *, defence_removed: str = ""
 ) -> Row:
     """Return a row that shows whether a client accepts answers from an attacker."""
     victims = _victims(attacker, defence_removed)
-    rightful = _on_service(Role.SERVER, Identity(victims, "server"))
+    rightful = _service_party(Role.SERVER, Identity(victims, "server"))
     return Row(
         name,
         expected,
         mechanism,
         (
-            _on_service(Role.SERVER, attacker, _ATTACKER),
-            _on_service(Role.CLIENT, Identity(victims, "client")),
+            _service_party(Role.SERVER, attacker, _ATTACKER),
+            _service_party(Role.CLIENT, Identity(victims, "client")),
             *(() if defence_removed else (rightful,)),
         ),
         (answered("client", _ATTACKER).expecting(expected),),
@@ -249,7 +251,7 @@ _OPEN_GOVERNANCE = Undefended(forger.weaker_governance)
 _STRANGERS_REFUSED = "the refusal of unauthenticated participants"
 
 
-def _eavesdropping(
+def _eavesdropping_row(
     name: str,
     expected: RowStatus,
     mechanism: str,
@@ -271,7 +273,7 @@ def _eavesdropping(
     )
 
 
-def _forged_packets(
+def _forged_packets_row(
     name: str, relation: Relation, expected: RowStatus, mechanism: str, keystore: KeystoreChoice
 ) -> Row:
     """Return a row in which a talker's packets are sent again, unchanged or changed."""
@@ -293,7 +295,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
     *tries(
         "eavesdropping on the wire",
         replace(
-            _eavesdropping(
+            _eavesdropping_row(
                 "payload read on the wire",
                 RowStatus.NOT_READABLE,
                 "every packet with data is encrypted, with keys that only authenticated peers get",
@@ -310,7 +312,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
             ),
         ),
         replace(
-            _eavesdropping(
+            _eavesdropping_row(
                 "payload read on the wire, not encrypted",
                 RowStatus.READABLE,
                 "with the protection kind NONE, access is controlled but nothing is encrypted",
@@ -322,7 +324,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
     *tries(
         "replay of captured packets",
         replace(
-            _forged_packets(
+            _forged_packets_row(
                 "packets of a secured talker sent again",
                 Relation.HEARS_AGAIN,
                 RowStatus.NOT_HEARD_AGAIN,
@@ -342,7 +344,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
             ),
         ),
         replace(
-            _forged_packets(
+            _forged_packets_row(
                 "packets of an unsecured talker sent again",
                 Relation.HEARS_AGAIN,
                 RowStatus.HEARD_AGAIN,
@@ -356,7 +358,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
     *tries(
         "changed packets",
         replace(
-            _forged_packets(
+            _forged_packets_row(
                 "packets of a secured talker changed",
                 Relation.BELIEVES,
                 RowStatus.NOT_DECEIVED,
@@ -374,7 +376,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
             ),
         ),
         replace(
-            _forged_packets(
+            _forged_packets_row(
                 "packets of a secured talker changed, not signed",
                 Relation.BELIEVES,
                 RowStatus.DECEIVED,
@@ -388,7 +390,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
         "what the handshake reveals",
         *(
             known_open(
-                _eavesdropping(
+                _eavesdropping_row(
                     f"{what} read in the handshake",
                     RowStatus.READABLE,
                     "certificates and permissions are sent unencrypted before the participants "
@@ -404,13 +406,13 @@ _NETWORK_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "an unsecured node listens",
-        _listening(
+        _listening_row(
             "an unsecured node listens",
             UNSECURED,
             RowStatus.NOT_HEARD,
             "a node that cannot authenticate gets no keys and no messages",
         ),
-        _listening(
+        _listening_row(
             "an unsecured node listens, open governance",
             UNSECURED,
             RowStatus.HEARD,
@@ -421,7 +423,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "an unsecured node lists topics",
-        _discovering(
+        _discovery_row(
             "an unsecured node lists topics",
             UNSECURED,
             RowStatus.NOT_VISIBLE,
@@ -433,7 +435,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                 "remove allow_unauthenticated_participants from the template",
             ),
         ),
-        _discovering(
+        _discovery_row(
             "an unsecured node lists topics, open governance",
             UNSECURED,
             RowStatus.VISIBLE,
@@ -444,13 +446,13 @@ _NETWORK_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "an unsecured node injects",
-        _injection(
+        _injection_row(
             "an unsecured node injects",
             UNSECURED,
             RowStatus.NOT_HEARD,
             "a listener in a closed domain ignores a talker that cannot authenticate",
         ),
-        _injection(
+        _injection_row(
             "an unsecured node injects, open governance",
             UNSECURED,
             RowStatus.HEARD,
@@ -462,7 +464,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
     *tries(
         "an authenticated node looks around",
         known_open(
-            _discovering(
+            _discovery_row(
                 "an enclave without rights lists topics",
                 Identity(OWN, "guest"),
                 RowStatus.VISIBLE,
@@ -484,7 +486,7 @@ _EVERY_TOPIC = "permissions for * allow every topic"
 _BOTH_DIRECTIONS = "permissions for * allow both directions"
 
 
-def _trespass(
+def _trespass_rows(
     kind: Callable[..., Row],
     attack: str,
     part: str,
@@ -498,7 +500,7 @@ def _trespass(
     allow.
     """
     given = " that it was not given" if attack.startswith("an enclave ") else ""
-    done = RowStatus.ANSWERED if kind in (_calling, _posing_as_server) else RowStatus.HEARD
+    done = RowStatus.ANSWERED if kind in (_call_row, _false_server_row) else RowStatus.HEARD
     return tries(
         attack,
         kind(f"{attack}{given}", Identity(OWN, part), RowStatus.REFUSED, mechanism),
@@ -513,48 +515,48 @@ def _trespass(
 
 
 _RIGHTS_ROWS: tuple[Row, ...] = (
-    *_trespass(
-        _injection,
+    *_trespass_rows(
+        _injection_row,
         "an enclave publishes a topic",
         "guest",
         _NOT_ALLOWED,
         forger.guest_may_do_everything,
         _EVERY_TOPIC,
     ),
-    *_trespass(
-        _listening,
+    *_trespass_rows(
+        _listening_row,
         "an enclave hears a topic",
         "guest",
         _NOT_ALLOWED,
         forger.guest_may_do_everything,
         _EVERY_TOPIC,
     ),
-    *_trespass(
-        _injection,
+    *_trespass_rows(
+        _injection_row,
         "a listener publishes",
         "listener",
         _OTHER_DIRECTION,
         forger.listener_may_do_everything,
         _BOTH_DIRECTIONS,
     ),
-    *_trespass(
-        _listening,
+    *_trespass_rows(
+        _listening_row,
         "a talker listens",
         "talker",
         _OTHER_DIRECTION,
         forger.talker_may_do_everything,
         _BOTH_DIRECTIONS,
     ),
-    *_trespass(
-        _calling,
+    *_trespass_rows(
+        _call_row,
         "an enclave calls a service",
         "guest",
         _NEITHER_ALLOWED,
         forger.guest_may_do_everything,
         "permissions for * allow every service",
     ),
-    *_trespass(
-        _posing_as_server,
+    *_trespass_rows(
+        _false_server_row,
         "a client poses as the server",
         "client",
         "its signed permissions allow requests, not replies",
@@ -563,7 +565,7 @@ _RIGHTS_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "an enclave without a policy",
-        _injection(
+        _injection_row(
             "an enclave without a policy publishes",
             Identity(OWN, "newcomer"),
             RowStatus.REFUSED,
@@ -575,7 +577,7 @@ _RIGHTS_ROWS: tuple[Row, ...] = (
                 "give every enclave a policy, or use the template production",
             ),
         ),
-        _injection(
+        _injection_row(
             "an enclave without a policy publishes, open default",
             Identity(Undefended(template=forger.open_default), "newcomer"),
             RowStatus.HEARD,
@@ -590,28 +592,28 @@ WIDEST_CLIENT, WIDEST_SERVER = "widest client", "widest server"
 _OF_THE_WIDEST: tuple[tuple[str, Callable[..., Row], str, str, str], ...] = (
     (
         WIDEST_PUBLISHER,
-        _injection,
+        _injection_row,
         "an enclave publishes a topic",
         "publishes a topic that it was not given",
         _NOT_ALLOWED,
     ),
     (
         WIDEST_SUBSCRIBER,
-        _listening,
+        _listening_row,
         "an enclave hears a topic",
         "hears a topic that it was not given",
         _NOT_ALLOWED,
     ),
     (
         WIDEST_CLIENT,
-        _calling,
+        _call_row,
         "an enclave calls a service",
         "calls a service that it was not given",
         _NEITHER_ALLOWED,
     ),
     (
         WIDEST_SERVER,
-        _posing_as_server,
+        _false_server_row,
         "a client poses as the server",
         "poses as the server",
         "its signed permissions do not allow replies",
@@ -628,21 +630,21 @@ WIDEST: dict[str, Row] = {
 """The attack of the enclave with the widest permissions in a user's keystore, by part."""
 
 
-def joining(enclave: str, fault: str) -> Row:
+def faulty_enclave_row(enclave: str, fault: str) -> Row:
     """Return a row that shows whether an enclave with faulty files can join the others.
 
     The talker's DDS announces endpoints only to participants that it has authenticated.
     """
     name = f"{enclave} joins the other enclaves"
-    return _discovering(name, Identity(OWN, enclave), RowStatus.VISIBLE, fault)
+    return _discovery_row(name, Identity(OWN, enclave), RowStatus.VISIBLE, fault)
 
 
-def revoked_joining(enclave: str, own: bool) -> Row:
+def revoked_enclave_row(enclave: str, own: bool) -> Row:
     """Return a row that shows whether a revoked enclave can join the others.
 
     ``own`` says whether the enclave itself has the revocation list with its certificate.
     """
-    return _discovering(
+    return _discovery_row(
         f"{enclave}, revoked, joins the other enclaves",
         Identity(OWN, enclave),
         RowStatus.NOT_LET_IN if own else RowStatus.NOT_VISIBLE,
@@ -658,13 +660,13 @@ _NO_LIST = "without crl.pem, DDS does not check for revocation"
 _IDENTITY_ROWS: tuple[Row, ...] = (
     *tries(
         "identity of another CA",
-        _injection(
+        _injection_row(
             "identity of another CA",
             Identity(FOREIGN, "talker"),
             RowStatus.NOT_HEARD,
             "the listener does not trust the other CA: the handshake fails, and no keys are sent",
         ),
-        _succeeds(
+        _successful_injection_row(
             "identity of another CA, to a listener of that CA",
             Identity(FOREIGN, "talker"),
             "the wrong CA",
@@ -672,19 +674,19 @@ _IDENTITY_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "identity out of date",
-        _injection(
+        _injection_row(
             "expired identity",
             Identity(forger.expired_identity, "talker"),
             RowStatus.NOT_LET_IN,
             _DATES_CHECKED,
         ),
-        _injection(
+        _injection_row(
             "identity not yet valid",
             Identity(forger.identity_not_yet_valid, "talker"),
             RowStatus.NOT_LET_IN,
             _DATES_CHECKED,
         ),
-        _succeeds(
+        _successful_injection_row(
             "the same identity before it expires",
             Identity(Undefended(forger.identity_in_date), "talker"),
             "the wrong dates",
@@ -692,14 +694,14 @@ _IDENTITY_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "revoked identity",
-        _injection(
+        _injection_row(
             "revoked identity",
             Identity(OWN, "talker"),
             RowStatus.NOT_HEARD,
             "the listener's crl.pem lists the certificate",
             victims=forger.talker_revoked,
         ),
-        _injection(
+        _injection_row(
             "revoked identity, list not delivered",
             Identity(Undefended(forger.talker_revocation_not_delivered), forger.STOLEN),
             RowStatus.HEARD,
@@ -709,7 +711,7 @@ _IDENTITY_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "key and certificate do not belong together",
-        _injection(
+        _injection_row(
             "certificate with the key of another enclave",
             Identity(forger.key_of_another_enclave, "talker"),
             RowStatus.NOT_HEARD,
@@ -720,19 +722,19 @@ _IDENTITY_ROWS: tuple[Row, ...] = (
                 mechanism="the attacker's DDS compares the key with the certificate",
             ),
         ),
-        _succeeds(
+        _successful_injection_row(
             "certificate with its own key", Identity(Undefended(), "talker"), "the wrong key"
         ),
     ),
     *tries(
         "world-readable keys",
-        _injection(
+        _injection_row(
             "identity copied by another user of the robot",
             Identity(forger.identity_copied_by_another_user, "talker"),
             RowStatus.NOT_LET_IN,
             "the file modes deny other users the key, and without the key no node starts",
         ),
-        _injection(
+        _injection_row(
             "identity copied by another user, modes opened",
             Identity(Undefended(forger.files_readable_for_all), "talker"),
             RowStatus.HEARD,
@@ -755,14 +757,14 @@ _ONE_CA = Variant(
     " signed (the class of CVE-2023-24011)",
     "use a keystore with separate CAs (template development or production)",
 )
-_TRUSTED_AS_SIGNER = _injection(
+_TRUSTED_AS_SIGNER = _injection_row(
     "permissions signed by the enclave itself, a trusted signer",
     Identity(Undefended(forger.enclave_among_the_signers), "guest"),
     RowStatus.HEARD,
     "every certificate in the file of the permissions CA may sign",
     defence_removed="a permissions CA file with only the CA in it",
 )
-_SAME_SUBJECT = _injection(
+_SAME_SUBJECT = _injection_row(
     "permissions borrowed, the same subject",
     Identity(Undefended(forger.borrowed_permissions_and_subject), "guest"),
     RowStatus.HEARD,
@@ -773,21 +775,21 @@ _SAME_SUBJECT = _injection(
 _PERMISSIONS_ROWS: tuple[Row, ...] = (
     *tries(
         "forged permissions",
-        _injection(
+        _injection_row(
             "permissions copied from another enclave",
             Identity(forger.permissions_of_another, "guest"),
             RowStatus.NOT_LET_IN,
             "the permissions are for another subject name than the certificate's",
         ),
         *(
-            _injection(name, Identity(forge, "guest"), RowStatus.NOT_LET_IN, _SIGNED_WRONG)
+            _injection_row(name, Identity(forge, "guest"), RowStatus.NOT_LET_IN, _SIGNED_WRONG)
             for name, forge in (
                 ("permissions edited", forger.edited_permissions),
                 ("permissions unsigned", forger.unsigned_permissions),
                 ("permissions signed by another CA", forger.permissions_of_another_ca),
             )
         ),
-        _succeeds(
+        _successful_injection_row(
             "the same permissions, signed by the permissions CA",
             _SIGNED_BY_CA,
             "the wrong signature",
@@ -795,14 +797,14 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "the attacker's own permissions CA",
-        _injection(
+        _injection_row(
             "the attacker's own permissions CA",
             Identity(forger.own_permissions_ca, "guest"),
             RowStatus.NOT_HEARD,
             "the attacker's DDS accepts this CA; its peers verify with the CA that they trust",
             Variant((Condition.FAST,), RowStatus.NOT_HEARD),
         ),
-        _injection(
+        _injection_row(
             "the attacker's own permissions CA, trusted by the listener",
             Identity(Undefended(forger.another_permissions_ca_trusted), "guest"),
             RowStatus.HEARD,
@@ -812,7 +814,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "permissions signed by the enclave itself",
-        _injection(
+        _injection_row(
             "permissions signed by the enclave itself",
             Identity(forger.permissions_signed_by_itself, "guest"),
             RowStatus.NOT_LET_IN,
@@ -824,7 +826,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             ),
             _ONE_CA,
         ),
-        _injection(
+        _injection_row(
             "permissions and governance signed by the enclave",
             Identity(forger.permissions_and_governance_signed_by_itself, "guest"),
             RowStatus.NOT_HEARD,
@@ -842,7 +844,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             ),
             _ONE_CA,
         ),
-        _injection(
+        _injection_row(
             "permissions signed by the enclave itself, one CA",
             Identity(Undefended(forger.permissions_signed_by_itself, forger.one_ca), "guest"),
             RowStatus.HEARD,
@@ -858,7 +860,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "permissions borrowed from a longer enclave name",
-        _injection(
+        _injection_row(
             "permissions borrowed from a longer enclave name",
             Identity(forger.borrowed_permissions, "guest"),
             RowStatus.NOT_LET_IN,
@@ -876,7 +878,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 " each other",
             ),
         ),
-        _injection(
+        _injection_row(
             "permissions borrowed, subjects not unique",
             Identity(Undefended(forger.borrowed_permissions, forger.shared_subjects), "guest"),
             RowStatus.HEARD,
@@ -889,7 +891,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
     *tries(
         "old permissions put back",
         known_open(
-            _injection(
+            _injection_row(
                 "old permissions put back",
                 Identity(forger.permissions_signed_by_the_ca, "guest"),
                 RowStatus.HEARD,
@@ -902,7 +904,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "old permissions put back after renewal",
-        _injection(
+        _injection_row(
             "old permissions put back after renewal",
             Identity(forger.old_permissions_after_renewal, "guest"),
             RowStatus.NOT_LET_IN,
@@ -914,7 +916,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 "use the template production (unique_subject), or `sros revoke` and a new enclave",
             ),
         ),
-        _injection(
+        _injection_row(
             "old permissions put back after renewal, subjects not unique",
             Identity(
                 Undefended(forger.old_permissions_after_renewal, forger.shared_subjects), "guest"
@@ -926,14 +928,14 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "old permissions put back after revocation",
-        _injection(
+        _injection_row(
             "old permissions put back after revocation",
             Identity(forger.permissions_signed_by_the_ca, "guest"),
             RowStatus.NOT_HEARD,
             "the listener's crl.pem lists the certificate for which the permissions were signed",
             victims=forger.guest_revoked,
         ),
-        _injection(
+        _injection_row(
             "old permissions put back after revocation, list not delivered",
             Identity(Undefended(forger.guest_revocation_not_delivered), forger.STOLEN),
             RowStatus.HEARD,
@@ -943,7 +945,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "permissions for another domain",
-        _injection(
+        _injection_row(
             "permissions for another domain",
             Identity(forger.permissions_for_another_domain, "guest"),
             RowStatus.NOT_LET_IN,
@@ -973,7 +975,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 mechanism="its DDS controls no topic; its peers find no rule for the domain",
             ),
         ),
-        _discovering(
+        _discovery_row(
             "an enclave of another domain lists topics",
             Identity(forger.permissions_for_another_domain, "guest"),
             RowStatus.NOT_LET_IN,
@@ -1001,12 +1003,14 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 mechanism="its DDS controls no topic; its peers find no rule for the domain",
             ),
         ),
-        _succeeds("the same permissions for this domain", _SIGNED_BY_CA, "the wrong domain"),
+        _successful_injection_row(
+            "the same permissions for this domain", _SIGNED_BY_CA, "the wrong domain"
+        ),
     ),
     *tries(
         "weaker governance",
         *(
-            _tampered(
+            _tampered_files_row(
                 name,
                 RowStatus.NOT_LET_IN,
                 "the listener's DDS verifies the signature of the permissions CA",
@@ -1018,7 +1022,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             )
         ),
         known_open(
-            _tampered(
+            _tampered_files_row(
                 "an older, weaker governance put back",
                 RowStatus.HEARD,
                 "a governance that the CA has signed never expires: it has no dates",
@@ -1028,7 +1032,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             "after strengthening the governance (`sros update_keystore`): `sros rotate_ca "
             "--permissions`, so that nobody trusts the CA of the weaker governance",
         ),
-        _injection(
+        _injection_row(
             "weaker governance, signed by the permissions CA",
             UNSECURED,
             RowStatus.HEARD,
@@ -1045,7 +1049,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
 _ENABLE, _STRATEGY = "ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY"
 
 
-def _misconfigured(
+def _misconfiguration_row(
     name: str, identity: Identity, expected: RowStatus, mechanism: str, *, defence_removed: str = ""
 ) -> Row:
     """Return a row that shows whether a misconfigured talker is heard by an unsecured listener."""
@@ -1066,12 +1070,14 @@ def _misconfigured(
     )
 
 
-def _misspelt(name: str, keystore: KeystoreChoice, variable: str, value: str, why: str) -> Row:
+def _misspelt_setting_row(
+    name: str, keystore: KeystoreChoice, variable: str, value: str, why: str
+) -> Row:
     """Return a row with a misspelt setting: the talker then runs unsecured."""
     identity = Identity(keystore, "talker", ((variable, value),))
     mechanism = f"{why}: the talker runs unsecured"
     return known_open(
-        _misconfigured(name, identity, RowStatus.HEARD, mechanism),
+        _misconfiguration_row(name, identity, RowStatus.HEARD, mechanism),
         "rcl ignores every other spelling, and the node does not warn",
         "start nodes with `sros run`, which sets the variables; `sros doctor` finds wrong values",
     )
@@ -1080,13 +1086,13 @@ def _misspelt(name: str, keystore: KeystoreChoice, variable: str, value: str, wh
 _VARIABLE_ROWS: tuple[Row, ...] = (
     *tries(
         "a file of the enclave missing",
-        _misconfigured(
+        _misconfiguration_row(
             "a file of the enclave missing, Enforce",
             Identity(forger.missing_permissions, "talker"),
             RowStatus.NOT_LET_IN,
             "with Enforce, a node does not start if a file of its enclave is missing",
         ),
-        _misconfigured(
+        _misconfiguration_row(
             "a file of the enclave missing, Permissive",
             Identity(
                 Undefended(forger.missing_permissions), "talker", ((_STRATEGY, "Permissive"),)
@@ -1098,20 +1104,20 @@ _VARIABLE_ROWS: tuple[Row, ...] = (
     ),
     *tries(
         "misspelt security variables",
-        _misconfigured(
+        _misconfiguration_row(
             "variables spelt right",
             Identity(OWN, "talker"),
             RowStatus.NOT_HEARD,
             "the talker runs secured, and sends nothing to unsecured nodes",
         ),
-        _misspelt(
+        _misspelt_setting_row(
             f"{_ENABLE}=True",
             OWN,
             _ENABLE,
             "True",
             "every value but 'true' switches security off",
         ),
-        _misspelt(
+        _misspelt_setting_row(
             f"{_STRATEGY}=enforce and a file missing",
             forger.missing_permissions,
             _STRATEGY,

@@ -213,8 +213,8 @@ def _rows_of(kind: _Interface, both: str) -> tuple[Row, ...]:
     calling = kind.party("server as a client", kind.client_role, Identity(OWN, "server"))
     may_not = "its permissions allow it to {}, not to {}"
     return (
-        _answered(f"secured client of a secured {kind.server}", both, client, server),
-        _answered(
+        _answered_call_row(f"secured client of a secured {kind.server}", both, client, server),
+        _answered_call_row(
             f"unsecured client of an unsecured {kind.server}",
             "no security on either side: the control of the rows below",
             open_client,
@@ -251,7 +251,7 @@ def _rows_of(kind: _Interface, both: str) -> tuple[Row, ...]:
     )
 
 
-def _answered(name: str, mechanism: str, client: Party, server: Party) -> Row:
+def _answered_call_row(name: str, mechanism: str, client: Party, server: Party) -> Row:
     claims = (answered(client.name, server.name),)
     return Row(name, RowStatus.ANSWERED, mechanism, (client, server), claims, brief=True)
 
@@ -259,7 +259,7 @@ def _answered(name: str, mechanism: str, client: Party, server: Party) -> Row:
 _SERVICE = _Interface(SERVICE, Role.CLIENT, Role.SERVER, "client", "server", "request", "reply")
 
 
-def _on_the_wire(expected: RowStatus, mechanism: str, *, secured: bool) -> Row:
+def _wire_row(expected: RowStatus, mechanism: str, *, secured: bool) -> Row:
     client, server = _SERVICE.pair(secured=secured)
     return Row(
         f"answers on the wire, {'secured' if secured else 'unsecured'}",
@@ -280,8 +280,8 @@ SERVICES = Scenario(
         *_rows_of(
             _SERVICE, "the client may send requests and receive replies, the server the reverse"
         ),
-        _on_the_wire(RowStatus.READABLE, "the text is readable in the packets", secured=False),
-        _on_the_wire(
+        _wire_row(RowStatus.READABLE, "the text is readable in the packets", secured=False),
+        _wire_row(
             RowStatus.NOT_READABLE, "requests and replies are encrypted like topics", secured=True
         ),
     ),
@@ -335,7 +335,7 @@ COMPOSITION = Scenario(
             (hears("listener", "container"),),
             brief=True,
         ),
-        _answered(
+        _answered_call_row(
             "server of a container answers a client",
             "the enclave of the container may reply",
             _CLIENT,

@@ -340,12 +340,12 @@ class Row:
         """The talker of the first claim."""
         return self.party(self.claims[0].talker)
 
-    def expected_under(self, conditions: frozenset[Condition]) -> Row:
+    def with_expected_status(self, conditions: frozenset[Condition]) -> Row:
         """Return the row with the status that is expected under ``conditions``."""
         for variant in self.variants:
             if conditions.issuperset(variant.conditions):
                 if variant.instead is not None:
-                    return variant.instead.expected_under(conditions)
+                    return variant.instead.with_expected_status(conditions)
                 claims = tuple(
                     claim.expecting(variant.expected) if place == 0 else claim
                     for place, claim in enumerate(self.claims)

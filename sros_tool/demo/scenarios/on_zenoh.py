@@ -71,7 +71,7 @@ def _router(keystore: KeystoreChoice | None) -> Party:
     return Party("router", Role.ROUTER, identity)
 
 
-def _rightful(name: str, role: Role, keystore: KeystoreChoice, part: str = "") -> Party:
+def _permitted_party(name: str, role: Role, keystore: KeystoreChoice, part: str = "") -> Party:
     """Return a party that does what its enclave may do; ``part`` is its name by default."""
     return Party(name, role, Identity(keystore, part or name), _TOPIC_OF.get(role, ""), turn=1)
 
@@ -90,7 +90,7 @@ def _attacker(
     return Party(name, role, identity, topic or _TOPIC_OF.get(role, ""), intruder=True, turn=2)
 
 
-def _attempt(
+def _attempt_row(
     name: str,
     expected: RowStatus,
     mechanism: str,
@@ -116,7 +116,7 @@ def _attempt(
     )
 
 
-def _executes(server: str, client: str) -> Claim:
+def _execution_claim(server: str, client: str) -> Claim:
     """Return the claim that a server executes a call of a client."""
     return Claim(Relation.EXECUTES, server, client)
 
@@ -129,15 +129,15 @@ def _topic_pair(keystore: KeystoreChoice = OWN) -> tuple[Party, Party, Party]:
 
 def _service_pair(keystore: KeystoreChoice = OWN) -> tuple[Party, ...]:
     """Return router, server and client."""
-    server = _rightful("server", Role.SERVER, keystore)
-    client = _rightful("client", Role.CLIENT, keystore)
+    server = _permitted_party("server", Role.SERVER, keystore)
+    client = _permitted_party("client", Role.CLIENT, keystore)
     return _router(keystore), server, client
 
 
 def _action_pair() -> tuple[Party, ...]:
     """Return router, action server and action client."""
-    server = _rightful("action server", Role.ACTION_SERVER, OWN)
-    client = _rightful("action client", Role.ACTION_CLIENT, OWN)
+    server = _permitted_party("action server", Role.ACTION_SERVER, OWN)
+    client = _permitted_party("action client", Role.ACTION_CLIENT, OWN)
     return _router(OWN), server, client
 
 
@@ -150,7 +150,7 @@ def _topic_rows(link_mode: str, keystore: KeystoreChoice, world: str) -> tuple[R
     talker = _attacker("talker without permission", Role.TALKER, keystore, lawless=False)
     listener = _attacker("listener without permission", Role.LISTENER, keystore, lawless=False)
     rows = [
-        _attempt(
+        _attempt_row(
             f"talker to listener, {link_mode}",
             RowStatus.HEARD,
             "the rules allow the topic to both, by the names in their certificates",
@@ -164,7 +164,7 @@ def _topic_rows(link_mode: str, keystore: KeystoreChoice, world: str) -> tuple[R
         (listener, hears(listener.name, "talker")),
     ):
         rows.append(
-            _attempt(
+            _attempt_row(
                 f"{party.name}, {link_mode}",
                 RowStatus.NOT_HEARD,
                 "no rule allows it, and what no rule allows is dropped",
@@ -182,7 +182,7 @@ _ISOLATION = _scenario(
     "nobody hears or is heard without permission on Zenoh",
     *_topic_rows("directly", OWN, _PEERS),
     *_topic_rows("through the router", zenoh_forger.through_the_router, _CLIENTS),
-    _attempt(
+    _attempt_row(
         "unsecured talker to unsecured listener",
         RowStatus.HEARD,
         "no security: what rmw_zenoh does by itself",
@@ -193,27 +193,29 @@ _ISOLATION = _scenario(
             Party("unsecured listener", Role.LISTENER, turn=1),
         ),
     ),
-    _attempt(
+    _attempt_row(
         "talker in the graph of another enclave",
         RowStatus.VISIBLE,
         "every node needs the graph, and its token names the enclave of its certificate",
         Claim(Relation.SEES, "observer", "talker"),
-        (*_topic_pair(), _rightful("observer", Role.OBSERVER, OWN, "client")),
+        (*_topic_pair(), _permitted_party("observer", Role.OBSERVER, OWN, "client")),
         world=_PEERS,
     ),
 )
 
 
-def _unasked(name: str, role: Role, mechanism: str, party: str, server: str, client: str) -> Row:
+def _unpermitted_service_row(
+    name: str, role: Role, mechanism: str, party: str, server: str, client: str
+) -> Row:
     """Return a row in which an enclave calls or serves a service without the right to do so."""
     intruder = _attacker(party, role, OWN, lawless=False)
     calls = role in (Role.CLIENT, Role.ACTION_CLIENT)
     on_service = role in (Role.CLIENT, Role.SERVER)
-    return _attempt(
+    return _attempt_row(
         name,
         RowStatus.NOT_EXECUTED if calls else RowStatus.NOT_ANSWERED,
         f"{mechanism}: no rule allows it",
-        _executes(server, party) if calls else answered(client, party),
+        _execution_claim(server, party) if calls else answered(client, party),
         (*(_service_pair() if on_service else _action_pair()), intruder),
         _CALLS if on_service else _GOALS,
         world=_PEERS,
@@ -223,7 +225,7 @@ def _unasked(name: str, role: Role, mechanism: str, party: str, server: str, cli
 _SERVICES = _scenario(
     "services",
     "who may call and who may serve services and actions on Zenoh",
-    _attempt(
+    _attempt_row(
         "client of a service",
         RowStatus.ANSWERED,
         "the client may send requests and receive replies, the server the reverse",
@@ -231,7 +233,7 @@ _SERVICES = _scenario(
         _service_pair(),
         world=_PEERS,
     ),
-    _unasked(
+    _unpermitted_service_row(
         "client without permission",
         Role.CLIENT,
         "the request is dropped before it reaches the server",
@@ -239,7 +241,7 @@ _SERVICES = _scenario(
         "server",
         "client",
     ),
-    _unasked(
+    _unpermitted_service_row(
         "enclave that poses as the server",
         Role.SERVER,
         "nobody hears that it offers the service",
@@ -247,7 +249,7 @@ _SERVICES = _scenario(
         "server",
         "client",
     ),
-    _attempt(
+    _attempt_row(
         "client of an action",
         RowStatus.ANSWERED,
         "goal, feedback, status and result arrive: three services and two topics",
@@ -255,7 +257,7 @@ _SERVICES = _scenario(
         _action_pair(),
         world=_PEERS,
     ),
-    _unasked(
+    _unpermitted_service_row(
         "action client without permission",
         Role.ACTION_CLIENT,
         "the goal is dropped before it reaches the server",
@@ -263,7 +265,7 @@ _SERVICES = _scenario(
         "action server",
         "action client",
     ),
-    _unasked(
+    _unpermitted_service_row(
         "enclave that poses as the action server",
         Role.ACTION_SERVER,
         "nobody hears that it offers the action",
@@ -277,13 +279,13 @@ _SERVICES = _scenario(
 # ── attacks on the wire ────────────────────────────────────────────────────────────────────
 
 
-def _tapped(attack: str, wire: Wire, *, readable: bool) -> tuple[Row, ...]:
+def _wiretap_rows(attack: str, wire: Wire, *, readable: bool) -> tuple[Row, ...]:
     hidden = "TLS encrypts each link: only the endpoints of a link have its keys"
     row = Row(
         f"{attack}, without TLS" if readable else attack,
         RowStatus.READABLE if readable else RowStatus.NOT_READABLE,
         "TCP sends it unencrypted" if readable else hidden,
-        _topic_pair(zenoh_forger.in_the_clear if readable else OWN),
+        _topic_pair(zenoh_forger.links_in_the_clear if readable else OWN),
         (Claim(Relation.READABLE, "talker", holds=readable, wire=wire),),
         _CHATTER,
         wire=True,
@@ -301,7 +303,7 @@ _WIRE_ROWS = tuple(
         ("payload read on the wire", Wire.TEXT),
         ("topic names read on the wire", Wire.TOPIC),
     )
-    for row in _tapped(attack, wire, readable=readable)
+    for row in _wiretap_rows(attack, wire, readable=readable)
 )
 
 _LARGE = 64 * 1024
@@ -337,10 +339,12 @@ _MEMORY_ROWS = tries(
 # ── who gets a connection ──────────────────────────────────────────────────────────────────
 
 
-def _outsider(name: str, keystore: KeystoreChoice, mechanism: str, evidence: str) -> Row:
+def _refused_connection_row(
+    name: str, keystore: KeystoreChoice, mechanism: str, evidence: str
+) -> Row:
     """Return a row in which a process in the name of the talker gets no connection."""
     party = _attacker(f"talker with {name}", Role.TALKER, keystore, "talker")
-    return _attempt(
+    return _attempt_row(
         name,
         RowStatus.NOT_LET_IN,
         mechanism,
@@ -356,7 +360,7 @@ def _let_in(name: str, keystore: KeystoreChoice, defence_removed: str) -> Row:
     """Return a row in which messages of such a process arrive, because a defence is missing."""
     wide, _, listener = _topic_pair(keystore)
     party = _attacker("attacker", Role.TALKER, keystore, "talker")
-    return _attempt(
+    return _attempt_row(
         name,
         RowStatus.HEARD,
         "it gets a connection, and rules without a name let it through",
@@ -369,8 +373,8 @@ def _let_in(name: str, keystore: KeystoreChoice, defence_removed: str) -> Row:
 _IN_DATE = _attacker("talker in date", Role.TALKER, zenoh_forger.in_date, "talker")
 
 
-def _in_date(name: str, defence_removed: str) -> Row:
-    return _attempt(
+def _valid_certificate_row(name: str, defence_removed: str) -> Row:
+    return _attempt_row(
         name,
         RowStatus.HEARD,
         "an attacker with valid files is heard",
@@ -384,7 +388,7 @@ def _in_date(name: str, defence_removed: str) -> Row:
 _CONNECTION_ROWS = (
     *tries(
         "no certificate",
-        _outsider(
+        _refused_connection_row(
             "no certificate",
             zenoh_forger.without_certificate,
             "router and sessions ask for a certificate of the keystore's identity CA",
@@ -398,7 +402,7 @@ _CONNECTION_ROWS = (
     ),
     *tries(
         "a certificate of another CA",
-        _outsider(
+        _refused_connection_row(
             "a certificate of another CA",
             zenoh_forger.identity_of_another_ca,
             "the certificate has the talker's name, but the identity CA has not signed it",
@@ -412,7 +416,7 @@ _CONNECTION_ROWS = (
     ),
     *tries(
         "TCP instead of TLS",
-        _outsider(
+        _refused_connection_row(
             "TCP instead of TLS",
             zenoh_forger.plain_tcp,
             "the router listens with TLS alone",
@@ -426,35 +430,35 @@ _CONNECTION_ROWS = (
     ),
     *tries(
         "identity out of date",
-        _outsider(
+        _refused_connection_row(
             "an expired certificate",
             forger.expired_identity,
             "TLS checks the dates of the certificate",
             "certificate expired",
         ),
-        _outsider(
+        _refused_connection_row(
             "a certificate that is not yet valid",
             forger.identity_not_yet_valid,
             "TLS checks the dates of the certificate",
             "certificate not valid yet",
         ),
-        _in_date("the same identity before it expires", "the wrong dates"),
+        _valid_certificate_row("the same identity before it expires", "the wrong dates"),
     ),
     *tries(
         "the key of another enclave",
-        _outsider(
+        _refused_connection_row(
             "the key of another enclave",
             forger.key_of_another_enclave,
             "TLS needs the key that belongs to the certificate",
             "KeyMismatch",
         ),
-        _in_date("certificate with its own key", "the wrong key"),
+        _valid_certificate_row("certificate with its own key", "the wrong key"),
     ),
 )
 
 
-def _expiring(name: str, keystore: KeystoreChoice, *, link_is_cut: bool) -> Row:
-    steady = _rightful("steady talker", Role.TALKER, keystore, "admin")
+def _expiring_certificate_row(name: str, keystore: KeystoreChoice, *, link_is_cut: bool) -> Row:
+    steady = _permitted_party("steady talker", Role.TALKER, keystore, "admin")
     return Row(
         name,
         RowStatus.CUT_OFF if link_is_cut else RowStatus.STILL_HEARD,
@@ -472,8 +476,10 @@ def _expiring(name: str, keystore: KeystoreChoice, *, link_is_cut: bool) -> Row:
 
 _EXPIRY_ROWS = tries(
     "certificate that expires during a link",
-    _expiring("certificate that expires during a link", zenoh_forger.short_lived, link_is_cut=True),
-    _expiring(
+    _expiring_certificate_row(
+        "certificate that expires during a link", zenoh_forger.short_lived, link_is_cut=True
+    ),
+    _expiring_certificate_row(
         "certificate that expires, the link stays",
         zenoh_forger.links_that_outlive_certificates,
         link_is_cut=False,
@@ -484,7 +490,7 @@ _EXPIRY_ROWS = tries(
 # ── enclaves without the right ─────────────────────────────────────────────────────────────
 
 
-def _trespass(
+def _trespass_row(
     name: str,
     party: Party,
     expected: RowStatus,
@@ -497,13 +503,13 @@ def _trespass(
     claim = {
         Role.TALKER: hears("listener", party.name),
         Role.LISTENER: hears(party.name, "talker"),
-        Role.CLIENT: _executes("server", party.name),
+        Role.CLIENT: _execution_claim("server", party.name),
         Role.SERVER: answered("client", party.name),
     }[party.role]
     on_service = party.role in (Role.CLIENT, Role.SERVER)
     others = _service_pair(keystore) if on_service else _topic_pair(keystore)
     identity = replace(party.identity, keystore=keystore)
-    return _attempt(
+    return _attempt_row(
         name,
         expected,
         mechanism,
@@ -545,7 +551,7 @@ _ENTRIES: tuple[tuple[Party, str, RowStatus, RowStatus], ...] = (
 
 def _past_the_router(party: Party, attack: str, denied: RowStatus, done: RowStatus) -> list[Row]:
     return [
-        _trespass(
+        _trespass_row(
             attack,
             party,
             denied,
@@ -553,7 +559,7 @@ def _past_the_router(party: Party, attack: str, denied: RowStatus, done: RowStat
             OWN,
             _PEERS,
         ),
-        _trespass(
+        _trespass_row(
             f"{attack}, rules at the router only",
             party,
             done,
@@ -567,7 +573,7 @@ def _past_the_router(party: Party, attack: str, denied: RowStatus, done: RowStat
 
 def _through_the_router(party: Party, attack: str, denied: RowStatus, done: RowStatus) -> list[Row]:
     return [
-        _trespass(
+        _trespass_row(
             attack,
             party,
             denied,
@@ -575,7 +581,7 @@ def _through_the_router(party: Party, attack: str, denied: RowStatus, done: RowS
             zenoh_forger.through_the_router,
             _CLIENTS,
         ),
-        _trespass(
+        _trespass_row(
             f"{attack}, sessions that limit themselves",
             party,
             done,
@@ -587,7 +593,7 @@ def _through_the_router(party: Party, attack: str, denied: RowStatus, done: RowS
     ]
 
 
-def _trespasses() -> tuple[Row, ...]:
+def _trespass_rows() -> tuple[Row, ...]:
     """Return the rows past the router, and through it, with and without the defence."""
     rows: list[Row] = []
     for way, rows_of in (
@@ -600,7 +606,7 @@ def _trespasses() -> tuple[Row, ...]:
     for party, does, _, done in _ENTRIES[:2]:
         rows += tries(
             f"another enclave {does} past the router",
-            _trespass(
+            _trespass_row(
                 f"an enclave that was given the topic {does}",
                 party,
                 done,
@@ -616,7 +622,7 @@ def _trespasses() -> tuple[Row, ...]:
 # ── a router of another enclave ────────────────────────────────────────────────────────────
 
 
-def _rogue(
+def _rogue_router_row(
     name: str,
     keystore: KeystoreChoice,
     world: str,
@@ -631,7 +637,7 @@ def _rogue(
     """
     rogue = Party("attacking router", Role.RELAY, Identity(keystore, part), intruder=True)
     succeeds = bool(defence_removed) or part == "router"
-    return _attempt(
+    return _attempt_row(
         name,
         RowStatus.HEARD if succeeds else RowStatus.NOT_HEARD,
         "sessions trust this router"
@@ -662,7 +668,7 @@ _ROUTER_ROWS = tuple(
     )
     for row in tries(
         attack,
-        _rogue(
+        _rogue_router_row(
             f"{attack}{suffix}",
             keystore,
             world,
@@ -689,21 +695,23 @@ def _far_pair(keystore: KeystoreChoice) -> tuple[Party, ...]:
 
 
 _NEAR = replace(
-    _rightful("near talker", Role.TALKER, zenoh_forger.far_router_without_the_topic, "admin"),
+    _permitted_party(
+        "near talker", Role.TALKER, zenoh_forger.far_router_without_the_topic, "admin"
+    ),
     turn=2,
 )
 _NOT_CROSSING = (*_far_pair(zenoh_forger.far_router_without_the_topic), _NEAR)
 _ROUTERS = _scenario(
     "routers",
     "what passes between the routers of two hosts on Zenoh",
-    _attempt(
+    _attempt_row(
         "talker to listener at another router",
         RowStatus.HEARD,
         "both routers pass on a name that --cross allows and to which both enclaves have rights",
         hears("listener", "talker"),
         _far_pair(zenoh_forger.far_router),
     ),
-    _attempt(
+    _attempt_row(
         "talker to listener at the same router, --cross excludes the topic",
         RowStatus.HEARD,
         "--cross limits only what passes between routers",
@@ -711,7 +719,7 @@ _ROUTERS = _scenario(
         _NOT_CROSSING,
         world="not crossing",
     ),
-    _attempt(
+    _attempt_row(
         "talker to listener at another router, --cross excludes the topic",
         RowStatus.NOT_HEARD,
         "a router passes on to another router only the names of --cross",
@@ -723,12 +731,12 @@ _ROUTERS = _scenario(
 )
 
 
-def _rogue_far_router(name: str, keystore: KeystoreChoice, defence_removed: str = "") -> Row:
+def _rogue_far_router_row(name: str, keystore: KeystoreChoice, defence_removed: str = "") -> Row:
     """Return a row in which the guest connects to the talker's router as another router."""
     rogue = Party("attacking far router", Role.RELAY, Identity(keystore, "guest"), intruder=True)
     wide, talker, _ = _topic_pair(keystore)
-    observer = _rightful("observer", Role.OBSERVER, keystore, "client")
-    return _attempt(
+    observer = _permitted_party("observer", Role.OBSERVER, keystore, "client")
+    return _attempt_row(
         name,
         RowStatus.HEARD if defence_removed else RowStatus.NOT_HEARD,
         "the router trusts this router"
@@ -744,8 +752,8 @@ def _rogue_far_router(name: str, keystore: KeystoreChoice, defence_removed: str 
 _PLAYS_FAR_ROUTER = "another enclave plays the router of another host"
 _FAR_ROUTER_ROWS = tries(
     _PLAYS_FAR_ROUTER,
-    _rogue_far_router(_PLAYS_FAR_ROUTER, zenoh_forger.another_far_router),
-    _rogue_far_router(
+    _rogue_far_router_row(_PLAYS_FAR_ROUTER, zenoh_forger.another_far_router),
+    _rogue_far_router_row(
         f"{_PLAYS_FAR_ROUTER}, a subject for everybody",
         zenoh_forger.any_far_router,
         "a named subject for the router",
@@ -781,7 +789,7 @@ _WILDCARD_ROWS = (
         for party, attack, denied, _ in _WILDCARDS
         for row in tries(
             attack,
-            _trespass(
+            _trespass_row(
                 attack,
                 party,
                 denied,
@@ -797,7 +805,7 @@ _WILDCARD_ROWS = (
         for party, attack, _, done in _WILDCARDS
         for row in tries(
             attack,
-            _trespass(
+            _trespass_row(
                 f"{attack}, denied inside a wildcard",
                 party,
                 done,
@@ -857,7 +865,7 @@ _TOKENS = (
 )
 
 
-def _announcing(
+def _false_token_row(
     token: _FalseToken,
     keystore: KeystoreChoice,
     world: str,
@@ -869,9 +877,9 @@ def _announcing(
         _attacker(f"impostor on {token.topic[1:]}", token.role, keystore, token.part, token.topic),
         announced=token.announced,
     )
-    observer = _rightful("observer", Role.OBSERVER, keystore, "client")
+    observer = _permitted_party("observer", Role.OBSERVER, keystore, "client")
     wide, talker, _ = _topic_pair(keystore)
-    return _attempt(
+    return _attempt_row(
         f"{token.attack}{name_suffix}",
         RowStatus.VISIBLE if defence_removed else RowStatus.NOT_VISIBLE,
         "nobody compares the names in a token with a policy"
@@ -892,9 +900,9 @@ def _false_token_rows(token: _FalseToken) -> tuple[Row, ...]:
         forgery, wide = zenoh_forger.tokens_of_any_enclave, "enclaves"
     return tries(
         token.attack,
-        _announcing(token, OWN, _PEERS),
-        _announcing(token, zenoh_forger.through_the_router, _CLIENTS, ", through the router"),
-        _announcing(
+        _false_token_row(token, OWN, _PEERS),
+        _false_token_row(token, zenoh_forger.through_the_router, _CLIENTS, ", through the router"),
+        _false_token_row(
             token,
             forgery,
             f"tokens of any {wide}",
@@ -909,14 +917,14 @@ _SERVICE_TOKEN = _TOKENS[-1]
 _ERASING = "another enclave erases a node"
 
 
-def _erasing(
+def _erased_token_row(
     name_suffix: str, keystore: KeystoreChoice, world: str, defence_removed: str = ""
 ) -> Row:
     """Return a row in which the guest takes the talker out of the graph of an observer."""
     wide, talker, _ = _topic_pair(keystore)
     eraser = _attacker("eraser", Role.ERASER, keystore)
-    observer = _rightful("observer", Role.OBSERVER, keystore, "client")
-    return _attempt(
+    observer = _permitted_party("observer", Role.OBSERVER, keystore, "client")
+    return _attempt_row(
         f"{_ERASING}{name_suffix}",
         RowStatus.ERASED if defence_removed else RowStatus.NOT_ERASED,
         "when a token ends, the graph compares its session and name, but not the enclave"
@@ -934,7 +942,7 @@ _TOKEN_ROWS = (
     *(row for token in _TOKENS for row in _false_token_rows(token)),
     *tries(
         _SERVICE_TOKEN.attack,
-        _announcing(
+        _false_token_row(
             _SERVICE_TOKEN,
             zenoh_forger.tokens_of_any_name_through_the_router,
             "names through the router",
@@ -944,12 +952,12 @@ _TOKEN_ROWS = (
     ),
     *tries(
         _ERASING,
-        _erasing("", OWN, _PEERS),
-        _erasing(", through the router", zenoh_forger.through_the_router, _CLIENTS),
-        _erasing(
+        _erased_token_row("", OWN, _PEERS),
+        _erased_token_row(", through the router", zenoh_forger.through_the_router, _CLIENTS),
+        _erased_token_row(
             ", tokens of any name", zenoh_forger.tokens_of_any_name, "erased", _NAMES_OF_TOKENS
         ),
-        _erasing(
+        _erased_token_row(
             ", tokens of any name through the router",
             zenoh_forger.tokens_of_any_name_through_the_router,
             "erased through the router",
@@ -962,11 +970,11 @@ _TOKEN_ROWS = (
 # ── what was valid earlier ─────────────────────────────────────────────────────────────────
 
 
-def _earlier(
+def _earlier_file_row(
     name: str, keystore: KeystoreChoice, expected: RowStatus, defence_removed: str = ""
 ) -> Row:
     guest = _attacker("guest with an earlier file", Role.TALKER, keystore, lawless=False)
-    return _attempt(
+    return _attempt_row(
         name,
         expected,
         "only this file decides what its own process may do"
@@ -979,7 +987,7 @@ def _earlier(
     )
 
 
-def _thief(
+def _stolen_files_row(
     name: str,
     keystore: KeystoreChoice,
     expected: RowStatus,
@@ -987,9 +995,9 @@ def _thief(
     defence_removed: str = "",
 ) -> Row:
     wide, _, listener = _topic_pair(keystore)
-    talker = _rightful("talker", Role.TALKER, keystore, "admin")
+    talker = _permitted_party("talker", Role.TALKER, keystore, "admin")
     thief = _attacker("thief", Role.TALKER, keystore, STOLEN)
-    return _attempt(
+    return _attempt_row(
         name,
         expected,
         mechanism,
@@ -1003,12 +1011,12 @@ def _thief(
 _EARLIER_ROWS = (
     *tries(
         "session file of an earlier policy",
-        _earlier(
+        _earlier_file_row(
             "session file of an earlier policy",
             zenoh_forger.earlier_session_file,
             RowStatus.NOT_HEARD,
         ),
-        _earlier(
+        _earlier_file_row(
             "session file of an earlier policy, sessions that limit themselves",
             zenoh_forger.earlier_session_file_of_one_that_limits_itself,
             RowStatus.HEARD,
@@ -1017,13 +1025,13 @@ _EARLIER_ROWS = (
     ),
     *tries(
         "revoked identity",
-        _thief(
+        _stolen_files_row(
             "revoked identity",
             zenoh_forger.revoked_talker,
             RowStatus.NOT_HEARD,
             "the enclave still gets a connection, but no rule has its name any more",
         ),
-        _thief(
+        _stolen_files_row(
             "revoked identity, the rules not written again",
             zenoh_forger.revoked_talker_in_the_rules,
             RowStatus.HEARD,
@@ -1042,10 +1050,10 @@ def _open(row: Row, because: str, remedy: str) -> Row:
     return known_open(replace(row, attack=row.name), because, remedy)
 
 
-_LATE = replace(_rightful("late talker", Role.TALKER, OWN, "admin"), intruder=True, turn=3)
+_LATE = replace(_permitted_party("late talker", Role.TALKER, OWN, "admin"), intruder=True, turn=3)
 _OPEN_ROWS = (
     _open(
-        _thief(
+        _stolen_files_row(
             "revoked identity whose name is used again",
             zenoh_forger.revoked_name_in_use_again,
             RowStatus.HEARD,
@@ -1056,7 +1064,7 @@ _OPEN_ROWS = (
     ),
     replace(
         _open(
-            _attempt(
+            _attempt_row(
                 "rights taken away while all run",
                 RowStatus.HEARD,
                 "Zenoh reads its configuration at start",
@@ -1070,7 +1078,7 @@ _OPEN_ROWS = (
     ),
     *(
         _open(
-            _rogue(
+            _rogue_router_row(
                 f"the router itself {'reads' if reads else 'injects'}",
                 zenoh_forger.talkative_router,
                 "believed",
@@ -1083,7 +1091,7 @@ _OPEN_ROWS = (
         for reads in (False, True)
     ),
     _open(
-        _attempt(
+        _attempt_row(
             "an enclave without rights lists topics",
             RowStatus.VISIBLE,
             "every node may ask for the graph of its domain",
@@ -1098,10 +1106,10 @@ _OPEN_ROWS = (
 )
 
 
-def _flooded(name: str, keystore: KeystoreChoice, world: str, defence_removed: str = "") -> Row:
+def _flood_row(name: str, keystore: KeystoreChoice, world: str, defence_removed: str = "") -> Row:
     """Return a row in which a talker connects while somebody makes useless connections."""
     late = replace(_LATE, identity=replace(_LATE.identity, keystore=keystore))
-    return _attempt(
+    return _attempt_row(
         name,
         RowStatus.NOT_LET_IN if defence_removed else RowStatus.HEARD,
         "after each failed handshake the router accepts nobody for a moment"
@@ -1118,8 +1126,8 @@ def _flooded(name: str, keystore: KeystoreChoice, world: str, defence_removed: s
 
 _FLOOD_ROWS = tries(
     "new connections during a flood of useless ones",
-    _flooded("new connections during a flood of useless ones", OWN, "flooded"),
-    _flooded(
+    _flood_row("new connections during a flood of useless ones", OWN, "flooded"),
+    _flood_row(
         "new connections during a flood, room for few handshakes",
         zenoh_forger.room_for_few_handshakes,
         "flooded, few handshakes",
@@ -1134,7 +1142,7 @@ ATTACKS = _scenario(
     *_WIRE_ROWS,
     *_MEMORY_ROWS,
     *_CONNECTION_ROWS,
-    *_trespasses(),
+    *_trespass_rows(),
     *_ROUTER_ROWS,
     *_FAR_ROUTER_ROWS,
     *_WILDCARD_ROWS,

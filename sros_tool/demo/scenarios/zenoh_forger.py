@@ -151,7 +151,7 @@ def _add_far_router(copy: KeystoreCopy, crossing: str) -> None:
     )
     set_zenoh(copy.root, network, now=copy.now)
 
-    def here(document: _Document) -> None:
+    def listen_here(document: _Document) -> None:
         for side in ("listen", "connect"):
             endpoints = document[side]["endpoints"]
             document[side]["endpoints"] = [
@@ -160,8 +160,8 @@ def _add_far_router(copy: KeystoreCopy, crossing: str) -> None:
             ]
 
     # The second host is this one: its router has another port.
-    _edit_all(copy, here)
-    _edit(enclave_path(copy.root, FAR_ROUTER) / ROUTER_FILE, here)
+    _edit_all(copy, listen_here)
+    _edit(enclave_path(copy.root, FAR_ROUTER) / ROUTER_FILE, listen_here)
 
 
 def another_far_router(copy: KeystoreCopy) -> None:
@@ -200,7 +200,7 @@ def _rule(name: str, keys: Iterable[str], permission: str = "allow", flow: str =
     }
 
 
-def _everything(document: _Document) -> None:
+def _allow_everything(document: _Document) -> None:
     """Let everybody do everything."""
     control = document["access_control"]
     control["rules"].append(_rule(_EVERYBODY, ("**", "@ros2_lv/**")))
@@ -345,7 +345,7 @@ def certificates_not_asked_for(copy: KeystoreCopy) -> None:
 
     def change(document: _Document) -> None:
         _tls(document)["enable_mtls"] = False
-        _everything(document)
+        _allow_everything(document)
 
     _edit_all(copy, change)
     without_certificate(copy)
@@ -353,10 +353,10 @@ def certificates_not_asked_for(copy: KeystoreCopy) -> None:
 
 def plain_tcp(copy: KeystoreCopy) -> None:
     """Let the talker speak TCP to the port of the router."""
-    _edit_part(copy, "talker", _plain(f"tcp/{copy.endpoint}"))
+    _edit_part(copy, "talker", _set_plain_endpoint(f"tcp/{copy.endpoint}"))
 
 
-def _plain(endpoint: str) -> _Change:
+def _set_plain_endpoint(endpoint: str) -> _Change:
     def change(document: _Document) -> None:
         document["mode"] = Mode.CLIENT.value
         document["connect"]["endpoints"] = [endpoint]
@@ -374,14 +374,14 @@ def tcp_next_to_tls(copy: KeystoreCopy) -> None:
     def change(document: _Document) -> None:
         document["listen"]["endpoints"].append(endpoint)
         del document["transport"]["link"]["protocols"]
-        _everything(document)
+        _allow_everything(document)
 
     through_the_router(copy)
     _edit(enclave_path(copy.root, copy.router) / ROUTER_FILE, change)
-    _edit_part(copy, "talker", _plain(endpoint))
+    _edit_part(copy, "talker", _set_plain_endpoint(endpoint))
 
 
-def in_the_clear(copy: KeystoreCopy) -> None:
+def links_in_the_clear(copy: KeystoreCopy) -> None:
     """Let everybody speak TCP, without access control."""
 
     def change(document: _Document) -> None:

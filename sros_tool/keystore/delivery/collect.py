@@ -34,7 +34,7 @@ from sros_tool.keystore.confirmation import (
     LastMessage,
     Received,
     RefusedMessage,
-    keep,
+    keep_confirmation,
     keep_refusals,
     last_confirmation,
     locked_confirmations,
@@ -227,7 +227,7 @@ def collect(
                 changes.append(FileChange(action, str(root / path)))
                 if not dry_run:
                     # If this run is killed now, the next one judges the same requests.
-                    keep(root, message.received)
+                    keep_confirmation(root, message.received)
             taken.append(message.without_confirmation())
         if not dry_run:
             keep_refusals(root, refused_before, _refusals(refused_before, taken), now=now)
@@ -252,7 +252,7 @@ def collect(
         None,
         dry_run,
         [*changes, *signed],
-        [*_unknown_names(inbox, fleet), *notes],
+        [*_unknown_file_notes(inbox, fleet), *notes],
     )
 
 
@@ -399,7 +399,7 @@ def _read_message(inbox: Folder, robot: str) -> _File | None:
     return _File(data, time_of_file(state.st_mtime))
 
 
-def _unknown_names(inbox: Path, fleet: Fleet) -> Iterator[Note]:
+def _unknown_file_notes(inbox: Path, fleet: Fleet) -> Iterator[Note]:
     """Yield a note on names in the inbox that are those of no robot."""
     names: list[str] = []
     with suppress(OSError), os.scandir(inbox) as entries:  # others can move the folder
@@ -446,7 +446,7 @@ class _Verifier:
         before = last.message if last else None
         sha256 = hashlib.sha256(file.data).hexdigest()
         verified = self._verify(robot, file.data)
-        remarks += self._expired(verified.certificate)
+        remarks += self._expiry_clauses(verified.certificate)
         sequence = verified.confirmation.sequence
         assert sequence
         if before and before.sha256 == sha256:
@@ -547,7 +547,7 @@ class _Verifier:
             entries: Sequence[Entry] = self._keystore.ledger_with("sha256", sha256).entries
         else:
             entries = self._certificates.get(sha256, ())
-        return next((entry for entry in entries if _proves(entry, sha256)), None)
+        return next((entry for entry in entries if _proves_issue(entry, sha256)), None)
 
     @cached_property
     def _certificates(self) -> Mapping[str, Sequence[Entry]]:
@@ -562,7 +562,7 @@ class _Verifier:
         """Serial numbers of revoked certificates, by the ledger and the revocation lists."""
         return revoked_serials(self._keystore)
 
-    def _expired(self, certificate: x509.Certificate) -> Iterator[str]:
+    def _expiry_clauses(self, certificate: x509.Certificate) -> Iterator[str]:
         validity = validity_of(certificate)
         if self._now > validity.not_after:
             late = elapsed(self._now - validity.not_after)
@@ -571,7 +571,7 @@ class _Verifier:
             yield f"its certificate is valid only from {iso(validity.not_before)}"
 
 
-def _proves(entry: Entry, sha256: str) -> bool:
+def _proves_issue(entry: Entry, sha256: str) -> bool:
     """Return whether a line of the ledger shows that the keystore issued a certificate."""
     is_issued = entry.what == "certificate" and entry.reason != REPORTED
     return is_issued and entry.sha256 == sha256 and bool(entry.enclave)
@@ -589,7 +589,7 @@ class _DecidedRequest:
     vouching: Collection[int] = ()
     """Serial numbers of the certificates that vouch for the request."""
 
-    def done(self, outcome: str, why: str = "") -> None:
+    def set_outcome(self, outcome: str, why: str = "") -> None:
         """Say what was done with the request, which is not signed."""
         self.result = self.result._replace(outcome=outcome, why=why)
         self.request = None
@@ -657,7 +657,8 @@ class _Renewals:
             return "answered", "its new certificate comes with the next release"
         # Robots ask in the last third; the rest is for clocks that are wrong.
         due = min(
-            validity.not_after - validity.life(made) / 2 for validity, made in self._issued(name)
+            validity.not_after - validity.lifetime(made) / 2
+            for validity, made in self._issued(name)
         )
         if self._now < due:
             return "not_due", f"it can be renewed from {iso(due)}"
@@ -728,13 +729,13 @@ def _revoke_again(
     signed; but if they are lists of a CA service, which alone can sign another one and knows its
     certificates, there is only a note.  Return the same as `_sign`.
     """
-    if not (forgotten_lists.lists or forgotten_lists.unknown(Keystore(root))):
+    if not (forgotten_lists.lists or forgotten_lists.unknown_certificates(Keystore(root))):
         return "", [], []
     again = {entry.serial for crl in forgotten_lists.lists for entry in crl.revoked}
     requests = [request for message in messages for request in message.requests if request.request]
     for request in requests:
         if again & {*request.vouching}:
-            request.done("refused", "its certificate was revoked")
+            request.set_outcome("refused", "its certificate was revoked")
     have = (
         f"{first_few(robots_with_lists, _SHOWN)} {'has' if len(robots_with_lists) == 1 else 'have'}"
     )
@@ -759,7 +760,7 @@ def _revoke_again(
         )
         for request in requests:
             if request.request:
-                request.done("not_signed", why)
+                request.set_outcome("not_signed", why)
         return why, [], []
     notes = [restored_note(restored, have)] if robots_with_lists else []
     return "", [*notes, *restored.notes], [*changes_below(root, restored.changes)]
@@ -815,14 +816,14 @@ def _sign(
                 sign_parts(part, sign(part))
         elif error:
             for request in robots[0]:
-                request.done("refused", error.what)
+                request.set_outcome("refused", error.what)
 
     if not by_robot:
         return "", notes, changes
     joint = sign(by_robot)
     if joint and (problem := _cannot_sign(root, now, keyring)):
         for request in (request for judged in by_robot for request in judged):
-            request.done("not_signed", problem)
+            request.set_outcome("not_signed", problem)
         return problem, notes, changes
     sign_parts(by_robot, joint)
     return "", notes, changes

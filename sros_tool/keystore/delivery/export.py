@@ -42,7 +42,7 @@ from sros_tool.keystore.outcomes import (
 )
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
 from sros_tool.keystore.reader import Keystore, OpenedEnclave, open_enclave
-from sros_tool.keystore.selection import no_such_enclave, select_enclaves
+from sros_tool.keystore.selection import missing_enclave_error, select_enclaves
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
@@ -202,7 +202,7 @@ def exported_files(
     keystore.check()
     for name in names:
         if not has_enclave(root, check_enclave_name(name)):
-            raise no_such_enclave(keystore, name, keystore.names)
+            raise missing_enclave_error(keystore, name, keystore.names)
     check_readable(root, names)
     files: dict[str, bytes] = {}
     for name in names:
@@ -213,9 +213,9 @@ def exported_files(
                 "It was made on its robot and stays there, so an export could not run.",
                 _ANSWER_AGAIN,
             )
-        evaluation = _evaluated(root, name, now)
+        evaluation = _evaluate_enclave(root, name, now)
         if evaluation.problems:
-            raise _not_running(root, name, evaluation.problems)
+            raise _refused_enclave_error(root, name, evaluation.problems)
         files |= _files_of(root, name, evaluation)
     return dict(sorted(files.items()))
 
@@ -241,12 +241,12 @@ def released_enclave(root: Path, name: str, now: datetime) -> ReleasedEnclave:
     Raises:
         KeystoreError: the enclave cannot run for another reason.
     """
-    evaluation = _evaluated(root, name, now)
+    evaluation = _evaluate_enclave(root, name, now)
     state = evaluation.state
     problems = state.problems_in_keystore
     lasting = [str(problem) for problem in problems if problem.fault not in _OF_TIME]
     if lasting or (evaluation.problems and not problems):
-        raise _not_running(root, name, lasting or evaluation.problems)
+        raise _refused_enclave_error(root, name, lasting or evaluation.problems)
     _check_zenoh(root, enclave_path(root, name), name, state)
     _check_not_ca_key(enclave_path(root, name), state)
     files = released_files(root, name)
@@ -302,12 +302,12 @@ _OF_TIME = frozenset(
 """Faults that depend on the time."""
 
 
-def _evaluated(root: Path, name: str, now: datetime) -> EvaluatedEnclave:
+def _evaluate_enclave(root: Path, name: str, now: datetime) -> EvaluatedEnclave:
     folder = enclave_path(root, name)
     return evaluated(name, folder, open_enclave(folder, now=now), moment=now)
 
 
-def _not_running(root: Path, name: str, problems: Sequence[str]) -> KeystoreError:
+def _refused_enclave_error(root: Path, name: str, problems: Sequence[str]) -> KeystoreError:
     return KeystoreError(
         f"enclave {name} would not run on a robot",
         "; ".join(problem.rstrip(".") for problem in problems) + ".",
@@ -344,7 +344,7 @@ def _read_files(root: Path, name: str, wanted_files: Iterable[str]) -> dict[str,
             with suppress(FileNotFoundError):
                 files[path] = opened.read_inside(path)
                 if file != KEY_FILE and holds_private_key(files[path]):
-                    raise _holds_ca_key(root / path)
+                    raise _ca_key_error(root / path)
     return files
 
 
@@ -354,7 +354,7 @@ def _check_not_ca_key(folder: Path, state: OpenedEnclave) -> None:
         authority and state.certificate and authority.public_key() == state.certificate.public_key()
         for authority in (state.identity_ca, state.permissions_ca)
     ):
-        raise _holds_ca_key(folder / KEY_FILE)
+        raise _ca_key_error(folder / KEY_FILE)
 
 
 def _check_zenoh(root: Path, folder: Path, name: str, state: OpenedEnclave) -> None:
@@ -368,7 +368,7 @@ def _check_zenoh(root: Path, folder: Path, name: str, state: OpenedEnclave) -> N
         )
 
 
-def _holds_ca_key(path: Path) -> KeystoreError:
+def _ca_key_error(path: Path) -> KeystoreError:
     return KeystoreError(
         f"'{path}' contains a private key that is not the key of an enclave",
         "A CA key would get to the robot, and whoever has the robot could issue any identity.",
@@ -376,7 +376,7 @@ def _holds_ca_key(path: Path) -> KeystoreError:
     )
 
 
-def _real(path: Path) -> Path:
+def _real_path(path: Path) -> Path:
     # Unlike Path.resolve, realpath does not fail at a loop of links.
     return Path(os.path.realpath(path))
 
@@ -384,7 +384,7 @@ def _real(path: Path) -> Path:
 def _write_folder(
     root: Path, target: Path, files: dict[str, bytes], force: bool, dry_run: bool
 ) -> Sequence[Change]:
-    if _real(target).is_relative_to(_real(root)):
+    if _real_path(target).is_relative_to(_real_path(root)):
         raise KeystoreError(
             f"'{target}' is the keystore itself or a folder in it", "", "Choose another folder."
         )
@@ -399,7 +399,7 @@ def _write_folder(
             "Choose another folder.",
         )
     check_same_authority(target, files)
-    stale = _stale(target, files)
+    stale = _stale_paths(target, files)
     different = {
         path: data
         for path, data in files.items()
@@ -421,7 +421,7 @@ def _write_folder(
     return transaction.changes
 
 
-def _stale(target: Path, files: dict[str, bytes]) -> list[str]:
+def _stale_paths(target: Path, files: dict[str, bytes]) -> list[str]:
     """Return the paths in ``target`` of Zenoh files and keys that the enclaves no longer have.
 
     An enclave that is exported without a key keeps the key in ``target``: no other copy exists.

@@ -37,8 +37,8 @@ from sros_tool.keystore.delivery.published import (
     MetadataExpiry,
     PublishedRelease,
     PublishedRobot,
-    damaged_list,
-    may_be_later,
+    damaged_list_error,
+    may_have_later_releases,
     read_published,
 )
 from sros_tool.keystore.delivery.release import (
@@ -212,7 +212,7 @@ def publish(
         keys = _Keys(run.roots, root, root_key)
         keys.recover(dry_run)
         keys.open(rotate, now, run.expiry)
-        changed = run.changed()
+        changed = run.changed_robots()
         if changed or keys.new or keys.has_new_root:
             with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run) as change:
                 run.keystore = change.keystore
@@ -244,7 +244,7 @@ def later_in_folder(keystore: Keystore) -> str:
     signed counts.
     """
     with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
-        if may_be_later(keystore):
+        if may_have_later_releases(keystore):
             check_tuf()
             folder, never = Path(read_published(keystore).folder), datetime.min.replace(tzinfo=UTC)
             run = _Run(keystore, folder, never, MetadataExpiry(), dry_run=True)
@@ -329,7 +329,7 @@ class _Keys:
             )
         self.rotated = () if first else tuple(role for role in _ROLES if role in rotate)
         for role in _ONLINE:
-            self.signers[role] = self._online(role, new=first or role in rotate)
+            self.signers[role] = self._online_signers(role, new=first or role in rotate)
         left = expiry.root if first else self.roots.last.expires - now
         if first or rotate or left < expiry.root / 3:
             self._sign_root(
@@ -349,7 +349,7 @@ class _Keys:
     def _path(self, role: str) -> Path:
         return self._root / fleet_key(role)
 
-    def _online(self, role: str, *, new: bool) -> list[CryptoSigner]:
+    def _online_signers(self, role: str, *, new: bool) -> list[CryptoSigner]:
         """Return the signer of a role, and the previous signer while robots may still need it."""
         from sros_tool.keystore.delivery.repository import load_signer, new_key, replaced_key
 
@@ -479,16 +479,16 @@ class _Evaluator:
         """
         if before:
             by_enclave = {name: released_files(self._root, name) for name in enclaves}
-            files = _sorted(by_enclave.values())
-            if before.holds(_without_lists(files), self._now) and all(
+            files = _sorted_by_path(by_enclave.values())
+            if before.holds(_digest_without_lists(files), self._now) and all(
                 self._is_list_good(name, of_enclave) for name, of_enclave in by_enclave.items()
             ):
                 return _RobotFiles(files, "", before)
         released = {name: released_enclave(self._root, name, self._now) for name in enclaves}
-        files = _sorted(enclave.files for enclave in released.values())
+        files = _sorted_by_path(enclave.files for enclave in released.values())
         not_valid = (f"{name}: {of.not_valid}" for name, of in released.items() if of.not_valid)
         until = min(enclave.until for enclave in released.values())
-        evaluated = Evaluated(_without_lists(files), self._now, until)
+        evaluated = Evaluated(_digest_without_lists(files), self._now, until)
         return _RobotFiles(files, "; ".join(not_valid), evaluated if until > self._now else None)
 
     def _is_list_good(self, name: str, files: Mapping[str, bytes]) -> bool:
@@ -523,12 +523,12 @@ class _Evaluator:
 _read_list = lru_cache(maxsize=16)(partial(read_list, name=CRL_FILE))
 
 
-def _sorted(enclaves: Iterable[Mapping[str, bytes]]) -> dict[str, bytes]:
+def _sorted_by_path(enclaves: Iterable[Mapping[str, bytes]]) -> dict[str, bytes]:
     """Return the files of all enclaves by path, sorted."""
     return dict(sorted(item for files in enclaves for item in files.items()))
 
 
-def _without_lists(files: Mapping[str, bytes]) -> str:
+def _digest_without_lists(files: Mapping[str, bytes]) -> str:
     """Return a digest of files without revocation lists, and of the version that evaluates them."""
     others = {path: data for path, data in files.items() if not path.endswith(f"/{CRL_FILE}")}
     return hashlib.sha256(__version__.encode() + b"\n" + listed_digests(others)).hexdigest()
@@ -582,19 +582,19 @@ class _Run:
         """
         is_lost = self._published_before and not self._present.timestamp
         if is_lost and not new_folder:
-            raise self._nothing_published()
+            raise self._nothing_published_error()
         is_later = self._has_later_releases(restored)
         if restored and not is_later:
             self._check_removed()
         if restored:
-            self._restore(self._forgotten() if is_later else None, keyring)
+            self._restore(self._forgotten_revocations() if is_later else None, keyring)
         if not (is_later and self._dry_run):  # which has not revoked again
             self._check_removed()
         if is_lost or restored:
             self._least = int(self._now.timestamp())
             self.list.robots.clear()
 
-    def _nothing_published(self) -> KeystoreError:
+    def _nothing_published_error(self) -> KeystoreError:
         return KeystoreError(
             f"'{self._folder}' has nothing that the keystore '{self.keystore.root}' published",
             "The keystore has published before. If it was restored from a backup and the folder "
@@ -608,7 +608,7 @@ class _Run:
         """Return whether the folder has later releases; refuse that unless ``restored``."""
         if self.list.number >= (unused := self.keystore.ledger_file.next_number()):
             why = f"It has release {self.list.number}, but the ledger has none after {unused - 1}."
-            raise damaged_list(self.keystore, why)
+            raise damaged_list_error(self.keystore, why)
         latest = self._latest
         if latest <= self.list.number:
             return False
@@ -663,7 +663,7 @@ class _Run:
         """The highest number of a release in the folder; 0 without one."""
         return max((release.number for release in self._there.values()), default=0)
 
-    def _forgotten(self) -> Forgotten:
+    def _forgotten_revocations(self) -> Forgotten:
         """Return what the last releases revoke and the restored keystore does not."""
         forgotten = Forgotten(self.keystore, self._now)
         problem = ""
@@ -732,7 +732,7 @@ class _Run:
 
     # ── which robots ───────────────────────────────────────────────────────────────────────
 
-    def changed(self, among: Sequence[_Changed] | None = None) -> list[_Changed]:
+    def changed_robots(self, among: Sequence[_Changed] | None = None) -> list[_Changed]:
         """Return the robots that may need a new release; forget those that have no enclaves.
 
         Only the robots ``among`` are looked at; None looks at all.
@@ -749,7 +749,7 @@ class _Run:
             before = self.list.robots.get(robot)
             if not before or before.files != state:
                 found.append(_Changed(robot, names, state))
-            elif not self._has(robot, before.release):
+            elif not self._has_files_of(robot, before.release):
                 found.append(_Changed(robot, names, state))
                 self._damaged |= {robot} if robot in self._there else set()
         known = self.list.robots.keys() | self._there.keys()
@@ -770,7 +770,7 @@ class _Run:
             if (enclave_path(root, name) / CERTIFICATE_FILE).exists()
         ]
 
-    def _has(self, robot: str, release: PublishedRelease) -> bool:
+    def _has_files_of(self, robot: str, release: PublishedRelease) -> bool:
         """Return whether the folder has the archive of a release, undamaged."""
         return bool(self._read(robot, release))
 
@@ -791,7 +791,7 @@ class _Run:
 
         ``found`` are the robots that seemed changed before the keystore was locked.
         """
-        changed = self.changed(found)
+        changed = self.changed_robots(found)
         unused = change.keystore.ledger_file.next_number()
         number = max(unused, self._number + 1, self._least)
         if number > MOST_NUMBER:
@@ -839,7 +839,11 @@ class _Run:
                 yield _ReleaseOutcome(robot.robot, None, why=str(error))
                 continue
             content = hashlib.sha256(listed_digests(files.files)).hexdigest()
-            if before and before.content == content and self._has(robot.robot, before.release):
+            if (
+                before
+                and before.content == content
+                and self._has_files_of(robot.robot, before.release)
+            ):
                 kept = before._replace(files=robot.state, evaluated=files.evaluated)
                 yield _ReleaseOutcome(robot.robot, kept)
             else:
@@ -860,7 +864,7 @@ class _Run:
                 data = pack_release(Release(robot.robot, number, files.files, seal))
                 digest = hashlib.sha256(data).hexdigest()
                 release = PublishedRelease(number, digest, len(data))
-                _put(folder, release.path(robot.robot), data)
+                _put_file(folder, release.path(robot.robot), data)
                 published = PublishedRobot(release, content, robot.state, files.evaluated)
                 yield _ReleaseOutcome(
                     robot.robot, published, is_new=True, not_valid=files.not_valid
@@ -938,11 +942,11 @@ class _Run:
             late = [] if self._present.follows(self.roots.last) else roots
             *files, timestamp = self._composed.files
             for path, data in (*([] if late else roots), *files):
-                _put(folder, path, data)
+                _put_file(folder, path, data)
             folder.flush_file_system()
-            _put(folder, *timestamp)
+            _put_file(folder, *timestamp)
             for path, data in late:
-                _put(folder, path, data)
+                _put_file(folder, path, data)
             folder.flush_file_system()
             for path, since in self.list.superseded.items():
                 if self._now - since >= _KEPT:
@@ -995,7 +999,7 @@ def _state(root: Path, names: Sequence[str]) -> str:
     return digest.hexdigest()
 
 
-def _put(folder: Folder, path: str, data: bytes) -> None:
+def _put_file(folder: Folder, path: str, data: bytes) -> None:
     """Write a file of the publishing folder, whole or not at all."""
     parent, _, name = path.rpartition("/")
     spare = f"{parent}/.{name}.new"

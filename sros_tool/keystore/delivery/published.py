@@ -153,10 +153,10 @@ def read_published(keystore: Keystore) -> Published:
             ),
         )
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
-        raise damaged_list(keystore) from error
+        raise damaged_list_error(keystore) from error
 
 
-def may_be_later(keystore: Keystore) -> bool:
+def may_have_later_releases(keystore: Keystore) -> bool:
     """Return whether the publishing folder of a keystore has later metadata than it published.
 
     Then the keystore was restored from a backup, or somebody else wrote the metadata: they are not
@@ -173,7 +173,7 @@ def may_be_later(keystore: Keystore) -> bool:
     return False
 
 
-def damaged_list(keystore: Keystore, why: str = "") -> DocumentError:
+def damaged_list_error(keystore: Keystore, why: str = "") -> DocumentError:
     """Return the error for a list that is not what was published, with the sentence ``why``."""
     return DocumentError(
         f"'{keystore.root / PUBLISHED}' is damaged",

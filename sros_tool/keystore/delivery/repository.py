@@ -256,14 +256,14 @@ def read_present(folder: Path, roots: Roots) -> Present:
     except FileNotFoundError as error:
         if not folder.exists():
             return Present()
-        raise _not_ours(folder, f"'{error.filename}' is missing") from error
+        raise _foreign_folder_error(folder, f"'{error.filename}' is missing") from error
     except OSError as error:
-        raise _not_ours(folder, f"'{error.filename}': {error.strerror}") from error
+        raise _foreign_folder_error(folder, f"'{error.filename}': {error.strerror}") from error
     except (RepositoryError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise _not_ours(folder, str(error)) from error
+        raise _foreign_folder_error(folder, str(error)) from error
 
 
-def _not_ours(folder: Path, why: str) -> KeystoreError:
+def _foreign_folder_error(folder: Path, why: str) -> KeystoreError:
     return KeystoreError(
         f"'{folder}' has metadata that this keystore did not write",
         f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
@@ -374,12 +374,12 @@ class Composer:
         for name, content in targets.items():
             old = self._present.bins.get(name)
             same_key = old is not None and key.keyid in old.signatures
-            if same_key and old and old.signed.targets == content and self._lasts(old):
+            if same_key and old and old.signed.targets == content and self._is_valid_for_long(old):
                 self._expires[name] = old.signed.expires
             else:
                 self._add(name, Targets(targets=content), self._signers[_TARGETS][:1])
         delegations = Delegations({key.keyid: key}, succinct_roles=roles)
-        if before and before.signed.delegations == delegations and self._can_stay(before):
+        if before and before.signed.delegations == delegations and self._can_be_kept(before):
             self._expires[_TARGETS] = before.signed.expires
         else:
             self._add(_TARGETS, Targets(delegations=delegations), self._signers[_TARGETS])
@@ -398,16 +398,16 @@ class Composer:
             bits = bits if bits > kept + 1 else kept
         return SuccinctRoles([self._signers[_TARGETS][0].public_key.keyid], 1, bits, _BINS)
 
-    def _lasts(self, metadata: Metadata[_Content]) -> bool:
+    def _is_valid_for_long(self, metadata: Metadata[_Content]) -> bool:
         """Return whether more than half of the validity is left."""
         signed = metadata.signed
         return signed.expires - self._now > self._expiry.of(signed.type) / 2
 
-    def _can_stay(self, metadata: Metadata[_Content]) -> bool:
+    def _can_be_kept(self, metadata: Metadata[_Content]) -> bool:
         """Return whether top-level metadata can stay: it lasts, and each signer has signed it."""
         signers = self._signers[metadata.signed.type]
         signed = all(signer.public_key.keyid in metadata.signatures for signer in signers)
-        return signed and self._lasts(metadata)
+        return signed and self._is_valid_for_long(metadata)
 
     def _add(self, name: str, content: _Content, signers: Sequence[CryptoSigner]) -> None:
         """Add a file with a new version of the metadata ``name``."""
@@ -432,7 +432,7 @@ class Composer:
         # Names of bins that are no longer used stay: robots refuse a snapshot that lacks any.
         meta = {f"{name}.json": MetaFile(self.versions[name]) for name in parts}
         before = self._present.snapshot
-        if before and before.signed.meta == meta and self._can_stay(before):
+        if before and before.signed.meta == meta and self._can_be_kept(before):
             self._expires[_SNAPSHOT] = before.signed.expires
             data = self._present.snapshot_file
         else:

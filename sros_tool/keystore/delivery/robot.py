@@ -58,7 +58,7 @@ from sros_tool.keystore.reader import (
     weaknesses,
 )
 from sros_tool.keystore.transaction.stage import Change
-from sros_tool.keystore.transaction.transaction import Transaction, tidy
+from sros_tool.keystore.transaction.transaction import Transaction, recover_keystore
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
@@ -133,7 +133,7 @@ def create_request(
             "Leave one of the two options out.",
         )
     if not dry_run and folder.is_dir():
-        tidy(folder)
+        recover_keystore(folder)
     _refuse_ca_keystore(
         folder, f"Make the enclave with `sros create_enclave {quote(str(folder))} {name}`."
     )
@@ -452,7 +452,7 @@ def import_answer(
     name = answer.name
     place = folder / enclave_folder(name)
     if not dry_run and folder.is_dir():
-        tidy(folder)
+        recover_keystore(folder)
     _refuse_ca_keystore(folder, "Name the folder in which the request was made.")
     if not has_key(place):
         raise KeystoreError(

@@ -154,7 +154,7 @@ def sign_request(
     if only_enclaves:
         _check_requested_enclaves([request], only_enclaves)
     name = check_enclave_name(request.name)
-    stated = _stated(policy, [name])
+    stated = _stated_rights(policy, [name])
     if answer is not None:
         _check_free(answer, force)
     change = KeystoreChange(
@@ -192,7 +192,7 @@ class _Stated(NamedTuple):
     path: str = ""
 
 
-def _stated(policy: Policy | FleetPolicy | None, names: Sequence[str]) -> dict[str, _Stated]:
+def _stated_rights(policy: Policy | FleetPolicy | None, names: Sequence[str]) -> dict[str, _Stated]:
     """Map enclaves to the rights that a policy states for them.
 
     Raises:
@@ -249,7 +249,7 @@ def certify_requests(
     if only_enclaves:
         _check_requested_enclaves(requests, only_enclaves)
     _check_distinct(requests)
-    stated = _stated(policy, [check_enclave_name(request.name) for request in requests])
+    stated = _stated_rights(policy, [check_enclave_name(request.name) for request in requests])
     change = KeystoreChange(
         root, now=now, keyring=keyring, allow_refusal=allow_refusal, dry_run=dry_run
     )
@@ -346,7 +346,7 @@ class _Signer:
         self._root = change.root
         change.open_authorities()
         change.check_domain(domain)
-        self._stated = stated
+        self._stated_rights = stated
         self._record_paths()
         self._domains = EnclaveDomains(change.domains, change.fleet)
         self._writer = change.writer()
@@ -358,7 +358,7 @@ class _Signer:
 
         The robots of that fleet stay the same, also if the policy was expanded for another fleet.
         """
-        change, root, stated = self._change, self._root, self._stated
+        change, root, stated = self._change, self._root, self._stated_rights
         fleet = change.fleet
         paths = {of_enclave.path for of_enclave in stated.values() if of_enclave.path}
         if fleet and not paths <= set(fleet.enclaves):
@@ -388,7 +388,7 @@ class _Signer:
         """
         change, root, name = self._change, self._root, request.name
         known, authority = change.known, change.permissions.certificate
-        stated = self._stated[name].enclave
+        stated = self._stated_rights[name].enclave
         _check_name(root, name, renew, has_enclave(root, name))
         if stated is not None:
             refuse_less_protected(root, change.governance, stated_protections([stated]))
@@ -591,7 +591,7 @@ def _lost_rights(
     text = lasting_text(change.root, (replaced,))
     if not text:
         return []
-    lost = f"{replaced.enclave} loses: {replaced.loses()}."
+    lost = f"{replaced.enclave} loses: {replaced.lost_text()}."
     again = "Then answer its request again with `sros sign_request --renew`."
     return [Note("request.rights-lost", f"{lost} {text} {again}")]
 
@@ -609,7 +609,7 @@ def _earlier_rights(
             "These permissions belong to another certificate.",
             "State the rights with -p POLICY_FILE.",
         )
-    return change.recorded.of(name, old.digest, old.grant)
+    return change.recorded.rights_to_sign(name, old.digest, old.grant)
 
 
 def _answer_files(root: Path, issued: Issued, zenoh: KeptZenoh) -> dict[str, bytes]:

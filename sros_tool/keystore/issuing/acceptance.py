@@ -21,7 +21,7 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.dds.decision.access import Decision
-from sros_tool.dds.decision.vendors import TESTED, Vendor, together, words_of
+from sros_tool.dds.decision.vendors import TESTED, Vendor, joined_titles, words_of
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import render_permissions
 from sros_tool.errors import KeystoreError, Note, SrosError
@@ -135,10 +135,10 @@ def refuse_stopping(
     files = _FilesOfChange(transaction, keystore or Keystore(transaction.root))
     stopped, revoked = _stopped_enclaves(files, now)
     if refused := {vendor: why for vendor, why in stopped.items() if vendor not in allowed}:
-        raise _would_stop(transaction.root, refused, remedy())
+        raise _refused_change_error(transaction.root, refused, remedy())
     old = _authority_without_list(files)
     if old and (cut_off := [vendor for vendor in _READ_SEVERAL if vendor not in allowed]):
-        raise _would_be_shut_out(transaction.root, old, cut_off, remedy())
+        raise _shut_out_error(transaction.root, old, cut_off, remedy())
     notes = [
         Note(
             "vendor.refuses",
@@ -229,7 +229,9 @@ def _reason(participant: VendorParticipant, decision: Decision) -> str:
     return str(participant.problems[0]).rstrip(".") if participant.problems else decision.clause
 
 
-def _would_stop(root: Path, refused: Mapping[Vendor, _Refusals], remedy: str) -> KeystoreError:
+def _refused_change_error(
+    root: Path, refused: Mapping[Vendor, _Refusals], remedy: str
+) -> KeystoreError:
     names = tuple(sorted({name for refusals in refused.values() for name in refusals.enclaves}))
     why = {vendor: "; ".join(refusals.reasons[:_SHOWN]) for vendor, refusals in refused.items()}
     whose = "its" if len(names) == 1 else "their"
@@ -238,7 +240,7 @@ def _would_stop(root: Path, refused: Mapping[Vendor, _Refusals], remedy: str) ->
         f"no node could start in {_names_text(names)} of '{root}'",
         f"{_clauses(why, f'{whose} files after the change')}. Nothing was changed.",
         f"{remedy or 'Replace the file that the error names.'} If no node runs on "
-        f"{enumerated(together(vendor.title for vendor in refused))}, add {options}.",
+        f"{enumerated(joined_titles(vendor.title for vendor in refused))}, add {options}.",
     )
 
 
@@ -266,10 +268,10 @@ def _authority_without_list(files: _FilesOfChange) -> x509.Certificate | None:
     )
 
 
-def _would_be_shut_out(
+def _shut_out_error(
     root: Path, old: x509.Certificate, vendors: Sequence[Vendor], remedy: str
 ) -> KeystoreError:
-    titles = together(vendor.title for vendor in vendors)
+    titles = joined_titles(vendor.title for vendor in vendors)
     demand = f"{enumerated(titles)} {'demands' if len(titles) == 1 else 'demand'}"
     name = subject_text(old.subject)
     options = " ".join(f"--allow-refusal {word}" for word in words_of(vendors))
@@ -288,7 +290,9 @@ def _clauses(refused: Mapping[Vendor, str], label: str) -> str:
         by_reason.setdefault(reason, []).append(vendor.title)
     return "; ".join(
         f"{enumerated(titles)} {'refuses' if len(titles) == 1 else 'refuse'} {label} ({reason})"
-        for reason, titles in ((reason, together(named)) for reason, named in by_reason.items())
+        for reason, titles in (
+            (reason, joined_titles(named)) for reason, named in by_reason.items()
+        )
     )
 
 
@@ -325,14 +329,16 @@ def imported_notes(
     known = " ".join(note.text for note in authorities.notes)
     notes = []
     if new := {vendor: why for vendor, why in refused.items() if vendor.title not in known}:
-        others = together(vendor.title for vendor in TESTED if vendor not in refused)
+        others = joined_titles(vendor.title for vendor in TESTED if vendor not in refused)
         verb = "accepts" if len(others) == 1 else "accept"
         text = (
             f"{_clauses(new, 'the enclaves of this keystore')}; {enumerated(others)} {verb} them."
         )
         notes.append(Note("portable.imported-ca", text))
     identity = authorities.identity
-    validity = validity_of(identity.certificate).within(window(now, template.revocation_validity))
+    validity = validity_of(identity.certificate).intersection(
+        window(now, template.revocation_validity)
+    )
     crl = sign_crl(
         identity.certificate,
         identity.key,
@@ -375,11 +381,11 @@ def _example(
     )
     signer = authorities.permissions
     rights = default_rights(template, _EXAMPLE)
-    validity = validity.within(validity_of(signer.certificate))
+    validity = validity.intersection(validity_of(signer.certificate))
     permissions = permissions_for(
         rights,
         subject=subject_text(certificate.subject),
-        validity=validity.within(validity_of(certificate)),
+        validity=validity.intersection(validity_of(certificate)),
         domains=domains.closed(),
     )
     files[CERTIFICATE_FILE] = pem(certificate)

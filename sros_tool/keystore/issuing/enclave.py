@@ -196,7 +196,7 @@ class EnclaveWriter:
             and (note := _early_expiry(what, validity, authority.certificate, transaction.root))
         )
         if permissions:
-            self._permissions_validity = self._permissions_validity.within(
+            self._permissions_validity = self._permissions_validity.intersection(
                 validity_of(permissions.certificate)
             )
         signs = (authority.on_token for authority in (identity, permissions) if authority)
@@ -255,14 +255,14 @@ class EnclaveWriter:
         """Return whether `write` would only change dates, and the present ones are far enough away.
 
         ``text`` is the present document, with LF line ends.  Its ``validity`` is long enough until
-        two thirds of a new validity are over (`Window.lasts`).
+        two thirds of a new validity are over (`Window.can_be_kept`).
 
         Raises:
             KeystoreError: the permissions would not decide as the policy does.
         """
         name = rights.enclave.path
         new = self._validity_of_permissions(name, certificate)
-        if not validity.lasts(new, self._now):
+        if not validity.can_be_kept(new, self._now):
             return False
         permissions = _permissions(rights, subject_text(certificate.subject), validity)
         return render_permissions(permissions) == text
@@ -273,7 +273,7 @@ class EnclaveWriter:
         return (
             default_validity
             if longest is None
-            else default_validity.within(window(self._now, longest))
+            else default_validity.intersection(window(self._now, longest))
         )
 
     def _validity_of_permissions(self, name: str, certificate: x509.Certificate) -> Window:
@@ -319,7 +319,7 @@ class EnclaveWriter:
             identity.request or self._request(name, identity),
             identity.subject,
             identity.public_key,
-            validity.within(validity_of(authority.certificate)),
+            validity.intersection(validity_of(authority.certificate)),
         )
         return authority.service.issue(asked, authority.certificate, self._now)
 

@@ -97,17 +97,17 @@ class ExpressionSets:
             self.denied[verb], topic
         )
 
-    def says(self, stated: ExpressionSets) -> bool:
+    def matches_same_names(self, stated: ExpressionSets) -> bool:
         """Return whether these sets match the same names as the sets ``stated``.
 
         They have to be subsets of ``stated``, and may lack only names that a wildcard also matches.
         """
         return all(
-            own <= theirs and _matched_anyway(theirs - own, own)
-            for own, theirs in self.beside(stated)
+            own <= theirs and _are_matched_by_wildcards(theirs - own, own)
+            for own, theirs in self.paired_sets(stated)
         )
 
-    def beside(self, other: ExpressionSets) -> Iterator[tuple[set[str], set[str]]]:
+    def paired_sets(self, other: ExpressionSets) -> Iterator[tuple[set[str], set[str]]]:
         """Yield pairs of sets for the same side and direction: from here, and from ``other``."""
         for own, theirs in ((self.allowed, other.allowed), (self.denied, other.denied)):
             for verb in (_OUT, _IN):
@@ -149,7 +149,7 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
     stated = stated_expressions(policy)
     wildcards = {expression for expression in stated.all() if is_expression(expression)}
     signed = signed_expressions(permissions, domains)
-    if signed and signed.says(stated) and all(map(matched_as_meant, wildcards)):
+    if signed and signed.matches_same_names(stated) and all(map(matched_as_meant, wildcards)):
         return
     disagreements = differences(policy, permissions, domains)
     if disagreements:
@@ -165,7 +165,7 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
         )
 
 
-def _matched_anyway(left_out: set[str], expressions: set[str]) -> bool:
+def _are_matched_by_wildcards(left_out: set[str], expressions: set[str]) -> bool:
     """Return whether each name in ``left_out`` (no wildcards) matches one of ``expressions``."""
     if not left_out:
         return True
@@ -247,7 +247,7 @@ def differences(
     for expression in filter(is_expression, expressions):
         topics.update(example_topics([expression]))
     signed = signed_expressions(permissions, domains)
-    for pair in signed.beside(stated) if signed else ():
+    for pair in signed.paired_sets(stated) if signed else ():
         for left, right in (pair, pair[::-1]):
             names = (common_name([n], sorted(right), absolute=False) for n in left - right)
             topics.update(filter(None, names))
@@ -275,27 +275,27 @@ def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
     wild = [expression for expression in known if is_expression(expression)]
     found: set[str | None] = {name for name in known if not is_expression(name)}
     for index, one in enumerate(wild):
-        found.add(_only_match(one, known))
-        found.add(_matched(one))
+        found.add(_uniquely_matched_name(one, known))
+        found.add(_matching_name(one))
         for other in wild[index + 1 :]:
             if overlap(one, other):
                 found.add(common_name([one, other], absolute=False))
     for prefix in ("rt/*", "rq/*Request", "rr/*Reply", "*"):
-        found.add(_only_match(prefix, known))
+        found.add(_uniquely_matched_name(prefix, known))
     return tuple(sorted(topic for topic in found if topic))
 
 
-def _matched(expression: str) -> str | None:
+def _matching_name(expression: str) -> str | None:
     """Return a name that an expression matches, or None if no valid name does."""
     name = expression.replace("*", "n")
     # The search for the shortest name is only worth its time where this is none.
     return common_name([expression], absolute=False) if is_expression(name) else name
 
 
-def _only_match(expression: str, known: list[str]) -> str | None:
+def _uniquely_matched_name(expression: str, known: list[str]) -> str | None:
     """Return a name that only ``expression`` matches, or None if no simple name is such."""
     for letter in ("never_mentioned", "n", "0", ""):
-        name = _SET.sub(_member, expression).replace("*", letter).replace("?", "n")
+        name = _SET.sub(_member_of_set, expression).replace("*", letter).replace("?", "n")
         if matches(expression, name) and not any(
             matches(other, name) for other in known if other != expression
         ):
@@ -303,7 +303,7 @@ def _only_match(expression: str, known: list[str]) -> str | None:
     return None
 
 
-def _member(match: re.Match[str]) -> str:
+def _member_of_set(match: re.Match[str]) -> str:
     """Return a character that a set such as ``[a-c]`` matches."""
     return next((c for c in _CHARACTERS if matches(match[0], c)), "")
 

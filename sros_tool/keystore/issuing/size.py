@@ -178,7 +178,7 @@ def minimized_policy(
     notes += _scope_notes(policy, result, observed_rights)
     narrowed = written(result.policy)
     document = checked_text(narrowed, output, "narrowed", placeholders=fleet is not None)
-    return Minimization(document, _measured(stated, result, observed_rights, fleet), notes)
+    return Minimization(document, _measured_enclaves(stated, result, observed_rights, fleet), notes)
 
 
 def _node_basics() -> Sequence[Group]:
@@ -213,7 +213,7 @@ def _scope_notes(policy: Policy, result: MinimizedPolicy, observed: Set[Right]) 
         yield Note("minimize.enclave-not-in-policy", text)
 
 
-def _measured(
+def _measured_enclaves(
     policy: Policy, result: MinimizedPolicy, observed: Set[Right], fleet: Fleet | None
 ) -> list[MinimizedEnclave]:
     """Return the enclaves of a minimized policy with their sizes."""
@@ -224,7 +224,7 @@ def _measured(
     ):
         sizes = PermissionsBytes(
             *(
-                estimator.signed_bytes(_longest(Policy((enclave,)), fleet))
+                estimator.signed_bytes(_longest_enclave(Policy((enclave,)), fleet))
                 for enclave in (before, after)
             )
         )
@@ -241,7 +241,7 @@ def _measured(
     return measured
 
 
-def _longest(policy: Policy, fleet: Fleet | None) -> Enclave:
+def _longest_enclave(policy: Policy, fleet: Fleet | None) -> Enclave:
     """Return the only enclave of a policy, expanded for the robot with the longest enclave path."""
     robots = FleetPolicy(written(policy), fleet) if fleet else None
     return robots[max(robots, key=len)] if robots else policy.enclaves[0]

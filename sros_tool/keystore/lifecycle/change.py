@@ -61,13 +61,13 @@ from sros_tool.keystore.settings import (
 )
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.stage import Change
-from sros_tool.keystore.transaction.transaction import Transaction, tidy
+from sros_tool.keystore.transaction.transaction import Transaction, recover_keystore
 from sros_tool.keystore.zenoh_files import (
     NO_CHANGE,
     Drift,
     Drifted,
     ZenohChange,
-    drifted,
+    drifted_configurations,
     signed_path,
     stale_files,
     zenoh_documents,
@@ -176,7 +176,7 @@ class KeystoreChange:
             KeystoreError: it is not a keystore, is busy, or cannot be read.
         """
         if not self.dry_run:
-            tidy(self.root)
+            recover_keystore(self.root)
         if not self.is_new:
             check_keystore(self.root)
         self.transaction.__enter__()
@@ -282,7 +282,7 @@ class KeystoreChange:
         if self.template.zenoh:
             self.set_network(self.with_routers_of_robots(self.template.zenoh, before))
         elif any(robot.router for robot in fleet.robots.values()):
-            self.notes.append(_no_network(self.root))
+            self.notes.append(_no_network_note(self.root))
         return fleet
 
     def with_routers_of_robots(
@@ -460,7 +460,7 @@ class KeystoreChange:
         if signer is None:
             signer = self.permissions if self.identity.service else self.identity
             self._check_served()
-        self.entries = _take_over(self.transaction, self.keystore, self.now, self.entries)
+        self.entries = _take_over_records(self.transaction, self.keystore, self.now, self.entries)
         append(
             self.transaction,
             self.entries,
@@ -472,14 +472,16 @@ class KeystoreChange:
     @property
     def is_guess(self) -> bool:
         """Whether certificates stand for those that a CA service would issue: in a dry run."""
-        return self.dry_run and bool(self._served())
+        return self.dry_run and bool(self._entries_of_ca_service())
 
     @property
     def moment(self) -> datetime:
         """The time of the change, or when certificates that a CA service issued begin later."""
-        return max([self.now, *(parse_iso(entry.not_before) for entry in self._served())])
+        return max(
+            [self.now, *(parse_iso(entry.not_before) for entry in self._entries_of_ca_service())]
+        )
 
-    def _served(self) -> list[Entry]:
+    def _entries_of_ca_service(self) -> list[Entry]:
         """Return the ledger entries of the certificates that a CA service issued."""
         identity: Authority | None = self.__dict__.get("identity")  # none is opened for this
         if identity is None or identity.service is None:
@@ -493,7 +495,7 @@ class KeystoreChange:
             KeystoreError: a serial number was there before: whoever revokes one certificate would
                 revoke the other one, too.
         """
-        if not (issued := self._served()):
+        if not (issued := self._entries_of_ca_service()):
             return
         serials = [entry.serial for entry in issued]
         known = self.keystore.ledger_file.with_values("serial", serials).entries
@@ -506,7 +508,7 @@ class KeystoreChange:
                 "changed.",
             )
         asked = window(self.now, self.template.certificate_validity)
-        end = iso(asked.within(validity_of(self.identity.certificate)).not_after - _NOTED)
+        end = iso(asked.intersection(validity_of(self.identity.certificate)).not_after - _NOTED)
         usual = [e for e in issued if self.template.longest_validity(e.enclave) is None]
         if early := [entry for entry in usual if entry.not_after < end]:
             text = (
@@ -562,7 +564,7 @@ class KeystoreChange:
         return kind(**shared | more)
 
 
-def _no_network(root: Path) -> Note:
+def _no_network_note(root: Path) -> Note:
     text = (
         "the fleet names Zenoh routers of robots, but the keystore has no Zenoh network yet; "
         f"create it with `sros zenoh {quote(str(root))}`."
@@ -574,7 +576,7 @@ _ADOPTED = "taken over"
 """The ``reason`` of ledger entries for files that existed before the ledger."""
 
 
-def _take_over(
+def _take_over_records(
     transaction: Transaction, keystore: Keystore, now: datetime, entries: Iterable[Entry]
 ) -> list[Entry]:
     """Return ``entries`` after entries for the files that ros2/sros2 made; stage the settings.
@@ -590,7 +592,7 @@ def _take_over(
     if not keystore.is_of_ros2:
         return added
     before = list(_left_by_ros2(keystore, transaction.enclaves, now))
-    transaction.adopt()
+    transaction.note_adoption()
     if not any(entry.what == "settings" for entry in added):
         before += _settings_of_ros2(transaction, keystore, now)
     return [*before, *added]
@@ -651,7 +653,7 @@ def _keep_zenoh(
     """
     existing = transaction.enclaves
     wanted = zenoh_documents(keystore, network, domains, authority, now, change, existing=existing)
-    drifts = drifted(keystore, wanted, authority, change.gone)
+    drifts = drifted_configurations(keystore, wanted, authority, change.gone)
     for drift in drifts:
         if drift.kind is Drift.STALE:
             _remove(transaction, drift.path)

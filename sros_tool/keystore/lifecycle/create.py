@@ -28,11 +28,11 @@ from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageE
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
-from sros_tool.keystore.delivery.published import may_be_later
+from sros_tool.keystore.delivery.published import may_have_later_releases
 from sros_tool.keystore.fleet import (
     EnclaveDomains,
     enclaves_of_robot,
-    left_enclaves,
+    left_enclave_notes,
     load_fleet,
     publish_command,
     refuse_stale_domains,
@@ -84,10 +84,10 @@ from sros_tool.keystore.lifecycle.replaced import (
 )
 from sros_tool.keystore.protection import less_protected, with_stated
 from sros_tool.keystore.reader import Keystore, check_domain
-from sros_tool.keystore.selection import no_such_enclave
+from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.keystore.settings import edit_remedy, found_edits, with_places, write_settings
 from sros_tool.keystore.template import NODE_BASICS, Template, template_names
-from sros_tool.keystore.transaction.transaction import tidy
+from sros_tool.keystore.transaction.transaction import recover_keystore
 from sros_tool.names import check_enclave_name
 from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.parallel import Progress
@@ -168,7 +168,7 @@ def create_keystore(
             work with a new CA.
     """
     if not dry_run:
-        tidy(root)
+        recover_keystore(root)
     _check_free(root)
     with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run, fresh=True) as change:
         domains = domains or DomainSet.of((0, 0))
@@ -250,10 +250,10 @@ def create_permission(
         existing = frozenset(change.names)
         for name in names:
             if name not in existing:
-                raise no_such_enclave(change.keystore, name, existing)
+                raise missing_enclave_error(change.keystore, name, existing)
         stated = {enclave.path: enclave for enclave in policy.enclaves}
         wanted = {name: stated.get(name) or stated_enclave(policy, name) for name in names}
-        _begin(change, domain, protections=stated_protections(wanted.values()))
+        _prepare_change(change, domain, protections=stated_protections(wanted.values()))
         rights = write_enclaves(change, wanted, revoke_old=revoke_old)
     return creation(change, rights)
 
@@ -291,13 +291,13 @@ def generate_artifacts(
             is in a domain that the keystore is not for.
     """
     wanted = _rights_by_enclave(enclaves, policies)
-    protections = stated_protections(_protecting(policies))
+    protections = stated_protections(_enclaves_with_protection(policies))
     for_fleet = [policy for policy in policies if isinstance(policy, FleetPolicy)]
     fleet = for_fleet[0].fleet if for_fleet else None
     patterns = [pattern for policy in for_fleet for pattern in policy.patterns]
     places = token_places(key, list(wanted)) if key else {}
     if not dry_run:
-        tidy(root)
+        recover_keystore(root)
     fresh = create is not None and not is_keystore(root)
     if fresh:
         _check_typo(root)
@@ -312,9 +312,9 @@ def generate_artifacts(
     )
     if create is None or not fresh:
         with change:
-            _begin(change, domain, fleet, patterns, wanted, protections)
+            _prepare_change(change, domain, fleet, patterns, wanted, protections)
             again = _revoked_before(change, wanted, enclaves, fleet)
-            ended = dict(_ended(change, wanted.keys() - {*enclaves}))
+            ended = dict(_expired_enclaves(change, wanted.keys() - {*enclaves}))
             again = [*again, *ended.values()]
             if ended:
                 wanted = {name: wanted[name] for name in wanted if name not in ended}
@@ -340,7 +340,7 @@ def generate_artifacts(
     return creation(change, ())
 
 
-def _ended(change: KeystoreChange, names: Iterable[str]) -> Iterator[tuple[str, Note]]:
+def _expired_enclaves(change: KeystoreChange, names: Iterable[str]) -> Iterator[tuple[str, Note]]:
     """Yield the short-lived enclaves that have expired, with a note: nobody has to renew them."""
     for name in sorted(names):
         path = enclave_path(change.root, name) / CERTIFICATE_FILE
@@ -366,7 +366,7 @@ def creation(change: KeystoreChange, rights: tuple[ReplacedRights, ...]) -> Crea
     )
 
 
-def _protecting(policies: Sequence[Policy | FleetPolicy]) -> Iterator[Enclave]:
+def _enclaves_with_protection(policies: Sequence[Policy | FleetPolicy]) -> Iterator[Enclave]:
     """Yield the enclaves of the policies; fleet policies count only if they state protection."""
     for policy in policies:
         if not isinstance(policy, FleetPolicy):
@@ -476,7 +476,7 @@ def _rights_by_enclave(
 # ── the keystore ───────────────────────────────────────────────────────────────────────────
 
 
-def _begin(
+def _prepare_change(
     change: KeystoreChange,
     domain: int | None,
     fleet: Fleet | None = None,
@@ -501,7 +501,7 @@ def _begin(
         before = load_fleet(change.keystore)
         recorded = change.write_fleet(fleet, patterns)
         refuse_stale_domains(root, EnclaveDomains(change.domains, before), recorded, stated)
-        change.notes += left_enclaves(root, before, recorded) if before else ()
+        change.notes += left_enclave_notes(root, before, recorded) if before else ()
     if protections:
         _raise_protection(change, protections)
 
@@ -535,7 +535,7 @@ def _write_keystore(
 def _check_free(root: Path) -> None:
     """Raise `KeystoreError` if a new keystore cannot be created at ``root``."""
     if is_keystore(root):
-        raise _already_exists(root)
+        raise _already_exists_error(root)
     refuse_earlier(root)
     if os.path.realpath(root) == "/":  # unlike Path.resolve, it does not fail at a loop of links
         raise KeystoreError(
@@ -554,7 +554,7 @@ def _check_free(root: Path) -> None:
     remains = [part for part in (PUBLIC, PRIVATE, ENCLAVES) if (root / part).exists()]
     if remains:
         if is_keystore(root):  # another process has just completed it
-            raise _already_exists(root)
+            raise _already_exists_error(root)
         raise KeystoreError(
             f"'{root}' already contains parts of a keystore",
             f"It has {', '.join(remains)}; with a new CA, every enclave that trusts the old CA "
@@ -578,7 +578,7 @@ def _place_notes(root: Path) -> Iterator[Note]:
         )
 
 
-def _already_exists(root: Path) -> KeystoreError:
+def _already_exists_error(root: Path) -> KeystoreError:
     return KeystoreError(
         f"keystore '{root}' already exists",
         "",
@@ -887,10 +887,10 @@ class _EnclaveMaker:
             replaced = replaced_rights(name, earlier, grant, change.now) if earlier else None
             if old is None:
                 return _EnclaveOutcome("changed", notes, replaced)
-            superseded = Superseded.by(name, old, issued.certificate, change.now)
+            superseded = Superseded.record(name, old, issued.certificate, change.now)
             return _EnclaveOutcome("changed", notes, replaced and replaced.revoked(), superseded)
         if rights and policy is None:
-            notes += tuple(self._lost_rights(rights.enclave, present))
+            notes += tuple(self._lost_rights_notes(rights.enclave, present))
         completed = len(change.transaction.changes) > before
         return _EnclaveOutcome("completed" if completed else "kept", notes)
 
@@ -922,7 +922,7 @@ class _EnclaveMaker:
             )
         except SrosError:  # a sealed part of the ledger is elsewhere
             return working
-        if ledger.gaps or ledger.unchained or was_restored or may_be_later(keystore):
+        if ledger.gaps or ledger.unchained or was_restored or may_have_later_releases(keystore):
             return working
         revoked = revoked_serials(keystore)
         for entry in ledger.entries:
@@ -933,7 +933,7 @@ class _EnclaveMaker:
                 permissions.append(entry.subject)
         return working
 
-    def _lost_rights(self, default: Enclave, existing_files: set[str]) -> Iterator[Note]:
+    def _lost_rights_notes(self, default: Enclave, existing_files: set[str]) -> Iterator[Note]:
         """Yield a note if an enclave had other rights than the default ones that it gets.
 
         The unsigned copy of lost permissions shows that an enclave had some which the ledger does
@@ -1050,10 +1050,10 @@ class _EnclaveMaker:
                 "again.",
             )
         if not validity_of(certificate).contains(self._change.now):
-            raise self._not_valid()
+            raise self._not_valid_error()
         return certificate
 
-    def _not_valid(self) -> KeystoreError:
+    def _not_valid_error(self) -> KeystoreError:
         """Return the error that names all enclaves whose certificates are not valid now."""
         found: dict[str, Window] = {}
         for name in self._names:

@@ -30,7 +30,7 @@ from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_enclave, h
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import IssuedEarlier, Superseded
 from sros_tool.keystore.rights import RecordedRights, SignedRights
-from sros_tool.keystore.selection import no_such_enclave
+from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.names import check_enclave_name
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import (
@@ -84,7 +84,7 @@ def renew(
     with change:
         for name in names:
             if not has_enclave(root, check_enclave_name(name)):
-                raise no_such_enclave(change.keystore, name, change.names)
+                raise missing_enclave_error(change.keystore, name, change.names)
         writer = change.writer(keys_on_token=bool(places), revoke_old=revoke_old)
         thresholds: dict[str, Threshold | None] = dict.fromkeys(names)
         if expiring is not None:
@@ -187,7 +187,7 @@ class _Renewer:
             raise
         except SrosError as error:
             return UnreadableEnclave(name, error)
-        return Superseded.by(name, state.certificate, issued.certificate, now)
+        return Superseded.record(name, state.certificate, issued.certificate, now)
 
     def _issuance(self, state: Credentials) -> Issuance:
         """Return what to issue for an enclave, after verifying its present files."""
@@ -249,4 +249,4 @@ def checked_rights(
             "Restore the certificate, or remove the enclave's folder and create it again.",
         )
     state.signed.verify(authorities.permissions.certificate)
-    return recorded.of(state.name, state.digest, state.grant)
+    return recorded.rights_to_sign(state.name, state.digest, state.grant)

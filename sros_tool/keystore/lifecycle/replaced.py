@@ -19,7 +19,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet, folded
-from sros_tool.keystore.delivery.published import may_be_later
+from sros_tool.keystore.delivery.published import may_have_later_releases
 from sros_tool.keystore.known_keys import restored_at, revoked_serials
 from sros_tool.keystore.ledger import Entry, certificate_entry
 from sros_tool.keystore.reader import Keystore
@@ -67,15 +67,15 @@ class ReplacedRights:
         """Return a copy for an enclave whose earlier certificate is revoked."""
         return replace(self, works_until=None)
 
-    def loses(self, fleet: Fleet | None = None) -> str:
+    def lost_text(self, fleet: Fleet | None = None) -> str:
         """Return the rights and domains that are lost, as text; "" for none.
 
         Rights to names that differ only in the robot of ``fleet`` are one.
         """
         return self._text(self.lost, self.lost_domains, fleet)
 
-    def gains(self, fleet: Fleet | None = None) -> str:
-        """Return the rights and domains that are gained, as text, like `loses`; "" for none."""
+    def gained_text(self, fleet: Fleet | None = None) -> str:
+        """Return the rights and domains that are gained, as text, like `lost_text`; "" for none."""
         return self._text(self.gained, self.gained_domains, fleet)
 
     def _text(self, rights: Sequence[Right], domains: str, fleet: Fleet | None) -> str:
@@ -143,7 +143,7 @@ class IssuedEarlier:
     """
 
     def __init__(self, keystore: Keystore, names: Collection[str]) -> None:
-        self.lacks_some = bool(restored_at(keystore) or may_be_later(keystore))
+        self.lacks_some = bool(restored_at(keystore) or may_have_later_releases(keystore))
         self._expiry: dict[tuple[str, str], str] = {}
         revoked = revoked_serials(keystore)
         for entry in keystore.ledger_file.with_values("enclave", names).entries:
@@ -199,7 +199,7 @@ class Superseded:
     new_key: str
 
     @classmethod
-    def by(
+    def record(
         cls, name: str, old: x509.Certificate, new: x509.Certificate, now: datetime
     ) -> Superseded:
         """Return the record that the certificate ``new`` replaced ``old`` at ``now``."""
@@ -231,7 +231,7 @@ def lasting_text(root: Path, replaced_rights: Sequence[ReplacedRights]) -> str:
     lasting = [
         rights
         for rights in replaced_rights
-        if rights.loses() and (rights.works_until or rights.may_work_longer)
+        if rights.lost_text() and (rights.works_until or rights.may_work_longer)
     ]
     if not lasting:
         return ""

@@ -106,7 +106,7 @@ class Forgotten:
         self.certificates.setdefault(entry.serial, entry)
         return True
 
-    def unknown(self, keystore: Keystore) -> dict[str, Entry]:
+    def unknown_certificates(self, keystore: Keystore) -> dict[str, Entry]:
         """Return the certificates that ``keystore`` neither issued nor revoked, as far as it knows.
 
         A certificate that the ledger has only from a robot's message is included if a sealed
@@ -202,7 +202,9 @@ def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> li
     return [entry for entry in old.revoked if expiries.get(entry.serial, issued) >= issued]
 
 
-def _moved_away(keystore: Keystore, known: Container[str] = ()) -> Iterator[x509.Certificate]:
+def _certificates_of_revoked(
+    keystore: Keystore, known: Container[str] = ()
+) -> Iterator[x509.Certificate]:
     """Yield the certificates in the folder ``revoked`` that a trusted identity CA issued.
 
     Certificates whose serial number (hexadecimal) is in ``known`` are not read.
@@ -252,7 +254,7 @@ class RevocationListSigner:
         self._now = now
         self._last: Mapping[str, Entry] = {}
         self.remarks: list[Note] = []
-        self.present = self._authentic(keystore.revocation_list)
+        self.present = self._list_if_authentic(keystore.revocation_list)
 
     def recipients(self) -> Sequence[str] | None:
         """Return the enclaves that have the list already; None if perhaps not all have it.
@@ -343,7 +345,9 @@ class RevocationListSigner:
                 and not expired
             ):
                 certificates[entry.enclave][int(entry.serial, 16)] = entry
-        for certificate in _moved_away(self._keystore, self._recorded_as_moved(listed_serials)):
+        for certificate in _certificates_of_revoked(
+            self._keystore, self._recorded_as_moved(listed_serials)
+        ):
             name = common_name_of(certificate.subject)
             if name in certificates and validity_of(certificate).not_after >= self._now:
                 entry = certificate_entry(self._now, "certificate", certificate, name)
@@ -391,7 +395,7 @@ class RevocationListSigner:
 
     # ── the lists ──────────────────────────────────────────────────────────────────────────
 
-    def _authentic(self, crl: RevocationList | None) -> RevocationList | None:
+    def _list_if_authentic(self, crl: RevocationList | None) -> RevocationList | None:
         """Return ``crl`` if a trusted identity CA signed it; else None, with a remark.
 
         Whoever can write the file, but not sign, could otherwise have the CA sign entries that
@@ -431,7 +435,7 @@ class RevocationListSigner:
         date = self._now.replace(microsecond=0)
         new_entries = [Revoked(int(entry.serial, 16), date, entry.reason) for entry in revocations]
         expiries = self._expiries()
-        if lost := self._lost(expiries):
+        if lost := self._lost_revocations(expiries):
             new_entries = [*new_entries, *lost]
             text = (
                 f"The revocation list was not the last list that this keystore signed: {len(lost)} "
@@ -517,7 +521,7 @@ class RevocationListSigner:
             remedy,
         )
 
-    def _lost(self, expiries: Mapping[int, str]) -> list[Revoked]:
+    def _lost_revocations(self, expiries: Mapping[int, str]) -> list[Revoked]:
         """Return the revocations that the present list lacks, if it is older than the last list."""
         entries = self._keystore.ledger_file.with_values("what", ("revocation", "crl")).entries
         count = max(
@@ -561,7 +565,7 @@ class RevocationListSigner:
             if entry.what == "certificate" and entry.serial and entry.not_after
         }
         expiries = {int(serial, 16): not_after for serial, not_after in recorded.items()}
-        for certificate in _moved_away(self._keystore, recorded):
+        for certificate in _certificates_of_revoked(self._keystore, recorded):
             expiries.setdefault(certificate.serial_number, iso(validity_of(certificate).not_after))
         return expiries
 
@@ -592,7 +596,7 @@ class RevocationListSigner:
         (other,) = [candidate for candidate in certificates if digest(candidate) == sha256]
         if coming and crls_confusable(certificates[0], other):
             return None  # in this case all processes have to be restarted together anyway
-        old = self._authentic(self._keystore.embedded_list(file))
+        old = self._list_if_authentic(self._keystore.embedded_list(file))
         try:
             authority = self._open(other, replaced, is_coming=coming)
         except KeystoreError as error:

@@ -28,7 +28,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import RESTORED, Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import Forgotten
-from sros_tool.keystore.selection import no_such_enclave
+from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import issued_by
 from sros_tool.pki.crl import REASONS, SUPERSEDED
@@ -108,7 +108,7 @@ def revoke(
         _check_names(change, names)
         lists = change.revocation_lists()
         gone = frozenset(names)
-        last = {name: _move_away(change, name) for name in dict.fromkeys(names)}
+        last = {name: _move_to_revoked(change, name) for name in dict.fromkeys(names)}
         recipients = lists.recipients()
         everybody = change.names if recipients is None else recipients
         change.restart = tuple(name for name in everybody if name not in gone)
@@ -157,7 +157,9 @@ def restore_revocations(
             if entry.serial not in known
         }
         # A CA service knows its certificates, also those of other sites.
-        unknown = {} if change.identity.service else forgotten_lists.unknown(change.keystore)
+        unknown = (
+            {} if change.identity.service else forgotten_lists.unknown_certificates(change.keystore)
+        )
         reasons = _reasons_of_revoked(change, unknown) | reasons
         recorded = change.keystore.ledger_file.with_values("serial", reasons).entries
         issued = {
@@ -186,7 +188,7 @@ def restore_revocations(
         _check_names(change, tuple(again))
         revocations = []
         for name, reason in again.items():
-            revocations += lists.revocations({name: _move_away(change, name)}, reason)
+            revocations += lists.revocations({name: _move_to_revoked(change, name)}, reason)
         done = {entry.serial for entry in revocations}
         for serial, reason in reasons.items():
             if serial not in done:
@@ -300,9 +302,9 @@ def _check_names(change: KeystoreChange, names: Sequence[str]) -> None:
         check_enclave_name(name)
         exists = has_enclave(change.root, name)
         if name == router and exists:
-            raise _is_router(change, name)
+            raise _router_error(change, name)
         if not exists:
-            raise no_such_enclave(change.keystore, name, change.names, may_create=False)
+            raise missing_enclave_error(change.keystore, name, change.names, may_create=False)
 
 
 def _drop_routers(change: KeystoreChange, revoked: Collection[str]) -> None:
@@ -320,7 +322,7 @@ def _drop_routers(change: KeystoreChange, revoked: Collection[str]) -> None:
         change.notes.append(Note("zenoh.router-revoked", text))
 
 
-def _is_router(change: KeystoreChange, router: str) -> KeystoreError:
+def _router_error(change: KeystoreChange, router: str) -> KeystoreError:
     where = quote(str(change.root))
     other = next(n for at in count(2) if (n := f"{router}{at}") not in change.names)
     return KeystoreError(
@@ -333,7 +335,7 @@ def _is_router(change: KeystoreChange, router: str) -> KeystoreError:
     )
 
 
-def _move_away(change: KeystoreChange, name: str) -> Entry:
+def _move_to_revoked(change: KeystoreChange, name: str) -> Entry:
     """Stage the move of an enclave's files to ``revoked``; return the entry of its certificate.
 
     A folder that has nothing else moves as a whole, unless others could open its key.

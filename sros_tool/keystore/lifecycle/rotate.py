@@ -159,7 +159,7 @@ def rotate_ca(
                 _refuse_edited(change.keystore)
             cut_off = robots_cut_off(change.keystore, rotation, stage, now)
             if cut_off and not allow_unconfirmed:
-                raise _would_cut_off(root, rotation, cut_off)
+                raise _cut_off_error(root, rotation, cut_off)
             stage = rotator.go_to(stage, roles, new_keys, validity, progress)
             if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
                 change.notes += _no_robot_notes(change.keystore, change.names)
@@ -235,7 +235,7 @@ def _no_robot_notes(keystore: Keystore, names: Iterable[str]) -> Iterator[Note]:
         )
 
 
-def _would_cut_off(root: Path, rotation: Rotation, robots: Sequence[str]) -> KeystoreError:
+def _cut_off_error(root: Path, rotation: Rotation, robots: Sequence[str]) -> KeystoreError:
     stage = "a rotation" if rotation.stage is RotationStage.NONE else f"the stage {rotation.stage}"
     return KeystoreError(
         f"not every robot has confirmed {stage}: {first_few(robots, _SHOWN)}",
@@ -436,7 +436,7 @@ class _Rotator:
         2.9.1 refuses every enclave of a CA without a list (tested).
         """
         if self._rotation.stage is RotationStage.REISSUE:
-            self._retire()
+            self._retire_old_cas()
             return stage
         if self._rotation.stage is RotationStage.NONE:
             successors = self._begin_rotation(
@@ -447,7 +447,7 @@ class _Rotator:
             else:
                 self._reissue(successors, stage, progress)
         else:
-            successors = _distributed(self._change, self._rotation)
+            successors = _distributed_successors(self._change, self._rotation)
             if stage is RotationStage.REISSUE and self._lacks_crl(successors):
                 stage = RotationStage.DISTRIBUTE
                 self._distribute(successors)
@@ -624,7 +624,7 @@ class _Rotator:
             self._transaction.write(path, message)
             self._change.entries.append(document_entry(self._change.now, "governance", message))
 
-    def _retire(self) -> None:
+    def _retire_old_cas(self) -> None:
         files = self._keystore.authority_files
         for replacement in self._rotation.replacements:
             new, *others = self._keystore.certificates_of(replacement.file)
@@ -746,7 +746,7 @@ def _verified_rights(
             "They belong to another certificate.",
             f"Sign them again with `sros create_permission {quote(str(root))} {name} POLICY_FILE`.",
         )
-    return change.recorded.of(name, old.digest, old.grant)
+    return change.recorded.rights_to_sign(name, old.digest, old.grant)
 
 
 # ── new CAs ────────────────────────────────────────────────────────────────────────────────
@@ -853,7 +853,7 @@ def _make_successor(
     return _Successor(file, roles, old, Authority(certificate, key), place or at)
 
 
-def _distributed(change: KeystoreChange, rotation: Rotation) -> list[_Successor]:
+def _distributed_successors(change: KeystoreChange, rotation: Rotation) -> list[_Successor]:
     """Return the new CAs of a rotation at the stage DISTRIBUTE, with their keys."""
     found = []
     files = change.keystore.authority_files

@@ -302,7 +302,7 @@ def update_keystore(
         goal = _Goal(
             _checked_target(root, present, target), domains.closed() if domains else present.domains
         )
-        pending = _pending(present, goal)
+        pending = _pending_stages(present, goal)
         done = pending[:1] if next_stage else pending
         step = goal if done == pending else _first_step(present, goal)
         change.template, change.governance = present.settings, present.governance
@@ -379,7 +379,7 @@ _ONLY_STATED = ("name", "description", "distributions")
 """Settings that no file depends on."""
 
 
-def _pending(present_settings: PresentSettings, goal: _Goal) -> tuple[UpdateStage, ...]:
+def _pending_stages(present_settings: PresentSettings, goal: _Goal) -> tuple[UpdateStage, ...]:
     """Return the stages that change something, in order."""
     found = []
     before, after = present_settings.settings, _first_step(present_settings, goal).settings
@@ -566,14 +566,14 @@ class _Updater:
             enclave = default_rights(self._goal.settings, name)
             rights = StatedRights(enclave, self._after.of(name))
         else:
-            rights = earlier._replace(grant=self._on_domains(name, earlier.grant))
+            rights = earlier._replace(grant=self._grant_for_new_domains(name, earlier.grant))
         identity = self._new_identity(state) if certificate else state.certificate
         issued = self._writer.write(Issuance(name, identity, rights))
         (grant,) = issued.permissions.grants
         present = EarlierPermissions(state.certificate, state.grant)
         old = None
         if certificate:
-            old = Superseded.by(name, state.certificate, issued.certificate, change.now)
+            old = Superseded.record(name, state.certificate, issued.certificate, change.now)
         return _Reissued(name, replaced_rights(name, present, grant, change.now), old)
 
     def _changes_longest_validity(self, name: str) -> bool:
@@ -610,7 +610,7 @@ class _Updater:
         difference = compare(grant_rights(state.name, grant), own)
         return all(right in difference.covered for _, right in difference.lines())
 
-    def _on_domains(self, name: str, grant: Grant) -> Grant:
+    def _grant_for_new_domains(self, name: str, grant: Grant) -> Grant:
         """Return a grant whose rules are for the new domains.
 
         Raises:
@@ -723,7 +723,7 @@ def trust_records(
                 "Damaged records cannot be trusted.",
                 f"See `sros check {quote(str(root))}`.",
             )
-        last = RecordedRights(change.keystore, ledger).unproven()
+        last = RecordedRights(change.keystore, ledger).unproven_entries()
         names = [name for name in change.names if name in last]
         if not names:
             raise KeystoreError(
@@ -788,7 +788,7 @@ def set_zenoh(
             network = _with_routers_of_robots(change, network)
             check_network(network)
         if network and before and before.router != network.router:
-            change.notes.append(_router_moved(before.router, network.router))
+            change.notes.append(_moved_router_note(before.router, network.router))
         template = replace(change.template, zenoh=network)
         for router in network.router_names() if network else ():
             if router in change.names:
@@ -829,7 +829,7 @@ def _with_routers_of_robots(change: KeystoreChange, network: ZenohNetwork) -> Ze
     return complete
 
 
-def _router_moved(old: str, new: str) -> Note:
+def _moved_router_note(old: str, new: str) -> Note:
     return Note(
         "zenoh.router-moved",
         f"the router is now in enclave {new}: stop the router that runs in {old}, and start it "

@@ -204,7 +204,7 @@ def _read_manifest(folder: Folder) -> tuple[Move, ...]:
             raise ValueError(f"its version is not {_VERSION}")
         return tuple(_move(*move) for move in read["moves"])
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        raise _unknown(
+        raise _damaged_stage_error(
             folder, f"Its list of files, {MANIFEST}, cannot be read: {error}."
         ) from error
 
@@ -252,10 +252,12 @@ def _check_stage(folder: Folder) -> str | None:
         return None
     _check_owner(folder, STAGE)
     if folder.mode(STAGE) & 0o077:
-        raise _foreign(folder, "Other users may open it.")
+        raise _foreign_stage_error(folder, "Other users may open it.")
     for name in folder.names(STAGE):
         if not _KNOWN.fullmatch(name):
-            raise _unknown(folder, f"{name!r} is not part of the format of this version of sros.")
+            raise _damaged_stage_error(
+                folder, f"{name!r} is not part of the format of this version of sros."
+            )
         path = f"{STAGE}/{name}"
         _check_owner(folder, path)
         if name == ADDED:
@@ -264,13 +266,17 @@ def _check_stage(folder: Folder) -> str | None:
             folder.is_folder(path)
             for staged in folder.names(path):
                 if not _STAGED_NAME.fullmatch(staged):
-                    raise _unknown(folder, f"{staged!r} is not a file of a transaction.")
+                    raise _damaged_stage_error(
+                        folder, f"{staged!r} is not a file of a transaction."
+                    )
                 _check_file(folder, f"{path}/{staged}")
     to = folder.link_target(f"{STAGE}/{LIVE}")
     if to not in (None, BEFORE, AFTER) or (
         to is None and folder.state(f"{STAGE}/{LIVE}") is not None
     ):
-        raise _unknown(folder, f"{LIVE!r} is not part of the format of this version of sros.")
+        raise _damaged_stage_error(
+            folder, f"{LIVE!r} is not part of the format of this version of sros."
+        )
     return to
 
 
@@ -293,7 +299,7 @@ def _check_added(folder: Folder, path: str) -> None:
             _check_added(folder, f"{path}/{name}".lstrip("/"))
         return
     if not is_layout_path(path):
-        raise _unknown(folder, f"{ADDED}/{path} is not a file of a keystore.")
+        raise _damaged_stage_error(folder, f"{ADDED}/{path} is not a file of a keystore.")
     _check_file(folder, whole)
 
 
@@ -301,16 +307,16 @@ def _check_file(folder: Folder, path: str) -> None:
     _check_owner(folder, path)
     mode = folder.mode(path)
     if not stat.S_ISREG(mode) and not stat.S_ISLNK(mode):
-        raise _unknown(folder, f"{path} is neither a file nor a link.")
+        raise _damaged_stage_error(folder, f"{path} is neither a file nor a link.")
 
 
 def _check_owner(folder: Folder, path: str) -> None:
     state = folder.state(path)
     if state and state.st_uid not in (0, os.geteuid(), folder.owner[0]):
-        raise _foreign(folder, f"{path} belongs to user {state.st_uid}.")
+        raise _foreign_stage_error(folder, f"{path} belongs to user {state.st_uid}.")
 
 
-def _unknown(folder: Folder, why: str) -> KeystoreError:
+def _damaged_stage_error(folder: Folder, why: str) -> KeystoreError:
     return KeystoreError(
         f"the interrupted change in '{folder.path / STAGE}' can be neither completed nor undone",
         why,
@@ -319,7 +325,7 @@ def _unknown(folder: Folder, why: str) -> KeystoreError:
     )
 
 
-def _foreign(folder: Folder, why: str) -> KeystoreError:
+def _foreign_stage_error(folder: Folder, why: str) -> KeystoreError:
     return KeystoreError(
         f"'{folder.path / STAGE}' is not an interrupted change of yours",
         f"{why} Somebody else may have put it there, to make sros move files with your rights.",

@@ -112,7 +112,7 @@ class Transaction:
         self._after: list[Callable[[], None]] = []
         self._adopts = False
         # New files, None for those beyond the limit, and targets of links, of a dry run.
-        self._kept: dict[str, bytes | str | None] = {}
+        self._path_of_old_content: dict[str, bytes | str | None] = {}
         self._kept_bytes = 0
 
     @property
@@ -256,7 +256,7 @@ class Transaction:
         self.write_parts(path, (data,), private=private)
         if self.dry_run and not private:
             fits = self._kept_bytes + len(data) <= _MOST_KEPT
-            self._kept[path] = data if fits else None
+            self._path_of_old_content[path] = data if fits else None
             self._kept_bytes += len(data) if fits else 0
 
     def write_parts(self, path: str, parts: Iterable[bytes], *, private: bool = False) -> None:
@@ -298,7 +298,7 @@ class Transaction:
         if not self.is_staged(place):
             return _content(self.root / place)
         if self.dry_run:
-            kept = self._kept.get(place)
+            kept = self._path_of_old_content.get(place)
             return kept if isinstance(kept, bytes) else None
         return _content(Path(self._stage_place(place)))
 
@@ -307,7 +307,7 @@ class Transaction:
 
         Private files are not among them.
         """
-        return sorted(path for path, kept in self._kept.items() if kept is None)
+        return sorted(path for path, kept in self._path_of_old_content.items() if kept is None)
 
     def target_after(self, path: str) -> str | None:
         """Return the target of the link at ``path`` after the transaction; None: no link."""
@@ -316,7 +316,7 @@ class Transaction:
         if self._links_to_list(path):
             return link_to_list(path.rpartition("/")[0].removeprefix(ENCLAVES) or "/")
         if self.dry_run:
-            kept = self._kept.get(path)
+            kept = self._path_of_old_content.get(path)
             return kept if isinstance(kept, str) else None
         target = _link_target(self._stage_place(path))
         return target and target.removeprefix(relocated_target(path, ""))
@@ -345,7 +345,7 @@ class Transaction:
             flat = self._folders[path.rpartition("/")[0]]
             self._in.symlink(relocated_target(path, target) if flat else target, staged)
         else:
-            self._kept[path] = target
+            self._path_of_old_content[path] = target
 
     def link_to_first_list(self, names: Sequence[str]) -> None:
         """Stage the link ``crl.pem`` for enclaves without one; this transaction writes the list.
@@ -463,14 +463,14 @@ class Transaction:
         With ``alone``, there are no forked workers: the session of a token does not survive a fork.
         """
         own_process, first_change, first_move = os.getpid(), self.changes.mark(), len(self._moves)
-        first_kept = len(self._kept)
+        first_kept = len(self._path_of_old_content)
 
         def work_on(part: Sequence[Item]) -> tuple[Result, Staged | None]:
             result = work(part)
             if os.getpid() == own_process:
                 return result, None
             changes, moves = self.changes.since(first_change), self._moves[first_move:]
-            kept = dict(islice(self._kept.items(), first_kept, None))
+            kept = dict(islice(self._path_of_old_content.items(), first_kept, None))
             return result, Staged(changes, tuple(moves), kept)
 
         slices = [(items, work_on(items))] if alone else map_slices(items, work_on)
@@ -481,10 +481,10 @@ class Transaction:
                     self._note_staged(place, (*self._staged.get(place, ()), *names))
                 self.changes.extend(staged.changes)
                 self._moves += staged.moves
-                self._kept |= staged.kept
+                self._path_of_old_content |= staged.kept
         return [(part, result) for part, (result, _) in slices]
 
-    def adopt(self) -> None:
+    def note_adoption(self) -> None:
         """Add a change that says that the keystore gets its first settings and ledger."""
         self._adopts = True
         self.changes.add(ADOPT, "")
@@ -510,7 +510,7 @@ class Transaction:
         folder = self._in
         if self._new_root:
             folder.flush_file_system()
-            self._appear()
+            self._put_keystore_in_place()
             self._finish()
             return
         write_manifest(folder, self._moves)
@@ -545,7 +545,7 @@ class Transaction:
             for change in self.changes:
                 _LOG.debug("%s %s", change.action, change.path)
 
-    def _appear(self) -> None:
+    def _put_keystore_in_place(self) -> None:
         os.fchmod(self._in.handle(""), folder_mode(""))
         try:
             with Folder(self.root.parent) as parent:
@@ -653,7 +653,7 @@ class _Bridge:
                 self._keep_link(move)
                 self._place(move)
                 continue
-            kept = _kept(move)
+            kept = _path_of_old_content(move)
             self._folder.symlink(stage_link_target(move.path), kept)
             if not self._folder.exchange(kept, move.path):
                 whole = str(self._folder.path / move.path)
@@ -667,9 +667,9 @@ class _Bridge:
                 self._keep_link(move)
                 continue
             try:
-                self._folder.link(move.path, _kept(move))
+                self._folder.link(move.path, _path_of_old_content(move))
             except OSError:  # a file system, or an owner, that allows no hard links
-                self._folder.copy(move.path, _kept(move))
+                self._folder.copy(move.path, _path_of_old_content(move))
                 copied = True
         return copied
 
@@ -680,7 +680,9 @@ class _Bridge:
 
     def _keep_link(self, move: Move) -> None:
         if move.before:
-            self._folder.symlink(relocated_target(move.path, move.before), _kept(move))
+            self._folder.symlink(
+                relocated_target(move.path, move.before), _path_of_old_content(move)
+            )
 
     def _place(self, move: Move) -> None:
         if move.before is None:
@@ -691,7 +693,7 @@ class _Bridge:
         self._folder.replace(spare, move.path)
 
 
-def _kept(move: Move) -> str:
+def _path_of_old_content(move: Move) -> str:
     """Return the path of the old content during the commit."""
     return f"{STAGE}/{BEFORE}/{staged_name(move.path)}"
 
@@ -759,14 +761,14 @@ class KeystoreLock:
         except OSError as error:
             if error.errno not in (errno.ELOOP, errno.ENXIO):  # a link, a socket
                 raise
-            raise self._in_the_way() from error
+            raise self._blocked_lock_error() from error
         regular = stat.S_ISREG(os.fstat(handle).st_mode)
         os.close(handle)
         if not regular:
-            raise self._in_the_way()
+            raise self._blocked_lock_error()
         return False
 
-    def _in_the_way(self) -> KeystoreError:
+    def _blocked_lock_error(self) -> KeystoreError:
         return KeystoreError(
             f"'{self._folder.path / LOCK}' is in the way",
             "It is not a file that sros made.",
@@ -815,7 +817,7 @@ def _signals_held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def tidy(root: Path) -> None:
+def recover_keystore(root: Path) -> None:
     """Remove the transaction and the lock that an interrupted process left in the keystore.
 
     The transaction is completed if it was committed, and otherwise undone.
@@ -874,7 +876,7 @@ def _replace_links(folder: Folder, moves: Sequence[Move]) -> None:
         for path, before, after, to in part:
             name = staged_name(path)
             if to:
-                _move_folder(folder, path, to)
+                _move_revoked_folder(folder, path, to)
             elif after is None:
                 if _leads_into_stage(folder, path):
                     folder.unlink(path)
@@ -893,7 +895,7 @@ def _replace_links(folder: Folder, moves: Sequence[Move]) -> None:
     _remove_empty_folders(folder, gone)
 
 
-def _move_folder(folder: Folder, certificate: str, to: str) -> None:
+def _move_revoked_folder(folder: Folder, certificate: str, to: str) -> None:
     """Move the folder of a removed ``certificate`` to ``to``, without the links in it."""
     with contextlib.suppress(FileNotFoundError):  # an earlier recovery moved it
         folder.rename(certificate.rpartition("/")[0], to)

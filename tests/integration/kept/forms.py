@@ -129,7 +129,7 @@ class _Writer:
                 if info in self._keys:
                     continue
                 self._keys[info] = key
-                algorithm, bits = _children(der.first(info))
+                algorithm, bits = _children(der.first_value(info))
                 size = getattr(key, "key_size", "")
                 name = f"{algorithm.content.hex()} {size} {len(self._keys)}"
                 self._names[info] = f"<key {name}>"
@@ -149,10 +149,10 @@ class _Writer:
     def _blob(self, data: bytes) -> str:
         private = _private_key(data)
         if private is None:
-            return self._value(der.first(data))
+            return self._value(der.first_value(data))
         info = private.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
         tags: list[str] = []
-        _walk(der.first(data), lambda value: tags.append(f"{value.tag:02x}"))
+        _walk(der.first_value(data), lambda value: tags.append(f"{value.tag:02x}"))
         return f"<private part of {self._names.get(info)}: {' '.join(tags)}>"
 
     def text(self, text: str) -> str:
@@ -294,10 +294,10 @@ def _keys_in(data: bytes) -> list[tuple[bytes, Any]]:
 
     private = _private_key(data)
     if private is None:
-        _walk(der.first(data), look)
+        _walk(der.first_value(data), look)
     else:
         encoding = Encoding.DER, PublicFormat.SubjectPublicKeyInfo
-        look(der.first(private.public_key().public_bytes(*encoding)))
+        look(der.first_value(private.public_key().public_bytes(*encoding)))
     return found
 
 
@@ -323,7 +323,7 @@ def _parsed(content: bytes) -> list[der.Value]:
 def _inside(value: der.Value) -> der.Value | None:
     """The value that an OCTET STRING contains, if it is nothing but that."""
     nested = value.tag == der.OCTET_STRING and value.content[:1] in (b"\x30", b"\x04", b"\x03")
-    return der.first(value.content) if nested and _is_whole(value.content) else None
+    return der.first_value(value.content) if nested and _is_whole(value.content) else None
 
 
 def _walk(value: der.Value, look: Callable[[der.Value], None]) -> None:
