@@ -66,6 +66,7 @@ from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import merge_into
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy
+from sros_tool.policy.patterns import overlap
 from sros_tool.policy.rights import Right, Rules, policy_rights
 from sros_tool.proof.findings import decide_all
 from sros_tool.proof.requirements import Requirement, read_requirements
@@ -665,6 +666,7 @@ class OpenRobot:
         self.keystore, self.export = folder / "keystore", folder / "export"
         self.start, self.page = folder / "start", folder / "rights.html"
         self.seen, self.processes = folder / "observed.json", folder / CLOSED_PROCESSES
+        self.seen_again = folder / "seen.xml"
         self._check_own()
         self.observed = read_processes(self.processes) if self.processes.exists() else None
         named = domain_of(shell.environment) if domain is None else domain
@@ -786,8 +788,12 @@ class OpenRobot:
         closing = self._closing()._replace(steps=steps, dry_run=dry_run)
         if dry_run or is_stopped:
             return closing._replace(problems=problems)
-        if self.observed and len(closing.observed.processes) > len(self.observed.processes):
-            self._write_processes(closing.observed)
+        if self.observed:
+            known = {process.enclave for process in self.observed.processes}
+            later = [each for each in closing.observed.processes if each.enclave not in known]
+            if later:
+                processes = [*self.observed.processes, *later]
+                self._write_processes(self.observed._replace(processes=processes))
         changes = [*self._write_starts(closing), *changes]
         denied = self._denied_access_texts()
         newly = [right for right in denied if right not in denied_before]
@@ -942,7 +948,7 @@ class OpenRobot:
         Return, as a sentence, which of the observed rights an earlier policy lacks.
         """
         replace_file(self.observer, (policies_dir() / "observer.xml").read_bytes())
-        nodes = [node for node in self._observation().nodes if not is_tool(node)]
+        nodes = [node for node in self._observation(every=True).nodes if not is_tool(node)]
         running = ProcessTable().look(self._shell.now()).processes
         of_cyclone = [process.pid for process in running if "libddsc" in process.libraries]
         process_ids = _process_ids_of_cyclone(of_cyclone, self.domain)
@@ -961,14 +967,24 @@ class OpenRobot:
         lacking = learned["added"] if learned["dry_run"] else ()
         if not lacking:
             return ""
-        policy = shlex.quote(str(self.policy))
-        add = f"sros generate_policy {policy} --enclave-per-node --domain {self.domain}"
+        self._write_seen(nodes)
+        policy, seen = shlex.quote(str(self.policy)), shlex.quote(str(self.seen_again))
+        add = f"sros merge_policy {policy} {seen} --in-place"
         rights = [f"{right['enclave']} {right['right']} {right['name']}" for right in lacking]
         return (
             f"'{self.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "
             f"({first_few(rights, _MOST_NAMES)}); if a process should not have them, stop it, and "
             f"run `sros close {shlex.quote(str(self.folder))}`; if they are right, add them: {add}"
         )
+
+    def _write_seen(self, nodes: Iterable[ObservedNode]) -> None:
+        """Write the rights that nodes use as a policy of its own."""
+        from sros_tool.graph.learn import draft, learn, write  # only after another watch
+
+        common = common_parts(self.folder, policies_dir())
+        if self.seen_again.exists():
+            remove_file(self.seen_again)
+        write(draft(self.seen_again, learn(make_observation(nodes), common), common))
 
     def _shared_program_texts(self) -> Iterator[str]:
         """Yield which programs start processes of several enclaves, and so would put all in one."""
@@ -1011,11 +1027,11 @@ class OpenRobot:
         self.observed = observed
         replace_file(self.processes, f"{json.dumps(as_plain(observed), indent=2)}\n".encode())
 
-    def _observation(self) -> Observation:
+    def _observation(self, *, every: bool = False) -> Observation:
         """Return the nodes that were observed, in the enclaves that the policy has now.
 
         A node whose profile was moved to another enclave is in that one; a node without an enclave
-        is left out.
+        is left out, unless ``every`` node is asked for.
         """
         enclaves = read_policy(self.policy).enclaves
         names = {enclave.path for enclave in enclaves}
@@ -1031,6 +1047,8 @@ class OpenRobot:
                     nodes.append(node)
                 elif place := moved.get((node.ns, stable_name(node.name))):
                     nodes.append(replace(node, enclaves=place))
+                elif every:
+                    nodes.append(node)
             return make_observation(nodes)
         except (ValueError, TypeError, KeyError) as error:
             raise DocumentError(
@@ -1208,10 +1226,11 @@ class OpenRobot:
         silent = "they would not be heard any more (accept: --partial)"
         if observed.unknown:
             named = first_few(observed.unknown, _MOST_NAMES)
+            opened = f"go back by sros close {folder} --undo, and " if closing.secured else ""
             yield (
                 f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "
-                f"{named}; watch again while they run: sros close {folder} --for 1m; otherwise "
-                f"{silent}"
+                f"{named}; {opened}watch again while they run: sros close {folder} --for 1m; "
+                f"otherwise {silent}"
             )
         if observed.elsewhere:
             named = first_few(observed.elsewhere, _MOST_NAMES)
@@ -1388,7 +1407,8 @@ class OpenRobot:
                     return [Proof(_CLAIM, False, why)]
                 break
             time.sleep(0.2)
-        nodes, not_here = self._observation().nodes, self._not_here
+        nodes, without_profile = self._by_profile(self._observation().nodes)
+        not_here = self._not_here
         # A laptop may be away; a computer whose nodes were seen has to be seen again.
         may_be_away = not_here - {node.enclaves[0] for node in nodes}
         away = sorted({*missing} | may_be_away | not_here.intersection(self._without))
@@ -1399,11 +1419,33 @@ class OpenRobot:
             if names:
                 proof = proof._replace(reason=f"{proof.reason}; {what}: {', '.join(names)}")
         talk = self._proof_of_talk(before, away)
+        if without_profile and not talk.fails:
+            left_out = first_few(sorted(map(_node_name, without_profile)), _MOST_NAMES)
+            why = "the policy has no profile for them any more"
+            talk = talk._replace(reason=f"{talk.reason}; not compared, as {why}: {left_out}")
         if talk.fails and (compared := sorted(not_here.difference(away))):
             options = " ".join(f"--without {name}" for name in compared)
             talk = talk._replace(reason=f"{talk.reason}; if they may be away, add {options}")
         silence = self._proof_of_silence(before, hears=talk.holds is not None)
         return [proof, self._proof_of_files(), *self._proof_of_requirements(), talk, silence]
+
+    def _by_profile(
+        self, nodes: Iterable[ObservedNode]
+    ) -> tuple[list[ObservedNode], list[ObservedNode]]:
+        """Divide nodes into those with a profile in the policy, and those without."""
+        if not self.policy.exists():
+            return [*nodes], []
+        profiles = [
+            profile
+            for enclave in read_policy(self.policy).enclaves
+            for profile in enclave.all_profiles()
+        ]
+        sides: tuple[list[ObservedNode], list[ObservedNode]] = [], []
+        for node in nodes:
+            name = stable_name(node.name)
+            has_one = any(overlap(e.ns, node.ns) and overlap(e.node, name) for e in profiles)
+            sides[0 if has_one else 1].append(node)
+        return sides
 
     def _proof_of_files(self) -> Proof:
         """Ask `check` about the files that the processes use, such as a key that others read."""
@@ -1536,7 +1578,7 @@ class OpenRobot:
                 "denied": [f"{right['enclave']} {right['name']}" for right in value["denied"]],
                 "refused": [refused["enclave"] for refused in value["refused"]],
                 "not seen": [
-                    unseen["node"] or unseen["enclave"]
+                    self._unseen_text(unseen["node"], unseen["enclave"])
                     for unseen in value["unseen"]
                     if unseen["enclave"] not in missing
                 ],
@@ -1549,8 +1591,22 @@ class OpenRobot:
                 but = f", but for {counted(len(denied), 'right')} that the policy denies now"
                 seen = f"{number} with {before.endpoint_count} endpoints as before"
                 left = f", without {', '.join(missing)}" if missing else ""
-                return Proof(_TALK, True, f"{seen}{left}{but if denied else ''}")
+                _, others = self._by_profile(from_json(value).nodes)
+                known = {*map(_node_name, before.nodes)}
+                new = sorted(
+                    f"{_node_name(node)} in {' or '.join(node.enclaves) or 'no enclave'}"
+                    for node in others
+                    if _node_name(node) not in known and not is_tool(node)
+                )
+                more = f"; new, without a profile: {first_few(new, _MOST_NAMES)}" if new else ""
+                return Proof(_TALK, True, f"{seen}{left}{but if denied else ''}{more}")
         return Proof(_TALK, False, reason)
+
+    def _unseen_text(self, node: str, enclave: str) -> str:
+        """Return a node that an enclave has a profile for, and what to do if it does not exist."""
+        if not node or is_expression(node):
+            return f"any node in {enclave}"
+        return f"{node} (if it is gone for good, remove its profile from '{self.policy}')"
 
     def _proof_of_silence(self, before: Observation, *, hears: bool) -> Proof:
         """Look for nodes as an open listener; before, the same listener saw all nodes.
@@ -1606,7 +1662,7 @@ def _keystore_of(enclave: ProcessEnclave) -> str:
     return plain(enclave.keystore, _LONGEST_PATH)
 
 
-_CLAIM = "every process runs in its enclave"
+_CLAIM = "every process was started in its enclave"
 _TALK = "everything that talked still talks"
 _SILENCE = "an open listener finds nothing"
 
@@ -1637,9 +1693,13 @@ def _lost_endpoints(
     return sorted(expected - {*_endpoints(now.nodes)})
 
 
+def _node_name(node: ObservedNode) -> str:
+    return f"{node.ns.rstrip('/')}/{stable_name(node.name)}"
+
+
 def _endpoints(nodes: Iterable[ObservedNode]) -> Iterator[str]:
     for node in nodes:
-        name = f"{node.ns.rstrip('/')}/{stable_name(node.name)}"
+        name = _node_name(node)
         for way in (PUBLISH, SUBSCRIBE):
             for topic in node.publish if way == PUBLISH else node.subscribe:
                 yield f"{name} {way} {topic.replace(node.name, stable_name(node.name))}"

@@ -109,10 +109,10 @@ def close(
     printed. Existing files are kept: edit policy.xml and requirements.toml, and run it again.
 
     Nothing is closed before --apply, which restarts the processes that are systemd units, and
-    shows the commands for all others. --proof checks that every process runs in its enclave, that
-    the files of the enclaves have no error, that everything that talked still talks, and that an
-    open listener finds nothing; --apply does it too, if nothing is left to do by hand. --undo goes
-    back.
+    shows the commands for all others. --proof checks that every process was started in its enclave,
+    that the files of the enclaves have no error, that everything that talked still talks, and that
+    an open listener finds nothing; --apply does it too, if nothing is left to do by hand. --undo
+    goes back.
 
     Example:
       $ sros close robot --for 5m
@@ -213,6 +213,9 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
     if not_here := closed.observed.not_here:
         bring = f"sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER"
         echo(f"not on this machine: {', '.join(not_here)} (to bring one there: {bring})")
+    seen = {process.enclave for process in robot.observed.processes} if robot.observed else set()
+    if left_out := sorted(seen.difference(enclave.path for enclave in policy.enclaves)):
+        echo(f"seen when sros watched, and not in the policy: {', '.join(left_out)}")
     for right in closed.newly_denied:
         echo(f"used when sros watched, and denied now: {right}")
     if closed.newly_denied:
@@ -229,7 +232,7 @@ def _nodes(policy: Policy, enclave: str) -> str:
     """Return a clause on the nodes of an enclave, if it has several; "" otherwise."""
     own = policy.enclave(enclave)
     nodes = [f"{node.ns.rstrip('/')}/{node.node}" for node in own.all_profiles()] if own else []
-    return f", with the nodes {enumerated(sorted(nodes))}" if len(nodes) > 1 else ""
+    return f", for the nodes {enumerated(sorted(nodes))}" if len(nodes) > 1 else ""
 
 
 def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) -> None:

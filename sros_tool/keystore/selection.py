@@ -22,11 +22,13 @@ from sros_tool.fleet.robots import (
 )
 from sros_tool.keystore.fleet import arguments_for, checked_fleet, enclaves_of_robot, load_fleet
 from sros_tool.keystore.layout import (
+    CLOSED_POLICY,
     FLEET,
     PERMISSIONS_FILE,
     PRIVATE,
     REVOKED,
     SETTINGS,
+    closed_robot,
     enclaves_below,
     has_enclave,
 )
@@ -247,6 +249,15 @@ def missing_enclave_error(
     except InvalidNameError as error:
         return error
     why = f"The keystore has {first_few(names, _SHOWN) or 'no enclave'}."
+    if robot := closed_robot(root):
+        folder, policy = quote(str(robot)), quote(str(robot / CLOSED_POLICY))
+        return KeystoreError(
+            what,
+            why,
+            f"If it is not a typo, write its rights into {policy}, and run `sros close {folder}`. "
+            f"To learn them: `sros close {folder} --undo`, start the robot open with this "
+            f"process, and `sros close {folder} --for 1m`.",
+        )
     if not keystore.is_original:
         where = f"`sros distribute_key KEYSTORE {name} {quote(str(root))}`"
         return KeystoreError(what, why, f"If it is not a typo, export it with {where}.")

@@ -64,7 +64,11 @@ SYSTEMCTL = '#!/bin/sh\necho "$@" >> {log}\nexit $(cat {status})\n'
 
 
 def secured(*nodes: tuple[str, str, str, str, list[str]]) -> list[Any]:
-    return [(f"{ns}{name}", ns, name, of, rights) for _, ns, name, of, rights in nodes]
+    """The nodes in enclaves; those of one participant are in that of the first one."""
+    first: dict[str, str] = {}
+    for _, ns, name, of, _ in nodes:
+        first.setdefault(of, f"{ns}{name}")
+    return [(first[of], ns, name, of, rights) for _, ns, name, of, rights in nodes]
 
 
 @dataclass
@@ -236,9 +240,13 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert policy.read_text() == changed
     assert "nothing is closed yet; fix this first:\n  'robot/policy.xml' stays as it " in again.out
     assert "lacks 1 right seen now (/listener subscribe /chatter); if a " in again.out
-    assert "; if they are right, add them: sros generate_policy robot/policy.xml" in again.out
     assert "process should not have them, stop it, and run `sros close robot`; if" in again.out
-    assert "generate_policy robot/policy.xml --enclave-per-node --domain 0\n" in again.out
+    add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"
+    assert f"; if they are right, add them: {add}\n" in again.out
+    sros(*add.split()[1:], cwd=robot.folder).ok()
+    assert "would have" not in robot.close("--for", "1s").out
+    policy.write_text(changed)
+    robot.close()
     robot.remaining = (TALKER, ros_node("listener", "04"))
     said = robot.close("--apply").out
     assert "36 endpoints as before, but for 1 right that the policy denies now\n" in said
@@ -284,7 +292,9 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     assert not left.exists()
     assert "removed robot/export/enclaves/listener: its enclave was revoked\n" in ended.err
     assert robot.restarts == ["daemon-reload", "restart talker.service"]
-    assert "no: every process runs in its enclave: process 4712 (run): in domain 0" in ended.out
+    assert (
+        "no: every process was started in its enclave: process 4712 (run): in domain 0" in ended.out
+    )
     assert "yes: everything that talked still talks: 1 node with 18 endpoints" in ended.out
 
 
@@ -314,7 +324,7 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     closed = robot.close("--apply")
     assert robot.restarts == ["daemon-reload", "restart listener.service talker.service"]
     assert closed.out.splitlines()[-5:] == [
-        "yes: every process runs in its enclave: 2 enclaves, and no open process",
+        "yes: every process was started in its enclave: 2 enclaves, and no open process",
         "yes: the files have no error: sros check finds none: robot/export",
         "yes: the requirements hold: all of them: robot/requirements.toml",
         "yes: everything that talked still talks: 2 nodes with 36 endpoints as before",
@@ -350,8 +360,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(robot: Robot) -> None:
     assert "stop process 4711, and start it with:\n  cd /opt && sros run " in ended.out
     assert ended.err.endswith("next: these commands, and then sros close robot --proof\n")
     assert (
-        "no: every process runs in its enclave: no secured process of /listener (stop process "
-        "4712, which is open), /talker (stop process 4711, which is open); "
+        "no: every process was started in its enclave: no secured process of /listener (stop "
+        "process 4712, which is open), /talker (stop process 4711, which is open); "
     ) in robot.close("--proof", status=1).out
     for root in ("robot/keystore", "robot/export"):
         denied = sros("explain", root, "/talker", "publish", "/x", cwd=robot.folder).out
@@ -485,7 +495,10 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     robot.close()
     robot.by_hand, robot.absent, robot.remaining = {"/talker"}, {"/listener"}, (TALKER,)
     ended = robot.close("--proof", status=1)
-    assert "no: every process runs in its enclave: no secured process of /listener; st" in ended.out
+    assert (
+        "no: every process was started in its enclave: no secured process of /listener; st"
+        in ended.out
+    )
     assert "if it does not always run, add --without /listener\n" in ended.out
     assert ended.out == robot.close("--proof", "--partial", status=1).out
     assert "has no enclave /x. It has /l" in robot.close("--proof", "--without", "/x", status=2).err
@@ -493,8 +506,8 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert robot.close("--apply", *without[1:]).err.endswith("it has the CA keys\n")
     ended = robot.close(*without)
     assert (
-        "yes: every process runs in its enclave: 1 enclave, and no open process; not running: "
-        "/listener\n"
+        "yes: every process was started in its enclave: 1 enclave, and no open process; "
+        "not running: /listener\n"
     ) in ended.out
     assert "talks: 1 node with 18 endpoints as before, without /listener\n" in ended.out
     assert "the robot is closed, without a process of /listener, its files are" in ended.err
@@ -518,13 +531,13 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     robot.more = (Process(5, ("spy", "--ros-args"), {}, datetime.now(UTC)),)
     robot.more += (robot.process("/talker", is_secured=False),)
     ended = robot.close("--proof", status=1)
-    assert "no: every process runs in its enclave: process 5 (spy)" in ended.out
+    assert "no: every process was started in its enclave: process 5 (spy)" in ended.out
     assert "ROS_SECURITY_ENABLE. Stop it: another process runs in /talker.\n" in ended.err
     robot.more = ()
     robot.outdated = {"/talker"}
     named = f"earlier files in the processes of /talker (process {PID['/talker']}); restart them\n"
     out = robot.close("--proof", status=1).out
-    assert f"no: every process runs in its enclave: {named}" in out
+    assert f"no: every process was started in its enclave: {named}" in out
     robot.outdated = set()
     robot.remaining = (TALKER,)
     assert (
@@ -552,7 +565,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
     ended = robot.close("--proof", status=1)
     key.chmod(0o600)
     named = f"process 4711 (run): the mode of '{key}' is 0644\n"
-    assert f"no: every process runs in its enclave: {named}" in ended.out
+    assert f"no: every process was started in its enclave: {named}" in ended.out
     assert "no: the files have no error: sros check finds one: robot/export\n" in ended.out
     assert "no: the requirements hold: one is violated: robot/requirements.toml\n" in ended.out
     assert "/talker: may publish /chatter" in ended.err
@@ -571,7 +584,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot) -> None:
         "policy.xml' differs from the signed permissions of /listener: `sros close robot` checks"
         in ended.err
     )
-    assert "not asked: every process runs in its enclave" in ended.out
+    assert "not asked: every process was started in its enclave" in ended.out
     assert "closed, except for what was not asked" in ended.err
 
 
@@ -653,6 +666,48 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     robot.close("--apply")
 
 
+def test_a_renamed_node_is_accepted_and_a_new_one_is_named(robot: Robot) -> None:
+    """Or a robot whose node got another name could never be proved closed again."""
+    robot.units, of = UNITS, LISTENER[3]
+    robot.nodes = (TALKER, LISTENER, ros_node("rear_camera", of))
+    robot.close()
+    policy = robot.folder / "robot/policy.xml"
+    policy.write_text(policy.read_text().replace('node="rear_camera"', 'node="stern_camera"'))
+    robot.close()
+    robot.remaining = (
+        TALKER,
+        LISTENER,
+        ros_node("stern_camera", of),
+        ("/", "/", "ghost_node", of, ["publish rt/rosout"]),
+    )
+    said = robot.close("--apply").out
+    assert "yes: everything that talked still talks: 2 nodes with 36 endpoints as before" in said
+    assert "not compared, as the policy has no profile for them any more: /rear_camera\n" in said
+    assert "; new, without a profile: /ghost_node in /listener; not" in said
+    robot.remaining = (TALKER, LISTENER)
+    said = robot.close("--proof", status=1).out
+    assert "no: everything that talked still talks: not seen: /stern_camera (if it is gone" in said
+
+
+def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None:
+    robot.nodes = (LISTENER,)
+    robot.absent = {"/talker"}
+    robot.close()
+    lacking = sros("env", "robot/export", "/talker", cwd=robot.folder).err
+    assert "write its rights into robot/policy.xml, and run `sros close robot`." in lacking
+    robot.nodes, robot.absent = (TALKER, LISTENER), set()
+    said = robot.close("--for", "1s", status=1).out
+    add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"
+    assert "(/talker publish /chatter" in said and f"; if they are right, add them: {add}\n" in said
+    assert "seen when sros watched, and not in the policy: /talker\n" in robot.close().out
+    sros(*add.split()[1:], cwd=robot.folder).ok()
+    said = robot.close().out
+    assert "/talker: process 4711, known by its process id: by hand\n" in said
+    assert "not in the policy" not in said
+    commands = (robot.folder / "robot/start/commands.txt").read_text()
+    assert "/talker -- /opt/run talker\n" in commands
+
+
 def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
     """Or whoever calls itself /talker while sros watches gets its rights into /talker."""
     twin = ("/", "/", "talker", "010f0000070000000000", ["publish rt/cmd_vel"])
@@ -689,7 +744,7 @@ def test_a_program_that_starts_its_nodes_has_one_enclave(
     )
     policy.write_text(moved)
     ended = robot.close()
-    assert "  /listener: process 4700, known by its process id, with the nodes /l" in ended.out
+    assert "  /listener: process 4700, known by its process id, for the nodes /l" in ended.out
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     export = robot.folder / "robot/export"
     assert f"cd /opt && sros run {export} /listener -- python3 pumps.py\n" in commands
@@ -981,7 +1036,7 @@ def test_the_nodes_of_a_process_that_has_several(tmp_path: Path) -> None:
         f"{profiles}</profiles></enclave></enclaves></policy>"
     )
     nodes = close._nodes(read_policy(file), "/p/tracker")
-    assert nodes == ", with the nodes /p/detector and /p/tracker"
+    assert nodes == ", for the nodes /p/detector and /p/tracker"
 
 
 def test_a_process_of_cyclone_dds_is_known_by_what_it_says() -> None:
