@@ -61,9 +61,9 @@ def path_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[F
     """Return the findings at paths: policies, folders of policies, keystores, or enclaves.
 
     All policies count as the policies of one robot or fleet: a name may have its counterpart in
-    another policy.  Keystores and enclaves in several folders have to trust each other.  A file
-    ``*.json5``, ``*.json`` or ``*.yaml`` is a Zenoh configuration.  Raises
-    `DocumentError` for any other path.
+    another policy.  The nodes of keystores and enclaves in several folders have to communicate.
+    A file ``*.json5``, ``*.json`` or ``*.yaml`` is a Zenoh configuration.  Raises `DocumentError`
+    for any other path.
     """
     findings: list[Finding] = []
     policies, paths = [], tuple(paths)
@@ -75,12 +75,12 @@ def path_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[F
             findings += found
     if policies:
         findings += policy_findings(policies, circumstances)
-    findings += stranger_findings(paths, circumstances)
+    findings += findings_between_folders(paths, circumstances)
     return list(dict.fromkeys(findings))
 
 
-def stranger_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[Finding]:
-    """Return findings about folders among the paths whose enclaves do not trust each other."""
+def findings_between_folders(paths: Iterable[Path], circumstances: Circumstances) -> list[Finding]:
+    """Return findings about folders among the paths whose nodes do not communicate."""
     targets: dict[str, tuple[Keystore, Sequence[str]]] = {}
     for path in filter(Path.is_dir, paths):
         if is_keystore(path):
@@ -91,9 +91,11 @@ def stranger_findings(paths: Iterable[Path], circumstances: Circumstances) -> li
             targets[str(path)] = circumstances.keystore(root), (name,)
     if len(targets) < 2:
         return []
-    from sros_tool.checks.keystores.trust import stranger_findings
+    from sros_tool.checks.keystores.trust import findings_between
 
-    return list(stranger_findings(targets, on_zenoh=circumstances.vendors == (ZENOH,)))
+    return list(
+        findings_between(targets, now=circumstances.now, on_zenoh=circumstances.vendors == (ZENOH,))
+    )
 
 
 def _no_policy_findings(path: Path, circumstances: Circumstances) -> list[Finding] | None:

@@ -575,7 +575,7 @@ def _refuse_besides_upgrade() -> None:
 
 def _findings(family: str, paths: tuple[Path, ...], circumstances: Circumstances) -> list[Finding]:
     from sros_tool.checks.keystores.keystore import keystore_findings
-    from sros_tool.checks.targets import path_findings, policy_findings, stranger_findings
+    from sros_tool.checks.targets import findings_between_folders, path_findings, policy_findings
     from sros_tool.keystore.layout import is_keystore
 
     if family == "runtime":
@@ -606,7 +606,7 @@ def _findings(family: str, paths: tuple[Path, ...], circumstances: Circumstances
                 vendors=circumstances.vendors,
             )
         ]
-        return [*findings, *stranger_findings(roots, circumstances)]
+        return [*findings, *findings_between_folders(roots, circumstances)]
     if paths:
         return path_findings(paths, circumstances)
     findings = _runtime(circumstances)

@@ -1018,9 +1018,11 @@ def _text_without_findings(log: str) -> str:
         )
     return (
         f"a node ran in '{found['folder']}'. Where its peers refuse it, it often logs nothing: "
-        "explain the log of the other node, too. `sros check FOLDER OTHER` finds keystores and "
-        "exports that do not trust each other; `sros explain KEYSTORE --who publish NAME` says "
-        "whether anybody may send"
+        "explain the log of the other node, too. Both logs can be empty if the CAs, a revocation "
+        "list, the governance or the domains of both ends do not fit: `sros check FOLDER OTHER` "
+        "finds this in the keystores or exports of both. They can be empty if a clock is wrong: "
+        "`sros check runtime` on both machines finds a clock that is behind, `date -u` shows one "
+        "that is ahead. `sros explain KEYSTORE --who publish NAME` says whether anybody may send"
     )
 
 

@@ -1,20 +1,27 @@
-"""Findings about several keystores and exports whose enclaves do not trust each other."""
+"""Findings about several keystores and exports whose nodes do not communicate."""
 
 from __future__ import annotations
 
 from datetime import UTC, datetime
 from itertools import combinations
 from pathlib import Path
+from shutil import rmtree
 
 from sros_tool.checks.targets import Circumstances, path_findings
 from tests.support.harness import copy_of, sros
 
-FOUND = {"keystore.strangers"}
-AT = Circumstances(datetime.now(UTC))
+FOUND = {
+    "keystore.strangers",
+    "keystore.peers-revoked",
+    "keystore.peers-protection",
+    "keystore.peers-domains",
+}
+NOW = datetime.now(UTC)
 
 
-def strangers(*paths: Path, at: Circumstances = AT) -> list[str]:
-    return [each.text for each in path_findings(paths, at) if each.id in FOUND]
+def strangers(*paths: Path, vendors: tuple[str, ...] = ()) -> list[str]:
+    found = path_findings(paths, Circumstances(NOW, vendors=vendors))
+    return [each.text for each in found if each.id in FOUND]
 
 
 def test_keystores_and_their_exports_are_strangers(keystore: Path, tmp_path: Path) -> None:
@@ -29,9 +36,7 @@ def test_keystores_and_their_exports_are_strangers(keystore: Path, tmp_path: Pat
     )
     assert strangers(keystore, export) == strangers(keystore, keystore / "enclaves/a") == []
     assert strangers(other) == strangers(keystore / "enclaves/a/cert.pem", other) == []
-    (text,) = strangers(
-        export / "enclaves/a", other / "enclaves/a", at=Circumstances(AT.now, vendors=("zenoh",))
-    )
+    (text,) = strangers(export / "enclaves/a", other / "enclaves/a", vendors=("zenoh",))
     assert text.endswith("the other's identity CA")
     assert "keystore.strangers" in sros("check", "keystore", export, other).out
     export.rename(tmp_path / "keystore")  # the word names the folder, and no family of checks
@@ -47,3 +52,44 @@ def test_enclaves_in_a_rotation_are_strangers_after_two_stages(
         sros("rotate_ca", stages[-1], "--permissions", "--next").ok()
     for one, other in combinations(range(4), 2):
         assert bool(strangers(stages[one], stages[other])) is (other - one > 1), (one, other)
+
+
+def test_a_list_that_revokes_an_enclave_of_the_other_folder(keystore: Path, tmp_path: Path) -> None:
+    laptop, robot = tmp_path / "laptop", tmp_path / "robot"
+    sros("distribute_key", keystore, "/a", laptop).ok()
+    sros("distribute_key", keystore, "/b", robot).ok()
+    assert strangers(keystore, laptop) == strangers(robot, laptop) == []
+    sros("renew", keystore, "/a", "--new-key", "--revoke-old").ok()
+    sros("distribute_key", keystore, "/b", robot, "--force").ok()
+    for paths in ((robot, laptop), (laptop, robot), (keystore, robot, laptop)):
+        refusing = ", ".join(str(path) for path in paths if path != laptop)
+        assert strangers(*paths) == [
+            f"nodes of {refusing} refuse nodes of {laptop} in /a: their revocation list revokes "
+            "the certificate"
+        ]
+    assert strangers(robot, laptop, vendors=("zenoh",)) == []
+    sros("distribute_key", keystore, "/a", laptop, "--force").ok()
+    assert strangers(keystore, robot, laptop) == []
+
+
+def test_protection_and_domains_that_keep_nodes_apart(keystore: Path, tmp_path: Path) -> None:
+    robot, other = tmp_path / "robot", tmp_path / "other"
+    sros("distribute_key", keystore, "/a", robot).ok()
+    for change, text in (
+        (("--set", "protection.rtps=NONE"), ": protection.rtps is SIGN in "),
+        (
+            ("--rule", "topic /scan data=NONE metadata=SIGN"),
+            " on topic /scan: protection.topic /scan.",
+        ),
+        (("--domain", "5"), ": the former are for domain 0, the latter for domain 5"),
+        (("--set", "protection.join_access_control=false"), ""),  # does no harm; tested
+        (("--domain", "0,5"), ""),
+    ):
+        copy_of(keystore, other)
+        sros("update_keystore", other, *change, "--allow-looser").ok()
+        found = strangers(other, robot)
+        assert bool(found) is bool(text), found
+        for each in found:
+            assert each.startswith(f"nodes of {robot} do not communicate with nodes of {other}")
+            assert text in each
+        rmtree(other)

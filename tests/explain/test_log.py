@@ -566,7 +566,10 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
     (tmp_path / "robot.log").write_text(line)
     ended = sros("explain", "--log", tmp_path / "robot.log").ok()
     assert "a node ran in '/k/enclaves/talker'" in ended.err
-    assert "exports that do not trust each other" in ended.err
+    for cause in ("CAs", "revocation list", "governance", "domains", "clock"):
+        assert cause in ended.err
+    assert "`sros check FOLDER OTHER`" in ended.err
+    assert "`sros check runtime`" in ended.err
 
 
 def test_what_the_nodes_of_the_demo_print_names_the_topic() -> None:

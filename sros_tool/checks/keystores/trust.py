@@ -1,19 +1,26 @@
-"""Whether the enclaves of several keystores and exports trust each other."""
+"""Whether the nodes of several keystores and exports communicate, by the files of both."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import lru_cache
-from itertools import combinations, product
+from datetime import datetime
+from functools import cached_property, lru_cache
+from itertools import chain, combinations, product
+from typing import NamedTuple
 
 from cryptography import x509
 
-from sros_tool.checks.kind import NOTE, Finding, FindingKind, some_names
+from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, some_names
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.errors import SrosError
+from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
+    CRL_FILE,
+    GOVERNANCE_FILE,
     IDENTITY_CA_FILE,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
@@ -22,6 +29,9 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import Keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import issued_by, load_certificate, load_certificates
+from sros_tool.pki.crl import lists_as_revoked, read_list
+from sros_tool.pki.distinguished_names import same_name
+from sros_tool.wording import first_few
 
 STRANGERS = FindingKind(
     "keystore.strangers",
@@ -32,6 +42,39 @@ STRANGERS = FindingKind(
     "DDS-Security 1.1, 9.3 and 9.4; Fast DDS 2.9.1, Cyclone DDS 0.10.2; tested.",
     "If their nodes have to communicate, export all of their enclaves again from one keystore; if "
     "not, ignore this.",
+    prominent=True,
+)
+PEERS_REVOKED = FindingKind(
+    "keystore.peers-revoked",
+    WARNING,
+    "enclaves that the revocation list of another keystore or export revokes",
+    "A node with this list refuses the nodes of the revoked enclaves. Fast DDS logs nothing about "
+    "it, on either side.",
+    "RFC 5280, 5; rmw_dds_common (crl.pem); Fast DDS 2.6 to 3.6; tested.",
+    "If an enclave is meant to be revoked, remove its files. If not, export it again from its "
+    "keystore, which may have a new certificate already. If it has the same one there: `sros renew "
+    "KEYSTORE ENCLAVE --new-key`, and export it again.",
+)
+PEERS_PROTECTION = FindingKind(
+    "keystore.peers-protection",
+    WARNING,
+    "keystores or exports whose governance protects messages differently",
+    "Both ends of a connection have to protect messages in the same way. Where they differ, nodes "
+    "do not hear each other, and log nothing.",
+    "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; tested.",
+    "If one of them is an earlier export, export its enclaves again, and restart the processes. "
+    "Otherwise give both keystores the same protection (`sros inspect` shows it, `sros "
+    "update_keystore --set` and `--rule` change it), and export the enclaves again.",
+)
+PEERS_DOMAINS = FindingKind(
+    "keystore.peers-domains",
+    NOTE,
+    "keystores or exports for different ROS domains",
+    "Nodes find each other only in one ROS domain, and these files let no node of the one join a "
+    "domain of the other.",
+    "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; tested.",
+    "If their nodes have to communicate, name the domain of both in `sros update_keystore KEYSTORE "
+    "--domain IDS --allow-looser`, and export the enclaves again; if not, ignore this.",
     prominent=True,
 )
 
@@ -62,17 +105,42 @@ def _certificates(data: bytes) -> _Certificates:
     return load_certificates(data, "the certificate of a CA")
 
 
-def stranger_findings(
-    targets: Mapping[str, tuple[Keystore, Sequence[str]]], *, on_zenoh: bool = False
+Targets = Mapping[str, tuple[Keystore, Sequence[str]]]
+"""Maps what the user named to a keystore or export, and the enclaves in it."""
+
+
+def findings_between(
+    targets: Targets, *, now: datetime, on_zenoh: bool = False
+) -> Iterator[Finding]:
+    """Yield findings about keystores and exports whose nodes do not communicate with each other.
+
+    What cannot be read is a finding of another check, and so are files that are not valid ``now``:
+    if the files of two enclaves are never valid together, those of one are not valid at any moment.
+
+    Args:
+        targets: the keystores and exports, as the user named them.
+        now: the moment to check for.
+        on_zenoh: whether all nodes use Zenoh, which reads neither permissions nor governance, and
+            no revocation list.
+    """
+    refused: set[frozenset[str]] = set()
+    yield from _strangers(targets, refused, on_zenoh=on_zenoh)
+    if not on_zenoh:
+        yield from _revoked(targets)
+        governed = {shown: _Governed(*target, now) for shown, target in targets.items()}
+        yield from _governed_apart(governed, refused)
+
+
+# ── CAs ────────────────────────────────────────────────────────────────────────────────────
+
+
+def _strangers(
+    targets: Targets, refused_pairs: set[frozenset[str]], *, on_zenoh: bool
 ) -> Iterator[Finding]:
     """Yield findings about keystores and exports of which no two enclaves accept each other.
 
-    In a rotation of CAs, enclaves trust the old and the new one.  What cannot be read is a finding
-    of another check.
-
-    Args:
-        targets: maps what the user named to a keystore or export, and the enclaves in it.
-        on_zenoh: whether all nodes use Zenoh, which reads no permissions.
+    In a rotation of CAs, enclaves trust the old and the new one.  Pairs with a finding are added to
+    ``refused_pairs``.
     """
     read = {shown: dict(_parties(*target)) for shown, target in targets.items()}
     # Most exports trust and present the same as others: only one of each kind is compared.
@@ -97,6 +165,7 @@ def stranger_findings(
                 f"{some_names(others)}: not both of them trust the other's {authorities}"
             )
             yield STRANGERS.found(others[0], text, others[0])
+            refused_pairs.update(map(frozenset, product(some, others)))
 
 
 def _refused_roles(
@@ -135,3 +204,183 @@ def _parties(keystore: Keystore, enclaves: Sequence[str]) -> Iterator[tuple[_Kin
             seen.add(shown)
             party.signer = smime.parse(message).signer()
             yield (*shown, party.signer), party
+
+
+# ── revocation lists ───────────────────────────────────────────────────────────────────────
+
+
+def _revoked(targets: Targets) -> Iterator[Finding]:
+    """Yield findings about enclaves that the revocation lists of other targets revoke."""
+    holders: dict[bytes, dict[str, None]] = defaultdict(dict)
+    for shown, (keystore, enclaves) in targets.items():
+        for name in enclaves:
+            with suppress(SrosError):
+                data = keystore.read(keystore.folder(name) / CRL_FILE, "revocation list")
+                holders[data][shown] = None
+    found: dict[tuple[str, tuple[str, ...]], dict[str, None]] = defaultdict(dict)
+    for data, of_list in holders.items():
+        for shown, target in targets.items():
+            if shown not in of_list and (names := tuple(_names_revoked(data, *target))):
+                found[shown, names].update(of_list)
+    for (shown, names), of_lists in found.items():
+        text = (
+            f"nodes of {some_names(list(of_lists))} refuse nodes of {shown} in "
+            f"{some_names(names)}: their revocation list revokes "
+            f"{'the certificate' if len(names) == 1 else 'the certificates'}"
+        )
+        yield PEERS_REVOKED.found(shown, text, shown)
+
+
+def _names_revoked(data: bytes, keystore: Keystore, enclaves: Sequence[str]) -> Iterator[str]:
+    """Yield the enclaves whose certificates a revocation list revokes."""
+    with suppress(SrosError):
+        revocation_list = read_list(data, CRL_FILE)
+        for name in enclaves:
+            with suppress(SrosError, ValueError):
+                certificate = keystore.certificate(keystore.folder(name) / CERTIFICATE_FILE)
+                if same_name(revocation_list.issuer, certificate.issuer) and lists_as_revoked(
+                    revocation_list, certificate.serial_number
+                ):
+                    yield name
+
+
+# ── governance and domains ─────────────────────────────────────────────────────────────────
+
+
+class _Governed:
+    """The governance documents of a target, and the domains that its enclaves may join."""
+
+    def __init__(self, keystore: Keystore, enclaves: Sequence[str], now: datetime) -> None:
+        self._keystore = keystore
+        self._enclaves = enclaves
+        self._now = now
+
+    @cached_property
+    def documents(self) -> tuple[Governance, ...]:
+        """The different governance documents of the enclaves."""
+        signed: dict[bytes, None] = {}
+        for name in self._enclaves:
+            with suppress(SrosError):
+                file = self._keystore.folder(name) / GOVERNANCE_FILE
+                signed[self._keystore.read(file, "governance document")] = None
+        found = []
+        for message in signed:
+            with suppress(SrosError):
+                found.append(parse_governance(self._keystore.files.signed(message).document))
+        return tuple(found)
+
+    @cached_property
+    def first(self) -> tuple[DomainSet, ...]:
+        """The domains of the first enclave."""
+        return self._domains(self._enclaves[:1])
+
+    @cached_property
+    def domains(self) -> tuple[DomainSet, ...]:
+        """The different sets of domains of all enclaves; () if one of them cannot be read."""
+        return self._domains(self._enclaves)
+
+    def _domains(self, enclaves: Sequence[str]) -> tuple[DomainSet, ...]:
+        found: dict[DomainSet, None] = {}
+        for name in enclaves:
+            domains = None
+            with suppress(SrosError):
+                domains = self._keystore.enclave(name, now=self._now).joined_domains()
+            if domains is None:
+                return ()
+            found[domains] = None
+        return tuple(found)
+
+    def joined(self) -> Iterator[int]:
+        """Yield the domains that an enclave may join."""
+        return chain.from_iterable(self.domains)
+
+    def meets(self, other: _Governed) -> bool:
+        """Return whether two enclaves may join one domain, also if that cannot be known."""
+        return _meet(self.first, other.first) or _meet(self.domains, other.domains)
+
+
+def _meet(some: Sequence[DomainSet], others: Sequence[DomainSet]) -> bool:
+    pairs = list(product(some, others))
+    return not pairs or any((one & other).ranges for one, other in pairs)
+
+
+class _Apart(NamedTuple):
+    """Why two targets do not communicate.
+
+    ``differences`` are settings with their values here and there; () for other domains.
+    """
+
+    kind: FindingKind
+    names: tuple[str, ...] = ()
+    differences: tuple[tuple[str, str, str], ...] = ()
+
+
+def _governed_apart(
+    governed: Mapping[str, _Governed], refused_pairs: set[frozenset[str]]
+) -> Iterator[Finding]:
+    """Yield findings about targets that trust each other, and differ in governance or domains."""
+    groups: dict[tuple[_Apart, tuple[str, ...]], list[str]] = defaultdict(list)
+    shown_before: list[str] = []
+    for shown, own in governed.items():
+        found: dict[_Apart, list[str]] = defaultdict(list)
+        for other in shown_before:
+            if frozenset((shown, other)) not in refused_pairs and (
+                apart := _apart(own, governed[other])
+            ):
+                found[apart].append(other)
+        for apart, others in found.items():
+            groups[apart, tuple(others)].append(shown)
+        shown_before.append(shown)
+    for (apart, those), alike in groups.items():
+        on = f" on {first_few(apart.names, _MOST_SHOWN)}" if apart.names else ""
+        why = first_few(
+            [
+                f"{key} is {own_value} in {alike[0]} and {value} in {those[0]}"
+                for key, own_value, value in apart.differences
+            ],
+            _MOST_SHOWN,
+        )
+        if apart.kind is PEERS_DOMAINS:
+            own_domains, domains = (
+                DomainSet.of(*((d, d) for name in names for d in governed[name].joined()))
+                for names in (alike, those)
+            )
+            why = f"the former are for domain {own_domains}, the latter for domain {domains}"
+        text = (
+            f"nodes of {some_names(alike)} do not communicate with nodes of {some_names(those)}"
+            f"{on}: {why}"
+        )
+        yield apart.kind.found(alike[0], text, alike[0])
+
+
+def _apart(own: _Governed, other: _Governed) -> _Apart | None:
+    if not own.meets(other):
+        return _Apart(PEERS_DOMAINS)
+    different = [_different(*pair) for pair in product(own.documents, other.documents)]
+    if not different or not all(disturbed for disturbed, _ in different):
+        return None
+    disturbed, values = min(different, key=lambda each: (each[0].everything, len(each[0].names)))
+    return _Apart(PEERS_PROTECTION, () if disturbed.everything else disturbed.names, values)
+
+
+_MOST_SHOWN = 3
+
+
+@lru_cache(maxsize=256)
+def _different(
+    own: Governance, other: Governance
+) -> tuple[Mismatch, tuple[tuple[str, str, str], ...]]:
+    """Return which communication fails between two, and the settings with both values."""
+    disturbed = mismatch(other, own)
+    if not disturbed:
+        return disturbed, ()
+    values = {
+        change.key: (change.key, change.after, change.before)
+        for change in compare_governance(other, own)
+        if change.key.startswith("protection") and not change.key.endswith(_HARMLESS)
+    }
+    return disturbed, tuple(values.values())
+
+
+_HARMLESS = ("allow_unauthenticated_participants", "join_access_control")
+"""Settings in which two ends may differ; see `Mismatch`."""
