@@ -30,7 +30,7 @@ _LONGEST = 100 * _SECONDS["y"]
 
 
 def time_of_file(seconds: float) -> datetime:
-    """Return a file's time, limited to valid years: its writer can set any number."""
+    """Return a file's time in UTC; a time outside the years of `datetime` becomes its limit."""
     try:
         return datetime.fromtimestamp(seconds, UTC)
     except (ValueError, OverflowError, OSError):

@@ -1,4 +1,4 @@
-"""A round of a robot's agent: fetch, install, restart, look, and send what it finds.
+"""A round of a robot's agent: fetch, install, restart, examine processes, and report.
 
 A part that fails is reported as a problem of the round, and the other parts still run: a robot that
 cannot reach its source still confirms, and a robot that cannot reach its inbox still installs.
@@ -480,7 +480,7 @@ class _Round:
         return [name for name in done.enclaves if seen.states[name] is not RunningFiles.NOT_SEEN]
 
     def _look_after(self, restarted: Sequence[str], names: Iterable[str]) -> EnclaveProcesses:
-        """Look at the processes, until those of restarted units have loaded their files."""
+        """Examine the processes until those of restarted units have loaded their new files."""
         end = time.monotonic() + self._machine.patience
         while True:
             seen = self._look(names)
@@ -490,7 +490,7 @@ class _Round:
             time.sleep(_LOOK_SECONDS)
 
     def _look(self, names: Iterable[str]) -> EnclaveProcesses:
-        """Look at the processes at the present time, which is later than the begin of the round."""
+        """Examine the processes at the present time, which is later than the start of the round."""
         passed = timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME) - self._began)
         machine = self._machine
         return look_at_processes(
@@ -566,7 +566,7 @@ class _Round:
         return self._replaced_list() if self._is_in_step else self._revocation_list(names)
 
     def _replaced_list(self) -> str | None:
-        """Return the list that a release replaced by one that revokes less, or None."""
+        """Return the kept revocation list that a release replaced by a shorter one, or None."""
         with suppress(SrosError, OSError):
             path = agent_folder(self._folder) / _REPLACED_LIST
             since = time_of_file(path.stat().st_mtime)

@@ -1,4 +1,4 @@
-"""A connection to a web server that neither endless nor slow answers keep open for ever."""
+"""A connection to a web server that is closed after a time, however the server answers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ REFUSALS = frozenset({400, 401, 495, 496})
 
 
 def ended_tls(error: BaseException | None) -> bool:
-    """Return whether a server ended TLS, as for a client's certificate that it refuses.
+    """Return whether a server ended TLS, as it does if it refuses the client's certificate.
 
     With TLS 1.3 this may be an alert, or only the end of the connection.
     """
@@ -68,7 +68,7 @@ class GuardedConnection(http.client.HTTPConnection):
             self.sock = self._context.wrap_socket(plain, server_hostname=self.host)
 
     def end(self) -> None:
-        """Close everything, also an answer without an end, which `close` leaves open."""
+        """Close the connection and an unfinished answer, which `close` leaves open."""
         self.close()
         self._end_guard()
 

@@ -210,7 +210,7 @@ def _transport(
 
 
 def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datetime) -> Updater:
-    """Return the client of TUF: it trusts the pinned root, and what that led it to since."""
+    """Return the TUF client, which trusts the pinned root and the roots that follow from it."""
     from tuf.ngclient import Updater, UpdaterConfig
 
     path = state / _PINNED_ROOT

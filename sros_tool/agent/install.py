@@ -67,7 +67,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Installation(NamedTuple):
-    """What became of the enclaves of a release; an enclave without a change is in none of these."""
+    """The outcome for the enclaves of a release; unchanged enclaves are in none of the fields."""
 
     changed: tuple[str, ...] = ()
     """Enclaves of which a file changed."""

@@ -637,7 +637,7 @@ def _is_not_shipped(folder: str) -> bool:
 
 
 def _denied_at_start(lacking: Sequence[_Lacking]) -> str:
-    """Return a sentence that says what nodes do at their start and may not."""
+    """Return a sentence on what nodes do when they start although the policy denies it."""
     nodes = list(dict.fromkeys(gap.node for gap in lacking))
     kinds = Counter(gap.finding.kind for gap in lacking)
     what = [

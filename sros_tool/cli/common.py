@@ -396,7 +396,7 @@ def split_root(words: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
 
 
 def root_and_file(words: Sequence[str], usage: str) -> tuple[Path, Path]:
-    """Return the keystore (from the first of two words or the environment) and the file.
+    """Return keystore and file from one or two words; one word is the file.
 
     Raises `UsageError` with ``usage`` if there are other words.
     """

@@ -545,11 +545,11 @@ def import_verb(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """On a robot: install the file ANSWER (or -) next to the key in DIR, or change nothing.
+    """On a robot: install the answer in ANSWER (or -) next to the key in DIR, or change nothing.
 
-    Everything is checked first: that the certificate belongs to the key, its chain, the
-    signatures, the validity, and that the archive has no other files.  The first answer sets the
-    CAs that the robot trusts: give --ca, or an attacker could replace this answer on its way.
+    Before anything is installed, sros checks that the certificate belongs to the key, its chain,
+    the signatures, the validity, and that the archive has no other files.  The first answer sets
+    the CAs that the robot trusts: give --ca, or an attacker could replace this answer on its way.
     Later answers must come from the same CAs.
 
     Example:

@@ -419,8 +419,8 @@ def _publish(
     or left the fleet are removed.
 
     The keys are in KEYSTORE/private. The root key only signs the list of the other keys. Move this
-    key away from the keystore, and name it with --root-key when you replace a key, and once a year
-    to renew that list.
+    key away from the keystore. Name it with --root-key to replace a key, and once a year to renew
+    that list.
 
     Example:
       $ sros fleet publish keystore pub
@@ -555,7 +555,7 @@ def _status(
     after a restart. Confirmations by the Ansible collection and `sros agent` say which restarts
     are due, confirmations by `sros fleet report` do not. A robot without a recent confirmation is
     offline. Robots with the same state share a line. A robot that reports a release which was never
-    published is named even if its files are current. The last line counts the known vulnerabilities
+    published is shown even if its files are current. The last line counts the known vulnerabilities
     of the robots' DDS, by the advisories of sros; --robot and --advisories list them.
 
     The revocation list is in force on a robot that has the list and reports that no restart is

@@ -223,23 +223,23 @@ def diff_policy(
 ) -> int:
     """Compare the rights that A and B give: "-" is only in A, "+" only in B.
 
-    A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, or
-    Zenoh configurations such as router.json5. Permissions and Zenoh rules are shown in ROS
-    terms; the signature of permissions is verified if the permissions CA is next to them. "!" is a
-    right of B that needs a counterpart, such as a subscriber, which only A has. If A or B covers
-    only some enclaves, only these are compared. Lines that differ only in the robot of a fleet are
-    shown as one. For two policies, the protection that they demand is compared, too; of two
-    keystores, whether the governance differs.
+    A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, or Zenoh
+    configurations such as router.json5. Permissions and Zenoh rules are shown in ROS terms; the
+    signature of permissions is verified if the permissions CA is next to them. "!" marks a right of
+    B whose counterpart, such as the subscriber, only A has. If A or B covers only some enclaves,
+    only these are compared. Lines that differ only in the robot of a fleet are shown as one. Two
+    policies are also compared by the protection that they demand, two keystores by their
+    governance.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
 
     With --no-new-access, A and B can also be folders of policies, and policies at a git revision,
-    as git:REVISION:PATH. The exit status is 0 only if B gives no enclave any access that A does
-    not give, with no vendor, in no domain and for no name, and protects nothing less; it is 2 if
-    that cannot be decided. sros assumes that a policy is signed with a governance that controls all
-    access. If A is a policy, a keystore B that protects less than the template production counts as
-    giving more access; a policy B never lowers the protection. The last line says what is assumed
-    and what is left out, such as dates.
+    as git:REVISION:PATH. The exit status is 0 only if B gives no enclave access that A does not
+    give, for any vendor, domain or name, and protects nothing less; it is 2 if that cannot be
+    decided. sros assumes that a policy is signed with a governance that controls all access. If A
+    is a policy, a keystore B that protects less than the template production counts as giving more
+    access; a policy B never lowers the protection. The last line says what is assumed and what is
+    left out, such as dates.
 
     Example:
       $ sros diff_policy robot.xml keystore

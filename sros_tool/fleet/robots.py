@@ -500,7 +500,7 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
 
 
 class _Folding(NamedTuple):
-    """A text for several robots: for each one, for those other than ``own``, or for pairs."""
+    """A text that stands for several robots: any robot, any robot but ``own``, or any pair."""
 
     text: str
     own: str = ""
@@ -508,7 +508,7 @@ class _Folding(NamedTuple):
 
 
 def _foldings(fleet: Fleet, enclave: str, text: str) -> list[tuple[_Folding, str]]:
-    """Return a line folded by its robot, the one other robot, and both, with the robot's name."""
+    """Return the ways to fold a line: by its own robot, by the only other robot, or by both."""
     own = robot_of(fleet, enclave)
     named = [robot for robot in named_robots(fleet, "", text) if robot != own]
     other = named[0] if len(named) == 1 else None

@@ -475,7 +475,7 @@ def _part_rights(root: Path, part: str) -> frozenset[NodeRight] | None:
 def _shipped_parts(
     shipped: Path,
 ) -> Mapping[str, tuple[Mapping[str, bytes], frozenset[NodeRight] | None]]:
-    """Map each common part to its files, as `_needed_files`, and to the rights that it allows."""
+    """Map each common part to its files (see `_needed_files`) and the rights that it allows."""
     return {part: (_needed_files(shipped, part), _part_rights(shipped, part)) for part in PARTS}
 
 

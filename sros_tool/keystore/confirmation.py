@@ -259,7 +259,7 @@ def make_confirmation(
 
 
 def _confirmed_files(root: Path, folder: Folder, name: str) -> dict[str, bytes]:
-    """Map the paths of an enclave's files, of those that a confirmation lists, to their content.
+    """Map the paths of an enclave's files that confirmations list to their content.
 
     Raises:
         KeystoreError: a file is a link that leads out of the keystore.
@@ -367,7 +367,7 @@ class Received:
 
 
 class KeptConfirmation(NamedTuple):
-    """A robot's confirmation that the keystore keeps."""
+    """The confirmation of a robot that was written to the keystore."""
 
     keystore: NamedKeystore
     robot: str
@@ -458,7 +458,7 @@ class RefusedMessage(NamedTuple):
 def keep_refusals(
     root: Path, before: Mapping[str, RefusedMessage], refused: Mapping[str, str], *, now: datetime
 ) -> None:
-    """Write why the last messages of robots were refused, by robot, if it is not as ``before``.
+    """Write the reasons for refused messages, by robot, if they differ from ``before``.
 
     The caller holds `locked_confirmations`.
     """

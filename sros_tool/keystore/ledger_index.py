@@ -69,7 +69,7 @@ class Posting(NamedTuple):
 
 
 class IndexState(NamedTuple):
-    """The ledger that an index is of.
+    """The state of the ledger that an index describes.
 
     ``lines`` and ``size`` are its lines and bytes, ``number`` is the highest number of an entry,
     ``last`` is the SHA-256 of the last line, in hexadecimal.  ``sealed`` and ``sealed_size`` are
@@ -90,7 +90,7 @@ class IndexState(NamedTuple):
 
 
 class IndexedEntry(Protocol):
-    """The fields of a ledger entry that the index is about."""
+    """The fields of a ledger entry that the index contains."""
 
     @property
     def what(self) -> str:
@@ -142,7 +142,7 @@ def _terms(entry: IndexedEntry) -> Iterator[bytes]:
 
 
 class LedgerIndex:
-    """An index that has the root which the signed head of the ledger states."""
+    """An index whose root hash is stated in the signed head of the ledger."""
 
     def __init__(self, path: Path, state: IndexState, digests: bytes) -> None:
         self.state = state

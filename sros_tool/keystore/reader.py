@@ -300,7 +300,7 @@ class Keystore:
 
     @_Part
     def template(self) -> Template:
-        """The settings; without settings, the template for ros2/sros2."""
+        """The settings of the keystore; if it has none, the template for ros2/sros2."""
         from sros_tool.keystore.template import decode_template, load_template
 
         if not self.has(SETTINGS):

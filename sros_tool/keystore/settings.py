@@ -59,7 +59,7 @@ def _recorded_settings(ledger: Ledger) -> Template | None:
 
 @dataclass(frozen=True, slots=True)
 class HandEdits:
-    """Edits by hand in a keystore that sros has not applied yet.
+    """Manual edits of settings and governance files that sros has not applied yet.
 
     ``settings`` are clauses on keys of ``sros.toml``; ``governance`` is a clause on
     ``governance.xml``, or "".  ``unsigned`` are clauses on protection that ``sros.toml`` states and

@@ -547,7 +547,7 @@ _ONE = der.encode_integer(1)
 def _certificate_with(
     *, algorithm: bytes = _ED25519, subject: bytes = _NOBODY, extension: bytes = b""
 ) -> x509.Certificate:
-    """Build a certificate from DER parts of another one, so that `cryptography` parses them.
+    """Return a minimal certificate with these DER parts, so that `cryptography` parses them.
 
     Raises:
         ValueError: `cryptography` does not read a part.

@@ -206,7 +206,7 @@ class Growth:
         return bool(self.added or self.lost)
 
     def without_renames(self, renamed: Mapping[str, str]) -> Growth:
-        """Return this growth without the access that a list has for renamed enclaves alone.
+        """Return this growth without access that only comes from the new names of enclaves.
 
         ``renamed`` is what `renamed_between` returns.  If nothing else is added, nobody reaches
         anybody whom it did not reach before, under the old names.
@@ -225,7 +225,7 @@ class Growth:
 
 
 def renamed_between(base: AccessSource, head: AccessSource) -> dict[str, str]:
-    """Map enclaves of BASE to enclaves of HEAD that have their rights, and only another name.
+    """Map enclaves of BASE to enclaves of HEAD with the same rights under another name.
 
     Their permissions are the same but for the subject; Zenoh rules are not compared, so that with
     them no enclave counts as renamed.
@@ -671,7 +671,7 @@ def _added_gains(
 
 
 class AccessByVendors:
-    """The access that enclaves have by their documents, compared between vendors.
+    """A comparison of the access that DDS vendors derive from the same documents.
 
     Only names that ROS 2 can have, or that documents state without wildcards, are compared.
     """
@@ -1057,7 +1057,7 @@ def _reached_with_hops(edges: _Edges, start: str) -> dict[str, Hop]:
 
 
 def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
-    """Return a side with the domains and access control that it does not state itself.
+    """Return a side in which domains and access control that it leaves open are filled in.
 
     Enclaves of robots are for the domain of their robot.  A side without a governance gets access
     control of everything, in its own domains and those of the other side.
@@ -1083,7 +1083,7 @@ def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
 
 
 def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permissions]:
-    """Return the permissions of a side; those of a policy get the subjects of the other side.
+    """Return the permissions of a side; a policy gets the certificate subjects of the other side.
 
     If the other side is a keystore with unique subjects, enclaves that only the policy has get a
     unique subject, too.

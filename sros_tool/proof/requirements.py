@@ -132,7 +132,7 @@ class Must(OfRights):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AtMost(OfRights):
-    """At most ``most`` enclaves may use the same name, by a right or by a part of a right."""
+    """No name may be used by more than ``most`` enclaves; a part of a right counts as a use."""
 
     KIND = "at_most"
 

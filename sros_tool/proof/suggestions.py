@@ -122,7 +122,7 @@ def _sole_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
 
 
 def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
-    """Yield requirements that nobody calls services that change a node and that no enclave uses."""
+    """Yield requirements that nobody calls the services that change nodes but are unused."""
     last = {name.rpartition("/")[2] for name in stated_rights.names("reply") if name.count("/") > 1}
     for each in sorted(last.difference(READING_SERVICES)):
         yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{each}",)),))
@@ -140,7 +140,7 @@ def _limit_requirements(stated_rights: _Stated) -> Iterator[AtMost]:
 
 
 def _gate_requirements(world: World) -> Iterator[Apart]:
-    """Yield requirements that some enclaves can be influenced only by way of one other enclave."""
+    """Yield requirements that enclaves can be influenced only through one other enclave."""
     for target, sources in sorted(influencers(world, SearchLimit()).items()):
         if len(sources) == 1:
             yield Apart(source=_NOWHERE, sources=("*",), targets=(target,), through=tuple(sources))

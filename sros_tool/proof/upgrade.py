@@ -210,14 +210,14 @@ def check_upgrade(
     here: Distribution | None = None,
     vendor: str = "",
 ) -> UpgradeFindings:
-    """Return what the update to a distribution changes for a policy file or a keystore.
+    """Return findings on what the update to ``later`` changes for a policy or a keystore.
 
     Args:
         path: the policy or keystore.
         later: the distribution after the update.
         circumstances: the moment, the ROS domain, and other conditions.
-        present: the distribution before it; by default those that the keystore says.
-        here: the distribution that is sourced, where the keystore says none.
+        present: the distribution before it; by default those that the keystore states.
+        here: the distribution that is sourced, if the keystore states none.
         vendor: the only DDS vendor that is used, of any release, or ``zenoh``; "" for all.
 
     Raises:

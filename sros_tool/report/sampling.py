@@ -154,7 +154,7 @@ def _without_unit_names(text: str, unit: DrawnUnit, names: UnitNames) -> str:
 
 
 def _with_mark(text: str, word: str, mark: str) -> str:
-    """Return a text with a mark in place of a word that stands between no letters and digits.
+    """Return a text with ``mark`` in place of each whole word ``word``.
 
     It is faster than a regular expression, which would be compiled for each of many robots.
     """

@@ -33,7 +33,7 @@ class EventKind(StrEnum):
 
 
 class ProcessStage(StrEnum):
-    """The stage at which a process was refused or failed."""
+    """How far a process got before it was refused or failed."""
 
     IMPORT = "import"
     PARTICIPANT = "participant"

@@ -1,4 +1,4 @@
-"""Reading the configuration of a Zenoh process, whoever wrote it: JSON5, or YAML that is JSON.
+"""Read Zenoh configurations, also those that sros did not write: JSON5, or YAML in JSON syntax.
 
 Zenoh chooses the language by the file name's ending, and reads no file with another ending.
 

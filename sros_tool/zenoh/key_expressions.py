@@ -65,7 +65,7 @@ class KeyExpressions:
 
     @cached_property
     def _by_begin(self) -> Mapping[str, Mapping[str, Mapping[str, list[str]]]]:
-        """Expressions with wildcards, by the text before these, `_landmark`, `_wildcard_form`."""
+        """Wildcard expressions, by text before the wildcard, `_landmark` and `_wildcard_form`."""
         groups: dict[str, dict[str, dict[str, list[str]]]] = {}
         for expression in self.all:
             if (begin := _fixed_begin(expression)) != expression:

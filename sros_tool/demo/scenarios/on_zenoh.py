@@ -102,7 +102,7 @@ def _attempt_row(
     defence_removed: str = "",
     evidence: str = "",
 ) -> Row:
-    """Return a brief row with one claim, expected as ``expected``."""
+    """Return a brief row with one claim that should have the status ``expected``."""
     return Row(
         name,
         expected,

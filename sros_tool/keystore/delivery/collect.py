@@ -367,7 +367,7 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Rec
 
 
 def _add_signed_by_others(received: _ReceivedMessage, message: bytes) -> None:
-    """Add what CAs signed in a message that does not count: revocation list and certificate."""
+    """Add the CA-signed parts of a message that does not count: revocation list, certificate."""
     with suppress(SrosError):
         signed = smime.parse_new(message)
         received.stranger = signed.signer()
@@ -400,7 +400,7 @@ def _read_message(inbox: Folder, robot: str) -> _File | None:
 
 
 def _unknown_file_notes(inbox: Path, fleet: Fleet) -> Iterator[Note]:
-    """Yield a note on names in the inbox that are those of no robot."""
+    """Yield a note on files in the inbox that are not named after a robot."""
     names: list[str] = []
     with suppress(OSError), os.scandir(inbox) as entries:  # others can move the folder
         names = sorted(entry.name for entry in islice(entries, _MOST_NAMES))

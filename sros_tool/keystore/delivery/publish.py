@@ -1,4 +1,4 @@
-"""Publishing the releases of a fleet's robots in a folder that any web server or stick carries.
+"""Publish the releases of a fleet's robots in a folder for any web server or USB stick.
 
 What robots see is whole at every moment, by the order of writing: new archives, which nothing
 names yet; the keystore's transaction with ledger, keys and the list of what is published; the
@@ -238,7 +238,7 @@ def publish(
 
 
 def later_in_folder(keystore: Keystore) -> str:
-    """Return how the folder in which a keystore publishes is later than the keystore, as a clause.
+    """Return, as a clause, what shows that the publishing folder is newer than the keystore.
 
     "" if it is not later, or if this is unknown here.  Only metadata that keys of the keystore
     signed counts.
@@ -492,7 +492,7 @@ class _Evaluator:
         return _RobotFiles(files, "; ".join(not_valid), evaluated if until > self._now else None)
 
     def _is_list_good(self, name: str, files: Mapping[str, bytes]) -> bool:
-        """Return whether a list is good for an enclave like this one, and does not revoke it.
+        """Return whether an enclave of this kind accepts the revocation list and is not on it.
 
         False also where only the whole evaluation can tell.
         """
@@ -930,7 +930,7 @@ class _Run:
         self._changes = changes_below(self.keystore.root, change.transaction.changes)
 
     def write(self, keys: _Keys) -> None:
-        """Write the metadata, the timestamp last; then remove files long without a reference.
+        """Write the metadata, the timestamp last; then remove files that were unused for long.
 
         A new root is written first if the present metadata already fits it; otherwise after the
         new metadata, which the keys of both roots have signed.  So robots find complete metadata

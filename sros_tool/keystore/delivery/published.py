@@ -157,10 +157,10 @@ def read_published(keystore: Keystore) -> Published:
 
 
 def may_have_later_releases(keystore: Keystore) -> bool:
-    """Return whether the publishing folder of a keystore has later metadata than it published.
+    """Return whether the publishing folder has later metadata than the keystore recorded.
 
-    Then the keystore was restored from a backup, or somebody else wrote the metadata: they are not
-    verified here.
+    If so, the keystore was restored from a backup, or somebody else wrote the metadata, which is
+    not verified here.
     """
     with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
         known = read_published(keystore)
@@ -174,7 +174,7 @@ def may_have_later_releases(keystore: Keystore) -> bool:
 
 
 def damaged_list_error(keystore: Keystore, why: str = "") -> DocumentError:
-    """Return the error for a list that is not what was published, with the sentence ``why``."""
+    """Return the error for a damaged list of published releases; ``why`` is its reason."""
     return DocumentError(
         f"'{keystore.root / PUBLISHED}' is damaged",
         why,

@@ -252,7 +252,7 @@ class EnclaveWriter:
     def would_only_date(
         self, rights: StatedRights, certificate: x509.Certificate, validity: Window, text: bytes
     ) -> bool:
-        """Return whether `write` would only change dates, and the present ones are far enough away.
+        """Return whether `write` would change only dates, and the present expiry is late enough.
 
         ``text`` is the present document, with LF line ends.  Its ``validity`` is long enough until
         two thirds of a new validity are over (`Window.can_be_kept`).
