@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from difflib import get_close_matches
 from functools import cache, cached_property
 from itertools import islice
 from pathlib import Path
@@ -39,7 +40,7 @@ from sros_tool.dds.permissions import (
 from sros_tool.errors import DocumentError, Note, PolicyError, SrosError
 from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
-from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.fleet.robots import Fleet, Robot, group_of
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.keystore.protection import contradictions
 from sros_tool.names import (
@@ -68,6 +69,7 @@ from sros_tool.policy.model import (
     stated_protections,
 )
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix
+from sros_tool.policy.placeholders import parts_of
 from sros_tool.policy.rights import WHOLE, Right, Rules, parts, placed_rights, policy_rights
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
@@ -1052,6 +1054,15 @@ SHARED_NAMESPACE = FindingKind(
     "Give each robot a namespace of its own in the fleet file, or a ROS domain of its own.",
 )
 
+ROBOT_WITHOUT_ENCLAVE = FindingKind(
+    "policy.robot-without-enclave",
+    WARNING,
+    "robots for which no policy has an enclave",
+    "Their processes get no keys. A misspelled group in the fleet file looks like that.",
+    "sros (placeholder {robot:GROUP}).",
+    "Correct the groups of the robots in the fleet file, or name all policies of the fleet.",
+)
+
 _CHECKS = (
     _check_rules,
     _check_nodes,
@@ -1112,6 +1123,8 @@ def policy_file_findings(
         yield from _include_findings(path)
         if fleet and (shared := [*_shared_namespaces(fleet)]):
             yield SHARED_NAMESPACE.found(str(path), first_few(shared, 3, "; "), str(path))
+    if fleet and read and (text := _robots_without_enclave(paths, fleet)):
+        yield ROBOT_WITHOUT_ENCLAVE.found(str(paths[0]), text, str(paths[0]))
     yield from findings_in(read, distribution)
     if on_zenoh:
         yield from _check_zenoh(enclave for policy in read for enclave in policy.enclaves)
@@ -1148,6 +1161,32 @@ def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
                     f"the namespace of {inner}, {namespace}, is inside {above}, the namespace of "
                     f"{outer}"
                 )
+
+
+def _robots_without_enclave(paths: Sequence[Path], fleet: Fleet) -> str:
+    """Return a clause on robots that get no enclave by mistake; "" if there are none.
+
+    A robot of a group that no policy names may belong to policies that were not named.  It counts
+    only if it has no group at all, or a group with a name like that of a group in the policies.
+    """
+    named = set[str]()
+    for path in paths:
+        with suppress(SrosError):  # what is wrong with it is a finding of its own
+            policy = read_policy(path, placeholders=True)
+            named |= {group_of(parts_of(each)) for each in FleetPolicy(policy, fleet).patterns}
+    if not named or "" in named:  # no policy of a fleet, or an enclave for every robot
+        return ""
+    clauses = []
+    for robot in fleet.robots.values():
+        if named.intersection(robot.groups):
+            continue
+        meant = {other for group in robot.groups for other in get_close_matches(group, named)}
+        if meant:
+            groups = ", ".join(robot.groups)
+            clauses.append(f"{robot.name} (group {groups}: perhaps {some_names(sorted(meant))})")
+        elif not robot.groups:
+            clauses.append(f"{robot.name} (in no group)")
+    return f"no enclave for {first_few(clauses, 5)}" if clauses else ""
 
 
 def _on_one_domain(

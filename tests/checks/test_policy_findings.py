@@ -31,6 +31,7 @@ FOUND_OTHERWISE = {
     "policy.redundant-include",
     "portable.enclave-names",
     "policy.root-enclave",
+    "policy.robot-without-enclave",
     "policy.shared-namespace",
     "policy.not-on-zenoh",
 }
@@ -293,3 +294,18 @@ def test_what_zenoh_cannot_express_is_found_where_zenoh_is_named(tmp_path: Path)
     file = tmp_path / "policy.xml"
     found = {each.id: each for each in policy_file_findings(file, on_zenoh=True)}
     assert "DENY publish /x*y* cannot be expressed" in found["policy.not-on-zenoh"].text
+
+
+def test_a_misspelled_group_is_found(tmp_path: Path) -> None:
+    fleet, file = tmp_path / "fleet.toml", tmp_path / "policy.xml"
+    carts = enclave("", "/{robot:carts}/base", "{namespace}")
+    file.write_text(policy(carts))
+    fleet.write_text(
+        '[robots]\nh1 = { groups = ["carts"] }\nh2 = { groups = ["cart"] }\nh3 = {}\n'
+        'w1 = { groups = ["windows"] }\n'
+    )
+    words = ("check", file, "--fleet", fleet, "--include", "policy.robot-without-enclave")
+    said = sros(*words).out
+    assert "no enclave for h2 (group cart: perhaps carts), h3 (in no group)\n" in said
+    file.write_text(policy(carts, enclave("", "/{robot}/all", "{namespace}")))
+    assert sros(*words).ok().out == ""
