@@ -22,6 +22,7 @@ from sros_tool.cli.common import (
     json_option,
     now,
     print_json,
+    secrets,
     verb,
 )
 from sros_tool.errors import UsageError
@@ -224,6 +225,7 @@ def demo(
         network=network,
         keep=keep,
         advisories=advisories_of(advisories),
+        secrets=secrets(),
     )
     for path in (summary, report):
         if path is not None:  # fail before the demo runs, not after it

@@ -43,7 +43,7 @@ from sros_tool.demo.scenarios.model import (
 )
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.faults import Fault
-from sros_tool.keystore.issuing.keyring import Keyring
+from sros_tool.keystore.issuing.keyring import Keyring, Secrets, no_secrets
 from sros_tool.keystore.layout import (
     CRL,
     CRL_FILE,
@@ -99,6 +99,7 @@ class UserKeystore(NamedTuple):
     ``rows`` are for the enclaves with the widest permissions, and for those with faulty or revoked
     files.  ``enclaves`` is the number of all enclaves, ``elsewhere`` the number of those whose key
     is not in the keystore.  ``not_tried`` lists tests that a proof needs and that cannot run.
+    ``secrets`` returns the passphrases of its CA keys.
     """
 
     root: Path
@@ -113,6 +114,7 @@ class UserKeystore(NamedTuple):
     enclaves: int
     elsewhere: int
     not_tried: tuple[str, ...]
+    secrets: Secrets = no_secrets
 
     def copy(self, target: Path) -> None:
         """Copy the keystore with modes and links, but only the enclaves of rows and no CA keys."""
@@ -125,7 +127,7 @@ class UserKeystore(NamedTuple):
         """Return the keyring of the CA keys: in the keystore, or where its settings say."""
         inside = {role: self.root.absolute() / ca_key(role) for role in ROLES}
         places = {role: f"file:{path}" for role, path in inside.items() if path.exists()}
-        return Keyring(places=places)
+        return Keyring(self.secrets, places)
 
     def topic_of(self, party: Party, topic: str) -> str:
         """Return the topic or service of a party; ``topic`` is the attacked ROS topic."""
@@ -233,7 +235,7 @@ class _Enclaves(NamedTuple):
     them.  ``unreadable`` have files that are not safe to read, such as an endless file of the
     kernel. ``elsewhere`` are enclaves whose key is not in the keystore.  ``without_list`` lack the
     newest revocation list of their keystore; ``other_governance`` have another governance than the
-    rest.
+    rest; ``other_domain`` are for other ROS domains than ``domain``, in which the enclaves meet.
     """
 
     rights: Mapping[str, Grant]
@@ -243,6 +245,8 @@ class _Enclaves(NamedTuple):
     elsewhere: tuple[str, ...]
     without_list: frozenset[str]
     other_governance: tuple[str, ...]
+    other_domain: tuple[str, ...]
+    domain: int
 
     def rows(self) -> Iterator[Row]:
         """Yield a row for each enclave with faulty or revoked files, up to `_MOST_FAULTY`."""
@@ -261,6 +265,8 @@ class _Enclaves(NamedTuple):
             yield f"{first_few(sorted(self.without_list), 1)} without the newest revocation list"
         if self.other_governance:
             yield f"{first_few(sorted(self.other_governance), 1)} with a governance of its own"
+        if self.other_domain:
+            yield f"{first_few(sorted(self.other_domain), 1)} outside domain {self.domain}"
 
     def faults_text(self) -> str:
         """Return a sentence on the first enclave left out because of its files, or ""."""
@@ -277,6 +283,7 @@ def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
     unreadable: list[str] = []
     elsewhere: list[str] = []
     without_list: list[str] = []
+    other_domain: list[str] = []
     governances: dict[str, Governance | None] = {}
     serials = _revoked_serials(keystore)
     newest = _content(keystore.root / CRL)
@@ -290,6 +297,8 @@ def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
             elsewhere.append(name)
         elif own or (state.certificate and state.certificate.serial_number in serials):
             revoked[name] = own
+        elif faults and all(fault.fault is Fault.PERMISSIONS_DOMAIN for fault in faults):
+            other_domain.append(name)
         elif reason := str(faults[0]) if faults else _strange_authority(keystore, state):
             faulty[name] = reason
         elif grant := state.grant:
@@ -312,6 +321,8 @@ def _read_enclaves(keystore: Keystore, now: datetime, domain: int) -> _Enclaves:
         other_governance=tuple(
             name for name, governance in governances.items() if governance != usual[0][0]
         ),
+        other_domain=tuple(other_domain),
+        domain=domain,
     )
 
 

@@ -81,6 +81,7 @@ from sros_tool.demo.wire import (
     with_changed_bit,
 )
 from sros_tool.errors import UnavailableError, UsageError
+from sros_tool.keystore.issuing.keyring import Secrets, no_secrets
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.names import dds_names
 from sros_tool.runtime.events import Event, EventKind, EventReader
@@ -135,7 +136,8 @@ class DemoOptions:
     is the template of that keystore, or production; the default ``topic`` is one that the cast may
     use.  ``only`` selects the rows whose names contain one of its words.  ``accept_open`` names the
     rows of attacks that may succeed because of the user's keystore.  ``advisories`` are the known
-    DDS vulnerabilities; None for those that ship with sros.
+    DDS vulnerabilities; None for those that ship with sros.  ``secrets`` returns the passphrases of
+    the CA keys in ``keystore``.
     """
 
     template: Template | None = None
@@ -150,6 +152,7 @@ class DemoOptions:
     accept_open: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
     advisories: tuple[Advisory, ...] | None = None
+    secrets: Secrets = no_secrets
 
 
 def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoResult:
@@ -342,7 +345,8 @@ def _user_keystore(options: DemoOptions, now: datetime) -> UserKeystore | None:
                 "Use --keystore with --scenario attacks alone.",
             )
     topic = "" if options.topic is None else check_topic(options.topic)
-    return open_user_keystore(options.keystore, topic, options.scenarios[0], now)
+    user = open_user_keystore(options.keystore, topic, options.scenarios[0], now)
+    return user._replace(secrets=options.secrets)
 
 
 def _with_rows_of(user: UserKeystore, scenario: Scenario) -> Scenario:

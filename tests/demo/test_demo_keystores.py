@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.demo import forger
+from sros_tool.demo import forger, program
 from sros_tool.demo.casting import UserKeystore, open_user_keystore
 from sros_tool.demo.forger import KeystoreCopy
 from sros_tool.demo.program import DemoOptions, run_demo
@@ -225,3 +225,24 @@ def test_an_enclave_with_a_file_of_the_kernel_is_neither_copied_nor_started(
     assert not {place.victim, place.other} & {*user.cast.values()}
     user.copy(tmp_path / "copy")
     assert not (tmp_path / "copy/enclaves/odd").exists()
+
+
+def test_enclaves_of_other_domains_are_sound_and_not_tried(tmp_path: Path) -> None:
+    root, fleet = tmp_path / "ks", tmp_path / "fleet.toml"
+    rights = {"/{robot}/eye": publish("/image"), "/{robot}/viewer": HEARS}
+    rights["/{robot}/other"] = publish("/b")
+    (tmp_path / "policy.xml").write_text(policy_text(rights))
+    fleet.write_text("[robots]\nr1 = { domain = 10 }\nr2 = { domain = 20 }\n")
+    sros("create_keystore", root, "--domain", "10,20", "--template", "production").ok()
+    sros("generate_artifacts", "-k", root, "-p", tmp_path / "policy.xml", "--fleet", fleet).ok()
+    user = opened(root)
+    assert {name.split("/")[1] for name in user.cast.values()} == {"r1"}
+    assert not [row.name for row in user.rows if "joins the other enclaves" in row.name]
+    assert user.not_tried == ("/r2/eye and 2 more outside domain 10",)
+
+
+def test_encrypted_ca_keys_are_opened_with_the_secrets_of_the_user(tmp_path: Path) -> None:
+    root, secret = make_keystore(tmp_path, ROBOT), "correct horse battery"
+    options = DemoOptions(scenarios=(ATTACKS,), keystore=root, secrets=lambda _: secret)
+    user = program._user_keystore(options, NOW)
+    assert user and user.keyring().secrets("the passphrase of the identity CA key") == secret
