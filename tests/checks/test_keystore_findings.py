@@ -132,7 +132,7 @@ def test_what_everybody_can_change(
 ) -> None:
     bench.path(name).chmod(mode)
     for only in (None, ["base"]):
-        bench.options["only"] = only and ["/base"]
+        bench.options["only_enclaves"] = only and ["/base"]
         assert {each for each in ids(bench) if each != "keystore.folder-open"} == found
     tmp_path.chmod(0o700)
 
