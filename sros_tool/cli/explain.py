@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.who import Decider, Everybody, FollowedReach
     from sros_tool.explain.zenoh import CheckedLink, ZenohAnswer, ZenohExplanation
     from sros_tool.fleet.robots import Fleet
+    from sros_tool.keystore.participant import LoadedEnclave
     from sros_tool.policy.model import Source
     from sros_tool.proof.requirements import Requirement
     from sros_tool.zenoh.delivery import Check
@@ -333,6 +334,8 @@ def explain(
     else:
         from sros_tool.explain.vendors import Compared, explain_on_dds
 
+        if not (vendor or distro):
+            distro = _stated_distribution(asked.enclave)
         chosen = chosen_vendor(None if vendor == ZENOH else vendor, distro, os.environ)
         every = Compared.VENDORS if all_vendors else Compared.DISTRIBUTIONS if all_distros else None
         explanation = explain_on_dds(asked, question, chosen, context, kind=kind, every=every)
@@ -424,6 +427,20 @@ def _open(root: Path | None, name: str, policy: Path | None, asking: AskingConte
     if root is None and not policy and not is_enclave(Path(name)):
         root = keystore_from_environment()
     return open_to_ask(root, name, policy, asking)
+
+
+def _stated_distribution(enclave: LoadedEnclave) -> Distribution | None:
+    """Return the only ROS 2 distribution that an enclave's fleet or keystore states, or None."""
+    from sros_tool.distributions import find_distribution
+    from sros_tool.keystore.fleet import stated_distributions
+
+    keystore = enclave.keystore
+    if keystore is None or keystore.settings is None:
+        return None
+    with suppress(SrosError):  # which `sros check` reports
+        stated = stated_distributions(keystore, enclave.name)
+        return find_distribution(stated[0]) if len(stated) == 1 else None
+    return None
 
 
 def _policy_alone(

@@ -244,5 +244,5 @@ def test_enclaves_of_other_domains_are_sound_and_not_tried(tmp_path: Path) -> No
 def test_encrypted_ca_keys_are_opened_with_the_secrets_of_the_user(tmp_path: Path) -> None:
     root, secret = make_keystore(tmp_path, ROBOT), "correct horse battery"
     options = DemoOptions(scenarios=(ATTACKS,), keystore=root, secrets=lambda _: secret)
-    user = program._user_keystore(options, NOW)
+    user = program._user_keystore(options, datetime.now(UTC))
     assert user and user.keyring().secrets("the passphrase of the identity CA key") == secret

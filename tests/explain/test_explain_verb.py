@@ -775,3 +775,16 @@ def test_the_remedy_is_for_the_file_that_is_at_fault(
     told = explain(keystore, ENCLAVE, "publish", "/chatter")
     assert told.status == 1
     assert remedy in told.out.partition("  remedy ")[2], told.out
+
+
+def test_the_distribution_of_the_robot_decides(tmp_path: Path) -> None:
+    (tmp_path / "policy.xml").write_text(policy_text({"/{robot}/a": publish("/x")}))
+    (tmp_path / "fleet.toml").write_text('[robots]\nr1 = { distribution = "humble" }\nr2 = {}\n')
+    root = tmp_path / "ks"
+    sros("create_keystore", root).ok()
+    made = ("-k", root, "-p", tmp_path / "policy.xml", "--fleet", tmp_path / "fleet.toml")
+    sros("generate_artifacts", *made).ok()
+    asked = ("/r1/a", "publish", "/x")
+    assert "as in ROS 2 Humble)" in explain(root, *asked).out
+    assert "on Fast DDS 3.6" in explain(root, *asked, "--distro", "lyrical").out
+    assert "Humble" not in explain(root, "/r2/a", "publish", "/x").out
