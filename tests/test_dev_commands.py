@@ -418,6 +418,25 @@ def test_every_check_is_run_and_shown_and_the_worst_counts(
     assert lines[-1].startswith("ruff check ok; ruff format FAILED (1); ")
 
 
+def test_tests_that_failed_run_again_with_the_same_seed_to_tell_their_values(
+    venv: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    python = venv / "python"
+    ends = 'case "$*" in *--processes*) exit 1;; esac'
+    python.write_text(f'#!/bin/sh\necho "ran $SROS_SEED: $*"\n{ends}\n')
+    python.chmod(0o755)
+    for name, value in (("PYTHON", python), ("VENV", venv), ("CHECKOUT", venv)):
+        monkeypatch.setattr(checks, name, value)
+    monkeypatch.setattr(checks, "read_record", Record)
+    assert checks.run([], {"PATH": "/usr/bin:/bin"}, with_tests=True) == 1
+    ran = [line for line in capfd.readouterr().out.splitlines() if "pytest" in line]
+    all_of_them, again = ran
+    assert "--assert=plain" in all_of_them and "--assert" not in again
+    assert "--last-failed" in again
+    seeds = [line.partition(":")[0] for line in ran]
+    assert seeds[0] == seeds[1] != "ran "
+
+
 def test_the_oldest_packages_are_those_that_the_package_asks_for_or_newer(
     venv: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
