@@ -12,6 +12,7 @@ from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -55,6 +56,7 @@ def no_search_for_garbage() -> Iterator[None]:
     yield
     tree_of.cache_clear()
     nodes_of.cache_clear()
+    nodes_by_kind.cache_clear()
     modules_of.cache_clear()
     gc.enable()
 
@@ -79,6 +81,22 @@ def nodes_of(tree: ast.AST) -> tuple[ast.AST, ...]:
     return tuple(nodes)
 
 
+@cache
+def nodes_by_kind(tree: ast.AST) -> Mapping[type[ast.AST], list[Any]]:
+    """Return the nodes of a tree by their class: most tests look at few of them."""
+    found: defaultdict[type[ast.AST], list[Any]] = defaultdict(list)
+    for node in nodes_of(tree):
+        found[type(node)].append(node)
+    return found
+
+
+def of_kind(tree: ast.AST, *kinds: type[ast.AST]) -> Iterator[Any]:
+    """Yield the nodes of a tree that are of one of these classes."""
+    found = nodes_by_kind(tree)
+    for kind in kinds:
+        yield from found.get(kind, ())
+
+
 def imported(source: str, module: tuple[str, ...]) -> Iterator[tuple[int, str]]:
     """Line and absolute name of each import in the text of `module`; also inside functions."""
     yield from imported_names(tree_of(source), module)
@@ -86,10 +104,10 @@ def imported(source: str, module: tuple[str, ...]) -> Iterator[tuple[int, str]]:
 
 def imported_names(tree: ast.Module, module: tuple[str, ...]) -> Iterator[tuple[int, str]]:
     """Line and absolute name of each import in the syntax of `module`; also inside functions."""
-    for node in nodes_of(tree):
+    for node in of_kind(tree, ast.Import, ast.ImportFrom):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, name.name) for name in node.names)
-        elif isinstance(node, ast.ImportFrom):
+        else:
             above = module[: len(module) - node.level] if node.level else ()
             origin = ".".join((*above, *([node.module] if node.module else [])))
             yield from ((node.lineno, f"{origin}.{name.name}") for name in node.names)
@@ -169,8 +187,8 @@ def clocks(source: str) -> list[int]:
     """The lines that ask what time it is."""
     return [
         node.lineno
-        for node in nodes_of(tree_of(source))
-        if isinstance(node, ast.Attribute)
+        for node in of_kind(tree_of(source), ast.Attribute)
+        if any(clock.endswith(f".{node.attr}") for clock in CLOCKS)
         and f"{ast.unparse(node.value).rpartition('.')[2]}.{node.attr}" in CLOCKS
     ]
 
@@ -394,7 +412,7 @@ def writing(source: str) -> list[int]:
     """The lines that change what is at a path, or import a function that can under a new name."""
     return sorted(
         node.lineno
-        for node in nodes_of(tree_of(source))
+        for node in of_kind(tree_of(source), ast.Call, ast.ImportFrom, ast.Import)
         if (isinstance(node, ast.Call) and is_writing(node))
         or (
             isinstance(node, ast.ImportFrom)
@@ -411,11 +429,11 @@ def writing(source: str) -> list[int]:
 def unsafe_pythons(source: str) -> list[int]:
     """Lines that start Python so that it imports modules from the working folder."""
     found = []
-    for node in nodes_of(tree_of(source)):
-        words = [ast.unparse(each) for each in getattr(node, "elts", ())]
+    for node in of_kind(tree_of(source), ast.List, ast.Tuple, ast.Set):
+        words = [ast.unparse(each) for each in node.elts]
         for place, word in enumerate(words):
             if word == "sys.executable" and words[place + 1 : place + 2] != ["'-P'"]:
-                found.append(node.lineno)  # type: ignore[attr-defined]
+                found.append(node.lineno)
     return found
 
 
@@ -491,7 +509,8 @@ _LOGGING = {"StreamHandler", "basicConfig", "lastResort"}
 
 def printing(source: str) -> list[int]:
     """The lines that write to the terminal, or import what does under another name."""
-    return sorted({node.lineno for node in nodes_of(tree_of(source)) if _is_printing(node)})  # type: ignore[attr-defined]
+    nodes = of_kind(tree_of(source), ast.Call, ast.ImportFrom)
+    return sorted({node.lineno for node in nodes if _is_printing(node)})
 
 
 def _is_printing(node: ast.AST) -> bool:
@@ -561,8 +580,8 @@ def meanings(modules: Modules) -> dict[str, list[str]]:
     """Return the public class names that are defined in several places, with the modules."""
     found = defaultdict(list)
     for name, tree in modules.items():
-        for node in nodes_of(tree):
-            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+        for node in of_kind(tree, ast.ClassDef):
+            if not node.name.startswith("_"):
                 found[node.name].append(name)
     return {name: places for name, places in found.items() if len(places) > 1}
 
@@ -608,14 +627,14 @@ def public_names(tree: ast.Module) -> set[str]:
 
 def used_names(name: str, modules: Modules, known: Modules) -> set[tuple[str, str]]:
     """Return what the module `name` takes from each of the `known` modules, also later on."""
-    nodes = nodes_of(modules[name])
+    tree = modules[name]
     found: set[tuple[str, str]] = set()
     aliases: dict[str, str] = {}
-    for node in nodes:
+    for node in of_kind(tree, ast.Import, ast.ImportFrom):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 aliases[alias.asname or alias.name] = alias.name
-        elif isinstance(node, ast.ImportFrom) and node.module:
+        elif node.module:
             for alias in node.names:
                 found.add((node.module, alias.name))
                 aliases[alias.asname or alias.name] = f"{node.module}.{alias.name}"
@@ -623,10 +642,10 @@ def used_names(name: str, modules: Modules, known: Modules) -> set[tuple[str, st
     folder = f"{name.rpartition('.')[0]}."
     beside = [each for each in known if each.startswith(folder) and each != name]
     # Of any module that is here whole: it may be asked as the variable of a loop.
-    attributes = {node.attr for node in nodes if isinstance(node, ast.Attribute)}
+    attributes = {node.attr for node in of_kind(tree, ast.Attribute)}
     found.update(product(whole, attributes))
     # A table of verbs, or of what is imported late, names what stands next to it.
-    constants = (node.value for node in nodes if isinstance(node, ast.Constant))
+    constants = (node.value for node in of_kind(tree, ast.Constant))
     words = {word for word in constants if isinstance(word, str) and word.isidentifier()}
     found.update(product(beside, words))
     return {(module, each) for module, each in found if module != name}
@@ -637,8 +656,8 @@ def loaded_names(*trees: ast.AST) -> set[str]:
     return {
         node.id
         for tree in trees
-        for node in nodes_of(tree)
-        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)
+        for node in of_kind(tree, ast.Name)
+        if isinstance(node.ctx, ast.Load)
     }
 
 
