@@ -286,11 +286,11 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     for statement in checked_policy.statements:
         if statement.allows:
             names[statement.right.right].add(statement.name)
-    sides = {right: Names(sorted(found)) for right, found in names.items()}
+    sides = {right: Names(sorted(names_of_right)) for right, names_of_right in names.items()}
 
-    def is_alone(each: _Statement, other: str) -> bool:
-        name = each.name
-        if not each.allows or is_expression(name) or name in _GLOBAL_TOPICS:
+    def is_alone(statement: _Statement, other: str) -> bool:
+        name = statement.name
+        if not statement.allows or is_expression(name) or name in _GLOBAL_TOPICS:
             return False
         # The other side may name the whole action.
         return not sides[other].meets(name) and not action_part(name)[1]
@@ -317,22 +317,24 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             yield statement.found(MISTAKEN_SIDE, text, f'Write {other}="ALLOW" for it.')
             continue
         candidates = [
-            one
+            candidate
             for name in (statement.name, *near.similar_names(statement.name))
-            for one in offered.get(name, ())
+            for candidate in offered.get(name, ())
         ] + [
-            one
+            candidate
             for name in near.same_name_elsewhere(statement.name)
-            for one in offered[name]
-            if one.right.right == other
+            for candidate in offered[name]
+            if candidate.right.right == other
         ]
         # A node has, say, a topic and a service of one name.
-        candidates = [one for one in candidates if one.profile is not statement.profile]
+        candidates = [
+            candidate for candidate in candidates if candidate.profile is not statement.profile
+        ]
         same_end = [
-            one
+            candidate
             for name in near.names_with_same_end(statement.name)
-            for one in offered[name][:1]
-            if one.right.right == other and one.profile is not statement.profile
+            for candidate in offered[name][:1]
+            if candidate.right.right == other and candidate.profile is not statement.profile
         ]
         if not candidates and len(same_end) == 1 and _is_namespace_apart(statement, same_end[0]):
             candidates = same_end
@@ -343,17 +345,19 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             yield statement.found(NO_COUNTERPART, f"no enclave may {other} {statement.name}{hint}")
 
 
-def _is_namespace_apart(one: _Statement, other: _Statement) -> bool:
+def _is_namespace_apart(statement_a: _Statement, statement_b: _Statement) -> bool:
     """Return whether the namespace of a profile alone makes one of two names longer.
 
     A name that is written with a namespace, or with ``~``, is longer on purpose.
     """
-    shorter, longer = sorted((one, other), key=lambda statement: len(statement.name))
+    shorter, longer = sorted((statement_a, statement_b), key=lambda statement: len(statement.name))
     return longer.name.endswith(shorter.name) and not {*"/~"} & {*longer.written}
 
 
 def _candidates_text(candidates: Sequence[_Statement]) -> str:
-    names = " or ".join(f"{one.name} ({one.right.right})" for one in candidates[:_NAMES_SHOWN])
+    names = " or ".join(
+        f"{candidate.name} ({candidate.right.right})" for candidate in candidates[:_NAMES_SHOWN]
+    )
     return f"perhaps you mean {names}, which nobody uses"
 
 
@@ -383,26 +387,29 @@ def _offered_by_others_findings(unused_statements: Iterable[_Statement]) -> Iter
 
 
 def _misspelt_name_finding(
-    each: _Statement, other: str, candidates: Sequence[_Statement]
+    misspelt: _Statement, other: str, candidates: Sequence[_Statement]
 ) -> Finding:
     """Return the finding on a name without counterpart, which suggests similar names."""
     shown, remedy = candidates[:_NAMES_SHOWN], ""
     hint, first = _candidates_text(shown), shown[0]
-    if first.name == each.name:
+    if first.name == misspelt.name:
         kind = first.right.kind.removesuffix("s")
         article = "an" if kind == "action" else "a"
         hint = f"{first.right.enclave} has it as {article} {kind} ({first.right.right}), unused"
-        if each.right.kind == "actions":
+        if misspelt.right.kind == "actions":
             place = RelatedPlace("", *_source_place(first.source))
             remedy = f"Write it at {place} {_as_action(other, first.written)}"
         elif kind == "action":
-            remedy = f"Write it {_as_action('call', each.written)}"
-    text = f"no enclave may {other} {each.name}; {hint}"
+            remedy = f"Write it {_as_action('call', misspelt.written)}"
+    text = f"no enclave may {other} {misspelt.name}; {hint}"
     places = tuple(
-        RelatedPlace(f"{one.right.enclave} may {one.right.describe()}", *_source_place(one.source))
-        for one in shown
+        RelatedPlace(
+            f"{candidate.right.enclave} may {candidate.right.describe()}",
+            *_source_place(candidate.source),
+        )
+        for candidate in shown
     )
-    return each.found(MISSPELT, text, remedy=remedy)._replace(related=places)
+    return misspelt.found(MISSPELT, text, remedy=remedy)._replace(related=places)
 
 
 def _as_action(right: str, name: str) -> str:
@@ -837,8 +844,8 @@ def within_root(rights: Collection[Right]) -> str:
             own[right.enclave].append(right)
     names = sorted(
         name
-        for name, found in own.items()
-        if all(root.allow("/", right.right, right.name) for right in found)
+        for name, allowed_rights in own.items()
+        if all(root.allow("/", right.right, right.name) for right in allowed_rights)
     )
     return f"/ has all rights of {first_few(names, _NAMES_SHOWN)}" if names else ""
 
@@ -1085,15 +1092,15 @@ def findings_in(policies: Sequence[Policy], distribution: str = "") -> Iterator[
     The counterparts of names are looked for in all the policies together.
     """
     checked = [_CheckedPolicy(policy, distribution) for policy in policies]
-    for each in checked:
+    for checked_policy in checked:
         for check in _CHECKS:
-            yield from check(each)
+            yield from check(checked_policy)
     if len(checked) > 1:
         enclaves = tuple(enclave for policy in policies for enclave in policy.enclaves)
         checked = [_CheckedPolicy(replace(policies[0], enclaves=enclaves), distribution)]
-    for each in checked:
+    for checked_policy in checked:
         for check in _CHECKS_TOGETHER:
-            yield from check(each)
+            yield from check(checked_policy)
 
 
 def policy_file_findings(
@@ -1208,11 +1215,11 @@ def _on_one_domain(
 
 
 def _unreadable_policy_findings(path: Path, error: SrosError) -> Iterator[Finding]:
-    found = False
+    has_duplicates = False
     for name, line in _duplicates(path):
-        found = True
+        has_duplicates = True
         yield DUPLICATE.found(name, f"{name} is defined here again", str(path), line)
-    if found:
+    if has_duplicates:
         return
     file, line, text = _split_place(error)
     if not file and (syntax := _SYNTAX.search(error.why)):
@@ -1248,7 +1255,9 @@ def _include_findings(path: Path) -> Iterator[Finding]:
     graph = _IncludeGraph(Path(os.path.realpath(path)))
     for includes in graph.by_parent():
         reached = {
-            each for file in {file for _, file in includes} for each in graph.included_files(file)
+            included
+            for file in {file for _, file in includes}
+            for included in graph.included_files(file)
         }
         seen: set[tuple[Path, str]] = set()
         for element, file in includes:
@@ -1276,8 +1285,8 @@ class _IncludeGraph:
         for parent in self._includer.load(self._file).iter():
             includes = list(parent.iterchildren(*_INCLUDES))
             if len(includes) <= _MANY:
-                found = ((element, self._target(self._file, element)) for element in includes)
-                yield [(element, file) for element, file in found if file]
+                targets = ((element, self._target(self._file, element)) for element in includes)
+                yield [(element, file) for element, file in targets if file]
 
     def included_files(self, file: Path) -> frozenset[Path]:
         """Return the files that a file includes, directly or through other files."""
@@ -1341,8 +1350,10 @@ class NearNames:
         removed, replaced or swapped with its neighbour; or only in capitals and separators.
         Parts that differ in digits, or are shorter than four letters, are not similar.
         """
-        found = {candidate for key in set(_keys(name)) for candidate in self._by_key.get(key, ())}
-        return sorted(other for other in found if other != name and _is_near(name, other))
+        candidates = {
+            candidate for key in set(_keys(name)) for candidate in self._by_key.get(key, ())
+        }
+        return sorted(other for other in candidates if other != name and _is_near(name, other))
 
     def same_name_elsewhere(self, name: str) -> list[str]:
         """Return the sorted names that are ``name`` with a namespace more, or less, before it.
@@ -1424,8 +1435,12 @@ def signed_findings(
         distribution: the ROS 2 distribution of the nodes; "" is the latest.
     """
     parts: list[Policy] = []
-    for each in policies:
-        policy = each.for_one_robot() if isinstance(each, FleetPolicy) else each
+    for policy_or_fleet in policies:
+        policy = (
+            policy_or_fleet.for_one_robot()
+            if isinstance(policy_or_fleet, FleetPolicy)
+            else policy_or_fleet
+        )
         chosen = [enclave for enclave in policy.enclaves if enclave.path in enclaves][
             :_MOST_ENCLAVES
         ]

@@ -217,7 +217,7 @@ class ZenohAnswer:
             other = check.remote if check.enforcer == self.enclave else check.enforcer
             by_ends.setdefault((self.enclave, other), []).append(check)
         return tuple(
-            CheckedLink(ends, all(each.allowed for each in checks), tuple(checks))
+            CheckedLink(ends, all(check.allowed for check in checks), tuple(checks))
             for ends, checks in by_ends.items()
         )
 
@@ -555,10 +555,10 @@ class ZenohEvaluator:
                 process, _unrestricted_process(name, Mode.CLIENT), wanted
             )
             other = self._file(name, self._file_of(name)) if not brief else None
-            if other and other.process and all(each.arrives for each in deliveries):
+            if other and other.process and all(delivery.arrives for delivery in deliveries):
                 lawless = _unrestricted_process(process.name, Mode.ROUTER)
                 deliveries = self._direct_deliveries(lawless, other.process, wanted)
-            if all(each.arrives for each in deliveries):
+            if all(delivery.arrives for delivery in deliveries):
                 believing.append(Reached(name, deliveries, other.problem if other else ""))
                 if brief:
                     break
@@ -602,7 +602,7 @@ class ZenohEvaluator:
         mode, they are the checks on its link with the first peer that allows the right.
         """
         checks = tuple(self._link_checks(process, router, wanted_rights))
-        if process.mode is not Mode.PEER or brief or all(each.allowed for each in checks):
+        if process.mode is not Mode.PEER or brief or all(check.allowed for check in checks):
             return checks
         for name in self.names:
             if name == process.name or name in self.routers:
@@ -611,11 +611,11 @@ class ZenohEvaluator:
             alone = self._link_checks(
                 process, _unrestricted_process(name, Mode.PEER), wanted_rights
             )
-            if all(each.allowed for each in alone):
+            if all(check.allowed for check in alone):
                 other = self._file(name, SESSION_FILE).process
                 if other and other.mode is Mode.PEER:
                     direct = tuple(self._link_checks(process, other, wanted_rights))
-                    if all(each.allowed for each in direct):
+                    if all(check.allowed for check in direct):
                         return direct
         return checks
 
@@ -679,14 +679,14 @@ class ZenohEvaluator:
                 _unrestricted_process(name, zenoh_file.process.mode),
                 wanted_rights,
             )
-            if not all(each.arrives for each in deliveries):
+            if not all(delivery.arrives for delivery in deliveries):
                 continue
             other = self._file(name, SESSION_FILE)
             if other.process:
                 deliveries = self._deliveries_between(
                     zenoh_file.process, other.process, wanted_rights
                 )
-            if all(each.arrives for each in deliveries):
+            if all(delivery.arrives for delivery in deliveries):
                 yield Reached(name, deliveries, other.problem)
 
     def _deliveries_between(
@@ -709,14 +709,15 @@ class ZenohEvaluator:
         Only a put or a query can have a wildcard as its key.  It passes only where a rule includes
         the whole wildcard.
         """
-        asked = [each for each in wanted_rights if each.right in ("publish", "request")]
+        asked = [right for right in wanted_rights if right.right in ("publish", "request")]
         for wide in dict.fromkeys(filter(None, map(self._wildcard, checks))):
             enclaves = [
-                each.enclave
-                for each in reached_enclaves
-                if (other := self._file(each.enclave, SESSION_FILE).process)
+                reached.enclave
+                for reached in reached_enclaves
+                if (other := self._file(reached.enclave, SESSION_FILE).process)
                 and any(
-                    one.arrives for one in self._deliveries_between(process, other, asked, wide)
+                    delivery.arrives
+                    for delivery in self._deliveries_between(process, other, asked, wide)
                 )
             ]
             yield DecidingWildcard(wide, tuple(enclaves))
@@ -744,7 +745,9 @@ _DATA = (Message.PUT, Message.QUERY, Message.LIVELINESS_TOKEN)
 def _check_to_report(checks: Iterable[Check], enclave: str) -> Check | None:
     """Return the check to report: on data before others, of other enclaves before ``enclave``."""
     return min(
-        checks, key=lambda each: (each.message not in _DATA, each.enforcer == enclave), default=None
+        checks,
+        key=lambda check: (check.message not in _DATA, check.enforcer == enclave),
+        default=None,
     )
 
 
@@ -823,17 +826,17 @@ class ZenohOfKeystore:
         self._reason_text = why
         self._domain = asking.domain
         first = asking.context(keystore.domains).domain
-        one = ZenohEvaluator(keystore, moment=asking.at, domain=first)
-        self._evaluators = {first: one}
+        evaluator = ZenohEvaluator(keystore, moment=asking.at, domain=first)
+        self._evaluators = {first: evaluator}
         self._parts: Sequence[DomainSet] = (DomainSet.of((first, first)),)
         if asking.domain is None:
-            self._parts = tuple(_with_equal_rules(one, keystore.domains))
+            self._parts = tuple(_with_equal_rules(evaluator, keystore.domains))
             for domain in (next(iter(part)) for part in self._parts):
                 if domain != first:
                     self._evaluators[domain] = ZenohEvaluator(
                         keystore, moment=asking.at, domain=domain
                     )
-        self._names = names or one.names
+        self._names = names or evaluator.names
 
     @property
     def title(self) -> str:

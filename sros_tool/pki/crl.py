@@ -109,19 +109,21 @@ def sign_crl(
         .add_extension(x509.CRLNumber(number), critical=False)
         .add_extension(authority_identifier(issuer), critical=False)
     )
-    for each in revoked:
-        if not 0 < each.serial < 1 << 159:
+    for revocation in revoked:
+        if not 0 < revocation.serial < 1 << 159:
             raise PkiError(
-                f"the serial number {each.serial:x} cannot be put on a revocation list",
+                f"the serial number {revocation.serial:x} cannot be put on a revocation list",
                 "Serial numbers are positive, and have at most 159 bits (RFC 5280, 4.1.2.2).",
                 "Sign the revocation list with the program that issued the certificate.",
             )
         entry = (
-            x509.RevokedCertificateBuilder().serial_number(each.serial).revocation_date(each.date)
+            x509.RevokedCertificateBuilder()
+            .serial_number(revocation.serial)
+            .revocation_date(revocation.date)
         )
-        if each.reason != "unspecified":  # RFC 5280, 5.3.1: the extension is left out instead
+        if revocation.reason != "unspecified":  # RFC 5280, 5.3.1: the extension is left out instead
             entry = entry.add_extension(
-                x509.CRLReason(x509.ReasonFlags(each.reason)), critical=False
+                x509.CRLReason(x509.ReasonFlags(revocation.reason)), critical=False
             )
         builder = builder.add_revoked_certificate(entry.build())
     return builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
@@ -223,9 +225,9 @@ def names_issuers(crl: x509.CertificateRevocationList) -> bool:
     Such a list is indirect: it can revoke certificates of several CAs (certificateIssuer).
     """
     return any(
-        extension.oid == CRLEntryExtensionOID.CERTIFICATE_ISSUER
+        ext.oid == CRLEntryExtensionOID.CERTIFICATE_ISSUER
         for entry in crl
-        for extension in entry.extensions
+        for ext in entry.extensions
     )
 
 
@@ -272,17 +274,17 @@ def refusal_of(crl: x509.CertificateRevocationList) -> str:
     With such a list, no certificate is verified.  Source: OpenSSL 3, x_crl.c (crl_set_issuers,
     crl_cb) and x509_vfy.c (get_crl_score).
     """
-    for each in crl.extensions:
-        if each.critical and each.oid not in _READ_IF_CRITICAL:
-            return f"it has the unknown critical extension {each.oid.dotted_string}"
-        if each.oid == ExtensionOID.DELTA_CRL_INDICATOR:
+    for ext in crl.extensions:
+        if ext.critical and ext.oid not in _READ_IF_CRITICAL:
+            return f"it has the unknown critical extension {ext.oid.dotted_string}"
+        if ext.oid == ExtensionOID.DELTA_CRL_INDICATOR:
             return "it is a delta CRL: only the changes to another list"
-        if isinstance(each.value, x509.IssuingDistributionPoint) and each.value != _OF_USERS:
+        if isinstance(ext.value, x509.IssuingDistributionPoint) and ext.value != _OF_USERS:
             return "it is not for all certificates of its CA"
     for entry in crl:
-        for found in entry.extensions:
-            if found.critical and found.oid != CRLEntryExtensionOID.CERTIFICATE_ISSUER:
-                return f"an entry has the unknown critical extension {found.oid.dotted_string}"
+        for ext in entry.extensions:
+            if ext.critical and ext.oid != CRLEntryExtensionOID.CERTIFICATE_ISSUER:
+                return f"an entry has the unknown critical extension {ext.oid.dotted_string}"
     return ""
 
 
@@ -368,12 +370,12 @@ def list_refusal(
     ``chain`` leads to a self-signed CA, and is valid without lists.
     """
     certificate = chain[0]
-    found = _best_list(chain, lists, moment)
-    if found is None:
+    best = _best_list(chain, lists, moment)
+    if best is None:
         name = subject_text(certificate.issuer)
         text = f"the revocation list of {name} is missing, and OpenSSL has another CA's list"
         return ListRefusal(Obstacle.MISSING, None, text)
-    crl, issuer, score = found
+    crl, issuer, score = best
     name = subject_text(issuer.subject)
     if not may_sign_lists(issuer):
         text = f"the keyUsage of {name} lacks cRLSign"
@@ -405,16 +407,16 @@ def _revokes(crl: x509.CertificateRevocationList, certificate: x509.Certificate)
         return lists_as_revoked(crl, certificate.serial_number)
     issuers: list[x509.Name] | None = None
     for entry in crl:
-        for each in entry.extensions:
-            if isinstance(each.value, x509.CertificateIssuer):
-                issuers = each.value.get_values_for_type(x509.DirectoryName)
+        for ext in entry.extensions:
+            if isinstance(ext.value, x509.CertificateIssuer):
+                issuers = ext.value.get_values_for_type(x509.DirectoryName)
         if entry.serial_number == certificate.serial_number and (
             issuers is None or any(same_name(name, certificate.issuer) for name in issuers)
         ):
             return not any(
-                isinstance(each.value, x509.CRLReason)
-                and each.value.reason is x509.ReasonFlags.remove_from_crl
-                for each in entry.extensions
+                isinstance(ext.value, x509.CRLReason)
+                and ext.value.reason is x509.ReasonFlags.remove_from_crl
+                for ext in entry.extensions
             )
     return False
 
@@ -506,11 +508,11 @@ class _Entries(NamedTuple):
 @lru_cache(maxsize=16)
 def _entries(content: _Content) -> _Entries:
     crl = content.crl
-    unknown = any(each.critical and each.oid not in _READ_IF_CRITICAL for each in crl.extensions)
+    unknown = any(ext.critical and ext.oid not in _READ_IF_CRITICAL for ext in crl.extensions)
     in_entry = any(
-        each.critical and each.oid != CRLEntryExtensionOID.CERTIFICATE_ISSUER
+        ext.critical and ext.oid != CRLEntryExtensionOID.CERTIFICATE_ISSUER
         for entry in crl
-        for each in entry.extensions
+        for ext in entry.extensions
     )
     return _Entries(unknown or in_entry, names_issuers(crl))
 

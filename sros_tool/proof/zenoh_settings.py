@@ -39,61 +39,61 @@ LONE = "the file"
 _OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...] = (
     (
         "transport/link/tls/enable_mtls",
-        lambda each: each.tls.mutual,
+        lambda document: document.tls.mutual,
         False,
         "whoever connects needs no certificate",
     ),
     (
         "transport/link/tls/verify_name_on_connect",
-        lambda each: each.tls.verifies_name,
+        lambda document: document.tls.verifies_name,
         False,
         "another host with a certificate of the CA can pose as the host that it connects to",
     ),
     (
         "transport/link/tls/close_link_on_expiration",
-        lambda each: each.tls.closes_on_expiration,
+        lambda document: document.tls.closes_on_expiration,
         False,
         "a connection stays when the certificate of the other side expires",
     ),
     (
         "transport/shared_memory/enabled",
-        lambda each: each.shared_memory,
+        lambda document: document.shared_memory,
         True,
         "processes of the host exchange data unencrypted",
     ),
     (
         "scouting/multicast/enabled",
-        lambda each: each.multicast,
+        lambda document: document.multicast,
         True,
         "it looks for others, and answers them, unencrypted",
     ),
     (
         "scouting/gossip/enabled",
-        lambda each: each.gossip,
+        lambda document: document.gossip,
         True,
         "it tells processes about each other",
     ),
     (
         "adminspace/permissions/read",
-        lambda each: each.adminspace and each.adminspace_readable,
+        lambda document: document.adminspace and document.adminspace_readable,
         True,
         "others may read its state and its settings",
     ),
     (
         "adminspace/permissions/write",
-        lambda each: each.adminspace and each.adminspace_writable,
+        lambda document: document.adminspace and document.adminspace_writable,
         True,
         "others may change its settings while it runs",
     ),
     (
         "access_control/enabled",
-        lambda each: each.access.enabled,
+        lambda document: document.access.enabled,
         False,
         "it lets everything pass",
     ),
     (
         "access_control/default_permission",
-        lambda each: each.access.allows_by_default,
+        lambda document: document.access.allows_by_default,
         True,
         "it allows by default",
     ),
@@ -149,11 +149,11 @@ def unknown_settings(old: _Files, new: _Files) -> Iterator[str]:
     files: dict[str, list[str]] = defaultdict(list)
     for place, file in sorted(new.items()):
         before = old[place].document if place in old else _default_configuration(file.document.mode)
-        one, other = before.settings, file.document.settings
-        for path in sorted({*one, *other, *file.document.unknown}):
-            known = any(each.fullmatch(path) for each in (_COMPARED, _HARMLESS))
-            gives = any(each.fullmatch(path) for each, _ in _GIVING)
-            if one.get(path) != other.get(path) and not known and not gives:
+        old_settings, new_settings = before.settings, file.document.settings
+        for path in sorted({*old_settings, *new_settings, *file.document.unknown}):
+            known = any(pattern.fullmatch(path) for pattern in (_COMPARED, _HARMLESS))
+            gives = any(pattern.fullmatch(path) for pattern, _ in _GIVING)
+            if old_settings.get(path) != new_settings.get(path) and not known and not gives:
                 files[path].append(place)
     for path, places in files.items():
         of = places[0] if len(places) == 1 else f"{len(places)} Zenoh files"
@@ -177,16 +177,20 @@ def _changes(
         yield "signature", SIGNED, file.signature, meaning
     for path, value, open_value, meaning in _OPEN:
         if value(after) is open_value is not value(before):
-            one, other = (str(value(each)).lower() for each in (before, after))
-            yield path, one, other, meaning
+            old_value, new_value = (str(value(document)).lower() for document in (before, after))
+            yield path, old_value, new_value, meaning
     for key, what in (
         ("listen", "it listens there"),
         ("connect", ("it connects to the process there")),
     ):
-        own = [before] if known else [each.document for each in old.values()]
-        there = {each.text for one in own for each in getattr(one, key)}
+        old_documents = (
+            [before] if known else [configuration.document for configuration in old.values()]
+        )
+        old_endpoints = {
+            endpoint.text for document in old_documents for endpoint in getattr(document, key)
+        }
         for endpoint in getattr(after, key):
-            if old and endpoint.text not in there:
+            if old and endpoint.text not in old_endpoints:
                 address = f"{endpoint.protocol}/{endpoint.address}"[:80]
                 yield f"{key}/endpoints", "without", f"with {address}", what
     if protocols := _more_protocols(before.protocols, after.protocols):
@@ -197,13 +201,18 @@ def _changes(
         for expression, meaning in _GIVING:
             plugin = "/".join(path.split("/")[:2])
             gone = plugin.startswith("plugins") and not any(
-                each == plugin or each.startswith(f"{plugin}/") for each in after.settings
+                setting == plugin or setting.startswith(f"{plugin}/") for setting in after.settings
             )
             if values[0] != values[1] and not gone and expression.fullmatch(path):
                 # The values may be secrets.
-                words = ("missing" if each is None else "stated" for each in values)
-                one, other = words
-                yield path[:80], one, "stated in another way" if one == other else other, meaning
+                words = ("missing" if value is None else "stated" for value in values)
+                old_word, new_word = words
+                yield (
+                    path[:80],
+                    old_word,
+                    "stated in another way" if old_word == new_word else new_word,
+                    meaning,
+                )
 
 
 def _more_protocols(before: tuple[str, ...] | None, after: tuple[str, ...] | None) -> str:
@@ -212,7 +221,7 @@ def _more_protocols(before: tuple[str, ...] | None, after: tuple[str, ...] | Non
         return ""
     if after is None:
         return "all"
-    return ", ".join(each[:20] for each in after if each not in before)
+    return ", ".join(protocol[:20] for protocol in after if protocol not in before)
 
 
 @lru_cache(maxsize=len(Mode))
