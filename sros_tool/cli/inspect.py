@@ -62,9 +62,20 @@ _INDENT = "  "
     help="List all certificates and documents that the keystore PATH ever issued, with "
     "their current state.",
 )
+@click.option(
+    "--policy",
+    type=PATH,
+    help="With --history: only permissions that were signed from this policy file, with the files "
+    "that it includes, as they are now.",
+)
 @json_option
 def inspect(
-    path: Path, enclave: str | None, authority: Path | None, history: bool, as_json: bool
+    path: Path,
+    enclave: str | None,
+    authority: Path | None,
+    history: bool,
+    policy: Path | None,
+    as_json: bool,
 ) -> int:
     """Show the contents of PATH, or of an ENCLAVE of the keystore PATH.
 
@@ -86,6 +97,9 @@ def inspect(
       $ sros inspect keystore --history
       2026-11-20T05:59:44Z  certificate  current     /talker  until 2027-11-20...
       ...
+      $ sros inspect keystore --history --policy robot.xml
+      2026-11-20T05:59:44Z  permissions  current     /talker  until 2027-05-20...
+      permissions of 1 enclave were signed from 'robot.xml', as it is now
     """
     from sros_tool.errors import DocumentError, UsageError
     from sros_tool.keystore.describe import describe, problems_of
@@ -97,7 +111,9 @@ def inspect(
             raise UsageError("--history is for a whole keystore", "", f"Leave {enclave} out.")
         path = _enclave_of(path, enclave)
     if history:
-        return _show_history(path, as_json)
+        return _show_history(path, policy, as_json)
+    if policy:
+        raise UsageError("--policy is for --history", "", "Add --history.")
     described = describe(path, now=now(), authority=authority)
     signature = getattr(described, "signature", None)
     if authority and signature is None:
@@ -132,10 +148,16 @@ def _enclave_of(root: Path, name: str) -> Path:
     return keystore.folder(name)
 
 
-def _show_history(root: Path, as_json: bool) -> int:
+def _show_history(root: Path, policy: Path | None, as_json: bool) -> int:
     from sros_tool.keystore.describe import history
 
     found = history(root, now=now())
+    if policy:
+        from sros_tool.policy.document import read_policy
+
+        digests = {each.digest for each in read_policy(policy, placeholders=True).enclaves}
+        signed = tuple(item for item in found.entries if item.entry.policy in digests)
+        found = found._replace(entries=signed)
     if as_json:
         print_json(found)
     else:
@@ -145,7 +167,8 @@ def _show_history(root: Path, as_json: bool) -> int:
             until = f"until {entry.not_after}" if expires else ""
             named = f" (SHA-256 {entry.sha256[:8]})" if entry.what == "ca" else ""
             subject = f"{entry.enclave or entry.subject}{named}"
-            words = (subject, until, entry.serial, entry.reason)
+            source = f"policy {entry.policy[:12]}" if entry.policy else ""
+            words = (subject, until, entry.serial, source, entry.reason)
             line = "  ".join(word for word in words if word)
             shown = f"{entry.time}  {entry.what:11}  {item.status:10}  {line}"
             echo(shown.rstrip())
@@ -153,7 +176,11 @@ def _show_history(root: Path, as_json: bool) -> int:
             echo(f"NOT IN THE LEDGER  {name}")
         for gap in found.gaps:
             echo(f"LEDGER DAMAGED  {gap}")
-    return 1 if found.unexplained or found.gaps else 0
+        if policy:
+            number = counted(len({item.entry.enclave for item in found.entries}), "enclave")
+            echo(f"permissions of {number} were signed from '{policy}', as it is now", err=True)
+    nothing = policy is not None and not found.entries
+    return 1 if found.unexplained or found.gaps or nothing else 0
 
 
 def _keystore_lines(keystore: DescribedKeystore) -> Iterator[str]:

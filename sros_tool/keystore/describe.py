@@ -21,6 +21,7 @@ from sros_tool.errors import DocumentError, SrosError
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
+    FLEET,
     GOVERNANCE_P7S,
     KEY_URI_FILE,
     PERMISSIONS_FILE,
@@ -1022,7 +1023,7 @@ def history(root: Path, *, now: datetime) -> History:
     revoked = {entry.serial for entry in entries if entry.what == "revocation"}
     revoked |= {f"{entry.serial:x}" for crl in keystore.revocation_lists for entry in crl.revoked}
     moment = iso(now)
-    settings = _files(root, iter((SETTINGS,)))
+    settings = _files(root, iter((SETTINGS, FLEET)))
 
     def status(entry: Entry) -> HistoryStatus:
         if entry.what in (GAP, RESTORED):
@@ -1031,7 +1032,7 @@ def history(root: Path, *, now: datetime) -> History:
             return HistoryStatus.SEALED
         if entry.what in ("answer", "release"):
             return HistoryStatus.SENT
-        if entry.what == "settings":
+        if entry.what in ("settings", "fleet"):
             return HistoryStatus.CURRENT if entry.sha256 in settings else HistoryStatus.REPLACED
         if entry.what == "revocation" or entry.serial in revoked or entry.sha256 in revoked_files:
             return HistoryStatus.REVOKED

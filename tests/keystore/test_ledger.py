@@ -109,6 +109,20 @@ def test_without_new_documents_the_ledger_does_not_change(tmp_path: Path) -> Non
     assert snapshot(root) == before
 
 
+def test_the_history_names_what_was_signed_from_a_policy(keystore: Path, tmp_path: Path) -> None:
+    policy = tmp_path / "policy.xml"
+    policy.write_text(policy_text({"/a": publish("old_a"), "/b": publish("old_b")}))
+    listed = ("inspect", keystore, "--history", "--policy", policy)
+    found = sros(*listed).ok()
+    words = [line.split() for line in found.out.splitlines()]
+    assert [(line[1], line[3]) for line in words] == [("permissions", "/a"), ("permissions", "/b")]
+    assert found.err == f"permissions of 2 enclaves were signed from '{policy}', as it is now\n"
+    assert len(json.loads(sros(*listed, "--json").out)["entries"]) == 2
+    policy.write_text(f"{policy.read_text()}<!-- changed -->")
+    assert (sros(*listed).status, sros(*listed).out) == (1, "")
+    assert sros("inspect", keystore, "--policy", policy).status == 2
+
+
 @pytest.mark.parametrize("line", ["{", "[]", "3", '{"unknown": 1}', '{"time": "x"}', "\xff"])
 def test_a_damaged_ledger_is_reported_and_kept(line: str, tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
