@@ -39,6 +39,7 @@ from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.files import remove_file, replace_file, staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
+    CONFIRMED_FILES,
     LONGEST_LIST,
     LONGEST_PROBLEM,
     MESSAGE_FILE,
@@ -176,6 +177,8 @@ class _Round:
         if self._machine.restarted or before.boot != boot:
             # After a start of the machine no process has files of before; what is seen counts.
             self._state = replace(before, due=(), boot=boot)
+        if self._machine.restarted:
+            self._state = replace(self._state, files=self._digests(self._enclaves()))
         proven = self._proven_moment()
         clock = self._clock(proven)
         # Documents that were verified prove that this moment has passed, whatever the clock shows.
@@ -423,8 +426,24 @@ class _Round:
         self._save()
 
     def _note_due(self, changed: Iterable[str], names: Iterable[str]) -> None:
-        due = {*self._state.due, *changed} & set(names)
-        self._state = replace(self._state, due=tuple(sorted(due)))
+        """Note the restarts that are due: also for files that somebody else changed."""
+        before, files = self._state.files, self._digests(names)
+        others = {name for name, digest in files.items() if before.get(name) != digest}
+        due = ({*self._state.due, *changed} & files.keys()) | others
+        self._state = replace(self._state, due=tuple(sorted(due)), files=files)
+
+    def _digests(self, names: Iterable[str]) -> dict[str, str]:
+        """Return a digest of the files of each enclave, all but the key."""
+        with Folder(self._folder) as opened:
+            return {
+                name: hashlib.sha256(
+                    " ".join(
+                        _sha256(opened, f"{enclave_folder(name)}/{file}") or "-"
+                        for file in CONFIRMED_FILES
+                    ).encode()
+                ).hexdigest()
+                for name in names
+            }
 
     def _enclaves(self) -> tuple[str, ...]:
         """Return the enclaves with a certificate, in which processes can run."""
@@ -532,11 +551,11 @@ class _Round:
         )
         confirmation = replace(
             confirmation,
-            restart=self._state.due,
+            restart=tuple(sorted({*self._state.due, *processes.elsewhere})),
             sequence=sequence,
             release=self._state.release,
             expiry={name: _expiry(opened_enclaves.get(name)) for name in names},
-            running=processes.states,
+            running=processes.with_elsewhere(),
             clock=clock,
             problems=_shortened_problems(self._problems),
             requests=asked.requests,

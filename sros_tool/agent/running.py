@@ -6,14 +6,18 @@ import ctypes
 import os
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
 from sros_tool.agent.settings import AgentSettings
-from sros_tool.checks.processes import PROCESS_OUTDATED, newer_files, process_findings
+from sros_tool.checks.processes import (
+    PROCESS_OUTDATED,
+    newer_files,
+    other_folder_findings,
+    process_findings,
+)
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.confirmation import (
     RobotClock,
@@ -44,13 +48,22 @@ class EnclaveProcesses(NamedTuple):
     """What runs in the enclaves of a security folder."""
 
     states: Mapping[str, RunningFiles]
-    """The files that the processes of each enclave have loaded."""
+    """The files that the processes of each enclave have loaded, of those that run from the folder.
+    """
+    elsewhere: tuple[str, ...]
+    """The enclaves of the folder in which a process runs from another folder: a restart of a unit
+    does not help there.
+    """
     complete: bool
     """Whether every process of the machine could be looked at."""
     problems: tuple[str, ...]
     """The findings of `sros check runtime` on these processes, except due restarts."""
     dds: RobotDds
     """The DDS of the robot."""
+
+    def with_elsewhere(self) -> Mapping[str, RunningFiles]:
+        """Return what the processes of each enclave have loaded, from whatever folder."""
+        return {**self.states, **dict.fromkeys(self.elsewhere, RunningFiles.EARLIER)}
 
 
 def look_at_processes(
@@ -66,12 +79,20 @@ def look_at_processes(
     own = [process for process in running.processes if _is_of(process, folder)]
     by_enclave: dict[str, list[Process]] = {}
     for process in own:
-        assert process.enclave
-        by_enclave.setdefault(f"/{process.enclave.name.strip('/')}", []).append(process)
+        by_enclave.setdefault(_enclave_of(process), []).append(process)
     states = {name: _state(by_enclave.get(name, ())) for name in names}
+    others = [
+        process
+        for process in running.processes
+        if _enclave_of(process) in states and not _is_of(process, folder)
+    ]
+    elsewhere = [process for process in others if _folder_is_known(process)]
     environment = {ENABLE: "true", KEYSTORE: str(folder)}
-    findings = process_findings(
-        environment, replace(running, processes=tuple(own), unseen=()), now=now, zone=zone
+    findings = (
+        *other_folder_findings(elsewhere, folder),
+        *process_findings(
+            environment, replace(running, processes=tuple(own), unseen=()), now=now, zone=zone
+        ),
     )
     problems = tuple(
         f"{finding.subject}: {finding.kind.title}: {finding.text}"
@@ -79,19 +100,37 @@ def look_at_processes(
         if finding.kind is not PROCESS_OUTDATED and finding.subject != "processes"
     )
     complete = not (running.unseen or running.hidden or running.container) and all(
-        process.enclave and not process.enclave.problem for process in own
+        process.enclave and not process.enclave.problem
+        for process in (*own, *others)
+        if process not in elsewhere
     )
-    return EnclaveProcesses(states, complete, problems, robot_dds(running))
+    return EnclaveProcesses(
+        states,
+        tuple(sorted({*map(_enclave_of, elsewhere)})),
+        complete,
+        problems,
+        robot_dds(running),
+    )
+
+
+def _enclave_of(process: Process) -> str:
+    """Return the name of the enclave that a process names; "" if it asks for no security."""
+    return f"/{process.enclave.name.strip('/')}" if process.enclave else ""
+
+
+def _folder_is_known(process: Process) -> bool:
+    """Return whether the folder from which a process runs was found, or is not there any more."""
+    return bool(process.enclave and (process.enclave.folders or not process.enclave.problem))
 
 
 def _is_of(process: Process, folder: Path) -> bool:
     enclave = process.enclave
     if enclave is None:
         return False
-    with suppress(OSError):
-        if enclave.here is not None:
-            return enclave.here.samefile(folder)
-    return os.path.abspath(enclave.keystore) == os.path.abspath(folder)  # noqa: PTH100
+    if enclave.is_of(folder):
+        return True
+    named = os.path.abspath(enclave.keystore) == os.path.abspath(folder)  # noqa: PTH100
+    return named and not _folder_is_known(process)
 
 
 def _state(processes: Iterable[Process]) -> RunningFiles:

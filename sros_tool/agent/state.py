@@ -9,9 +9,9 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,9 +43,10 @@ class AgentState:
     that of the last message.  ``latest`` is the latest moment that has certainly passed: verified
     documents begin to be valid then.  ``due`` are the enclaves whose processes were not yet seen
     with the installed files, since the start ``boot`` of the machine (see `boot_id`); of those in
-    ``unseen``, no process was seen.  ``fetched`` and ``sent`` tell when the source and the inbox
-    were last reached.  ``repaired`` is a sentence on files that were not those of the release and
-    were replaced, at ``repaired_at``.
+    ``unseen``, no process was seen.  ``files`` maps enclaves to a digest of their files at the end
+    of the last round: other files, from whomever, make a restart due.  ``fetched`` and ``sent``
+    tell when the source and the inbox were last reached.  ``repaired`` is a sentence on files that
+    were not those of the release and were replaced, at ``repaired_at``.
     """
 
     release: int = 0
@@ -60,6 +61,7 @@ class AgentState:
     problems: tuple[str, ...] = ()
     repaired: str = ""
     repaired_at: datetime | None = None
+    files: Mapping[str, str] = field(default_factory=dict)
 
     def next_sequence(self, now: datetime) -> int:
         """Return the sequence number of the next message: higher than all earlier ones.
@@ -102,6 +104,10 @@ def _state_from(value: Any) -> AgentState:
     value["repaired"] = _text(value.get("repaired", ""))
     for names in ("due", "unseen"):
         value[names] = tuple(check_enclave_name(_text(name)) for name in value[names])
+    value["files"] = {
+        check_enclave_name(_text(name)): _text(text)
+        for name, text in dict(value.get("files", {})).items()
+    }
     value["problems"] = tuple(map(_text, value["problems"]))
     return AgentState(**value)
 

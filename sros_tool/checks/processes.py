@@ -37,6 +37,7 @@ from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
+    GOVERNANCE_FILE,
     IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_URI_FILE,
@@ -48,6 +49,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.reader import Keystore
+from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificates, subject_text, validity_of
 from sros_tool.pki.crl import SUPERSEDED, load_crl
@@ -471,6 +473,16 @@ PROCESS_OTHER_KEYSTORE = FindingKind(
     "DDS-Security 1.1, 8.3.2.8; Fast DDS 2.14.5 and Cyclone DDS 0.10.2, tested.",
     "Start all processes of a domain with one keystore, or give each keystore its own domain.",
 )
+PROCESS_OTHER_FOLDER = FindingKind(
+    "runtime.process-other-folder",
+    WARNING,
+    "a process that runs in an enclave from another folder",
+    "The process loaded a copy of the enclave's files. What is delivered here, such as a "
+    "revocation list, does not reach it, also not by a restart.",
+    "rcl 9 (rcl/src/rcl/security.c): ROS_SECURITY_KEYSTORE names the folder.",
+    "Stop the process, start it from the folder that gets new files (`sros run FOLDER ENCLAVE -- "
+    "COMMAND...`), and remove the copy.",
+)
 ZENOH_UNREAD = FindingKind(
     "runtime.zenoh-process-unread",
     WARNING,
@@ -593,6 +605,10 @@ def process_findings(
     starts_nodes = is_secured_here and bool(environment.get(ENCLAVE))
     yield from _mixed_vendor_findings(secured, environment if starts_nodes else None)
     yield from _other_keystore_findings(secured, environment if is_secured_here else None)
+    if is_secured_here and environment.get(KEYSTORE):
+        root = Path(environment[KEYSTORE])
+        copies = (node for node in nodes if node.enclave and _has_other_files(node.enclave, root))
+        yield from other_folder_findings(copies, root)
     yield from _different_security_findings(nodes, security)
     yield from _unseen_process_findings(running)
 
@@ -775,6 +791,33 @@ def _other_keystore_findings(
         for process in (process for group in others for process in group):
             text = f"it has keystore '{_keystore(process)}', and {main}"
             yield PROCESS_OTHER_KEYSTORE.found(process.label, text)
+
+
+def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterator[Finding]:
+    """Yield a finding for each process, which runs in an enclave of ``folder`` from elsewhere."""
+    for process in processes:
+        assert process.enclave
+        there = _plain_path(process.enclave.keystore)
+        other = f"'{there}' of its own file system" if there == str(folder) else f"'{there}'"
+        name = plain(f"/{process.enclave.name.strip('/')}", _LONGEST_PATH)
+        text = f"{name} from {other}, not from '{folder}'"
+        yield PROCESS_OTHER_FOLDER.found(process.label, text)
+
+
+def _has_other_files(enclave: ProcessEnclave, root: Path) -> bool:
+    """Return whether ``root`` has the enclave, too, and its certificate, permissions, governance or
+    revocation list are other files there.
+    """
+    with suppress(SrosError, OSError):
+        place = enclave_path(root, check_enclave_name(f"/{enclave.name.strip('/')}"))
+        if enclave.is_of(root) or not enclave.is_there or not (place / CERTIFICATE_FILE).exists():
+            return False
+        for name in (CERTIFICATE_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE, CRL_FILE):
+            has, loaded = (place / name).exists(), enclave.file(name)
+            present = read_bytes(place / name, "file of the enclave") if has else b""
+            if not loaded.problem and present != loaded.data:
+                return True
+    return False
 
 
 def _keystore(process: Process) -> str:

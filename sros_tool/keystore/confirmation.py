@@ -135,7 +135,7 @@ class RunningFiles(StrEnum):
     CURRENT = "current"
     """All processes of the enclave that were seen have loaded the installed files."""
     EARLIER = "earlier"
-    """At least one process still has earlier files."""
+    """At least one process still has earlier files, or runs in the enclave from another folder."""
     NOT_SEEN = "not_seen"
     """No process of the enclave was seen: none runs, or it cannot be looked at."""
 

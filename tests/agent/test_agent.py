@@ -511,6 +511,34 @@ def test_a_restart_of_all_ends_what_cannot_be_seen(how: str, home: Home, r1: Rob
     assert r1.round().restart == ("/r1/a", "/r1/b")
 
 
+@pytest.mark.parametrize("ended", ["by a word", "by a process", "by a look at all", "by a start"])
+def test_files_that_somebody_else_changed_make_a_restart_due(
+    ended: str, home: Home, r1: Robot
+) -> None:
+    """Nobody saw that a process has the first files, nor those that were delivered by hand."""
+    r1.unseen, r1.release = True, None
+    assert r1.round().restart == NAMES
+    r1.restarted = True
+    assert not r1.round().restart
+    r1.restarted = False
+    for path, data in governance_again(home).items():
+        (r1.folder / path).write_bytes(data)
+    for _ in range(2):
+        done = r1.round()
+        assert done.restart == done.unseen == ("/r1/b",) == r1.message().restart
+    if ended == "by a start":  # of the machine: but what changes since then is another matter
+        r1.boot = "second"
+        (r1.folder / "enclaves/r1/a" / CRL_FILE).write_text("x")
+        assert r1.round().restart == ("/r1/a",)
+        return
+    r1.restarted = ended == "by a word"
+    r1.unseen = ended != "by a look at all"
+    r1.started = {"/r1/b": moment() + timedelta(seconds=1)} if ended == "by a process" else {}
+    assert not r1.round().restart
+    r1.restarted, r1.unseen, r1.started = False, True, {}
+    assert not r1.round().restart
+
+
 def governance_again(home: Home) -> dict[str, bytes]:
     """Return the governance of /r1/b, signed again."""
     path = "enclaves/r1/b/governance.p7s"
@@ -566,11 +594,43 @@ def test_what_is_wrong_with_processes_is_confirmed(r1: Robot) -> None:
     r1.started = {"/r1/a": moment() + timedelta(seconds=1)}
     process = r1.process("/r1/a")
     permissive = {**process.environment, "ROS_SECURITY_STRATEGY": "Permissive"}
-    outside = replace(process, enclave=replace(process.enclave, keystore="/x", here=None))  # type: ignore[type-var]
+    outside = replace(process, enclave=replace(process.enclave, name="/of/others", keystore="/x"))  # type: ignore[type-var]
     running = RunningProcesses((replace(process, environment=permissive), outside))
     r1.running = lambda now: running  # type: ignore[method-assign]
     (problem,) = r1.round().problems
     assert problem.startswith("process 1 (node):") and r1.message().problems == (problem,)
+
+
+def test_a_process_from_another_folder_never_has_the_present_files(
+    r1: Robot, tmp_path: Path
+) -> None:
+    """As of a node that was started from an older copy: a revocation list never reaches it."""
+    r1.round()
+    r1.started = {"/r1/a": moment() + timedelta(seconds=1)}
+    process = r1.process("/r1/a")
+    copy = copy_of(r1.folder, tmp_path / "copy")
+    state = copy.stat()
+    assert process.enclave
+    found = replace(
+        process.enclave,
+        keystore=str(copy),
+        name="r1/a/",
+        here=copy,
+        folders=((state.st_dev, state.st_ino),),
+    )
+    r1.settings = replace(r1.settings, restart=True, units=(Unit("a.service", ("/r1/a",)),))
+    for enclave in (found, replace(found, keystore=str(r1.folder), here=None)):  # in a container
+        running = RunningProcesses((process, replace(process, enclave=enclave)))
+        r1.running = lambda now, seen=running: seen  # type: ignore[method-assign, misc]
+        done = r1.round()
+        (problem,) = r1.message().problems or ()
+        assert "/r1/a from '" in problem and f"not from '{r1.folder}'" in problem
+        assert r1.message().restart == ("/r1/a",) and not done.restart and not r1.systemctl
+        assert (r1.message().running or {})["/r1/a"] is RunningFiles.EARLIER
+    hidden = replace(found, folders=(), problem="Permission denied")
+    r1.running = lambda now: RunningProcesses((replace(process, enclave=hidden),))  # type: ignore[method-assign]
+    (r1.folder / "enclaves/r1/a/permissions.p7s").unlink()
+    assert r1.round().restart == ("/r1/a",), "it may have files of before"
 
 
 # ── renewal ────────────────────────────────────────────────────────────────────────────────

@@ -94,7 +94,7 @@ def test_from_home_to_the_robot_and_back(world: World) -> None:
     for ended in (planned, made):
         seen.check("agent init", ended)
     assert world.run("agent", "status", "robot").status == 1, "it has not run yet"
-    first = world.agent().ok()
+    first = world.agent("--restarted").ok()
     said, sent = first.out.splitlines()
     assert said.startswith("release ") and said.endswith(": nothing new")
     assert sent == "message sent"
@@ -185,7 +185,7 @@ def test_a_robot_that_trusts_no_ca_gets_no_agent(world: World) -> None:
 
 def test_what_was_reached_before_is_nothing_of_another_source(world: World) -> None:
     world.run(*INIT).ok()
-    world.agent().ok()
+    world.agent("--restarted").ok()
     (world.folder / "pub").rename(world.folder / "moved")
     assert world.agent().status == 1
     assert "/pub': No such file" in world.run("agent", "status", "robot").out

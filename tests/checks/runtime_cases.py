@@ -180,6 +180,13 @@ def _among_strangers(state: RuntimeState, bench: Bench) -> RuntimeState:
     return running(0, **{KEYSTORE: str(other)})(state, bench)
 
 
+def _from_an_older_copy(state: RuntimeState, bench: Bench) -> RuntimeState:
+    older = bench.root.parent / "older"
+    shutil.copytree(state.environment[KEYSTORE], older)
+    (older / "enclaves/base/governance.p7s").write_text("of before")
+    return running(0, **{KEYSTORE: str(older)})(state, bench)
+
+
 def _unseen(state: RuntimeState, _: Bench) -> RuntimeState:
     unseen = UnseenProcess(9, ("/sbin/init",), "Permission denied", speaks=False)
     return replace(state, running=RunningProcesses(unseen=(unseen,)))
@@ -253,6 +260,7 @@ CASES: dict[str, Change] = {
     "runtime.process-expired": lambda state, _: replace(state, now=state.now + 9000 * DAY),
     "runtime.process-permissive": running(0, **{STRATEGY: "Permissive"}),
     "runtime.process-other-keystore": _among_strangers,
+    "runtime.process-other-folder": _from_an_older_copy,
     "runtime.process-local-time": lambda state, bench: _at_the_end(state, bench, TZ="Asia/Tokyo"),
     "runtime.process-files-replaceable": _others_can_write,
     "runtime.process-key-readable": _others_can_read_the_key,
