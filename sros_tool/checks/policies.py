@@ -355,10 +355,8 @@ def _is_namespace_apart(statement_a: _Statement, statement_b: _Statement) -> boo
 
 
 def _candidates_text(candidates: Sequence[_Statement]) -> str:
-    names = " or ".join(
-        f"{candidate.name} ({candidate.right.right})" for candidate in candidates[:_NAMES_SHOWN]
-    )
-    return f"perhaps you mean {names}, which nobody uses"
+    texts = dict.fromkeys(f"{each.name} ({each.right.right})" for each in candidates)
+    return f"perhaps you mean {' or '.join([*texts][:_NAMES_SHOWN])}, which nobody uses"
 
 
 def _is_of_a_node(name: str) -> bool:
