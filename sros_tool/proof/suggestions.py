@@ -17,7 +17,6 @@ from sros_tool.policy.rights import Right
 from sros_tool.proof.decide import MOST_STEPS, Worlds, influencers
 from sros_tool.proof.requirements import (
     Apart,
-    AtMost,
     Nobody,
     Only,
     Protected,
@@ -31,7 +30,7 @@ from sros_tool.proof.worlds import World
 _NOWHERE = Source("", 0)
 _OF_EVERY_NODE = frozenset({"/rosout", "/parameter_events"})
 _FEW = 3
-"""Highest number of enclaves with a right to a name for which a limit is proposed."""
+"""Highest number of enclaves with a right to a name that are proposed as the only ones."""
 _MOST = 1000
 """Highest number of candidates for each robot, so that a person can read the proposals."""
 _MOST_ROBOTS = 100
@@ -97,9 +96,8 @@ class _Stated:
 
 def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Requirement]:
     for right in ("publish", "call", "request"):
-        yield from _sole_holders(stated_rights, right)
+        yield from _few_holders(stated_rights, right)
     yield from _unused_services(stated_rights)
-    yield from _limit_requirements(stated_rights)
     yield from _gate_requirements(worlds[0])
     for kind, pair in RIGHTS.items():
         if any(stated_rights.wild[right] or stated_rights.names(right) for right in pair):
@@ -109,16 +107,17 @@ def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Req
         yield Widest(source=_NOWHERE, rights=((right, wild),), enclaves=("*",))
 
 
-def _sole_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
-    """Yield a requirement for each enclave that is the only one with a right to a received name."""
+def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
+    """Yield a requirement for each few enclaves that alone have a right to received names."""
     other = OTHER_SIDE[right]
-    names: dict[str, list[str]] = defaultdict(list)
+    names: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name in stated_rights.names(right):
-        users = stated_rights.users[right, name]
-        if len(users) == 1 and name not in _OF_EVERY_NODE and (other, name) in stated_rights.users:
-            names[next(iter(users))].append(name)
-    for enclave, found in sorted(names.items()):
-        yield Only(source=_NOWHERE, rights=((right, tuple(found)),), enclaves=(enclave,))
+        users = tuple(sorted(stated_rights.users[right, name]))
+        received = name not in _OF_EVERY_NODE and (other, name) in stated_rights.users
+        if len(users) <= _FEW and received:
+            names[users].append(name)
+    for enclaves, found in sorted(names.items(), key=lambda item: (len(item[0]), item[0])):
+        yield Only(source=_NOWHERE, rights=((right, tuple(found)),), enclaves=enclaves)
 
 
 def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
@@ -126,17 +125,6 @@ def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
     last = {name.rpartition("/")[2] for name in stated_rights.names("reply") if name.count("/") > 1}
     for each in sorted(last.difference(READING_SERVICES)):
         yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{each}",)),))
-
-
-def _limit_requirements(stated_rights: _Stated) -> Iterator[AtMost]:
-    """Yield limits for names that only few enclaves publish."""
-    names: dict[int, list[str]] = defaultdict(list)
-    for name in stated_rights.names("publish"):
-        if name not in _OF_EVERY_NODE and ("subscribe", name) in stated_rights.users:
-            names[len(stated_rights.users["publish", name])].append(name)
-    for count in range(2, _FEW + 1):
-        if names[count]:
-            yield AtMost(source=_NOWHERE, rights=(("publish", tuple(names[count])),), most=count)
 
 
 def _gate_requirements(world: World) -> Iterator[Apart]:
@@ -257,7 +245,7 @@ def _with_lists(requirement: Requirement, change: Callable[[Names, str], Names])
                 rights=rights(requirement.rights),
                 enclaves=change(requirement.enclaves, "robot"),
             )
-        case AtMost() | Nobody():
+        case Nobody():
             return replace(requirement, rights=rights(requirement.rights))
         case Protected():
             kinds = dict.fromkeys(kind for kind, _ in requirement.names)
@@ -307,9 +295,6 @@ def _values(requirement: Requirement) -> Iterator[tuple[str, object]]:
         case Only() | Widest():
             yield from requirement.rights
             yield "enclaves", requirement.enclaves
-        case AtMost():
-            yield from requirement.rights
-            yield "enclaves", requirement.most
         case Nobody():
             yield from requirement.rights
         case Protected():

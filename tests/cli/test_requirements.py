@@ -10,7 +10,7 @@ import pytest
 
 from sros_tool.files import templates_dir
 from sros_tool.proof import findings
-from tests.support.harness import copy_of, policy_text, publish, sros
+from tests.support.harness import copy_of, policy_text, publish, sros, subscribe
 
 LISTEN = '<topics subscribe="ALLOW"><topic>{}</topic></topics>'
 WILD = publish("/cmd_*")
@@ -171,6 +171,14 @@ def test_a_suggestion_holds(folder: Path, tmp_path: Path) -> None:
     ended = sros("check", changed, *ONLY[2:], "--requirements", suggested)
     assert ended.status == 1
     assert ended.out.count("[requirement.violated]") == 2
+
+
+def test_two_enclaves_with_a_right_are_proposed_by_name(tmp_path: Path) -> None:
+    policy = tmp_path / "robot.xml"
+    drives = publish("/cmd_vel")
+    policy.write_text(policy_text({"/a": drives, "/b": drives, "/base": subscribe("/cmd_vel")}))
+    suggested = sros("check", policy, "--suggest").ok().out
+    assert '[[only]]\npublish = ["/cmd_vel"]\nenclaves = ["/a", "/b"]' in suggested
 
 
 @pytest.mark.parametrize(
