@@ -12,7 +12,7 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from sros_tool.errors import KeystoreError, Note, UsageError
-from sros_tool.keystore.layout import PERMISSIONS_FILE
+from sros_tool.keystore.layout import PERMISSIONS_FILE, in_keystore_of
 from sros_tool.keystore.reader import of_one_state
 from sros_tool.owners import other_writers
 from sros_tool.wording import first_few
@@ -185,12 +185,12 @@ def _check_key_closed(key: Path, root: Path, name: str) -> None:
     """Raise `KeystoreError` if users other than the owner can read the enclave's private key."""
     mode = stat.S_IMODE(key.stat().st_mode)
     if mode & 0o077:
+        another = in_keystore_of(root, f"`sros renew KEYSTORE {name} --new-key --revoke-old`.")
         raise KeystoreError(
             f"others can read the private key of enclave {name}",
             f"The mode of '{key}' is {mode:04o}: whoever has read the key can act as the enclave.",
             f"Run `chmod 600 {quote(str(key))}`. If others had access, give the enclave another "
-            f"key: `sros renew {quote(str(root))} {name} --new-key --revoke-old`. To run it "
-            "nevertheless, add --accept-readable-key.",
+            f"key. {another} To run it nevertheless, add --accept-readable-key.",
         )
 
 
@@ -445,8 +445,8 @@ def _zenoh_domain(
             f"the Zenoh configuration is for domain {', '.join(map(str, own))}, not for "
             f"{wanted_domain}",
             "Its rules deny everything in any other domain.",
-            f"Set ROS_DOMAIN_ID to {own[0]}, or write the files for more domains: `sros zenoh "
-            f"{quote(str(root))} --domain ID`.",
+            f"Set ROS_DOMAIN_ID to {own[0]}, or write the files for more domains. "
+            f"{in_keystore_of(root, '`sros zenoh KEYSTORE --domain ID`.')}",
         )
     return wanted_domain
 

@@ -6,6 +6,7 @@ to some of them.  A command in a remedy works on a keystore with that fault, and
 
 from __future__ import annotations
 
+import re
 from enum import Enum
 
 _RCL = "rcl 9 (security.c) and the RMWs of ROS 2 Jazzy."
@@ -444,6 +445,12 @@ class Fault(Enum):
             return text
         if text in _IN_EXPORT:
             return _IN_EXPORT[text]
+        if self in (Fault.FILE_MISSING, Fault.LINK_DANGLING):
+            return (
+                f"Export the enclave again from the {ORIGINAL_KEYSTORE}: `sros distribute_key "
+                "{root} {enclave} TARGET --force`. If the file is missing there, too, first "
+                f"{text[0].lower()}{text[1:]}"
+            )
         return in_original_keystore(text)
 
 
@@ -451,6 +458,13 @@ def in_original_keystore(remedy: str) -> str:
     """Return the remedy for an export: to do ``remedy`` in the keystore with the CA keys."""
     then = "" if remedy.endswith("export the enclave again.") else " Then export the enclave again."
     return f"In the {ORIGINAL_KEYSTORE}: {remedy}{then}"
+
+
+NEEDS_CA_KEYS = re.compile(
+    r"`sros (create_\w+|generate_artifacts|update_keystore|renew|revoke|rotate_ca|distribute_key"
+    r"|crl KEYSTORE --refresh|zenoh) "
+)
+"""The begin of a command that works only in the keystore that has the CA keys."""
 
 
 FAULTS = {fault.id: fault for fault in Fault}

@@ -33,7 +33,7 @@ from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import FAST_DDS, Moments, Vendor
 from sros_tool.dds.permissions import Grant, parse_permissions
 from sros_tool.errors import SrosError
-from sros_tool.faults import Fault
+from sros_tool.faults import ORIGINAL_KEYSTORE, Fault
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
@@ -130,8 +130,9 @@ PROCESS_KEY_READABLE = FindingKind(
     "a process whose private key others can read",
     "Anyone who can read the key can act as the enclave. Neither rcl nor DDS checks file modes.",
     "rcl 9, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 check no modes.",
-    "Run `chmod 600` on the key. If others had access, give the enclave another key: `sros renew "
-    "KEYSTORE ENCLAVE --new-key --revoke-old`.",
+    "Run `chmod 600` on the key. If others had access, give the enclave another key in the "
+    f"{ORIGINAL_KEYSTORE}: `sros renew KEYSTORE ENCLAVE --new-key --revoke-old`. Then export the "
+    "enclave again, if the process runs from an export.",
 )
 PROCESS_NOT_SEEN = FindingKind(
     "runtime.process-not-seen",

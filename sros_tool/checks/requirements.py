@@ -54,6 +54,16 @@ NOT_CROSSING = FindingKind(
     "only.",
     prominent=True,
 )
+OF_EXPORT = FindingKind(
+    "requirement.of-export",
+    NOTE,
+    "requirements that were decided for the enclaves of an export only",
+    "An export may lack enclaves of its keystore. A laptop or another computer can have an enclave "
+    "that breaks a requirement.",
+    "The requirements file.",
+    "Check the keystore that the export comes from.",
+    prominent=True,
+)
 NOT_ON_ZENOH = FindingKind(
     "requirement.not-on-zenoh",
     NOTE,

@@ -803,8 +803,11 @@ def _show_who(
 
         decider = ZenohOfKeystore(keystore, why_zenoh, asking, names)
     fleet = load_fleet(keystore) if chosen_vendor else None
-    domains = keystore.domains if has_authorities(keystore.root) else None
-    return _print_everybody(decider, question, kind, (fleet, asking.domain, domains), as_json)
+    is_export = not has_authorities(keystore.root)
+    domains = None if is_export else keystore.domains
+    asked_in = " in this export" if is_export else ""
+    where = (fleet, asking.domain, domains, asked_in)
+    return _print_everybody(decider, question, kind, where, as_json)
 
 
 def _show_who_in_policy(
@@ -836,7 +839,7 @@ def _show_who_in_policy(
     fleet = fleet_of(asking.fleet_file, None)
     _, stated = policy_to_ask(policy, fleet)
     decider = VendorOfPolicy(stated, *chosen_vendor, asking, patterns or ("*",))
-    return _print_everybody(decider, question, kind, (fleet, asking.domain, None), as_json)
+    return _print_everybody(decider, question, kind, (fleet, asking.domain, None, ""), as_json)
 
 
 def _question_to_all(words_after_root: tuple[str, ...], kind: str | None) -> Question:
@@ -854,12 +857,12 @@ def _print_everybody(
     decider: Decider,
     question: Question,
     kind: str | None,
-    where: tuple[Fleet | None, int | None, DomainSet | None],
+    where: tuple[Fleet | None, int | None, DomainSet | None, str],
     as_json: bool,
 ) -> int:
     """Print the decisions on all enclaves; return 0 if any enclave may do it, else 1.
 
-    ``where`` has the fleet that groups enclaves, and the domains as `_who_lines` takes them.
+    ``where`` has the fleet that groups enclaves, and the rest as `_who_lines` takes it.
     """
     from sros_tool.explain.who import ask_everybody, callable_action, names_meant
 
@@ -881,13 +884,17 @@ def _print_everybody(
 
 
 def _who_lines(
-    everybody: Everybody, fleet: Fleet | None, domain: int | None, domains: DomainSet | None
+    everybody: Everybody,
+    fleet: Fleet | None,
+    domain: int | None,
+    domains: DomainSet | None,
+    asked_in: str,
 ) -> Iterator[str]:
     """Yield the allowed enclaves, the enclaves whose participant does not start now, and counts.
 
     The enclaves of a fleet are grouped by robot.  ``domain`` is that of --domain, ``domains`` are
     those of the keystore, None for an export or a policy: if only some of them allow the operation,
-    the line names these.
+    the line names these.  ``asked_in`` says where the enclaves are: " in this export", or "".
     """
     from sros_tool.fleet.robots import folded
 
@@ -911,7 +918,7 @@ def _who_lines(
     where = "" if domain is None else f" in domain {domain}"
     if by_domains:
         where = f": {', '.join(f'{n} in domain {text}' for text, n in by_domains.items())}"
-    yield f"{len(able)} of {count} may {everybody.question}{where}"
+    yield f"{len(able)} of {count}{asked_in} may {everybody.question}{where}"
 
 
 # ── --reach ────────────────────────────────────────────────────────────────────────────────

@@ -24,10 +24,10 @@ from sros_tool.explain.answer import Answer, Evaluator, Part, Question, ask
 from sros_tool.explain.asking import AskingContext, signed_enclave
 from sros_tool.explain.denials import Denial, read_denials, serving_node
 from sros_tool.explain.explanation import likely_names, remedy
-from sros_tool.faults import Fault
+from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, Fault, in_original_keystore
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.known_keys import enclaves_by_identity
-from sros_tool.keystore.layout import ROUTER_FILE, is_keystore
+from sros_tool.keystore.layout import ROUTER_FILE, has_authorities, is_keystore
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.reader import Keystore
@@ -586,13 +586,31 @@ class _Examiner:
     def _with_names(self, text: str, enclave: LoadedEnclave | None, hit: _Hit) -> str:
         """Return a remedy with keystore, enclave and the hit's fields for its placeholders."""
         own = "" if hit.meaning in (NO_ENCLAVE, RUNS_OPEN) or not enclave else enclave.name
-        names = {"KEYSTORE": self._root, "ENCLAVE": own}
-        for word, name in names.items():
-            if name:
-                plain = quote(name).replace("{", "{{").replace("}", "}}")
-                # Not the KEYSTORE in ROS_SECURITY_KEYSTORE.
-                text = plain.join(re.split(rf"\b{word}\b", text))
-        return text.format(**hit.quoted)
+        if self._is_export and NEEDS_CA_KEYS.search(text):
+            text = self._for_export(text)
+        else:
+            text = _with_name(text, "KEYSTORE", self._root)
+        return _with_name(text, "ENCLAVE", own).format(**hit.quoted)
+
+    @cached_property
+    def _is_export(self) -> bool:
+        return (
+            bool(self._root) and is_keystore(root := Path(self._root)) and not has_authorities(root)
+        )
+
+    def _for_export(self, text: str) -> str:
+        """Return a remedy with the export in its commands, except those that need the CA keys."""
+        parts = _COMMAND.split(text)
+        named = [
+            part if NEEDS_CA_KEYS.match(part) else _with_name(part, "KEYSTORE", self._root)
+            for part in parts
+        ]
+        if all(NEEDS_CA_KEYS.match(command) for command in parts[1::2]):
+            return in_original_keystore("".join(named))
+        return (
+            f"{''.join(named)} KEYSTORE is the {ORIGINAL_KEYSTORE}: export the enclave again from "
+            "there."
+        )
 
     def _with_peer_causes(self, finding: LogFinding, hits: Sequence[_Hit]) -> LogFinding:
         """Return the finding with causes and remedies in the enclaves of the peers in the log."""
@@ -702,7 +720,7 @@ class _Examiner:
                     f"{quote(enclaves[0])} -- COMMAND`."
                 )
             if nodes:
-                return [f"{this}this is the node {node}"], _renaming_advice(nodes[0], node)
+                return [f"{this}this is the node {node}"], _renaming_advice(nodes, node)
         if not nodes and (node or denial.topic in _TOPICS_OF_EVERY_NODE):
             return [f"the permissions lack {_EVERY_NODE}"], (
                 'Add <xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> to the '
@@ -786,6 +804,16 @@ class _Examiner:
         )
 
 
+def _with_name(text: str, word: str, name: str) -> str:
+    """Return a remedy to be formatted with ``name``, quoted, for a word; unchanged for ""."""
+    if not name:
+        return text
+    plain = quote(name).replace("{", "{{").replace("}", "}}")
+    # Not the KEYSTORE in ROS_SECURITY_KEYSTORE.
+    return plain.join(re.split(rf"\b{word}\b", text))
+
+
+_COMMAND = re.compile(r"(`sros [^`]*`)")
 _MOST_PEERS = 5
 """Highest number of peers that are examined for one message."""
 _OF_ROTATION = ("peer-signature", "peer-permissions-ca")
@@ -816,13 +844,25 @@ def _served_names(answer: Answer) -> tuple[str, ...]:
     return nodes_served((right.right, right.name) for right in rights)
 
 
-def _renaming_advice(right: str, wrong: str) -> str:
-    ns, _, name = right.rpartition("/")
+def _renaming_advice(nodes: Sequence[str], wrong: str) -> str:
+    """Return the remedy for a node with the name ``wrong`` in an enclave for other ``nodes``.
+
+    A rule without the name of a node renames all nodes of a process.
+    """
+    meant = likely_enclaves(wrong, nodes) or nodes
+    ns, _, name = meant[0].rpartition("/")
+    own = "" if len(nodes) == 1 else f"{quote(wrong.rpartition('/')[2])}:"
+    rules = f"`--ros-args -r {own}__node:={quote(name)} -r {own}__ns:={quote(ns or '/')}`"
+    start = f"Start it under that name ({rules})"
+    if own:
+        one = meant[0] if len(meant) == 1 else f"one of these names, such as {meant[0]}"
+        start = (
+            f"The enclave is for several nodes. Rename this one alone to {one}: in its code or "
+            f"launch file, or with {rules}; `-r __node:=` would rename all nodes of the process"
+        )
     return (
-        f"Start it under that name (`--ros-args -r __node:={quote(name)} "
-        f"-r __ns:={quote(ns or '/')}`); or, if {wrong} is right, give it a profile with "
-        "common/node.xml: in the policy of ENCLAVE, or in an enclave of its own if it is another "
-        "program."
+        f"{start}; or, if {wrong} is right, give it a profile with common/node.xml: in the policy "
+        "of ENCLAVE, or in an enclave of its own if it is another program."
     )
 
 

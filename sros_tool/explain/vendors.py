@@ -26,6 +26,7 @@ from sros_tool.explain.explanation import explain, likely_names
 from sros_tool.keystore.layout import (
     SETTINGS,
     ZENOH_SIGNED,
+    has_authorities,
     has_zenoh_files,
     is_keystore,
 )
@@ -354,7 +355,7 @@ class VendorOutcome(NamedTuple):
         return "" if runs else self.text.partition(": ")[2]
 
 
-@shows("question", "vendor", "vendor_why", "documented_only", "domain", "enclaves")
+@shows("question", "vendor", "vendor_why", "documented_only", "domain", "enclaves", "export")
 class WhoByVendor(NamedTuple):
     """The decision of a vendor for every enclave of a keystore."""
 
@@ -368,6 +369,8 @@ class WhoByVendor(NamedTuple):
     """The ROS domain of ``--domain``; null for every domain."""
     enclaves: Sequence[VendorOutcome]
     """All enclaves, with the decision for each."""
+    export: bool = False
+    """Whether an export was asked, which may lack enclaves of its keystore."""
 
     @property
     def documented_only(self) -> bool:
@@ -479,8 +482,17 @@ class VendorOfKeystore(NamedTuple):
 
     def printed(self, question: Question, outcomes: Sequence[VendorOutcome]) -> WhoByVendor:
         """Return the outcomes in the form that ``--json`` prints."""
-        return WhoByVendor(str(question), self.vendor, self.why, self.asking.domain, outcomes)
+        return WhoByVendor(
+            str(question),
+            self.vendor,
+            self.why,
+            self.asking.domain,
+            outcomes,
+            not has_authorities(self.keystore.root),
+        )
 
     def notes(self, _outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
-        """Yield no notes: DDS needs none."""
-        return iter(())
+        """Yield a note on an export, which may lack enclaves."""
+        from sros_tool.explain.who import note_on_export  # as in `outcomes`
+
+        return note_on_export(self.keystore.root)

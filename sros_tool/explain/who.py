@@ -93,6 +93,16 @@ class Everybody(NamedTuple):
         return any(outcome.allowed for outcome in self.outcomes)
 
 
+def note_on_export(root: Path) -> Iterator[Note]:
+    """Yield a note if a folder is an export, which may lack enclaves of its keystore."""
+    if not has_authorities(root):
+        text = (
+            f"'{root}' is an export, which may lack enclaves: enclaves that are elsewhere may have "
+            "the right, too. Ask the keystore that it comes from."
+        )
+        yield Note("explain.export", text)
+
+
 def ask_everybody(decider: Decider, question: Question, kind: str | None) -> Everybody:
     """Return the decisions on all enclaves; the name of an action is taken for the action.
 

@@ -38,7 +38,9 @@ from sros_tool.keystore.layout import (
     ROUTER_FILE,
     SESSION_FILE,
     enclave_path,
+    has_authorities,
     has_zenoh_files,
+    in_keystore_of,
     is_keystore,
 )
 from sros_tool.keystore.participant import JoinContext
@@ -253,6 +255,8 @@ class WhoOnZenoh(NamedTuple):
     """The ROS domain of ``--domain``; null for every domain."""
     enclaves: Sequence[ZenohEnclaveOutcome]
     """All enclaves; the enclave of the router may do whatever passes through the router."""
+    export: bool = False
+    """Whether an export was asked, which may lack enclaves of its keystore."""
 
 
 class ZenohEvaluator:
@@ -297,14 +301,14 @@ class ZenohEvaluator:
             raise KeystoreError(
                 f"keystore '{self.root}' has no {ROUTER_FILE}",
                 "sros cannot know what the router enforces without the router's file.",
-                "Ask about the keystore that this one was exported from, or write the files again: "
-                f"`sros zenoh {quote(str(self.root))}`.",
+                "Ask about the keystore that this one was exported from, or write the files again. "
+                f"{in_keystore_of(self.root, '`sros zenoh KEYSTORE`.')}",
             )
         raise KeystoreError(
             f"keystore '{self.root}' has no Zenoh configurations",
             "Without them its enclaves cannot open a session, and rmw_zenoh with files of its own "
             "runs without any access control.",
-            f"Write them: `sros zenoh {quote(str(self.root))}`.",
+            f"Write them. {in_keystore_of(self.root, '`sros zenoh KEYSTORE`.')}",
         )
 
     def _router_of(self, enclave: str) -> ZenohFile:
@@ -873,10 +877,14 @@ class ZenohOfKeystore:
             )
             for outcome in outcomes
         ]
-        return WhoOnZenoh(str(question), "zenoh", self._reason_text, self._domain, shown)
+        is_export = not has_authorities(self._keystore.root)
+        return WhoOnZenoh(str(question), "zenoh", self._reason_text, self._domain, shown, is_export)
 
     def notes(self, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
-        """Yield a note on the router's key, and a note if the router's file decided for peers."""
+        """Yield notes on an export, on the router's key, and on peers that its file decided for."""
+        from sros_tool.explain.who import note_on_export  # as in `outcomes`
+
+        yield from note_on_export(self._keystore.root)
         if any(outcome.of_router and outcome.allowed for outcome in outcomes):
             yield _ROUTERS_KEY
         if any(outcome.mode is Mode.PEER for outcome in outcomes):

@@ -14,7 +14,7 @@ from cryptography import x509
 
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore.layout import CERTIFICATE_FILE
+from sros_tool.keystore.layout import CERTIFICATE_FILE, in_keystore_of
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import Template
 from sros_tool.parallel import map_slices
@@ -249,8 +249,10 @@ def read_credentials(keystore: Keystore, name: str) -> Credentials:
         raise KeystoreError(
             f"the permissions of enclave {name} have no grant for {subject}",
             "They belong to another certificate.",
-            f"Sign them again with `sros create_permission {quote(str(keystore.root))} {name} "
-            "POLICY_FILE`.",
+            "Sign them again. "
+            + in_keystore_of(
+                keystore.root, f"`sros create_permission KEYSTORE {name} POLICY_FILE`."
+            ),
         )
     came = None
     with suppress(OSError):

@@ -16,6 +16,7 @@ from shlex import quote
 from typing import NamedTuple, TypeAlias
 
 from sros_tool.errors import DocumentError, KeystoreError
+from sros_tool.faults import in_original_keystore
 
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 CLOSED_PROCESSES, CLOSED_POLICY = "processes.json", "policy.xml"
@@ -210,6 +211,16 @@ def is_keystore(root: Path) -> bool:
 def has_authorities(root: Path) -> bool:
     """Return whether a folder is an original keystore, not an export or an enclave's folder."""
     return (root / PRIVATE).is_dir() or (root / LEDGER).is_file()
+
+
+def in_keystore_of(root: Path, remedy: str) -> str:
+    """Return a remedy, with commands for KEYSTORE, as it can be followed for a keystore or export.
+
+    An export has no CA keys: its remedy says to run the commands in the original keystore.
+    """
+    if has_authorities(root):
+        return re.sub(r"\bKEYSTORE\b", lambda _: quote(str(root)), remedy)
+    return in_original_keystore(remedy)
 
 
 def closed_robot(root: Path) -> Path | None:

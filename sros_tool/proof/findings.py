@@ -7,7 +7,14 @@ from dataclasses import dataclass, replace
 
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
-from sros_tool.checks.requirements import ASSUMED, NOT_CROSSING, NOT_ON_ZENOH, VACUOUS, VIOLATED
+from sros_tool.checks.requirements import (
+    ASSUMED,
+    NOT_CROSSING,
+    NOT_ON_ZENOH,
+    OF_EXPORT,
+    VACUOUS,
+    VIOLATED,
+)
 from sros_tool.dds.decision.vendors import joined_titles
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import (
@@ -204,6 +211,9 @@ def decided_findings(decided: Decided, system: System) -> list[Finding]:
     findings += [_vacuous_finding(requirement, why) for requirement, why in decided.vacuous]
     findings += [_assumption_finding(*each) for each in decided.assumed]
     findings += [_not_crossing_finding(*each) for each in decided.kept]
+    if system.is_export:
+        text = "only the enclaves in this export were judged: others of its keystore may be missing"
+        findings.append(OF_EXPORT.found(system.file, text, system.file))
     if system.left_out:
         error = system.left_out
         text = f"{error.what}: {error.why}" if error.why else error.what

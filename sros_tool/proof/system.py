@@ -35,6 +35,7 @@ from sros_tool.keystore.layout import (
     ROUTER_FILE,
     enclave_names,
     enclave_path,
+    has_authorities,
     has_zenoh_files,
     is_keystore,
 )
@@ -92,7 +93,8 @@ class System:
     """The worlds of a policy or keystore.
 
     ``file`` is its path, ``rights`` are the allowed rights as it states them, and ``places`` tells
-    where it states them.  ``left_out`` is the reason why there is no Zenoh world, if Zenoh
+    where it states them.  ``is_export`` says that it is an export, which may lack enclaves of its
+    keystore.  ``left_out`` is the reason why there is no Zenoh world, if Zenoh
     cannot enforce the policy.  ``fleet`` returns the robots of the policy or keystore, or None.
     """
 
@@ -102,6 +104,7 @@ class System:
     rights: frozenset[Right]
     left_out: SrosError | None = None
     fleet: Callable[[], Fleet | None] = lambda: None
+    is_export: bool = False
 
 
 def load_system(
@@ -463,7 +466,12 @@ def _keystore_system(
         for name in names
     }
     return System(
-        str(root), tuple(worlds), Places(places), rights, fleet=partial(checked_fleet, keystore)
+        str(root),
+        tuple(worlds),
+        Places(places),
+        rights,
+        fleet=partial(checked_fleet, keystore),
+        is_export=not has_authorities(root),
     )
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
+from sros_tool.keystore.layout import has_authorities
 from sros_tool.keystore.reader import Keystore
 from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier, StatedProtection
@@ -85,6 +86,16 @@ class PictureSource:
     keystore: Keystore | None = None
     unread: tuple[UnreadUnits, ...] = ()
     in_domains: DomainRights = field(default_factory=dict)
+
+    @property
+    def is_export(self) -> bool:
+        """Whether the source is an export, which may lack enclaves of its keystore."""
+        return self.keystore is not None and not has_authorities(self.keystore.root)
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether other enclaves of the system may not be in the source."""
+        return self.is_export or self.origin.kind in ("enclave", "permissions")
 
     def in_enclaves(self, homes: Mapping[str, str]) -> PictureSource:
         """Return a copy with rights and nodes moved from enclaves to their ``homes``."""
@@ -246,6 +257,7 @@ def _picture(
             sorted({validity for source in sources for validity in source.validities})
         ),
         findings=tuple(dict.fromkeys(finding for source in sources for finding in source.findings)),
+        exports=tuple(source.origin.title for source in sources if source.is_export),
         unread=tuple(units for source in sources for units in source.unread),
         join_needs_right=governance is not None
         and all(rule.enable_join_access_control for rule in governance.domain_access_rules),

@@ -95,6 +95,9 @@ def focused_picture(
     if routers > 1:
         left_out = f"; what passes between the {routers} Zenoh routers is not considered"
         focuses = tuple(replace(focus, sentence=f"{focus.sentence}{left_out}") for focus in focuses)
+    if system.is_partial:
+        here = f"of the enclaves in {picture.title}, "
+        focuses = tuple(replace(focus, sentence=f"{here}{focus.sentence}") for focus in focuses)
     picture = system.with_shortest_paths(replace(picture, focus=focuses))
     flow = FocusFlow.of(picture)
     edges = tuple(edge for edge in picture.edges if flow.has(edge))
@@ -225,6 +228,9 @@ class _System:
 
     def __init__(self, picture: Picture, sources: Sequence[PictureSource]) -> None:
         self._picture = picture
+        self.is_partial = all(
+            source.is_partial for source in sources if source.origin.kind != "observation"
+        )
         enclaves = {enclave.path for enclave in picture.enclaves}
         in_domains: dict[DomainSet | None, list[Right]] = defaultdict(list)
         for source in sources:
@@ -296,7 +302,15 @@ class _System:
         open_to_all = senders != frozenset(
             user for topic in topics for user in self._by_permissions.users("publish", topic)
         )
-        sentence = _sentence(kind, name, senders, receivers, influencing, open_to_all)
+        sentence = _sentence(
+            kind,
+            name,
+            senders,
+            receivers,
+            influencing,
+            open_to_all=open_to_all,
+            partial=self.is_partial,
+        )
         if not is_expression(name) and (kind, name) not in self._known:
             sentence = f"no right states {name} itself, but wildcards match it: {sentence}"
         domains = {self._domains.get(user, "") for user in senders | receivers} - {""}
@@ -387,14 +401,19 @@ def _sentence(
     senders: Collection[str],
     receivers: Collection[str],
     influencing: Sequence[Influence],
+    *,
     open_to_all: bool,
+    partial: bool,
 ) -> str:
-    """Return a sentence on who may use a name, and how many enclaves influence its senders."""
+    """Return a sentence on who may use a name, and how many enclaves influence its senders.
+
+    ``partial``: there may be other enclaves, so no enclave is said to be the only one.
+    """
     sends, sender, receives = _VERBS[kind]
-    who = "every enclave" if open_to_all else _enclaves_text(senders)
+    who = "every enclave" if open_to_all else _enclaves_text(senders, partial=partial)
     text = f"{who} may {sends} {name}"
     text += ", which the governance leaves open" if open_to_all else ""
-    text += f"; {_enclaves_text(receivers)} may {receives} it"
+    text += f"; {_enclaves_text(receivers, partial=partial)} may {receives} it"
     if open_to_all or not senders:
         return text
     them = f"the {sender}" if len(senders) == 1 else f"these {sender}s"
@@ -413,13 +432,14 @@ def _counted_influences(influences: Sequence[Influence], direct: int) -> str:
     return text if near == len(influences) else f"{text} ({near} directly)"
 
 
-def _enclaves_text(enclaves: Collection[str]) -> str:
+def _enclaves_text(enclaves: Collection[str], *, partial: bool) -> str:
     """Return the paths of a few enclaves, or the number of many enclaves, in words."""
     if not enclaves:
         return "no enclave"
     if len(enclaves) > _NAMED:
         return counted(len(enclaves), "enclave")
-    return enumerated(sorted(enclaves)) + (" alone" if len(enclaves) == 1 else "")
+    alone = len(enclaves) == 1 and not partial
+    return enumerated(sorted(enclaves)) + (" alone" if alone else "")
 
 
 HOPS = 2

@@ -457,7 +457,7 @@ class DifferentUnit(NamedTuple):
 
 @shows(
     *("title", "origins", "enclaves", "names", "edges", "overlay", "differences", "validities"),
-    *("findings", "focus", "requirements", "equal", "different"),
+    *("findings", "focus", "requirements", "equal", "different", "exports"),
 )
 @dataclass(frozen=True, slots=True)
 class Picture:
@@ -493,6 +493,8 @@ class Picture:
     """Robots, namespaces or enclaves that are equal except for their names, drawn as one."""
     different: tuple[DifferentUnit, ...] = ()
     """Units that differ slightly from equal ones."""
+    exports: tuple[str, ...] = ()
+    """The sources that are exports, which may lack enclaves of their keystore."""
     unread: tuple[UnreadUnits, ...] = ()
     join_needs_right: bool = False
     """Whether an enclave can join only ROS domains in which it has a right."""
@@ -506,7 +508,9 @@ class Picture:
         different = [unit.sentence() for unit in self.different[:_SAID]]
         different += [f"{more} more differ"] if more > 0 else []
         focus = (focus.sentence for focus in self.focus)
-        return (*focus, *requirements, *equal, *different, *self._unread_sentences())
+        exports = map(_sentence_on_export, self.exports)
+        unread = self._unread_sentences()
+        return (*focus, *exports, *requirements, *equal, *different, *unread)
 
     def _unread_sentences(self) -> Iterator[str]:
         if not self.unread:
@@ -521,6 +525,13 @@ class Picture:
             "and findings, and rights of others to their names, are not in this picture: --robot "
             "NAME reads one, `sros check` checks all"
         )
+
+
+def _sentence_on_export(title: str) -> str:
+    return (
+        f"'{title}' is an export, which may lack enclaves: what is said of one, all or no enclave "
+        "is said of the enclaves in this export. Draw the keystore that it comes from to see all"
+    )
 
 
 @dataclass(frozen=True, slots=True, order=True)

@@ -128,6 +128,12 @@ _READABLE = (
     "Allow the user that runs the node to read it, and to enter the folders above it: `ls -lL "
     "{path}`, run as that user, shows whether this works."
 )
+_HAND_OVER = (
+    "As the user that runs the node, run `sros check KEYSTORE`: it names what this user cannot "
+    "read. If the folder is an export, give it to that user: `sudo chown -R USER KEYSTORE`. If it "
+    "has the CA keys, which no node should be able to read, export the enclave into a folder of "
+    "that user."
+)
 _SET_DOMAIN = (
     "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env KEYSTORE ENCLAVE --domain ID` prints "
     "the variables."
@@ -196,6 +202,13 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "`sros explain KEYSTORE ENCLAVE join` names the file and the command that restores it; on "
         "a robot, export the enclave again.", _FILES,
         refuses=Refused.PARTICIPANT,
+    ),
+    _log_text(
+        "file-unreadable", _ROS,
+        r"filesystem error: [\w ]{1,40}: Permission denied "
+        r"\[(?P<path>[^\]]*/(?:key\.p11|[a-z_.]+\.(?:pem|p7s)))\]",
+        "the user that runs this process may not read {path}, or enter one of the folders above it",
+        _HAND_OVER,
     ),
     _log_text(
         "enclave-missing", _ROS,

@@ -308,8 +308,11 @@ def test_verify_reports_faults_and_sets_its_exit_status(keystore: Path, tmp_path
     assert "/b  NOT LOADABLE\n" in ended.out
     assert f"{out}/enclaves/b/cert.pem: error: a file that an enclave needs is miss" in ended.out
     # A robot's folder has no CA keys, so no remedy may need them.
-    assert "In the keystore that has the CA keys: Create the missing file: `sros " in ended.out
-    assert "`sros create_enclave KEYSTORE /b`. Then export the enclave again." in ended.out
+    assert (
+        "Export the enclave again from the keystore that has the CA keys: `sros distribute_key "
+    ) in ended.out
+    assert "If the file is missing there, too, first create the missing file: `sros " in ended.out
+    assert "`sros create_enclave KEYSTORE /b`." in ended.out
     assert f"{out}/enclaves/a/key.pem: error: a private key that others can read" in ended.out
     assert f"chmod 600 {out}/enclaves/a/key.pem`" in ended.out
     said = json.loads(sros("verify", out, "--json", "--at", "2026-12-24", "--domain", "7").out)

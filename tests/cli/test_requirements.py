@@ -55,6 +55,7 @@ CASES = {
     "requirement.dropped",
     "requirement.assumed",
     "requirement.not-on-zenoh",
+    "requirement.of-export",
 }
 """The kinds of findings that tests here bring about."""
 ONLY = ("check", "robot.xml", "--include", "requirement.*")
@@ -140,6 +141,23 @@ def test_what_is_no_longer_demanded(folder: Path, tmp_path: Path) -> None:
     assert ended.ok().out == ""
     ended = sros(*asked, "--requirements", more, cwd=folder)
     assert f"{more}:7: required: the web does not drive" in ended.out
+
+
+def test_an_export_is_judged_without_the_enclaves_that_it_lacks(tmp_path: Path) -> None:
+    (tmp_path / "robot.xml").write_text(POLICY)
+    (tmp_path / "required.toml").write_text(REQUIRED[: REQUIRED.index("[[apart]]")])
+    for line in (
+        "create_keystore ks",
+        "generate_artifacts -k ks -p robot.xml",
+        "distribute_key ks /mux /wheels robot",
+    ):
+        sros(*line.split(), cwd=tmp_path).ok()
+    asked = ("--include", "requirement.*", "--requirements", "required.toml")
+    assert "[requirement.violated]" in sros("check", "ks", *asked, cwd=tmp_path).out  # by /web
+    ended = sros("check", "robot", *asked, cwd=tmp_path).ok()
+    assert "[requirement.of-export]" in ended.out and "nothing found" not in ended.err
+    assert "Check the keystore that the export comes from." in ended.out
+    assert "of-export" not in sros("check", "ks", *asked, cwd=tmp_path).out
 
 
 def test_a_policy_that_zenoh_cannot_carry_out(folder: Path, tmp_path: Path) -> None:

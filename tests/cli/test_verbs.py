@@ -665,6 +665,11 @@ def test_no_process_starts_with_a_key_that_others_can_read(mode: int, keystore: 
     assert json.loads(accepted.out)["variables"] == variables(keystore)
     forked("run", keystore, "/a", "--accept-readable-key", "--", "touch", marker).ok()
     marker.unlink()
+    export = keystore.parent / "export"
+    sros("distribute_key", keystore, "/b", export).ok()
+    (export / "enclaves/b/key.pem").chmod(mode)
+    of_export = sros("run", export, "/b", "--", "true").err  # it has no CA keys
+    assert "CA keys: `sros renew KEYSTORE /b --new-key --revoke-old`. Then export" in of_export
     fix, replace = re.findall("`(.+?)`", refused.err)
     run(["sh", "-c", fix])
     forked("run", keystore, "/a", "--", "touch", marker).ok()

@@ -453,7 +453,12 @@ def test_who_may_in_an_export(whole: Path, tmp_path: Path) -> None:
     sros("distribute_key", whole, ENCLAVE, tmp_path / "robot").ok()
     words = ("publish", "/chatter")
     found = explain(tmp_path / "robot", "--who", *words)
-    assert found.out == f"{ENCLAVE}\n1 of 1 enclave may publish topic /chatter\n"
+    assert found.out == f"{ENCLAVE}\n1 of 1 enclave in this export may publish topic /chatter\n"
+    assert "is an export, which may lack enclaves" in found.err
+    assert "Ask the keystore that it comes from" in found.err
+    assert answer(tmp_path / "robot", "--who", *words)["export"] is True
+    assert answer(whole, "--who", *words)["export"] is False
+    assert "export" not in explain(whole, "--who", *words).err
     refused = explain(tmp_path / "robot", "--reach", ENCLAVE)
     assert refused.status == 2 and "is an export, which may lack enclaves" in refused.err
 

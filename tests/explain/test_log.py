@@ -19,6 +19,7 @@ from sros_tool.files import policies_dir
 from sros_tool.keystore.ledger import Ledger, LedgerFile
 from sros_tool.keystore.participant import LoadedEnclave, load_enclave_of
 from sros_tool.keystore.reader import Keystore
+from sros_tool.names import PARAMETER_SERVICES
 from sros_tool.pki.certificates import identity_of, load_certificate
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
@@ -335,6 +336,8 @@ def test_without_a_keystore(file: str, ids: list[str]) -> None:
         ("[SECURITY Error] Malformed permissions file", "malformed"),
         ("File could not be found, opened or is empty, path: /k/a.pem(code: 117)", "file-missing"),
         ("partition not found in rule", "partition"),
+        ("RuntimeError: filesystem error: status: Permission denied [/k/enclaves/a/governance.p7s]",
+         "file-unreadable"),
         ("rclpy._rclpy_pybind11.RCLError: Failed to create subscription: invalid allocator",
          "endpoint"),
     ],
@@ -517,6 +520,11 @@ def test_a_remedy_names_the_keystore_and_the_enclave_that_the_user_named(
     assert f"`sros explain {keystore} {ENCLAVE} publish /x`" in denied
     unnamed = sros("explain", "--log", tmp_path / "robot.log").out
     assert "`sros explain KEYSTORE ENCLAVE join`" in unnamed
+    line = f"filesystem error: status: Permission denied [{keystore}/enclaves/a/governance.p7s]"
+    (tmp_path / "user.log").write_text(f"RuntimeError: {line}\n")
+    unreadable = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "user.log").out
+    assert f"may not read {keystore}/enclaves/a/governance.p7s" in unreadable
+    assert f"As the user that runs the node, run `sros check {keystore}`" in unreadable
 
 
 def test_tests_of_declared_keys_are_not_called_nothing(tmp_path: Path) -> None:
@@ -657,6 +665,25 @@ def test_a_node_of_another_name_is_told(keystore: Path, log: str, node: str) -> 
     assert f"here it belongs to node {node}" in sros("explain", "--log", path).out
 
 
+def test_one_of_several_nodes_is_renamed_alone(keystore: Path, tmp_path: Path) -> None:
+    """A rule without the name of a node would rename all nodes of the process."""
+    served = "".join(
+        f"<service>{node}/{name}</service>"
+        for node in ("/camera/food", "/talker")
+        for name in PARAMETER_SERVICES
+    )
+    both = policy_text({ENCLAVE: f'<services reply="ALLOW">{served}</services>'})
+    (tmp_path / "both.xml").write_text(both)
+    sros("create_permission", keystore, ENCLAVE, tmp_path / "both.xml").ok()
+    log = LOGS / f"{FAST_14}.node_name_differs.log"
+    found = sros("explain", keystore, ENCLAVE, "--log", log).out
+    assert "the permissions are for the nodes /camera/food, /talker, and this is the node /foo" in (
+        found
+    )
+    assert "`--ros-args -r foo:__node:=food -r foo:__ns:=/camera`" in found
+    assert "-r __node:=food" not in found and "-r __node:=talker" not in found
+
+
 def test_rcl_alone_makes_one_look_at_the_name(keystore: Path, tmp_path: Path) -> None:
     log = tmp_path / "stderr.log"
     log.write_text("RCLError: failed to create service: create_service() failed to create ...\n")
@@ -746,6 +773,11 @@ def test_the_peer_whose_permissions_expired_is_named(
     assert f"{keystore} {ENCLAVE}" not in found
     unnamed = sros("explain", "--log", log).out
     assert "`sros renew KEYSTORE PEER`" in unnamed
+    sros("distribute_key", keystore, ENCLAVE, tmp_path / "robot").ok()
+    exported = sros("explain", tmp_path / "robot", ENCLAVE, "--log", log).out
+    assert "`sros renew KEYSTORE PEER`" in exported  # an export has no CA keys
+    assert f"`sros inspect {tmp_path / 'robot'}`" in exported
+    assert "KEYSTORE is the keystore that has the CA keys: export the enclave again" in exported
 
 
 @pytest.mark.parametrize(

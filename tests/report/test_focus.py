@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 
+from sros_tool.keystore.rights import load_rights
 from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.rights import Right
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network
@@ -225,6 +226,23 @@ def test_every_format_has_the_answer(tmp_path: Path) -> None:
     assert f"{MUX} alone may publish /cmd_vel" in ended.err
     words = " ".join(etree.fromstring(ended.out.encode()).itertext())
     assert f"{MUX} alone may publish /cmd_vel" in words and "2 HOPS BEFORE" in words
+
+
+def test_an_export_may_lack_enclaves(keystore: Path, tmp_path: Path) -> None:
+    """An enclave is not said to be the only one, where others may be elsewhere."""
+    robot, page = tmp_path / "robot", tmp_path / "page.html"
+    sros("distribute_key", keystore, "/a", robot).ok()
+    (right, *_) = [each for each in load_rights(robot).rights if each.right == "publish"]
+    for source, alone in ((keystore, True), (robot, False), (robot / "enclaves/a", False)):
+        asked = ("view", source, "--focus", right.name)
+        ended = sros(*asked, "--format", "markdown").ok()
+        for text in (ended.err, ended.out):
+            assert (f"/a alone may publish {right.name}" in text.replace("\\", "")) is alone
+            assert (f"of the enclaves in {source.name}, /a may" in text) is not alone
+            assert ("is an export, which may lack enclaves" in text) is (source == robot)
+    sros("view", robot, "-o", page).ok()
+    assert "is an export, which may lack enclaves" in page.read_text()
+    assert json.loads(sros("view", robot, "--json").ok().out)["exports"] == ["robot"]
 
 
 def test_hostile_names_can_be_a_focus(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ from sros_tool.dds.decision.vendors import TESTED, ZENOH, Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
-from sros_tool.faults import ORIGINAL_KEYSTORE, in_original_keystore
+from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, in_original_keystore
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import publish_command, stated_distributions
 from sros_tool.keystore.layout import (
@@ -301,12 +301,6 @@ def _with_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
     return finding._replace(file=str(root / real.relative_to(real_root)))
 
 
-_NEEDS_CA_KEYS = re.compile(
-    r"`sros (create_\w+|generate_artifacts|update_keystore|renew|revoke|rotate_ca|distribute_key"
-    r"|crl KEYSTORE --refresh|zenoh) "
-)
-
-
 _OF_SEVERAL = re.compile(
     r"(\bsros (?:renew|revoke|create_permission|create_enclave|distribute_key) \S+ )([^\s`]+)"
 )
@@ -319,7 +313,7 @@ def _with_enclave_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
     The remedy for an export says that commands which sign have to run in the original keystore.
     """
     remedy = finding.remedy
-    if not keystore.looks_like_original and _NEEDS_CA_KEYS.search(remedy):
+    if not keystore.looks_like_original and NEEDS_CA_KEYS.search(remedy):
         remedy = remedy if ORIGINAL_KEYSTORE in remedy else in_original_keystore(remedy)
     if ORIGINAL_KEYSTORE not in remedy:
         remedy = re.sub(r"\bKEYSTORE\b", lambda _: quote(str(keystore.root)), remedy)
