@@ -851,10 +851,12 @@ def _renaming_advice(nodes: Sequence[str], wrong: str) -> str:
     """
     meant = likely_enclaves(wrong, nodes) or nodes
     ns, _, name = meant[0].rpartition("/")
-    own = "" if len(nodes) == 1 else f"{quote(wrong.rpartition('/')[2])}:"
-    rules = f"`--ros-args -r {own}__node:={quote(name)} -r {own}__ns:={quote(ns or '/')}`"
+    rules = f"`--ros-args -r __node:={quote(name)} -r __ns:={quote(ns or '/')}`"
     start = f"Start it under that name ({rules})"
-    if own:
+    if len(nodes) > 1:
+        # rcl looks for the rule of the namespace under the new name.
+        rules = f"`--ros-args -r {quote(wrong.rpartition('/')[2])}:__node:={quote(name)} "
+        rules += f"-r {quote(name)}:__ns:={quote(ns or '/')}`"
         one = meant[0] if len(meant) == 1 else f"one of these names, such as {meant[0]}"
         start = (
             f"The enclave is for several nodes. Rename this one alone to {one}: in its code or "

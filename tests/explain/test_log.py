@@ -680,7 +680,7 @@ def test_one_of_several_nodes_is_renamed_alone(keystore: Path, tmp_path: Path) -
     assert "the permissions are for the nodes /camera/food, /talker, and this is the node /foo" in (
         found
     )
-    assert "`--ros-args -r foo:__node:=food -r foo:__ns:=/camera`" in found
+    assert "`--ros-args -r foo:__node:=food -r food:__ns:=/camera`" in found
     assert "-r __node:=food" not in found and "-r __node:=talker" not in found
 
 
