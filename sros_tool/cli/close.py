@@ -216,8 +216,10 @@ def _show(robot: OpenRobot, closed: Closing) -> None:
     seen = {process.enclave for process in robot.observed.processes} if robot.observed else set()
     if left_out := sorted(seen.difference(enclave.path for enclave in policy.enclaves)):
         echo(f"seen when sros watched, and not in the policy: {', '.join(left_out)}")
-    for right in closed.newly_denied:
+    for right in closed.newly_denied[:_MOST_DENIED]:
         echo(f"used when sros watched, and denied now: {right}")
+    if more := closed.newly_denied[_MOST_DENIED:]:
+        echo(f"  and {counted(len(more), 'right')} more (--json has all)")
     if closed.newly_denied:
         echo(
             "  if this is not intended, change the policy; if it is intended, the node may end "
@@ -335,6 +337,7 @@ def _started_together(processes: Sequence[ClosedProcess]) -> str:
     return f"process {enumerated(pids)}" if pids else ""
 
 
+_MOST_DENIED = 4
 _ANSWERS = {True: "yes", False: "no", None: "not asked"}
 _EARLIER = "with earlier files"
 _ACCEPT = "accept with --partial what could not be asked, "
