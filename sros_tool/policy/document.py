@@ -118,6 +118,8 @@ class Includer:
     """The includes whose fallback was used, each with the path of the missing file."""
     _documents: dict[Path, etree._Element] = field(default_factory=dict)
     _sizes: dict[Path, int] = field(default_factory=dict)
+    _real_paths: dict[tuple[Path, str], Path] = field(default_factory=dict)
+    """Where the includes of a folder lead; many profiles include the same file."""
     _includes: int = 0
     _elements: int = 0
     _bytes: int = 0
@@ -185,8 +187,11 @@ class Includer:
             )
         if not href:
             return place.file
-        # Unlike Path.resolve, realpath does not fail on circular links.
-        file = Path(os.path.realpath(place.file.parent / path))
+        folder = place.file.parent
+        file = self._real_paths.get((folder, path))
+        if file is None:
+            # Unlike Path.resolve, realpath does not fail on circular links.
+            file = self._real_paths[folder, path] = Path(os.path.realpath(folder / path))
         if _SCHEME.match(href) or not file.is_relative_to(self.root):
             raise PolicyError(
                 f"{where}: the include of {_short(href)} leaves the folder of the policy",
