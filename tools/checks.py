@@ -29,10 +29,11 @@ OLDEST = "--oldest"
 OLDEST_PACKAGES = ("click==8.1.6", "cryptography==41.0.7", "lxml==5.2.1")
 """The packages of Ubuntu 24.04, which ROS 2 Jazzy and Kilted have."""
 
-PLAIN = "--assert=plain"
-"""pytest's argument for assertions as Python compiles them.
+QUICK = ("--assert=plain", "-p", "no:logging")
+"""pytest's arguments for assertions as Python compiles them, and for no record of what is logged.
 
-To make all of them tell their values takes pytest 19 s of CPU, and a test that passes tells none.
+To make all assertions tell their values takes pytest 19 s of CPU, and a test that passes tells
+none; of each test, three parts have their own record.
 """
 
 WITH_VALUES = ("-m", "pytest", "--last-failed", "--last-failed-no-failures=none", "--maxfail=20")
@@ -81,7 +82,7 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     report.unlink(missing_ok=True)
     env = {"SROS_SEED": str(SystemRandom().randrange(1_000_000)), **env}
     processes = str(2 * len(os.sched_getaffinity(0)) + 1)
-    words = ["-m", "pytest", PLAIN, *FORKED, processes, f"--junit-xml={report}"]
+    words = ["-m", "pytest", *QUICK, *FORKED, processes, f"--junit-xml={report}"]
     results = _run_together(lint | {"tests": words}, "tests", env)
     if results["tests"] == 1:
         with _Step("tests that failed, again, for their values", [*WITH_VALUES], env) as again:
