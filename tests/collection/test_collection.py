@@ -19,6 +19,7 @@ from sros_tool import __version__
 from tests.integration.robots import CHECKOUT
 from tests.support.children import run
 from tests.support.harness import policy_text, publish, sros
+from tests.support.long_form import some
 
 COLLECTION = CHECKOUT / "ansible_collections/sros/fleet"
 PLAYS = sorted(path.stem for path in (COLLECTION / "playbooks").glob("*.yml"))
@@ -47,12 +48,13 @@ def ansible(program: str, *words: object, folder: Path) -> str:
 @needs_ansible
 def test_the_syntax_of_each_play(tmp_path: Path) -> None:
     assert {"deliver", "renew", "change", "revoke", "rotate", "requests", "status"} <= set(PLAYS)
-    plays = [f"sros.fleet.{each}" for each in PLAYS]
+    chosen = some(PLAYS, 5)
+    plays = [f"sros.fleet.{each}" for each in chosen]
     facts = json.dumps({"sros_stage": "reissue", "sros_revoke": ["r1"]})
     (tmp_path / "inventory.json").write_text('{"all": {"hosts": {"r1": {}}}}')
     words = ("-i", tmp_path / "inventory.json", "--syntax-check", "-e", facts)
     said = ansible("ansible-playbook", *words, *plays, folder=tmp_path)
-    assert said.count("playbook:") == len(PLAYS)
+    assert said.count("playbook:") == len(chosen)
 
 
 def test_each_play_looks_at_the_names_first() -> None:

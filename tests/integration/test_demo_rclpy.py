@@ -200,7 +200,7 @@ sys.exit(_run_role(build, NodeOptions("talker", report=Path(sys.argv[1])), []))
 """
 
 
-@pytest.mark.parametrize(("how", "status"), [("signal", 0), ("fault", 1)])
+@pytest.mark.parametrize(("how", "status"), some([("signal", 0), ("fault", 1)], 1))
 def test_a_node_that_is_ended_while_it_is_made_has_not_failed(
     how: str, status: int, tmp_path: Path
 ) -> None:

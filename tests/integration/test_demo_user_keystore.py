@@ -213,6 +213,7 @@ liveliness = false
 """
 
 
+@sometimes("what a keystore opens by itself", 1 / 2)
 @needs_isolation
 def test_what_a_keystore_opens_by_itself_fails_until_it_is_accepted_by_name(
     tmp_path: Path,

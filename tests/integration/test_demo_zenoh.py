@@ -31,7 +31,7 @@ def some_words() -> list[str]:
     """Return names of rows, of each scenario some, and of an attack; in the long form all."""
     attacks = list(dict.fromkeys(row.attack for row in ATTACKS.rows))
     others = [
-        some([row.name for row in each.rows if not row.attack], 2) for each in ZENOH_SCENARIOS
+        some([row.name for row in each.rows if not row.attack], 1) for each in ZENOH_SCENARIOS
     ]
     return [*(name for names in others for name in names), *some(attacks, 1)]
 

@@ -21,6 +21,7 @@ from tests.integration.trust.drawing import FAMILIES, Case, controls, draw, make
 from tests.integration.trust.replies import Compared, compare, engine_says, kept_replies, same
 from tests.integration.vendor_oracle import cyclone_vendor
 from tests.support.children import LONG
+from tests.support.long_form import some
 from tests.support.openssl import takes_changes_for_lists
 
 COUNT = int(os.environ.get("SROS_TRUST", "1000" if LONG else "0"))
@@ -35,7 +36,7 @@ pytestmark = pytest.mark.filterwarnings("ignore")
 def test_the_engine_says_what_vendors_were_observed_to_do(tmp_path: Path) -> None:
     kept, now = kept_replies(), datetime.now(UTC).replace(microsecond=0)
     wrong = []
-    for number, (case, observed) in enumerate(kept.items()):
+    for number, (case, observed) in enumerate(some([*kept.items()], 70)):
         trust, text = make(case)
         folder = tmp_path / str(number)
         trust.write(folder / "own", folder / "peer", now)

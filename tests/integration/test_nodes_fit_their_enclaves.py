@@ -174,7 +174,7 @@ def cast(tmp_path_factory: pytest.TempPathFactory) -> list[Casting]:
 @pytest.fixture(scope="module")
 def seen(cast: list[Casting]) -> dict[Key, list[dict[str, Any]]]:
     """The nodes of every process that differs, as the graph shows them."""
-    keys = some(sorted({each.key for each in cast}), 3)
+    keys = some(sorted({each.key for each in cast}), 2)
     # The graph knows nodes by their names, so that those of one name go into separate networks.
     rounds: defaultdict[int, dict[str, Key]] = defaultdict(dict)
     borne: defaultdict[str, int] = defaultdict(int)
@@ -215,7 +215,7 @@ def test_demo_nodes_bear_their_names_and_offer_their_services(
     seen: dict[Key, list[dict[str, Any]]],
 ) -> None:
     """What is missing in the graph could not be found to be denied."""
-    assert len(seen) > (15 if LONG else 2)
+    assert len(seen) > (15 if LONG else 1)
     for (role, names, topic), nodes in seen.items():
         shown = {expand(each["name"], each["ns"], "") for each in nodes}
         assert shown == set(names), role

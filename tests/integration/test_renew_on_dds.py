@@ -25,6 +25,7 @@ from tests.integration.test_life_on_dds import (
     probe,
 )
 from tests.support.harness import publish
+from tests.support.long_form import some
 
 __all__ = ["ask", "probe"]
 
@@ -32,7 +33,8 @@ pytestmark = pytest.mark.dds
 
 
 @pytest.mark.parametrize(
-    ("revoke_old", "kept", "put_back"), [(False, HEARD, HEARD), (True, SILENT, REFUSED)]
+    ("revoke_old", "kept", "put_back"),
+    some([(False, HEARD, HEARD), (True, SILENT, REFUSED)], 1),
 )
 def test_the_old_certificate_with_its_old_permissions(
     revoke_old: bool, kept: str, put_back: str, ask: Ask, tmp_path: Path

@@ -389,7 +389,9 @@ def revoked_by_all(root: Path, old: Path) -> None:
     assert "certificate revoked" in refused.stderr, refused
 
 
-@pytest.mark.parametrize("earlier", [False, True], ids=["the first", "not the first"])
+@pytest.mark.parametrize(
+    "earlier", some([False, True], 1), ids=lambda each: "not the first" if each else "the first"
+)
 def test_a_revocation_in_between(earlier: bool, root: Path, tmp_path: Path) -> None:
     """While both CAs are trusted, both revoke: what an enclave had of either is refused."""
     create_enclaves(root, ["/c", "/d"], now=NOW)
@@ -439,7 +441,7 @@ def serial_of(path: Path) -> int:
     return x509.load_pem_x509_certificate(path.read_bytes()).serial_number
 
 
-@pytest.mark.parametrize("how", ["deleted", "another", "elsewhere"])
+@pytest.mark.parametrize("how", some(["deleted", "another", "elsewhere"], 1))
 def test_without_the_old_key_revoking_waits_for_the_end(
     how: str, separate: Path, tmp_path: Path
 ) -> None:
