@@ -35,15 +35,19 @@ from sros_tool.agent.running import (
 )
 from sros_tool.agent.settings import AgentSettings, agent_folder
 from sros_tool.agent.state import read_seal, read_state, write_seal, write_state
+from sros_tool.checks.keystores.installed import (
+    InstalledEnclave,
+    exposed_sentences,
+    open_installed,
+    unusable_sentences,
+)
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.files import remove_file, replace_file, staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     CONFIRMED_FILES,
     LONGEST_LIST,
-    LONGEST_PROBLEM,
     MESSAGE_FILE,
-    MOST_PROBLEMS,
     MOST_REQUESTS,
     Confirmation,
     EnclaveExpiry,
@@ -53,6 +57,7 @@ from sros_tool.keystore.confirmation import (
     lacks_key,
     make_confirmation,
     render_confirmation,
+    shortened_problems,
 )
 from sros_tool.keystore.delivery.archive import listed_digests
 from sros_tool.keystore.delivery.release import Release, sealed_robot
@@ -68,8 +73,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     search_enclaves,
 )
-from sros_tool.keystore.participant import evaluated
-from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, open_enclave, read_certificate
+from sros_tool.keystore.reader import read_certificate
 from sros_tool.keystore.transaction.transaction import recover_keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import make_request, validity_of
@@ -188,9 +192,10 @@ class _Round:
         if repaired and abs(now - repaired) < _REPAIRED_FOR:
             self._problems.append(self._state.repaired)
         names = self._enclaves()
-        opened = self._open(names, now)
+        opened = open_installed(self._folder, names, now=now)
         if clock is not RobotClock.BEHIND:  # what is wrong is seen on a clock that is right
-            self._note_unusable(opened)
+            self._problems += unusable_sentences(opened)
+        self._problems += exposed_sentences(self._folder, now)
         self._note_due(installation.changed, names)
         restarted: Sequence[str] = ()
         if clock is not RobotClock.BEHIND:  # nodes would not accept their certificates
@@ -453,23 +458,8 @@ class _Round:
             if (enclave_path(self._folder, name) / CERTIFICATE_FILE).exists()
         )
 
-    def _open(self, names: Iterable[str], now: datetime) -> dict[str, _Opened]:
-        opened, files = {}, FilesReadOnce()
-        for name in names:
-            place = enclave_path(self._folder, name)
-            with suppress(SrosError, OSError):
-                state = open_enclave(place, now=now, files=files)
-                evaluation = evaluated(name, place, state, moment=now)
-                opened[name] = _Opened(evaluation.state, "; ".join(evaluation.problems_here))
-        return opened
-
-    def _note_unusable(self, opened_enclaves: Mapping[str, _Opened]) -> None:
-        for name, enclave in opened_enclaves.items():
-            if enclave.problem:
-                self._problems.append(f"{name} could not start: {enclave.problem}.")
-
     def _restart(
-        self, names: Iterable[str], opened_enclaves: Mapping[str, _Opened]
+        self, names: Iterable[str], opened_enclaves: Mapping[str, InstalledEnclave]
     ) -> Sequence[str]:
         """Restart the units of enclaves whose restart is due.
 
@@ -532,7 +522,7 @@ class _Round:
     def _confirm(
         self,
         names: Sequence[str],
-        opened_enclaves: Mapping[str, _Opened],
+        opened_enclaves: Mapping[str, InstalledEnclave],
         processes: EnclaveProcesses,
         clock: RobotClock,
         asked: Renewals,
@@ -557,7 +547,7 @@ class _Round:
             expiry={name: _expiry(opened_enclaves.get(name)) for name in names},
             running=processes.with_elsewhere(),
             clock=clock,
-            problems=_shortened_problems(self._problems),
+            problems=shortened_problems(self._problems),
             requests=asked.requests,
             crl=self._list_to_send(names),
         )
@@ -699,18 +689,6 @@ class _Round:
         return [files for _, files in found[:_MOST_CERTIFICATES]]
 
 
-class _Opened(NamedTuple):
-    """An enclave on the robot, and a clause on why no process could start in it, or ""."""
-
-    state: OpenedEnclave
-    problem: str
-
-    def permissions_until(self) -> datetime | None:
-        with suppress(SrosError):
-            return self.state.grant.validity.not_after if self.state.grant else None
-        return None
-
-
 def _sha256(folder: Folder, path: str) -> str:
     """Return the SHA-256 of a file; "" if it is missing or cannot be read."""
     with suppress(SrosError, OSError):
@@ -725,7 +703,7 @@ def _revoked(text: str) -> frozenset[int]:
     return frozenset()
 
 
-def _expiry(enclave: _Opened | None) -> EnclaveExpiry:
+def _expiry(enclave: InstalledEnclave | None) -> EnclaveExpiry:
     if enclave is None:
         return EnclaveExpiry(None, None)
     certificate = enclave.state.certificate
@@ -733,18 +711,6 @@ def _expiry(enclave: _Opened | None) -> EnclaveExpiry:
         until = validity_of(certificate).not_after if certificate else None
         return EnclaveExpiry(until, enclave.permissions_until())
     return EnclaveExpiry(None, enclave.permissions_until())
-
-
-def _shortened_problems(problems: Iterable[str]) -> tuple[str, ...]:
-    """Return problems in the form of a confirmation: not too long, and not too many."""
-    texts = []
-    for problem in dict.fromkeys(problems):
-        text = "".join(each if each.isprintable() else "?" for each in problem)
-        texts.append(text if len(text) <= LONGEST_PROBLEM else f"{text[: LONGEST_PROBLEM - 3]}...")
-    more = len(texts) - MOST_PROBLEMS
-    if more > 0:
-        texts = [*texts[: MOST_PROBLEMS - 1], f"There are {more + 1} more problems."]
-    return tuple(texts)
 
 
 def _sentence(error: SrosError) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from types import MappingProxyType
@@ -118,19 +119,27 @@ def _report(folder: Path, robot: str) -> None:
     """On a robot, print a report of its enclaves' files and its DDS, for `fleet confirm`.
 
     The report is JSON. It has the time, the SHA-256 of each file of the enclaves in DIR except
-    their keys, and the DDS libraries that processes have loaded or that are installed.
+    their keys, and the DDS libraries that processes have loaded or that are installed. Its problems
+    name each enclave in which no process could start, such as without a key that fits its
+    certificate, and files that other users can read or change.
     docs/json.md describes the report under "confirmation".
 
     Example:
       $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
             sros fleet confirm keystore --robot r7 -
     """
-    from sros_tool.keystore.confirmation import make_confirmation, render_confirmation
+    from sros_tool.checks.keystores.installed import installed_sentences
+    from sros_tool.keystore.confirmation import (
+        make_confirmation,
+        render_confirmation,
+        shortened_problems,
+    )
 
     with progress("reading"):
         moment = now()
         confirmation = make_confirmation(folder, robot, now=moment, dds=_dds_here(moment))
-    echo_document(render_confirmation(confirmation))
+        problems = shortened_problems(installed_sentences(folder, confirmation.enclaves(), moment))
+    echo_document(render_confirmation(replace(confirmation, problems=problems)))
 
 
 def _dds_here(moment: datetime) -> RobotDds:

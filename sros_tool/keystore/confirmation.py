@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -199,9 +199,19 @@ the robot: there is no key, or the certificate is for another one.
 """
 
 
+COULD_NOT_START = "could not start"
+"""What a robot says of an enclave in which no process would start."""
+
+
 def lacks_key(problem: str) -> bool:
-    """Return whether a problem of an agent is about a key, which no release can bring."""
-    return KEY_NOT_HERE in problem or OF_ANOTHER_KEY in problem
+    """Return whether a problem of a robot is about a key, which no release can bring."""
+    is_of_key = is_unusable(problem) and KEY_FILE in problem
+    return is_of_key or KEY_NOT_HERE in problem or OF_ANOTHER_KEY in problem
+
+
+def is_unusable(problem: str) -> bool:
+    """Return whether a problem of a robot is that no process would start in an enclave."""
+    return f" {COULD_NOT_START}: " in problem
 
 
 def enclave_of(path: str) -> str:
@@ -256,6 +266,18 @@ def make_confirmation(
     if dds and (more := len(dds.libraries) - _MOST_LIBRARIES) > 0:
         dds = RobotDds(dds.libraries[:_MOST_LIBRARIES], min(dds.unseen + more, _MOST_UNSEEN))
     return Confirmation(robot, now, files, certificates, dds)
+
+
+def shortened_problems(problems: Iterable[str]) -> tuple[str, ...]:
+    """Return problems in the form of a confirmation: not too long, and not too many."""
+    texts = []
+    for problem in dict.fromkeys(problems):
+        text = "".join(each if each.isprintable() else "?" for each in problem)
+        texts.append(text if len(text) <= LONGEST_PROBLEM else f"{text[: LONGEST_PROBLEM - 3]}...")
+    more = len(texts) - MOST_PROBLEMS
+    if more > 0:
+        texts = [*texts[: MOST_PROBLEMS - 1], f"There are {more + 1} more problems."]
+    return tuple(texts)
 
 
 def _confirmed_files(root: Path, folder: Folder, name: str) -> dict[str, bytes]:

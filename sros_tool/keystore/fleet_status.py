@@ -38,6 +38,7 @@ from sros_tool.keystore.confirmation import (
     RunningFiles,
     certificate_digests,
     enclave_of,
+    is_unusable,
     lacks_key,
     last_confirmation,
     refusals,
@@ -80,6 +81,8 @@ class State(StrEnum):
     """The robot has no enclave in the keystore."""
     RESTART = "restart"
     """The robot has the present files, and processes that still run with earlier ones."""
+    UNUSABLE = "unusable"
+    """The robot has the present files, and says that no process could start in an enclave."""
     EARLIER = "earlier"
     """An earlier file that the keystore issued for the same enclave."""
     DIFFERENT = "different"
@@ -205,6 +208,8 @@ class RobotStatus:
     state: State
     """The worst state of the robot's files; ``revoked`` also if all its enclaves were revoked
     (``enclaves`` is 0); ``restart``: they are current, but processes still run with earlier ones;
+    ``unusable``: they are current, but the robot says that no process could start in an enclave,
+    such as without its key;
     ``expired``: one of its files has expired (`expiry`);
     ``offline``: its last confirmation is too old (`overdue`); ``later``: it says that it has a
     later release than was ever published for it, so that nothing in its message is reliable;
@@ -252,8 +257,8 @@ class RobotStatus:
     dds: RobotDds | None
     """The DDS of the robot by its last confirmation; null if the confirmation does not tell."""
     problems: tuple[str, ...] | None
-    """What the robot's agent could not do, in its own words, or that it fetches from an old copy of
-    what was published; null if the confirmation does not tell."""
+    """What the robot's agent could not do, or what is wrong on the robot, in its own words, or that
+    it fetches from an old copy of what was published; null if the confirmation does not tell."""
     notes: tuple[str, ...]
     """Remarks, as clauses, such as on the robot's clock."""
     to_do: str = ""
@@ -333,6 +338,8 @@ class RobotStatus:
             return "look into it" if self.problems else ""
         if self.state in _TO_DO:
             return _TO_DO[self.state]
+        if self.state is State.UNUSABLE:
+            return "deliver" if self.lacks_key else "look into it"
         if self.state is State.EXPIRED and not self.pending:
             return "renew"
         if not self.fetches or self.lacks_key:
@@ -911,11 +918,13 @@ def _status(
         state = max((file.state for file in different), key=_BADNESS.__getitem__)
     elif not compared_robot.enclaves:
         state = State.NONE
-    elif restart:
-        state = State.RESTART
+    elif compared_robot.received is None:
+        state = State.NEVER
     else:
-        state = State.NEVER if compared_robot.received is None else State.CURRENT
+        state = State.RESTART if restart else State.CURRENT
     received, confirmed = compared_robot.received, compared_robot.confirmed
+    if compared_robot.enclaves and any(map(is_unusable, (confirmed and confirmed.problems) or ())):
+        state = max(state, State.UNUSABLE, key=_BADNESS.__getitem__)
     is_later = bool(
         compared_robot.enclaves
         and confirmed
@@ -964,7 +973,7 @@ def _status(
         renew_from=min(
             (file.window.expires_soon_from() for file in validity.values()), default=None
         ),
-        lacks_key=known.lacks_key(compared_robot) if different else (),
+        lacks_key=known.lacks_key(compared_robot) if different or state is State.UNUSABLE else (),
         is_locked_out=bool(compared_robot.enclaves) and certificates == {State.REVOKED},
     )
     if not (different and status.fetches and known.reads_copy(compared_robot, status.last_heard)):

@@ -369,7 +369,7 @@ def _demo_row(row: Json) -> Iterator[str]:
 # ── a fleet ──────────────────────────────────────────────────────────────────────────────────────
 
 _GOOD = ("current", "none")
-_OUT_OF_DATE = ("restart", "earlier", "different", "missing", "offline", "never")
+_OUT_OF_DATE = ("restart", "unusable", "earlier", "different", "missing", "offline", "never")
 
 
 def render_fleet_page(

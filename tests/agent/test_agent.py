@@ -390,6 +390,20 @@ def test_a_disk_of_yesterday_goes_on(home: Home, r1: Robot, tmp_path: Path) -> N
     assert last and now and now > last, "home takes it"
 
 
+def test_a_round_names_what_no_process_could_start_with_and_what_others_can_change(
+    r1: Robot,
+) -> None:
+    (r1.folder / "enclaves/r1/a/key.pem").unlink()
+    (r1.folder / "enclaves/r1/b").chmod(0o777)
+    (r1.folder / "enclaves/r1/c/key.pem").chmod(0o644)
+    r1.release = None
+    r1.round()
+    start, folder, key = sorted(r1.message().problems or ())
+    assert start == "/r1/a could not start: key.pem: missing."
+    assert folder.startswith("enclaves/r1/b: a file or folder that everybody can change")
+    assert key.startswith("enclaves/r1/c/key.pem: a private key that others can read")
+
+
 # ── the clock ──────────────────────────────────────────────────────────────────────────────
 
 

@@ -211,6 +211,43 @@ def test_a_robot_that_got_the_files_of_another_one(field: Field) -> None:
     assert "2 files of r2" in field.run("fleet", "status", "ks", status=1).out
 
 
+def test_a_robot_without_a_key_that_fits(field: Field) -> None:
+    """Its confirmed files are current, and no process would start with them."""
+    for robot in ("r1", "r2"):
+        (field.folder / robot / ENCLAVES / robot / "base/key.pem").unlink()
+    other = field.folder / "r3" / ENCLAVES / "r3/base/key.pem"
+    (field.folder / "r2" / ENCLAVES / "r2/base/key.pem").write_bytes(other.read_bytes())
+    (field.folder / "r2" / ENCLAVES / "r2/base/key.pem").chmod(0o600)
+    other.write_text("damaged")
+    for robot in ROBOTS:
+        field.confirm(robot)
+    assert field.states() == dict.fromkeys(ROBOTS, "unusable")
+    for name, found in field.status()["robots"].items():
+        (problem,) = found["problems"]
+        assert problem.startswith(f"/{name}/base could not start: key.pem: "), problem
+        assert found["to_do"] == "deliver"
+    assert "could not start: key.pem: missing" in field.run("fleet", "status", "ks", status=1).out
+    field.deliver(*ROBOTS)
+    assert field.states() == dict.fromkeys(ROBOTS, "current")
+    field.send("r1", problems=["/r1/base could not start: permissions.p7s: expired."], restart=[])
+    found = field.status()["robots"]["r1"]
+    assert (found["state"], found["to_do"]) == ("unusable", "look into it")
+
+
+def test_files_of_a_robot_that_others_can_read_or_change(field: Field) -> None:
+    place = field.folder / "r1" / ENCLAVES / "r1/base"
+    place.chmod(0o777)
+    (place / "permissions.p7s").chmod(0o666)
+    (place / "key.pem").chmod(0o644)
+    field.confirm("r1")
+    found = field.status()["robots"]["r1"]
+    folder, key, permissions = sorted(found["problems"], key=lambda text: text.partition(":")[0])
+    assert folder.startswith("enclaves/r1/base: a file or folder that everybody can change: its mo")
+    assert permissions.startswith("enclaves/r1/base/permissions.p7s: a file or folder that everyb")
+    assert key == "enclaves/r1/base/key.pem: a private key that others can read: its mode is 0644."
+    assert found["to_do"] == "look into it"
+
+
 def test_files_that_the_keystore_never_issued(field: Field) -> None:
     with (field.folder / "r1" / ENCLAVES / "r1/base/permissions.p7s").open("a") as file:
         file.write("\n")
@@ -784,6 +821,7 @@ def test_the_module_on_the_robot_confirms_the_same(field: Field) -> None:
         if path.is_file()
     }
     said = json.loads(field.run("fleet", "report", "r1", "--robot", "r1").out)
+    assert said.pop("problems") == [], "the module does not look for them"
     made = module.confirmation("r1", files, parse_iso(said["time"]).timestamp(), [])
     assert parse_confirmation(json.dumps(made).encode(), "it").dds
     assert made.pop("restart") == [], "sros does not know which processes were restarted"
