@@ -443,6 +443,14 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "another governance, or a packet was damaged or forged",
         f"If this continues, restart both sides. {_PEERS}",
     ),
+    _log_text(
+        "peer-governance", _FAST, r"Security manager returns an error for (?:reader|writer)",
+        "a publisher or subscription of a PEER was refused. Without another line with the reason, "
+        "the governance of the peer protects the topic differently: the processes have enclaves "
+        "of different keystores, or one was started before the governance changed",
+        "`sros check KEYSTORE OTHER`, with the keystore or export of the peer, names the topic. "
+        "Export the enclaves of both again from one keystore, and restart both.", weak=1,
+    ),
     # ── Fast DDS, starting ─────────────────────────────────────────────────────────────────
     _log_text(
         "identity", _FAST, r"SECURITY\s*Error\]\s*->\s*Function validate_local_identity"

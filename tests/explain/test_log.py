@@ -336,6 +336,8 @@ def test_without_a_keystore(file: str, ids: list[str]) -> None:
         ("[SECURITY Error] Malformed permissions file", "malformed"),
         ("File could not be found, opened or is empty, path: /k/a.pem(code: 117)", "file-missing"),
         ("partition not found in rule", "partition"),
+        ("[RTPS_EDP Error] Security manager returns an error for writer bd.e6.f5.35|0.0.13.3 -> "
+         "Function operator()", "peer-governance"),
         ("RuntimeError: filesystem error: status: Permission denied [/k/enclaves/a/governance.p7s]",
          "file-unreadable"),
         ("rclpy._rclpy_pybind11.RCLError: Failed to create subscription: invalid allocator",

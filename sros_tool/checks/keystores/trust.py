@@ -60,7 +60,7 @@ PEERS_PROTECTION = FindingKind(
     WARNING,
     "keystores or exports whose governance protects messages differently",
     "Both ends of a connection have to protect messages in the same way. Where they differ, nodes "
-    "do not hear each other, and Fast DDS logs nothing about it.",
+    "do not hear each other, and Fast DDS does not log why.",
     "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; tested.",
     "If one of them is an earlier export, export its enclaves again, and restart the processes. "
     "Otherwise give both keystores the same protection (`sros inspect` shows it, `sros "
