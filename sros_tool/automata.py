@@ -239,7 +239,7 @@ class Automaton:
         after: dict[int, list[tuple[Letters, int]]] = {}
         for at, letters, to in self.edges:
             after.setdefault(at, []).append((letters, to))
-        return _only_way(after, 0, self.ends)
+        return _forced_text(after, 0, self.ends)
 
     @cached_property
     def suffix(self) -> str:
@@ -249,7 +249,7 @@ class Automaton:
         before: dict[int, list[tuple[Letters, int]]] = {}
         for at, letters, to in self.edges:
             before.setdefault(to, []).append((letters, at))
-        return _only_way(before, next(iter(self.ends)), frozenset((0,)))[::-1]
+        return _forced_text(before, next(iter(self.ends)), frozenset((0,)))[::-1]
 
     @cached_property
     def order(self) -> tuple[str, str, str]:
@@ -263,7 +263,7 @@ class Automaton:
         )
 
 
-def _only_way(
+def _forced_text(
     edges: Mapping[int, Sequence[tuple[Letters, int]]], at: int, stops: frozenset[int]
 ) -> str:
     """Return the text that must follow position ``at``, up to a fork or a position in ``stops``."""
@@ -805,7 +805,7 @@ def _including_automata(node: _Node) -> frozenset[Automaton]:
             spare = len(node.of) - node.count
             return frozenset(automaton for automaton, number in counts.items() if number > spare)
         case _First(last=False):
-            return _in_all(_including_automata(part) for part, says in node.of if says)
+            return _common_automata(_including_automata(part) for part, says in node.of if says)
     return frozenset()
 
 
@@ -815,13 +815,13 @@ def _excluding_automata(node: _Node) -> frozenset[Automaton]:
         case _Not():
             return _including_automata(node.of)
         case _Intersection():
-            return _in_all(map(_excluding_automata, node.of))
+            return _common_automata(map(_excluding_automata, node.of))
         case _First(last=True):
-            return _in_all(_including_automata(part) for part, says in node.of if not says)
+            return _common_automata(_including_automata(part) for part, says in node.of if not says)
     return frozenset()
 
 
-def _in_all(sets: Iterable[frozenset[Automaton]]) -> frozenset[Automaton]:
+def _common_automata(sets: Iterable[frozenset[Automaton]]) -> frozenset[Automaton]:
     """Return the automata that are in all of the sets; none if there are no sets."""
     first, *others = [*sets] or [frozenset[Automaton]()]
     return first.intersection(*others)

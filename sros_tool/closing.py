@@ -45,8 +45,8 @@ from sros_tool.graph.observation import (
     SUBSCRIBE,
     Observation,
     ObservedNode,
-    from_json,
     make_observation,
+    observation_from_json,
 )
 from sros_tool.keystore.layout import (
     CLOSED_OBSERVER,
@@ -288,7 +288,7 @@ class ObservedProcesses(NamedTuple):
         program = [each for each in self.processes if each.enclave in names]
         return min((each.chooses, each.enclave) for each in program)[1]
 
-    def by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
+    def commands_by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
         """Map shell commands to the processes that they start and that no unit starts alone.
 
         A Zenoh router comes first: nodes wait for it.
@@ -393,7 +393,7 @@ class Closing(NamedTuple):
     @property
     def left_by_hand(self) -> Mapping[str, Sequence[ClosedProcess]]:
         """The commands to run by hand for the enclaves in ``left``, with their processes."""
-        by_hand = self.observed.by_hand(self.folder.absolute())
+        by_hand = self.observed.commands_by_hand(self.folder.absolute())
         return {
             command: processes
             for command, processes in by_hand.items()
@@ -806,7 +806,7 @@ class OpenRobot:
         """Return the processes of the enclaves that the policy has, as they run now."""
         running = ProcessTable().look(self._shell.now())
         observed, new = ObservedProcesses(self.domain), set[str]()
-        present = self._in_their_enclaves(running)
+        present = self._enclaves_with_process(running)
         names = {enclave.name for _, enclave in self._secured(running)} - {_OBSERVER}
         secured = {name: name in present for name in sorted(names)}
         if self.observed:
@@ -1042,7 +1042,9 @@ class OpenRobot:
         }
         try:
             nodes = []
-            for node in from_json(json.loads(read_bytes(self.seen, "observation"))).nodes:
+            for node in observation_from_json(
+                json.loads(read_bytes(self.seen, "observation"))
+            ).nodes:
                 if names.issuperset(node.enclaves):
                     nodes.append(node)
                 elif place := moved.get((node.ns, stable_name(node.name))):
@@ -1121,7 +1123,7 @@ class OpenRobot:
     def _command_lines(self, closing: Closing) -> list[str]:
         """Return the commands that start processes by hand: first those that are due now."""
         folder, due = self.folder.absolute(), closing.left_by_hand
-        commands = closing.observed.by_hand(folder)
+        commands = closing.observed.commands_by_hand(folder)
         rest = {command: commands[command] for command in commands if command not in due}
         place = "by its command, in the place that starts it today."
         lines = [
@@ -1315,9 +1317,9 @@ class OpenRobot:
         self._restart(sorted({*observed.units.values()} | of_drop_ins), dry_run=dry_run)
         changes = [FileChange("remove", str(path)) for path in drop_ins]
         closing = self._closing()._replace(dry_run=dry_run, changes=changes)
-        return closing._replace(problems=[*self._not_open(observed)])
+        return closing._replace(problems=[*self._texts_to_open(observed)])
 
-    def _not_open(self, observed: ObservedProcesses) -> Iterator[str]:
+    def _texts_to_open(self, observed: ObservedProcesses) -> Iterator[str]:
         """Yield, for each process that runs in an enclave or does not run, how to start it open.
 
         Processes of enclaves that were taken out of the policy are left out.  What sros cannot
@@ -1333,7 +1335,7 @@ class OpenRobot:
         secured = {enclave.name: process for process, enclave in own}
         if self.policy.exists():
             observed = observed.within(read_policy(self.policy))
-        by_hand = [*chain.from_iterable(observed.by_hand(self.folder).values())]
+        by_hand = [*chain.from_iterable(observed.commands_by_hand(self.folder).values())]
         closed = [process for process in by_hand if process.enclave in secured]
         for command in dict.fromkeys(process.open_command for process in closed):
             yield f"restart it open: {command}"
@@ -1394,7 +1396,7 @@ class OpenRobot:
         table, end = ProcessTable(), time.monotonic() + patience
         while True:
             running = table.look(self._shell.now())
-            missing = sorted(expected - self._in_their_enclaves(running))
+            missing = sorted(expected - self._enclaves_with_process(running))
             if not missing:
                 break
             if time.monotonic() > end:
@@ -1407,7 +1409,7 @@ class OpenRobot:
                     return [Proof(_CLAIM, False, why)]
                 break
             time.sleep(0.2)
-        nodes, without_profile = self._by_profile(self._observation().nodes)
+        nodes, without_profile = self._divide_by_profile(self._observation().nodes)
         not_here = self._not_here
         # A laptop may be away; a computer whose nodes were seen has to be seen again.
         may_be_away = not_here - {node.enclaves[0] for node in nodes}
@@ -1429,7 +1431,7 @@ class OpenRobot:
         silence = self._proof_of_silence(before, hears=talk.holds is not None)
         return [proof, self._proof_of_files(), *self._proof_of_requirements(), talk, silence]
 
-    def _by_profile(
+    def _divide_by_profile(
         self, nodes: Iterable[ObservedNode]
     ) -> tuple[list[ObservedNode], list[ObservedNode]]:
         """Divide nodes into those with a profile in the policy, and those without."""
@@ -1501,7 +1503,7 @@ class OpenRobot:
             reasons.append(f"earlier files in the processes of {', '.join(old)}; restart them")
         return "; ".join(reasons)
 
-    def _in_their_enclaves(self, running: RunningProcesses) -> set[str]:
+    def _enclaves_with_process(self, running: RunningProcesses) -> set[str]:
         """Return the enclaves in which a process runs with the present files of the export."""
         return {
             enclave.name
@@ -1533,7 +1535,7 @@ class OpenRobot:
         found = process_findings(here, running, now=now, zone=self._shell.zone)
         findings = [finding for finding in found if finding.severity > NOTE]
         present, known = (
-            self._in_their_enclaves(running),
+            self._enclaves_with_process(running),
             self.observed or ObservedProcesses(self.domain),
         )
         closed = {tuple(process.command): process.enclave for process in known.processes}
@@ -1574,7 +1576,7 @@ class OpenRobot:
             except UnavailableError as error:
                 return Proof(_TALK, None, f"{error}")
             wrong = {
-                "gone": _lost_endpoints(before, from_json(value), denied),
+                "gone": _lost_endpoints(before, observation_from_json(value), denied),
                 "denied": [f"{right['enclave']} {right['name']}" for right in value["denied"]],
                 "refused": [refused["enclave"] for refused in value["refused"]],
                 "not seen": [
@@ -1591,7 +1593,7 @@ class OpenRobot:
                 but = f", but for {counted(len(denied), 'right')} that the policy denies now"
                 seen = f"{number} with {before.endpoint_count} endpoints as before"
                 left = f", without {', '.join(missing)}" if missing else ""
-                _, others = self._by_profile(from_json(value).nodes)
+                _, others = self._divide_by_profile(observation_from_json(value).nodes)
                 known = {*map(_node_name, before.nodes)}
                 new = sorted(
                     f"{_node_name(node)} in {' or '.join(node.enclaves) or 'no enclave'}"

@@ -112,17 +112,17 @@ class Distribution(NamedTuple):
         )
         return ", ".join(parts)
 
-    def of_product(self, product: str) -> Shipped | None:
+    def shipped_product(self, product: str) -> Shipped | None:
         """Return the release of a product that this distribution ships, or None."""
         return next((shipped for shipped in self.shipped if shipped.product == product), None)
 
-    def of_vendor(self, vendor: Vendor) -> Shipped:
+    def shipped_vendor_product(self, vendor: Vendor) -> Shipped:
         """Return the release that it ships of a vendor's product, such as of ``cyclonedds``.
 
         Raises:
             UsageError: it ships another release than the vendor names, or sros knows no release.
         """
-        shipped = self.of_product(vendor.traits.product)
+        shipped = self.shipped_product(vendor.traits.product)
         if shipped and (shipped.vendor is vendor or "-" not in vendor.value):
             return shipped
         raise UsageError(
@@ -187,7 +187,7 @@ def selected_vendors(vendor: str, distributions: Sequence[Distribution]) -> tupl
     if not vendor or not distributions:
         chosen = [each for known in distributions for each in known.vendors]
         return (vendor,) if vendor else tuple(dict.fromkeys(each.value for each in chosen))
-    shipped = (known.of_vendor(Vendor(vendor)).vendor.value for known in distributions)
+    shipped = (known.shipped_vendor_product(Vendor(vendor)).vendor.value for known in distributions)
     return tuple(dict.fromkeys(shipped))
 
 

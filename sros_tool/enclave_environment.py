@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.layout import PERMISSIONS_FILE, in_keystore_of
-from sros_tool.keystore.reader import of_one_state
+from sros_tool.keystore.reader import read_consistently
 from sros_tool.owners import other_writers
 from sros_tool.wording import first_few
 
@@ -52,7 +52,7 @@ class EnclaveEnvironment:
     needs_pin: bool = False
 
 
-@of_one_state
+@read_consistently
 def loadable_environment(
     root: Path,
     name: str,
@@ -733,7 +733,7 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
     raise UsageError(f"the policy '{file}' has the node {full} {where}", why, remedy)
 
 
-def other_node(
+def other_node_notes(
     root: Path, enclave: str, command: Sequence[str], *, now: datetime
 ) -> tuple[Note, ...]:
     """Return a note if a command gives its nodes a name that the enclave's permissions lack.

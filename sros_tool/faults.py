@@ -451,10 +451,10 @@ class Fault(Enum):
                 "{root} {enclave} TARGET --force`. If the file is missing there, too, first "
                 f"{text[0].lower()}{text[1:]}"
             )
-        return in_original_keystore(text)
+        return remedy_in_original_keystore(text)
 
 
-def in_original_keystore(remedy: str) -> str:
+def remedy_in_original_keystore(remedy: str) -> str:
     """Return the remedy for an export: to do ``remedy`` in the keystore with the CA keys."""
     then = "" if remedy.endswith("export the enclave again.") else " Then export the enclave again."
     return f"In the {ORIGINAL_KEYSTORE}: {remedy}{then}"

@@ -48,7 +48,7 @@ class Tally:
         self._counts[:] = memoryview(bytes(8 * _MOST_PROCESSES)).cast("Q")
         self.total, self._began = total, time.monotonic()
 
-    def of_worker(self, place: int) -> None:
+    def use_worker_slot(self, place: int) -> None:
         """Count this worker's finished items in slot ``place``, which no other worker uses."""
         self._place = place
 
@@ -113,7 +113,7 @@ def map_slices(
         tally.begin(len(items))
     try:
         with _rare_collections():
-            return _on_slices(items, work, count)
+            return _run_on_slices(items, work, count)
     finally:
         for tally in _tallies:
             tally.begin(0)
@@ -130,7 +130,7 @@ def _rare_collections() -> Iterator[None]:
         gc.set_threshold(*before)
 
 
-def _on_slices(
+def _run_on_slices(
     items: Sequence[Item], work: Callable[[Sequence[Item]], Result], count: int
 ) -> list[tuple[Sequence[Item], Result]]:
     bounds = [len(items) * index // count for index in range(count + 1)]
@@ -177,7 +177,7 @@ def _fork(
         _die_with(parent)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for tally in _tallies:
-            tally.of_worker(len(workers) + 1)
+            tally.use_worker_slot(len(workers) + 1)
         with open(writer, "wb") as pipe:
             pickle.dump(_result_or_error(items, work), pipe)
     finally:

@@ -234,7 +234,7 @@ class Network:
             if each.topic in met:
                 continue
             for domains in joined.get(enclave, (None,)) if each.join_needs_right else (None,):
-                if common := _in_common(each.domains, domains):
+                if common := _common_domain_set(each.domains, domains):
                     ends[each.direction].append(_Access(enclave, each.topic, met, *common))
         self._sides = {direction: _Direction(accesses) for direction, accesses in ends.items()}
         self._router_of = links.router_of if links else {}
@@ -309,7 +309,7 @@ class Network:
 
     def _carried_topic(self, writer: _Access, reader: _Access) -> str:
         """Return a DDS topic that a writer may write and a reader gets, or ""."""
-        if not _in_common(writer.domains, reader.domains):
+        if not _common_domain_set(writer.domains, reader.domains):
             return ""
         sending, receiving = (self._router_of.get(end.enclave, "") for end in (writer, reader))
         if sending == receiving:
@@ -330,7 +330,7 @@ def _domains_by_enclave(rights: DomainRights) -> dict[str, list[DomainSet | None
     return joined
 
 
-def _in_common(
+def _common_domain_set(
     one: DomainSet | None, other: DomainSet | None
 ) -> tuple[DomainSet | None] | tuple[()]:
     """Return the ROS domains that two sets have in common, in a tuple; () if there are none."""

@@ -66,13 +66,13 @@ def _escapes() -> dict[int, str]:
 
 
 @cache
-def _in_json() -> dict[int, str]:
+def _json_escapes() -> dict[int, str]:
     return {code: f"\\u{code:04x}" for code in (*_CONTROLS, *range(0xD800, 0xE000))}
 
 
 def visible_json(document: str) -> str:
     """Replace the control characters in a JSON document with JSON escapes of the same value."""
-    return document.translate(_in_json())
+    return document.translate(_json_escapes())
 
 
 def echo(*parts: str | Coloured, err: bool = False) -> None:

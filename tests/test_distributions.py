@@ -42,6 +42,6 @@ def test_an_unknown_distribution_is_refused_with_all_that_are_known() -> None:
 
 def test_a_vendor_without_a_release_means_what_the_distribution_ships() -> None:
     lyrical = find_distribution("lyrical")
-    assert lyrical.of_vendor(Vendor.CYCLONE).vendor is Vendor.CYCLONE_11
+    assert lyrical.shipped_vendor_product(Vendor.CYCLONE).vendor is Vendor.CYCLONE_11
     with pytest.raises(UsageError, match="It ships Fast DDS"):
-        lyrical.of_vendor(Vendor.CONNEXT)
+        lyrical.shipped_vendor_product(Vendor.CONNEXT)

@@ -525,7 +525,9 @@ def test_denied_services_of_a_node_take_it_away(
     assert tuple(graph_rules("/e", 0, rights, nodes_in_rules(rules, "/e"))) == rules
     own = RemoteRights("/e", rules)
     peer = RemoteRights("/p", tuple(graph_rules("/p", 0, rights, profiles)))
-    direct = next(r for r in RightsBetween((own, peer)).of_all("/p") if r.common_name == "/e")
+    direct = next(
+        r for r in RightsBetween((own, peer)).rights_for_others("/p") if r.common_name == "/e"
+    )
     for remote in (own, direct):
         control = AccessControl((remote,))
         for announced in ("NN/%e/{}", "MP/%e/{}/%chatter/t/h/q"):

@@ -24,14 +24,14 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from sros_tool.agent.connection import REFUSALS, GuardedConnection, ended_tls
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
-from sros_tool.agent.install import Installation, install_release, made_at, newest_list
+from sros_tool.agent.install import Installation, install_release, newest_list, release_time
 from sros_tool.agent.running import (
     EnclaveProcesses,
     Systemd,
+    enclaves_to_restart,
     kernel_clock,
     look_at_processes,
     restart_units,
-    still_due,
 )
 from sros_tool.agent.settings import AgentSettings, agent_folder
 from sros_tool.agent.state import read_seal, read_state, write_seal, write_state
@@ -202,7 +202,7 @@ class _Round:
             restarted = self._restart(names, opened)
         seen = self._look_after(restarted, names)
         self._problems += [f"{problem}." for problem in seen.problems]
-        due = still_due(self._state.due, seen)
+        due = enclaves_to_restart(self._state.due, seen)
         unseen = tuple(name for name in due if seen.states[name] is RunningFiles.NOT_SEEN)
         self._state = replace(self._state, due=due, unseen=unseen)
         asked = self._renewals(names)
@@ -280,7 +280,7 @@ class _Round:
     def _fetch_and_install(self, certain_time: datetime) -> tuple[Installation, bool]:
         """Fetch and install a release; return what changed, and whether the source was reached."""
         settings, state = self._settings, self._state
-        others = self._other_files()
+        others = self._changed_files()
 
         def fetch(certificate: ClientCertificate | None) -> Release | None:
             return self._machine.fetch(
@@ -318,7 +318,7 @@ class _Round:
             self._note_repaired(release.number, tuple(repaired))
         return installation, True
 
-    def _other_files(self) -> tuple[str, ...] | None:
+    def _changed_files(self) -> tuple[str, ...] | None:
         """Return the paths of files that are missing, or not those of the installed release.
 
         None if no release is installed with all its enclaves, or its seal cannot be read.
@@ -411,7 +411,7 @@ class _Round:
         If documents have proven that the clock is behind, the keystore's clock counts, by which the
         release was made; a clock that may be right is never overruled.
         """
-        made = made_at(release) if self._machine.now < certain_time - _TOLERANCE else None
+        made = release_time(release) if self._machine.now < certain_time - _TOLERANCE else None
         return max(certain_time, made) if made else certain_time
 
     def _differs_from_accepted(self, release: Release) -> bool:
@@ -476,7 +476,7 @@ class _Round:
         ]
         done = restart_units(
             settings,
-            still_due(self._state.due, seen),
+            enclaves_to_restart(self._state.due, seen),
             routers=routers,
             unusable={
                 name: enclave.problem
@@ -738,7 +738,7 @@ def send(
 
     Raises:
         UnavailableError: the inbox cannot be reached, or does not take the message; `RefusedError`
-            if it answers as to a certificate that it refuses.
+            if it seems to refuse the client certificate.
     """
     if not inbox.startswith(("https://", "http://")):
         _write_message(Path(inbox), robot, message)

@@ -158,7 +158,7 @@ def install_release(
         tuple(name for name in removed if name in changes),
         kept,
         # What is not valid yet proves nothing: the clock of the keystore may have been ahead.
-        _made_at(files for name, files in enclaves.items() if name not in kept),
+        _newest_validity_start(files for name, files in enclaves.items() if name not in kept),
     )
 
 
@@ -294,12 +294,12 @@ def newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationLi
     return max(signed, key=list_number, default=None)
 
 
-def made_at(release: Release) -> datetime | None:
+def release_time(release: Release) -> datetime | None:
     """Return when the newest certificate or revocation list in a release began to be valid."""
-    return _made_at(release.enclaves().values())
+    return _newest_validity_start(release.enclaves().values())
 
 
-def _made_at(enclaves: Iterable[Mapping[str, bytes]]) -> datetime | None:
+def _newest_validity_start(enclaves: Iterable[Mapping[str, bytes]]) -> datetime | None:
     """Return when the newest certificate or revocation list of enclaves began to be valid."""
     moments = []
     for files in enclaves:

@@ -144,7 +144,9 @@ def _state(processes: Iterable[Process]) -> RunningFiles:
     return RunningFiles.CURRENT if seen else RunningFiles.NOT_SEEN
 
 
-def still_due(due_enclaves: Iterable[str], processes: EnclaveProcesses) -> tuple[str, ...]:
+def enclaves_to_restart(
+    due_enclaves: Iterable[str], processes: EnclaveProcesses
+) -> tuple[str, ...]:
     """Return the enclaves whose processes have to be restarted.
 
     A restart is done when the processes of the enclave were seen with the installed files, or when

@@ -148,7 +148,7 @@ def write_seal(folder: Path, seal: bytes) -> None:
 
 
 @contextmanager
-def only_agent(folder: Path) -> Iterator[None]:
+def agent_lock(folder: Path) -> Iterator[None]:
     """Let only one agent at a time work in ``folder``.
 
     Raises:

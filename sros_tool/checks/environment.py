@@ -421,14 +421,18 @@ def secured_by(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
     inline = value.lstrip().startswith("<") and "$" not in value
     for part in [value] if inline else filter(None, value.split(",")):
         path = folder / part.strip().removeprefix("file://")
-        yield from _said_in(_CYCLONE_SECURITY, "CYCLONEDDS_URI", part.encode() if inline else path)
+        yield from _security_in_configuration(
+            _CYCLONE_SECURITY, "CYCLONEDDS_URI", part.encode() if inline else path
+        )
     for name in (*_PROFILES, "FASTDDS_ENVIRONMENT_FILE"):
         if text := environment.get(name, ""):
             sought = _PROFILE_SECURITY if name in _PROFILES else _NAMES_PROFILES
-            yield from _said_in(sought, name, folder / text)
+            yield from _security_in_configuration(sought, name, folder / text)
     for path in map(folder.joinpath, _DEFAULT_PROFILES):
         if path.exists():
-            yield from _said_in(_PROFILE_SECURITY, f"'{path.name}' in this folder", path)
+            yield from _security_in_configuration(
+                _PROFILE_SECURITY, f"'{path.name}' in this folder", path
+            )
 
 
 def _secured_by_zenoh(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
@@ -450,7 +454,7 @@ def _secured_by_zenoh(environment: Mapping[str, str], folder: Path) -> Iterator[
         yield f"{named} has security"
 
 
-def _said_in(sought_text: bytes, name: str, place: bytes | Path) -> Iterator[str]:
+def _security_in_configuration(sought_text: bytes, name: str, place: bytes | Path) -> Iterator[str]:
     """Yield that a configuration has security, or cannot be read."""
     try:
         data = place if isinstance(place, bytes) else read_bytes(place, "configuration")

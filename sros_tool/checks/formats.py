@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from sros_tool.checks.kind import Finding, FindingKind, Severity, by_cause
+from sros_tool.checks.kind import Finding, FindingKind, Severity, group_by_cause
 from sros_tool.checks.registry import ChosenFindings
 from sros_tool.errors import SrosError
-from sros_tool.fleet.robots import Fleet, for_any_robot, named_robots
+from sros_tool.fleet.robots import Fleet, named_robots, with_robot_placeholder
 from sros_tool.keystore.expiry import Lifetime, survey
 from sros_tool.keystore.layout import (
     CRL_FILE,
@@ -52,8 +52,8 @@ def folded_findings(
     Findings that share a cause, or that have a line or related places, stay as they are.
     """
     alike: dict[Hashable, list[tuple[tuple[Finding, ...], str]]] = {}
-    for group, others in _by_robot(groups, fleet):
-        kind = group if others else _for_any_enclave(group)
+    for group, others in _merge_robots(groups, fleet):
+        kind = group if others else _key_without_enclave(group)
         alike.setdefault(kind, []).append((group, others))
     for members in alike.values():
         first, *more = members
@@ -64,7 +64,7 @@ def folded_findings(
             yield first[0], f"the same for {counted(len(more), 'more enclave')}: {names}"
 
 
-def _for_any_enclave(group: tuple[Finding, ...]) -> Hashable:
+def _key_without_enclave(group: tuple[Finding, ...]) -> Hashable:
     """Return a key that findings share if they differ only in the enclave that they are about."""
     finding = group[0]
     enclave = finding.subject
@@ -75,7 +75,7 @@ def _for_any_enclave(group: tuple[Finding, ...]) -> Hashable:
     return (finding.id, finding.accepted, *(text.replace(enclave, "{}") for text in texts))
 
 
-def _by_robot(
+def _merge_robots(
     groups: Iterable[tuple[Finding, ...]], fleet: Fleet | None
 ) -> Iterator[tuple[tuple[Finding, ...], str]]:
     """Merge single findings that differ only in one robot; yield the first of each kind.
@@ -131,12 +131,12 @@ def _kinds(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:
     kinds: dict[str, tuple[Hashable, Hashable]] = {}
     for robot in named:
         texts = [
-            for_any_robot(text, robot)
+            with_robot_placeholder(text, robot)
             for text in (first.subject, first.text, first.file, first.remedy)
         ]
         same = (first.id, first.line, first.accepted, *texts)
         for other in named:
-            texts = [for_any_robot(text, other, "other") for text in texts]
+            texts = [with_robot_placeholder(text, other, "other") for text in texts]
         kinds[robot.name] = same, (first.id, first.line, first.accepted, *texts)
     return kinds
 
@@ -147,7 +147,7 @@ def findings_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None = Non
     Findings that differ only in one robot of ``fleet`` are one item.
     """
     rest = "which `sros check` shows"
-    groups = folded_findings(by_cause(chosen_findings.shown), fleet)
+    groups = folded_findings(group_by_cause(chosen_findings.shown), fleet)
     listed = bounded_list((_markdown_item(group, others) for group, others in groups), _MOST, rest)
     title = f"### Findings: {plain(chosen_findings.summary())}"
     return "\n\n".join(part for part in (title, listed) if part) + "\n"

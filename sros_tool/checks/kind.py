@@ -187,7 +187,7 @@ class Finding(NamedTuple):
         return f"{self.file}:{self.line}" if self.line else self.file
 
 
-def by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:
+def group_by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:
     """Yield groups of findings: all that share a cause, or a single one without a cause."""
     groups: dict[Cause, list[Finding]] = {}
     for finding in findings:
@@ -203,7 +203,7 @@ def by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:
             yield tuple(groups[cause])
 
 
-def some_names(names: Sequence[str]) -> str:
+def names_text(names: Sequence[str]) -> str:
     """Return text with the first names and the number of the other names."""
     return first_few(names, _NAMES_SHOWN)
 
@@ -211,7 +211,7 @@ def some_names(names: Sequence[str]) -> str:
 _NAMES_SHOWN = 6
 
 
-def by_id(*kinds: FindingKind) -> Mapping[str, FindingKind]:
+def kinds_by_id(*kinds: FindingKind) -> Mapping[str, FindingKind]:
     """Map each kind's id to the kind; raise for a duplicate id."""
     table = {kind.id: kind for kind in kinds}
     assert len(table) == len(kinds), "duplicate id of a kind of finding"

@@ -25,8 +25,8 @@ from sros_tool.checks.kind import (
     Finding,
     FindingKind,
     RelatedPlace,
-    by_cause,
-    some_names,
+    group_by_cause,
+    names_text,
 )
 from sros_tool.dds.decision.vendors import CYCLONE_DDS, FAST_DDS, Vendor
 from sros_tool.dds.domains import DomainSet
@@ -34,8 +34,8 @@ from sros_tool.dds.permissions import (
     MAX_SIGNED_BYTES,
     Permissions,
     mistaken_names,
+    pairs_text,
     portability_problems,
-    some_pairs,
 )
 from sros_tool.errors import DocumentError, Note, PolicyError, SrosError
 from sros_tool.files import policies_dir
@@ -584,7 +584,11 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             included = gap.included if gap.included and differs(gap.included) else ""
             groups[gap.finding.file, included].append(gap)
     for (_, included), gaps in groups.items():
-        cause = _other_common_part(included, gaps) if included else _no_common_part(gaps)
+        cause = (
+            _different_common_part_cause(included, gaps)
+            if included
+            else _missing_common_part_cause(gaps)
+        )
         for gap in gaps:
             remedy = cause.remedy if included else ""
             shared = cause if len(gaps) > 1 else None
@@ -653,12 +657,12 @@ def _denied_at_start(lacking: Sequence[_Lacking]) -> str:
         if kinds[kind]
     ]
     return (
-        f"{some_names(nodes)} may not {'; '.join(what)}. A node exits at its start if this is "
+        f"{names_text(nodes)} may not {'; '.join(what)}. A node exits at its start if this is "
         "denied."
     )
 
 
-def _other_common_part(folder: str, lacking: Sequence[_Lacking]) -> Cause:
+def _different_common_part_cause(folder: str, lacking: Sequence[_Lacking]) -> Cause:
     """Return the common cause of findings: the included common part is not the one of sros."""
     here, old = quote(folder), quote(f"{folder}.old")
     return Cause(
@@ -671,7 +675,7 @@ def _other_common_part(folder: str, lacking: Sequence[_Lacking]) -> Cause:
     )
 
 
-def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
+def _missing_common_part_cause(lacking: Sequence[_Lacking]) -> Cause:
     """Return the common cause of findings in one file: ``common/node.xml`` is not included."""
     file = Path(lacking[0].finding.file)
     nodes = list(dict.fromkeys(gap.node for gap in lacking))
@@ -681,7 +685,7 @@ def _no_common_part(lacking: Sequence[_Lacking]) -> Cause:
     target = quote(str(file.parent / COMMON))
     first = "Put" if copied else f"Run `sros policies --copy {target}`, and put"
     place = "the <profile> of every node" if plural else "its <profile>"
-    at = f"line{'s' * (len(lines) > 1)} {some_names([str(line) for line in lines])}"
+    at = f"line{'s' * (len(lines) > 1)} {names_text([str(line) for line in lines])}"
     return Cause(
         f"{counted(len(nodes), 'node')} lack the common part"
         if plural
@@ -886,7 +890,7 @@ def _check_portability(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             text = f"it has {len(enclave.profiles)} <profiles>"
             yield SEVERAL_PROFILES.found(enclave.path, text, source.file, source.line)
     if pairs := mistaken_names(enclave.path for enclave in checked_policy.policy.enclaves):
-        text = f"Cyclone DDS mistakes {some_pairs(pairs)}"
+        text = f"Cyclone DDS mistakes {pairs_text(pairs)}"
         first = checked_policy.policy.enclave(pairs[0][0])
         line = first.source.line if first else None
         yield ENCLAVE_NAMES.found(pairs[0][0], text, checked_policy.policy.file, line)
@@ -1156,11 +1160,11 @@ def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
         for namespace, names in fleet.by_namespace.items()
     }
     for namespace, inside in robots.items():
-        if met := _on_one_domain(inside):
+        if met := _robots_on_one_domain(inside):
             yield f"{met[0].name} and {met[1].name} have the namespace {namespace}"
         above = namespace
         while above := above.rpartition("/")[0]:  # a robot in / is meant to be above the others
-            if met := _on_one_domain(inside, robots.get(above, [])):
+            if met := _robots_on_one_domain(inside, robots.get(above, [])):
                 outer, inner = (robot.name for robot in met)
                 yield (
                     f"the namespace of {inner}, {namespace}, is inside {above}, the namespace of "
@@ -1188,13 +1192,13 @@ def _robots_without_enclave(paths: Sequence[Path], fleet: Fleet) -> str:
         meant = {other for group in robot.groups for other in get_close_matches(group, named)}
         if meant:
             groups = ", ".join(robot.groups)
-            clauses.append(f"{robot.name} (group {groups}: perhaps {some_names(sorted(meant))})")
+            clauses.append(f"{robot.name} (group {groups}: perhaps {names_text(sorted(meant))})")
         elif not robot.groups:
             clauses.append(f"{robot.name} (in no group)")
     return f"no enclave for {first_few(clauses, 5)}" if clauses else ""
 
 
-def _on_one_domain(
+def _robots_on_one_domain(
     robots: Sequence[Robot], others: Sequence[Robot] | None = None
 ) -> tuple[Robot, Robot] | None:
     """Return two robots that may be in the same ROS domain, or None.
@@ -1251,7 +1255,7 @@ def _duplicates(path: Path) -> Iterator[tuple[str, int]]:
 def _include_findings(path: Path) -> Iterator[Finding]:
     """Yield findings about the includes of a file; reads an included file only once."""
     graph = _IncludeGraph(Path(os.path.realpath(path)))
-    for includes in graph.by_parent():
+    for includes in graph.includes_by_parent():
         reached = {
             included
             for file in {file for _, file in includes}
@@ -1278,7 +1282,7 @@ class _IncludeGraph:
         self._direct: dict[Path, frozenset[Path]] = {}
         self._reached: dict[Path, frozenset[Path]] = {}
 
-    def by_parent(self) -> Iterator[list[tuple[etree._Element, Path]]]:
+    def includes_by_parent(self) -> Iterator[list[tuple[etree._Element, Path]]]:
         """Yield lists of sibling include elements of the policy file, with the included files."""
         for parent in self._includer.load(self._file).iter():
             includes = list(parent.iterchildren(*_INCLUDES))
@@ -1445,7 +1449,7 @@ def signed_findings(
         parts.append(replace(policy, enclaves=tuple(chosen)))
     shown = [finding for finding in findings_in(parts, distribution) if finding.severity >= WARNING]
     shown.sort(key=lambda finding: -finding.severity.weight)
-    return list(by_cause(list(dict.fromkeys(shown))))
+    return list(group_by_cause(list(dict.fromkeys(shown))))
 
 
 def as_note(findings: tuple[Finding, ...]) -> Note:

@@ -738,7 +738,9 @@ def _first_nodes(nodes: Sequence[Process]) -> str:
 # ── next to each other ─────────────────────────────────────────────────────────────────────
 
 
-def _by_network_and_domain(processes: Iterable[Process]) -> Mapping[tuple[str, str], list[Process]]:
+def _group_by_network_and_domain(
+    processes: Iterable[Process],
+) -> Mapping[tuple[str, str], list[Process]]:
     found: dict[tuple[str, str], list[Process]] = defaultdict(list)
     for process in processes:
         found[_network_and_domain(process)].append(process)
@@ -752,7 +754,7 @@ def _mixed_vendor_findings(
 
     ``environment`` is the environment of this shell if it enables security, otherwise None.
     """
-    places = dict(_by_network_and_domain(secured))
+    places = dict(_group_by_network_and_domain(secured))
     here = ("", environment.get(DOMAIN) or "0") if environment is not None else None
     if here:
         places.setdefault(here, [])
@@ -778,8 +780,8 @@ def _other_keystore_findings(
     """
     here = ("", environment.get(DOMAIN) or "0") if environment is not None else None
     own = _authorities_here(environment) if environment is not None else frozenset()
-    for place, processes in _by_network_and_domain(secured).items():
-        groups = _by_authorities(process for process in processes if not process.is_zenoh)
+    for place, processes in _group_by_network_and_domain(secured).items():
+        groups = _group_by_authorities(process for process in processes if not process.is_zenoh)
         if own and place == here:
             main = f"this environment has '{plain((environment or {})[KEYSTORE], _LONGEST_PATH)}'"
             others = [group for keys, group in groups if not keys & own]
@@ -829,7 +831,7 @@ _Keys = frozenset[bytes]
 """Public keys of identity CAs, as bytes in DER."""
 
 
-def _by_authorities(processes: Iterable[Process]) -> list[tuple[_Keys, list[Process]]]:
+def _group_by_authorities(processes: Iterable[Process]) -> list[tuple[_Keys, list[Process]]]:
     """Group processes by a common identity CA; leave out processes whose CA is not known."""
     groups: list[tuple[_Keys, list[Process]]] = []
     for process in processes:

@@ -17,8 +17,8 @@ from sros_tool.checks.kind import (
     Finding,
     FindingKind,
     Severity,
-    by_cause,
-    by_id,
+    group_by_cause,
+    kinds_by_id,
 )
 from sros_tool.errors import UsageError
 from sros_tool.wording import counted
@@ -44,7 +44,7 @@ def _declared(module: ModuleType) -> Iterator[FindingKind]:
 def all_kinds() -> Mapping[str, FindingKind]:
     """Return all kinds of findings by id; imports all modules of checks."""
     modules = [import_module(f"sros_tool.checks.{name}") for name in _MODULES]
-    return by_id(
+    return kinds_by_id(
         *dict.fromkeys(
             kind
             for module in modules
@@ -199,7 +199,7 @@ def shown_findings(chosen_findings: ChosenFindings) -> ShownFindings:
         SharedCause(
             cause.title, cause.text, cause.remedy, [place[id(finding)] for finding in group]
         )
-        for group in by_cause(chosen_findings.shown)
+        for group in group_by_cause(chosen_findings.shown)
         if len(group) > 1 and (cause := group[0].cause)
     ]
     error, warning, note = chosen_findings.numbers().values()

@@ -68,7 +68,7 @@ def path_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[F
     findings: list[Finding] = []
     policies, paths = [], tuple(paths)
     for path in paths:
-        found = _no_policy_findings(path, circumstances)
+        found = _findings_unless_policy(path, circumstances)
         if found is None:
             policies.append(path)
         else:
@@ -98,7 +98,7 @@ def findings_between_folders(paths: Iterable[Path], circumstances: Circumstances
     )
 
 
-def _no_policy_findings(path: Path, circumstances: Circumstances) -> list[Finding] | None:
+def _findings_unless_policy(path: Path, circumstances: Circumstances) -> list[Finding] | None:
     """Return the findings at a path; None if it has to be a policy, or a folder of policies."""
     if path.suffix in (".json5", ".json", ".yaml", ".yml") and not path.is_dir():
         from sros_tool.checks.zenoh import configuration_findings

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, some_names
+from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.advisories import (
     Advisory,
     known_vulnerabilities,
@@ -87,7 +87,7 @@ def vulnerability_findings(
 ) -> Iterator[Finding]:
     """Yield one finding for each DDS library of the processes, and of ``libraries``."""
     users = _users(running, libraries)
-    by = {library: [f"loaded by {some_names(of)}"] if of else [] for library, of in users.items()}
+    by = {library: [f"loaded by {names_text(of)}"] if of else [] for library, of in users.items()}
     yield from _library_findings(by, advisories)
 
 
@@ -112,12 +112,12 @@ def robot_findings(
         if dds.unseen:
             lacking.setdefault(_UNSEEN, []).append(robot)
     by = {
-        library: [f"{_SEEN[how]} {some_names(where[how])}" for how in Seen if how in where]
+        library: [f"{_SEEN[how]} {names_text(where[how])}" for how in Seen if how in where]
         for library, where in seen.items()
     }
     yield from _library_findings(by, advisories)
     if lacking:
-        parts = (f"{what} {some_names(names)}" for what, names in lacking.items())
+        parts = (f"{what} {names_text(names)}" for what, names in lacking.items())
         remedy = _UNSEEN_REMEDY if lacking.keys() == {_UNSEEN} else ""
         yield ROBOTS_UNKNOWN.found("DDS of robots", "; ".join(parts), remedy=remedy)
 

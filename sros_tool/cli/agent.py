@@ -259,7 +259,7 @@ def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool
     The exit status of --once is 0 if nothing is wrong, and 1 if something is.
     """
     from sros_tool.agent.settings import read_settings
-    from sros_tool.agent.state import only_agent
+    from sros_tool.agent.state import agent_lock
     from sros_tool.validity import parse_duration
 
     pause = parse_duration(interval)
@@ -267,13 +267,13 @@ def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool
         raise UsageError("--restarted is for --once only")
     read_settings(folder)  # a missing agent is reported first, also with --interval
     if once:
-        with only_agent(folder):
+        with agent_lock(folder):
             done = _round(folder, read_settings(folder), restarted=restarted)
         _show(folder, done, as_json=as_json)
         return int(bool(done.problems))
     while True:
         try:
-            with only_agent(folder):
+            with agent_lock(folder):
                 _show(folder, _round(folder, read_settings(folder)), as_json=as_json)
         except (SrosError, OSError) as error:
             if isinstance(error, BrokenPipeError):

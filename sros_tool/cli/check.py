@@ -528,14 +528,14 @@ def _circumstances(
 
 def _stated_differences(paths: Sequence[Path], circumstances: Circumstances) -> Iterator[Finding]:
     """Yield where keystores are decided differently on the distributions that they are for."""
-    from sros_tool.keystore.fleet import of_several_distributions
+    from sros_tool.keystore.fleet import enclaves_of_several_distributions
     from sros_tool.keystore.layout import is_keystore
 
     for path in paths or filter(None, (Path(os.environ.get(KEYSTORE_VARIABLE, "")),)):
         if circumstances.vendors or not is_keystore(path):
             continue
         keystore = circumstances.keystore(path)
-        if of_several_distributions(keystore):
+        if enclaves_of_several_distributions(keystore):
             from sros_tool.proof.upgrade import check_distributions
 
             yield from check_distributions(
@@ -749,9 +749,11 @@ def _print_all(chosen_findings: ChosenFindings, _selection: FindingFilter) -> No
 
 
 def _print_text(chosen_findings: ChosenFindings, fleet: Fleet | None = None) -> None:
-    from sros_tool.checks.kind import by_cause
+    from sros_tool.checks.kind import group_by_cause
 
-    echo_folded(sorted(by_cause(chosen_findings.shown), key=lambda group: len(group) == 1), fleet)
+    echo_folded(
+        sorted(group_by_cause(chosen_findings.shown), key=lambda group: len(group) == 1), fleet
+    )
     for choice in dict.fromkeys(finding.accepted for finding in chosen_findings.accepted):
         kinds = {e.id: e.kind.title for e in chosen_findings.accepted if e.accepted == choice}
         kinds_text = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())

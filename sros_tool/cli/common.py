@@ -264,7 +264,7 @@ def policy_for(file: Path, fleet_file: Path | None) -> Policy:
     return read_policy_for(file, read_fleet(fleet_file) if fleet_file else None)
 
 
-def only_enclaves(when: str = "Only") -> Callable[[Decorated], Decorated]:
+def enclave_filter_options(when: str = "Only") -> Callable[[Decorated], Decorated]:
     """Add ``--match PATTERN`` and ``--robot NAME`` to a verb whose default is all enclaves."""
 
     def add(function: Decorated) -> Decorated:

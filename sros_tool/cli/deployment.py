@@ -17,6 +17,7 @@ from sros_tool.cli.common import (
     complete_file,
     domain_of,
     dry_run_option,
+    enclave_filter_options,
     fleet_option,
     json_option,
     key_option,
@@ -24,7 +25,6 @@ from sros_tool.cli.common import (
     keystore_argument,
     moment_of,
     now,
-    only_enclaves,
     print_json,
     print_notes,
     progress,
@@ -198,7 +198,7 @@ def _refuse_terminal() -> None:
 @click.option(
     "--at", metavar="MOMENT", help="Check as of a date (2027-06-01) or time from now (90d)."
 )
-@only_enclaves()
+@enclave_filter_options()
 @click.option(
     "--tokens",
     is_flag=True,

@@ -21,6 +21,7 @@ from sros_tool.cli.common import (
     complete_keystore_and_enclave,
     distro_option,
     domain_of,
+    enclave_filter_options,
     fleet_option,
     json_option,
     keystore_from_environment,
@@ -28,7 +29,6 @@ from sros_tool.cli.common import (
     moment_of,
     named_zone,
     now,
-    only_enclaves,
     print_json,
     print_notes,
     progress,
@@ -210,7 +210,7 @@ def _refuse_ignored(mode: str) -> None:
     "[default: this machine's]",
 )
 @click.option("--who", is_flag=True, help="Show which enclaves may do the operation on NAME.")
-@only_enclaves("With --who: only")
+@enclave_filter_options("With --who: only")
 @click.option(
     "--reach",
     metavar="ENCLAVE",
@@ -516,10 +516,10 @@ def _vendor_lines(explanation: DdsExplanation) -> Iterator[str]:
         yield from _answer_lines(explanation.answer, explanation.vendor_why)
     else:
         yield from _table_lines(explanation)
-    yield from _beside_lines(explanation.beside)
+    yield from _zenoh_decision_lines(explanation.beside)
 
 
-def _beside_lines(on_zenoh: ZenohBeside | None) -> Iterator[str]:
+def _zenoh_decision_lines(on_zenoh: ZenohBeside | None) -> Iterator[str]:
     if on_zenoh and on_zenoh.zenoh:
         word = "yes" if on_zenoh.zenoh.allowed else f"no, {on_zenoh.zenoh.outcome}"
         yield _labelled_row("zenoh", f"{word}: {on_zenoh.zenoh.text}")

@@ -25,6 +25,7 @@ from sros_tool.cli.common import (
     chosen_enclaves,
     complete_template,
     dry_run_option,
+    enclave_filter_options,
     fleet_option,
     fleet_policies,
     json_option,
@@ -33,7 +34,6 @@ from sros_tool.cli.common import (
     keystore_argument,
     keystore_from_environment,
     now,
-    only_enclaves,
     policy_for,
     print_json,
     print_signed,
@@ -359,7 +359,7 @@ def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
 
 @verb("list_enclaves")
 @keystore_argument()
-@only_enclaves()
+@enclave_filter_options()
 @json_option
 def list_enclaves(
     root: Path, patterns: tuple[str, ...], robots: tuple[str, ...], as_json: bool

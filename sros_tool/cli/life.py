@@ -239,7 +239,7 @@ def revoke(
             reason=reason_text,
             keyring=keyring(),
             until_retired=until_retired,
-            crl=_given_list(crl_file),
+            crl=_read_given_list(crl_file),
             allow_refusal=allow_refusal,
             dry_run=dry_run,
         )
@@ -294,7 +294,7 @@ def crl(
             root,
             now=now(),
             keyring=keyring(),
-            crl=_given_list(crl_file),
+            crl=_read_given_list(crl_file),
             allow_refusal=allow_refusal,
             dry_run=dry_run,
         )
@@ -334,7 +334,7 @@ def crl(
     return 1 if soon else 0
 
 
-def _given_list(path: Path | None) -> bytes:
+def _read_given_list(path: Path | None) -> bytes:
     from sros_tool.xml import read_bytes
 
     return read_bytes(path, "revocation list") if path else b""

@@ -191,7 +191,7 @@ def _watch(
 ) -> Snapshot:
     from sros_tool.graph.observe import watch
 
-    with _until_signalled() as stopped:
+    with _signal_watch() as stopped:
         until = f"for {seconds:.0f} s, or {_FOREVER}" if seconds else _FOREVER
         echo(f"watching {until}; then {then}", err=True)
         begin = time.monotonic()
@@ -202,7 +202,7 @@ def _watch(
 
 
 @contextmanager
-def _until_signalled() -> Iterator[Callable[[], bool]]:
+def _signal_watch() -> Iterator[Callable[[], bool]]:
     """Catch Ctrl-C and SIGTERM; yield a function that returns whether one was received."""
     came: list[int] = []
 

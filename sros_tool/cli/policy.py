@@ -93,7 +93,7 @@ def merge_policy(
     from sros_tool.fleet.robots import namespace_problem
     from sros_tool.policy.document import read_policy
     from sros_tool.policy.merge import EditedText, MergedPolicy, merge_all
-    from sros_tool.policy.model import in_namespace
+    from sros_tool.policy.model import policy_in_namespace
 
     if in_place and output:
         raise UsageError("--in-place and --output exclude each other")
@@ -104,7 +104,7 @@ def merge_policy(
     if namespace is not None:
         if problem := namespace_problem(namespace):
             raise UsageError(f"--namespace {namespace!r}: {problem}", "", "Write it as /left.")
-        additions = [in_namespace(other, namespace) for other in additions]
+        additions = [policy_in_namespace(other, namespace) for other in additions]
     merged = merge_all(policy, additions)
     if merged.added and (output is None or output.parent.resolve() == policy.parent.resolve()):
         from sros_tool.graph.learn import with_common_parts

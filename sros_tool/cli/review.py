@@ -494,7 +494,7 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
         f"{_SIGN_ALLOWED if step.allowed else _SIGNS[step.status]} {_TITLES[step.kind]}"
         f"{' ' + code(result.with_shown_paths(step.subject)) if step.subject else ''}: "
         f"{code(sentence)}"
-        for step, sentence in _sentences(result, _by_weight(result))
+        for step, sentence in _sentences(result, _sorted_by_weight(result))
     )
     count = len(result.left_out)
     out = f", but {count} thing{'s were' if count > 1 else ' was'} left out:" if count else ""
@@ -505,7 +505,7 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
     parts += [bounded_list(map(code, result.left_out), 6000, printed)] if count else []
     parts += [sides, bounded_list(lines, 12_000, printed)]
     room = _MOST - sum(map(len, parts))
-    for step in _by_weight(result):
+    for step in _sorted_by_weight(result):
         detail = result.with_shown_paths(_detail(result, step, request))
         if detail and len(detail) > room:
             detail = f"### {_TITLES[step.kind]}: too long for a comment"
@@ -515,7 +515,7 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
     return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 
-def _by_weight(result: Review) -> list[ReviewStep]:
+def _sorted_by_weight(result: Review) -> list[ReviewStep]:
     """Sort the steps: failed ones first, then allowed ones, then by importance."""
     kinds = list(_TITLES)
     return sorted(

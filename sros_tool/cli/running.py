@@ -41,7 +41,7 @@ from sros_tool.enclave_environment import (
     container_text,
     enclave_of_node,
     node_units,
-    other_node,
+    other_node_notes,
     target_path,
 )
 from sros_tool.errors import KeystoreError, Note, UnavailableError, UsageError
@@ -370,7 +370,9 @@ def run(
         print_notes([Note("token.no-pin", _NO_PIN)])
     elif secured.needs_pin and pin is not None:
         environment[_FAST_DDS_PIN] = pin
-    print_notes([*secured.notes, *(() if policy else other_node(root, name, given, now=now()))])
+    print_notes(
+        [*secured.notes, *(() if policy else other_node_notes(root, name, given, now=now()))]
+    )
     names_it = enclave_argument(command) == name or _is_demo(command)
     if not names_it:
         print_notes(secured.enclave_notes)

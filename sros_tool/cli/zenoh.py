@@ -153,7 +153,7 @@ def zenoh(
     """
     from sros_tool.keystore.layout import ZENOH_FILES, check_keystore
     from sros_tool.keystore.lifecycle.update import set_zenoh
-    from sros_tool.keystore.reader import Keystore, of_one_state
+    from sros_tool.keystore.reader import Keystore, read_consistently
 
     if existing:
         _refuse_with_from(
@@ -180,7 +180,7 @@ def zenoh(
         raise UsageError("--off takes no options of the network", "", "Leave one of them out.")
     network = None if off else _network(settings, given, further, crossing)
     with progress("writing the Zenoh files"):
-        work = of_one_state(set_zenoh) if only_check else set_zenoh
+        work = read_consistently(set_zenoh) if only_check else set_zenoh
         result = work(root, network, now=now(), keyring=keyring(), dry_run=dry_run or only_check)
     # A document and the signed one next to it are written together.
     actions = {

@@ -430,7 +430,7 @@ def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
     if pairs:
         yield Note(
             "portable.enclave-names",
-            f"Cyclone DDS 0.10 mistakes {some_pairs(pairs)}, if the first enclave presents the "
+            f"Cyclone DDS 0.10 mistakes {pairs_text(pairs)}, if the first enclave presents the "
             "(public) permissions of the second one, which contain all parts of its name. "
             "Choose names that do not consist of parts of another name, such as /robot_admin.",
         )
@@ -457,7 +457,7 @@ def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
     )
 
 
-def some_pairs(pairs: Sequence[tuple[str, str]]) -> str:
+def pairs_text(pairs: Sequence[tuple[str, str]]) -> str:
     """Return the first pairs in words, such as "/robot for /robot/admin and 2 more"."""
     return first_few([f"{inner} for {outer}" for inner, outer in pairs], _SHOWN)
 

@@ -635,7 +635,7 @@ class _Runner:
             libraries = frozenset[MappedLibrary]().union(
                 *(process.dds() for process in processes.values())
             )
-            if _in_memory(row):
+            if _uses_shared_memory(row):
                 texts = {name: process.text for name, process in processes.items()}
                 segments = frozenset().union(
                     *(process.segments() for process in processes.values())
@@ -811,7 +811,7 @@ def groups_of_rows(rows: Sequence[Row]) -> list[list[int]]:
     return list(groups.values())
 
 
-def _in_memory(row: Row) -> bool:
+def _uses_shared_memory(row: Row) -> bool:
     return any(claim.wire is Wire.MEMORY for claim in row.claims)
 
 

@@ -243,9 +243,11 @@ class _Case:
         """Return the finding that the claim's relation ``holds``, or that it does not."""
         return _Finding(STATUS_OF[self.claim.relation, holds], detail)
 
-    def sent(self, party: PartyRecord) -> list[Event]:
+    def messages_sent(self, party: PartyRecord) -> list[Event]:
         """Return the messages that a party sent during the observation."""
-        return [e for e in party.events if e.kind is EventKind.SENT and _in_window(e, self.record)]
+        return [
+            e for e in party.events if e.kind is EventKind.SENT and _is_in_window(e, self.record)
+        ]
 
     def heard(self) -> list[Event]:
         """Return the talker's messages that the subject heard, at any time."""
@@ -276,30 +278,30 @@ def _is_of_user(name: str, row: Row) -> bool:
 
 def _judge_hearing(case: _Case) -> _Finding:
     claim, record = case.claim, case.record
-    sent = {event.text for event in case.sent(case.talker)}
+    sent = {event.text for event in case.messages_sent(case.talker)}
     if not sent:
         return _undecided(f"{claim.talker} sent nothing in the window")
     heard = case.heard()
     if record.row.meanwhile is not None:  # what was heard before the change proves nothing
-        heard = [event for event in heard if _in_window(event, record)]
+        heard = [event for event in heard if _is_in_window(event, record)]
     arrived = len(sent & {event.text for event in heard})
     heard_of = f"{arrived} of {len(sent)} messages of the {claim.talker}"
     return case.result(bool(heard), f"{claim.subject} heard {heard_of} in {record.seconds:.1f} s")
 
 
 def _judge_answers(case: _Case) -> _Finding:
-    claim, asked = case.claim, case.sent(case.subject)
+    claim, asked = case.claim, case.messages_sent(case.subject)
     if not asked:
         return _undecided(f"{claim.subject} sent no request in the window")
     answers = case.heard()
-    within = sum(_in_window(event, case.record) for event in answers)
+    within = sum(_is_in_window(event, case.record) for event in answers)
     right = f"{min(within, len(asked))} right answers from the {claim.talker}"
     return case.result(bool(answers), f"{claim.subject} asked {len(asked)} times and got {right}")
 
 
 def _judge_execution(case: _Case) -> _Finding:
     """Judge a call by the requests that the server executed: its reply may be lost afterwards."""
-    claim, asked = case.claim, case.sent(case.talker)
+    claim, asked = case.claim, case.messages_sent(case.talker)
     if not asked:
         return _undecided(f"{claim.talker} sent no request in the window")
     reached = case.heard()
@@ -389,9 +391,11 @@ def _judge_view(case: _Case) -> _Finding:
     claim, observer, topic = case.claim, case.subject, case.talker.topic
     serves = case.record.row.party(claim.talker).role is Role.SERVER
     # A server only has to be there: nobody has to call it.
-    if not serves and not case.sent(case.talker):
+    if not serves and not case.messages_sent(case.talker):
         return _undecided(f"{claim.talker} sent nothing in the window")
-    looks = [e for e in observer.events if e.kind is EventKind.SEEN and _in_window(e, case.record)]
+    looks = [
+        e for e in observer.events if e.kind is EventKind.SEEN and _is_in_window(e, case.record)
+    ]
     if not looks:
         return _undecided(f"{claim.subject} counted nothing in the window")
     most = max(event.publishers.get(topic, 0) for event in looks)
@@ -408,7 +412,7 @@ def _judge_loss(case: _Case) -> _Finding:
     if not most:
         return _undecided(f"{claim.subject} never saw a publisher on {topic}")
     # After the window the talker itself ends.
-    inside = [event for event in looks if _in_window(event, case.record)]
+    inside = [event for event in looks if _is_in_window(event, case.record)]
     if not inside:
         return _undecided(f"{claim.subject} counted nothing in the window")
     left = inside[-1].publishers.get(topic, 0)
@@ -432,7 +436,7 @@ def _judge_wire(case: _Case) -> _Finding:
         return case.result(shown > 0, f"{shown} packets show {what}")
     if count.plain:
         return case.result(True, f"{count.plain} packets show the text")
-    sent = len(case.sent(case.subject))
+    sent = len(case.messages_sent(case.subject))
     # Missing text proves something only if the messages were in the captured packets.
     if count.protected * 2 < max(2, sent):
         return _undecided(
@@ -511,7 +515,7 @@ def _exit_text(record: PartyRecord) -> str:
     return f"ended by itself with status {status}. {last}".strip()
 
 
-def _in_window(event: Event, record: RowRecord) -> bool:
+def _is_in_window(event: Event, record: RowRecord) -> bool:
     if record.window is None:
         return False
     start, end = record.window
@@ -800,10 +804,10 @@ def _summary(result: DemoResult) -> str:
         parts.append(f"{opened} open in this keystore (accept each with --accept-open NAME)")
     if wrong > opened:
         parts.append(f"{wrong - opened} not as expected")
-    return ", ".join([*parts, *_left_out(result)]) + "."
+    return ", ".join([*parts, *_left_out_clauses(result)]) + "."
 
 
-def _left_out(result: DemoResult) -> Iterator[str]:
+def _left_out_clauses(result: DemoResult) -> Iterator[str]:
     """Yield clauses on rows and enclaves that were not tried."""
     skipped = [row for row in result.rows if row.observed is RowStatus.SKIPPED]
     if others := sum(1 for row in skipped if row.applies):
@@ -878,7 +882,7 @@ def _verdict(result: DemoResult, wrong: Sequence[RowResult]) -> str:
     parts = [f"{len(wrong)} of {len(result.rows)} rows not as expected" if wrong else good]
     if known:
         parts.append(f"{known} attacks that are known to succeed")
-    return ", ".join([*parts, *_left_out(result)]) + "."
+    return ", ".join([*parts, *_left_out_clauses(result)]) + "."
 
 
 def _attack_lines(

@@ -58,12 +58,12 @@ def _run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> 
         return _fail(name, error, ProcessStage.IMPORT, events)
     stage = ProcessStage.PARTICIPANT
     nodes: list[Any] = []
-    ended = _until_signalled()
+    ended = _signal_watch()
     try:
         from rclpy.signals import SignalHandlerOptions
 
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
-        nodes.append(_by_hand(name) if options.by_hand else rclpy.create_node(name))
+        nodes.append(_create_node_by_hand(name) if options.by_hand else rclpy.create_node(name))
         stage = ProcessStage.ENDPOINT
         nodes += build(nodes[0], options, events) or ()
         stage = ProcessStage.RUNNING
@@ -84,7 +84,7 @@ def _run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> 
     return 0
 
 
-def _by_hand(name: str) -> Any:
+def _create_node_by_hand(name: str) -> Any:
     """Return a node without the parts that would need the rights of a node of this name."""
     import rclpy
     from rclpy.parameter import Parameter
@@ -107,7 +107,7 @@ def _spin(nodes: Sequence[Any], ended: Callable[[], bool]) -> None:
         executor.spin_once(timeout_sec=_TICK_SECONDS)
 
 
-def _until_signalled() -> Callable[[], bool]:
+def _signal_watch() -> Callable[[], bool]:
     """Handle SIGINT and SIGTERM; return a function that tells whether a signal has arrived.
 
     rclpy's handlers are not used: they shut its context down in the middle of a callback, or just

@@ -291,9 +291,9 @@ def as_learned(
         UsageError: The log does not name the enclave of a denial, and ``enclave`` is "".
     """
     profiles, others, wholes = [], dict[str, str](), dict[str, str]()
-    for path, rights in sorted(_by_enclave(missing_rights, enclave).items()):
+    for path, rights in sorted(_rights_by_enclave(missing_rights, enclave).items()):
         present = _profiles(policy, path)
-        for profile, denied in sorted(_by_profile(rights, node, present).items()):
+        for profile, denied in sorted(_rights_by_profile(rights, node, present).items()):
             if present and node is None and profile not in (_ANY_NODE, *present):
                 there = ", ".join(sorted(map(_full_name, present)))
                 others[_full_name(profile)] = f"enclave {path} has {there}"
@@ -322,7 +322,9 @@ def as_learned(
     return Learned(tuple(profiles), (*_notes(missing_rights), *notes), source=RightsFound.LOG)
 
 
-def _by_enclave(missing_rights: MissingRights, enclave: str) -> dict[str, frozenset[NodeRight]]:
+def _rights_by_enclave(
+    missing_rights: MissingRights, enclave: str
+) -> dict[str, frozenset[NodeRight]]:
     """Return the rights by enclave; only of ``enclave`` if it is not ""."""
     found: dict[str, frozenset[NodeRight]] = {}
     for named, rights in missing_rights.rights.items():
@@ -339,7 +341,7 @@ def _by_enclave(missing_rights: MissingRights, enclave: str) -> dict[str, frozen
     return found
 
 
-def _by_profile(
+def _rights_by_profile(
     rights: frozenset[NodeRight],
     node: tuple[str, str] | None,
     present: Mapping[tuple[str, str], frozenset[NodeRight]],

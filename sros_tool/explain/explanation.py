@@ -31,7 +31,7 @@ from sros_tool.explain.answer import (
     lines_of_right,
     recorded_policy,
 )
-from sros_tool.faults import FAULTS, REPLACE, Fault, in_original_keystore
+from sros_tool.faults import FAULTS, REPLACE, Fault, remedy_in_original_keystore
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     GOVERNANCE_P7S,
@@ -190,7 +190,7 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
             return _filled_remedy(text, root, enclave, file)
         if fault:
             return _filled_remedy(fault.remedy_in_export(file), "KEYSTORE", enclave, file)
-        return in_original_keystore(_filled_remedy(text, "KEYSTORE", enclave, file))
+        return remedy_in_original_keystore(_filled_remedy(text, "KEYSTORE", enclave, file))
     if keystore and fault:
         wrong_issuer = fault is Fault.CERTIFICATE_ISSUER
         if wrong_issuer and _is_own_copy(keystore, enclave, IDENTITY_CA_FILE):

@@ -24,7 +24,7 @@ from sros_tool.explain.answer import Answer, Evaluator, Part, Question, ask
 from sros_tool.explain.asking import AskingContext, signed_enclave
 from sros_tool.explain.denials import Denial, read_denials, serving_node
 from sros_tool.explain.explanation import likely_names, remedy
-from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, Fault, in_original_keystore
+from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, Fault, remedy_in_original_keystore
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.known_keys import enclaves_by_identity
 from sros_tool.keystore.layout import ROUTER_FILE, has_authorities, is_keystore
@@ -546,7 +546,7 @@ class _Examiner:
         )
         if meaning.id.startswith("peer-"):
             return self._with_peer_causes(plain, hits)
-        if better := self._other_folder(first.fields.get("path", ""), remedy_of):
+        if better := self._other_folder_remedy(first.fields.get("path", ""), remedy_of):
             return replace(plain, remedy=better)
         examined = meaning.faults or meaning.id == "service"
         enclave = named if examined else None
@@ -568,7 +568,7 @@ class _Examiner:
             remedy=" ".join(remedies) if remedies else nothing,
         )
 
-    def _other_folder(self, path: str, remedy: str) -> str:
+    def _other_folder_remedy(self, path: str, remedy: str) -> str:
         """Return the remedy if this keystore lacks a folder that a log reports missing."""
         place, inside, name = path.rpartition("/enclaves/")
         if not inside or self._keystore is None:
@@ -606,7 +606,7 @@ class _Examiner:
             for part in parts
         ]
         if all(NEEDS_CA_KEYS.match(command) for command in parts[1::2]):
-            return in_original_keystore("".join(named))
+            return remedy_in_original_keystore("".join(named))
         return (
             f"{''.join(named)} KEYSTORE is the {ORIGINAL_KEYSTORE}: export the enclave again from "
             "there."

@@ -275,7 +275,7 @@ def follow_reach(
         rights,
         excluded=without,
         questions=questions,
-        unguarded=opened if domain is None else _in_domain(opened, domain),
+        unguarded=opened if domain is None else _access_in_domain(opened, domain),
         everybody=names if of_keystore else (),
         links=source.links,
     )
@@ -294,7 +294,7 @@ def follow_reach(
     return FollowedReach(source.path, (*without, *questions), domain, reach, source.fleet, notes)
 
 
-def _in_domain(unguarded_access: Iterable[Unguarded], domain: int) -> Iterator[Unguarded]:
+def _access_in_domain(unguarded_access: Iterable[Unguarded], domain: int) -> Iterator[Unguarded]:
     """Yield, as rights in one domain, the access that its governance leaves open."""
     only = DomainSet.of((domain, domain))
     for topics in unguarded_access:

@@ -422,7 +422,7 @@ class ZenohEvaluator:
             authority = self.keystore.ca_certificate(PERMISSIONS)
             ours = {answer.enclave, *self.routers}
             deciding = ours | {check.enforcer for check in answer.checks}
-            ends = self._other_ends(answer)
+            ends = self._enclaves_at_other_end(answer)
             if answer.mode is not Mode.CLIENT:
                 deciding |= ends
             drifts = zenoh_drift(
@@ -448,7 +448,7 @@ class ZenohEvaluator:
             )
         )
 
-    def _other_ends(self, answer: ZenohAnswer) -> set[str]:
+    def _enclaves_at_other_end(self, answer: ZenohAnswer) -> set[str]:
         """Return the enclaves with which an enclave may exchange the messages of the question.
 
         The enclave's file decides; for a client, the file of its router.

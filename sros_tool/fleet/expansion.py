@@ -288,7 +288,7 @@ def with_placeholders(policy: FleetPolicy, observed: Iterable[Right]) -> frozens
     the policy does not have its enclave, the right also keeps the enclave.
     """
     expanded: set[Right] = set()
-    for path, rights in _by_enclave(observed).items():
+    for path, rights in _rights_by_enclave(observed).items():
         if path in policy:
             expanded.update(_stated(policy, path, unfolded(rights)))
         else:
@@ -302,7 +302,7 @@ def unobserved_robots(policy: FleetPolicy, observed: Iterable[Right]) -> dict[st
     Only paths that were observed for another robot are included; robots are in the order of the
     fleet.
     """
-    seen = _by_enclave(observed)
+    seen = _rights_by_enclave(observed)
     missing: dict[str, list[str]] = defaultdict(list)
     some = {policy.stated(path)[0].path for path in seen if path in policy}
     for path in policy:
@@ -319,7 +319,7 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
         PolicyError: a wildcard of the policy means something else for another robot.
     """
     after = FleetPolicy(written(result.policy), policy.fleet)
-    seen = _by_enclave(observed)
+    seen = _rights_by_enclave(observed)
     replaced = {use.enclave for use in result.uses if use.wildcards}
     for path in policy:
         if path not in seen and policy.stated(path)[0].path not in replaced:
@@ -338,7 +338,7 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
             )
 
 
-def _by_enclave(observed: Iterable[Right]) -> dict[str, list[Right]]:
+def _rights_by_enclave(observed: Iterable[Right]) -> dict[str, list[Right]]:
     by_enclave: dict[str, list[Right]] = defaultdict(list)
     for right in observed:
         if right.qualifier is ALLOW:

@@ -309,7 +309,7 @@ def robot_of(fleet: Fleet, enclave: str) -> Robot | None:
     return None
 
 
-def left_robot_of(fleet: Fleet, enclave: str) -> str:
+def former_robot_of(fleet: Fleet, enclave: str) -> str:
     """Return the robot that an enclave belonged to before it left the fleet or its group, or "".
 
     The result is "" for an enclave of a robot, and if its path names no robot.  If a path has only
@@ -535,7 +535,7 @@ def named_robots(fleet: Fleet, enclave: str, text: str) -> tuple[Robot, ...]:
     return tuple(dict.fromkeys((*([owner] if owner else []), *named)))
 
 
-def for_any_robot(text: str, robot: Robot, word: str = "robot") -> str:
+def with_robot_placeholder(text: str, robot: Robot, word: str = "robot") -> str:
     """Return a text with ``{robot}``, or another word, in place of a robot's namespace and name.
 
     The name can also be a part of a name, as in ``r1_lift``.

@@ -133,7 +133,7 @@ def make_observation(
     return Observation(tuple(sorted(nodes)), frozenset(silent), frozenset(strays))
 
 
-def from_json(value: Mapping[str, Any]) -> Observation:
+def observation_from_json(value: Mapping[str, Any]) -> Observation:
     """Return the observation that `as_plain` turned into the JSON value ``value``.
 
     Raises:

@@ -704,7 +704,7 @@ def _facts_in_keystore(evaluation: EvaluatedEnclave, state: OpenedEnclave) -> En
 
     ``state`` also has the problems that some vendors accept.
     """
-    problems = [*evaluation.problems, *evaluation.for_some(state.problems)]
+    problems = [*evaluation.problems, *evaluation.partial_refusal_clauses(state.problems)]
     return _enclave_facts(evaluation)._replace(problems=problems)
 
 

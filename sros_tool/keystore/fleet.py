@@ -77,7 +77,7 @@ def stated_distributions(keystore: Keystore, enclave: str) -> tuple[str, ...]:
     return keystore.template.distributions
 
 
-def of_several_distributions(keystore: Keystore) -> dict[tuple[str, ...], list[str]]:
+def enclaves_of_several_distributions(keystore: Keystore) -> dict[tuple[str, ...], list[str]]:
     """Map tuples of several ROS 2 distributions to the enclaves that are for all of them.
 
     Enclaves whose settings or fleet cannot be read are left out: another finding reports that.

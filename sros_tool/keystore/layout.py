@@ -16,7 +16,7 @@ from shlex import quote
 from typing import NamedTuple, TypeAlias
 
 from sros_tool.errors import DocumentError, KeystoreError
-from sros_tool.faults import in_original_keystore
+from sros_tool.faults import remedy_in_original_keystore
 
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 CLOSED_PROCESSES, CLOSED_POLICY = "processes.json", "policy.xml"
@@ -220,7 +220,7 @@ def in_keystore_of(root: Path, remedy: str) -> str:
     """
     if has_authorities(root):
         return re.sub(r"\bKEYSTORE\b", lambda _: quote(str(root)), remedy)
-    return in_original_keystore(remedy)
+    return remedy_in_original_keystore(remedy)
 
 
 def closed_robot(root: Path) -> Path | None:

@@ -801,7 +801,7 @@ def _read_lines(
             damaged += 1
         else:
             if damaged:
-                faults.append(_not_entries(number - 1, damaged))
+                faults.append(_not_entries_fault(number - 1, damaged))
             if chained and not entry.previous:
                 faults.append(_Fault(number, f"line {number} was added from outside"))
             elif entry.previous:
@@ -818,7 +818,7 @@ def _read_lines(
         if number == stated:
             signed = last
     if damaged:
-        faults.append(_not_entries(number, damaged))
+        faults.append(_not_entries_fault(number, damaged))
     if not chained:
         unchained = number
         if number:
@@ -847,7 +847,7 @@ def _without_lines(root: Path, *, file_exists: bool) -> _Reading:
     return _Reading(Ledger(gaps=(missing.text,)), [missing])
 
 
-def _not_entries(last: int, count: int) -> _Fault:
+def _not_entries_fault(last: int, count: int) -> _Fault:
     """Return the fault of ``count`` lines up to the line ``last``."""
     if count == 1:
         return _Fault(last, f"line {last} is not an entry")

@@ -396,7 +396,7 @@ class EvaluatedEnclave(NamedTuple):
             sentences.append(f"{participant.vendor.title} refuses it: {'; '.join(causes)}.")
         return " ".join(sentences)
 
-    def for_some(self, problems: Sequence[Problem]) -> list[str]:
+    def partial_refusal_clauses(self, problems: Sequence[Problem]) -> list[str]:
         """Return clauses on the problems for which only some of the vendors refuse the enclave."""
         clauses = []
         for problem in problems:

@@ -62,7 +62,7 @@ from sros_tool.pki.certificates import (
     issued_by,
     load_certificate,
     load_certificates,
-    other_issuer,
+    other_issuer_text,
     subject_text,
     validity_of,
     weakness,
@@ -927,7 +927,7 @@ class _EnclaveFiles:
         if certificate and ca and not issued_by(certificate, ca):
             text = (
                 f"it was not issued by the identity CA of the enclave ({subject_text(ca.subject)}) "
-                f"but by {other_issuer(certificate, ca)}"
+                f"but by {other_issuer_text(certificate, ca)}"
             )
             if refusal := self._fault_with_all(certificate, authorities or b""):
                 text += f"; with all CAs of the file, {refusal}"
@@ -1077,7 +1077,7 @@ Arguments = ParamSpec("Arguments")
 Opened = TypeVar("Opened", Path, Keystore)
 
 
-def of_one_state(
+def read_consistently(
     read: Callable[Concatenate[Opened, Arguments], Result],
 ) -> Callable[Concatenate[Opened, Arguments], Result]:
     """Decorate a function so that it is called again if the keystore changes meanwhile.

@@ -165,10 +165,12 @@ def rights_by_domains(source: RightsSource) -> dict[DomainSet | None, set[Right]
 
     A policy is for every domain, except for enclaves of robots whose domain the fleet states.
     """
-    return by_domains(source.rights, source.documents, source.key_domains, source.fleet)
+    return rights_grouped_by_domains(
+        source.rights, source.documents, source.key_domains, source.fleet
+    )
 
 
-def by_domains(
+def rights_grouped_by_domains(
     rights: Iterable[Right],
     documents: Mapping[str, Permissions],
     key_domains: Mapping[Right, frozenset[int | None]],
@@ -186,9 +188,9 @@ def by_domains(
     result: dict[DomainSet | None, set[Right]] = {}
     for enclave, own in by_enclave.items():
         if key_domains:
-            divided = _by_keys(own, key_domains)
+            divided = _divide_by_keys(own, key_domains)
         elif enclave in documents:
-            divided = _by_rules(own, enclave, documents[enclave])
+            divided = _divide_by_rules(own, enclave, documents[enclave])
         else:
             robot = robot_of(fleet, enclave) if fleet else None
             domain = robot.domain if robot else None
@@ -201,7 +203,7 @@ def by_domains(
 _Divided = Iterator[tuple[DomainSet | None, Collection[Right]]]
 
 
-def _by_keys(
+def _divide_by_keys(
     rights: Collection[Right], domains_of: Mapping[Right, frozenset[int | None]]
 ) -> _Divided:
     """Yield the rights of an enclave on Zenoh, divided by the ROS domains of their keys."""
@@ -211,7 +213,7 @@ def _by_keys(
         yield None if domain is None else DomainSet.of((domain, domain)), some
 
 
-def _by_rules(rights: Collection[Right], enclave: str, permissions: Permissions) -> _Divided:
+def _divide_by_rules(rights: Collection[Right], enclave: str, permissions: Permissions) -> _Divided:
     """Yield the rights of an enclave, divided by the ROS domains of the rules of its grant."""
     grant = _first_of_each(permissions).get(enclave, permissions.grants[0])
     listed = [rule.domains.closed() for rule in grant.rules]

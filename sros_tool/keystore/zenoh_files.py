@@ -153,7 +153,7 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
             problems.append(read)
             continue
         configurations[file] = read
-        if (text := _before_revocation(read, state)) or (
+        if (text := _before_revocation_clause(read, state)) or (
             text := _out_of_date(read, file, name, state)
         ):
             problems.append(ZenohProblem(file, text, ZenohFault.OUT_OF_DATE))
@@ -215,7 +215,7 @@ def _read(folder: Path, file: str, state: OpenedEnclave) -> Configuration | Zeno
         return ZenohProblem(file, error.what, ZenohFault.MALFORMED)
 
 
-def _before_revocation(configuration: Configuration, state: OpenedEnclave) -> str:
+def _before_revocation_clause(configuration: Configuration, state: OpenedEnclave) -> str:
     """Return a clause if a configuration with others' rights is older than a revocation, or ""."""
     data = state.files.get(CRL_FILE)
     if configuration.mode is Mode.CLIENT or data is None:
@@ -570,7 +570,9 @@ def _peers(name: str, router: RenderedRights, between: RightsBetween) -> list[Re
     """
     try:
         # Zenoh takes no policy without rules.
-        rendered = [render_rights(rights) for rights in between.of_all(name) if rights.rules]
+        rendered = [
+            render_rights(rights) for rights in between.rights_for_others(name) if rights.rules
+        ]
     except TooManyExpressions:
         raise PolicyError(
             f"the common rights of {name} and another enclave cannot be expressed in Zenoh",
@@ -619,7 +621,7 @@ def _router_files(
         remotes = [rules[name].remote for name in sides[router.name]]
         remotes += [
             render_rights(rights)
-            for rights in (between.of_all(router.name) if together else ())
+            for rights in (between.rights_for_others(router.name) if together else ())
             if rights.rules and rights.common_name != router.name
         ]
         files[_router_path(router.name)] = render_configuration(
@@ -873,7 +875,7 @@ def _prove(
         more = announced != _to_announce(stated_rights)
         check_meaning(more, False, f"that {enclave} announces names that it has no right to")
         return
-    nodes = _some_nodes(enclave, control)
+    nodes = _example_nodes(enclave, control)
     kinds = {right: kind for kind, right in _ANNOUNCED.items()}
 
     def is_announced(domain: int, right: str, name: str) -> bool:
@@ -950,7 +952,7 @@ def _to_announce(stated_rights: Mapping[int, Sequence[StatedRight]]) -> set[tupl
     }
 
 
-def _some_nodes(enclave: str, control: AccessControl) -> set[tuple[str, ...]]:
+def _example_nodes(enclave: str, control: AccessControl) -> set[tuple[str, ...]]:
     """Return nodes, as tokens name them, that rules let an enclave announce: one for each wildcard.
 
     The result is empty if the rights of the enclave deny all its nodes.

@@ -190,7 +190,9 @@ def _joined_if_unordered(rules: Sequence[Rule]) -> list[Rule]:
     for verb in _VERBS:
         ordered = _Ordered([], [])
         for position, rule in enumerate(rules):
-            topics = [(position, topic) for topic in _in_default_partition(getattr(rule, verb))]
+            topics = [
+                (position, topic) for topic in _topics_in_default_partition(getattr(rule, verb))
+            ]
             (ordered.allowed if rule.allow else ordered.denied).extend(topics)
         kept = [
             (position, topic)
@@ -214,7 +216,7 @@ def _joined_if_unordered(rules: Sequence[Rule]) -> list[Rule]:
     ]
 
 
-def _in_default_partition(all_criteria: Iterable[Criteria]) -> Iterator[str]:
+def _topics_in_default_partition(all_criteria: Iterable[Criteria]) -> Iterator[str]:
     for criteria in all_criteria:
         if not criteria.partitions or any(matches(text, "") for text in criteria.partitions):
             yield from criteria.topics

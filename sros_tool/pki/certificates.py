@@ -548,7 +548,7 @@ def authority_text(certificate: x509.Certificate) -> str:
     return f"{subject_text(certificate.subject)} (SHA-256 {digest(certificate)[:8]})"
 
 
-def other_issuer(certificate: x509.Certificate, authority: x509.Certificate) -> str:
+def other_issuer_text(certificate: x509.Certificate, authority: x509.Certificate) -> str:
     """Return a certificate's issuer, as "another CA named X" if ``authority`` has that name."""
     name = subject_text(certificate.issuer)
     return f"another CA named {name}" if certificate.issuer == authority.subject else name

@@ -337,7 +337,8 @@ def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
             kind = _authority(certificate)
             root = place == len(chain) - 1
             if not kind or (_Authority.OLD in kind and (strict or not root)):
-                yield f"{subject_text(certificate.subject)} is not a CA: {_not_a_ca(certificate)}"
+                subject = subject_text(certificate.subject)
+                yield f"{subject} is not a CA: {_not_a_ca_clause(certificate)}"
         longest = constraints.path_length if constraints else None
         if place > 1 and longest is not None and below > longest:
             name = subject_text(certificate.subject)
@@ -346,7 +347,7 @@ def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
             below += 1
 
 
-def _not_a_ca(certificate: x509.Certificate) -> str:
+def _not_a_ca_clause(certificate: x509.Certificate) -> str:
     """Return why a certificate is not a CA certificate, as a clause."""
     if extension(certificate, x509.BasicConstraints) is None:
         return "it has no basicConstraints"

@@ -395,7 +395,7 @@ def list_refusal(
         return ListRefusal(Obstacle.CRITICAL, crl, "it has an unknown critical extension")
     if _revokes(crl, certificate):
         return ListRefusal(Obstacle.REVOKED, crl, "it is revoked")
-    if not _all_reasons(certificate, crl):
+    if not _covers_all_reasons(certificate, crl):
         text = "the certificate names lists only for some revocation reasons"
         return ListRefusal(Obstacle.SCOPE, crl, text)
     return None
@@ -565,7 +565,7 @@ def _general_name(name: x509.GeneralName) -> object:
     return canonical(name.value) if isinstance(name, x509.DirectoryName) else name
 
 
-def _all_reasons(certificate: x509.Certificate, crl: x509.CertificateRevocationList) -> bool:
+def _covers_all_reasons(certificate: x509.Certificate, crl: x509.CertificateRevocationList) -> bool:
     """Return whether the distribution points of a certificate cover all reasons to revoke it."""
     for place in extension(certificate, x509.CRLDistributionPoints) or ():
         if _is_in_place(place, crl):

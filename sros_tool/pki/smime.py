@@ -283,7 +283,7 @@ class SignedDocument(NamedTuple):
         for signature in self.signatures:
             signer = signature.signer_among(self.certificates)
             if signer is None or signer != authority:
-                raise PkiError(f"it is signed {_other_signer(signer, authority)}")
+                raise PkiError(f"it is signed {_wrong_signer_clause(signer, authority)}")
             if not signature.is_intact(self.content, signer):
                 raise PkiError(
                     "its signature does not match its content",
@@ -304,7 +304,7 @@ class SignedDocument(NamedTuple):
         return all(signature.digest_matches(self.content) for signature in self.signatures)
 
 
-def _other_signer(signer: x509.Certificate | None, authority: x509.Certificate) -> str:
+def _wrong_signer_clause(signer: x509.Certificate | None, authority: x509.Certificate) -> str:
     """Return a clause on the wrong signer; ``signer`` is None if it is not embedded."""
     name = authority.subject.rfc4514_string()
     if signer is None:

@@ -192,7 +192,7 @@ class _TolerantCertificate(_Signed):
         values = _sequence(der.first_value(rest.pop(0).content)) if rest else []
         if rest:
             raise ValueError("its signed part has extra fields that a certificate does not have")
-        self.extensions = _read(values, _in_certificate, _LOOSE_OF_CERTIFICATES)
+        self.extensions = _read(values, _parse_in_certificate, _LOOSE_OF_CERTIFICATES)
 
     @property
     def tbs_certificate_bytes(self) -> bytes:
@@ -237,7 +237,7 @@ class _TolerantList(_Signed):
             raise ValueError(
                 "its signed part has extra fields that a revocation list does not have"
             )
-        self.extensions = _read(values, _in_list, _LOOSE_OF_LISTS)
+        self.extensions = _read(values, _parse_in_list, _LOOSE_OF_LISTS)
         self._entries = list(_entries(entries))
 
     @property
@@ -356,7 +356,7 @@ def _entries(values: list[der.Value]) -> Iterator[_TolerantEntry]:
     damaged = False
     for value in values:
         serial, date, *rest = _sequence(value)
-        found = _read(_sequence(rest[0]) if rest else [], _in_entry, _LOOSE_OF_ENTRIES)
+        found = _read(_sequence(rest[0]) if rest else [], _parse_in_entry, _LOOSE_OF_ENTRIES)
         if damaged:
             found = x509.Extensions([])
         elif any(
@@ -567,7 +567,7 @@ def _certificate_with(
     return x509.load_der_x509_certificate(der.encode(der.SEQUENCE, signed, algorithm, _BITS))
 
 
-def _in_certificate(extension: bytes) -> x509.Extensions:
+def _parse_in_certificate(extension: bytes) -> x509.Extensions:
     return _certificate_with(extension=extension).extensions
 
 
@@ -576,11 +576,11 @@ def _list(entry: bytes, extensions: bytes) -> x509.CertificateRevocationList:
     return x509.load_der_x509_crl(der.encode(der.SEQUENCE, signed, _ED25519, _BITS))
 
 
-def _in_list(extension: bytes) -> x509.Extensions:
+def _parse_in_list(extension: bytes) -> x509.Extensions:
     return _list(b"", der.encode(der.CONTEXT_0, der.encode(der.SEQUENCE, extension))).extensions
 
 
-def _in_entry(extension: bytes) -> x509.Extensions:
+def _parse_in_entry(extension: bytes) -> x509.Extensions:
     entry = der.encode(der.SEQUENCE, _ONE, _WHEN, der.encode(der.SEQUENCE, extension))
     return next(iter(_list(der.encode(der.SEQUENCE, entry), b""))).extensions
 
@@ -661,7 +661,9 @@ def _names(values: Iterable[der.Value]) -> list[x509.GeneralName]:
             raise ValueError("not a GeneralName")
         alone = der.encode(der.SEQUENCE, value.whole)
         try:
-            (extension,) = _in_certificate(_encoded(ExtensionOID.SUBJECT_ALTERNATIVE_NAME, alone))
+            (extension,) = _parse_in_certificate(
+                _encoded(ExtensionOID.SUBJECT_ALTERNATIVE_NAME, alone)
+            )
             assert isinstance(extension.value, x509.SubjectAlternativeName)
             names += extension.value
         except ValueError:

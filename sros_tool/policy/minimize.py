@@ -136,7 +136,9 @@ def minimize(
     by_enclave: dict[str, set[Right]] = defaultdict(set)
     for right in seen:
         by_enclave[right.enclave].add(right)
-    needed = (right for enclave in policy.enclaves for right in _for_nodes(enclave, common))
+    needed = (
+        right for enclave in policy.enclaves for right in _common_rights_of_nodes(enclave, common)
+    )
     names = _KnownNames((policy_rights(policy), seen, needed))
     enclaves, uses = [], []
     for enclave in policy.enclaves:
@@ -230,7 +232,7 @@ class _Narrowing:
         self._use = Rules(self._in_use)
         self._common = {
             right
-            for right in _for_nodes(enclave, common)
+            for right in _common_rights_of_nodes(enclave, common)
             if right in stated or (not is_expression(right.name) and self._is_allowed(right))
         }
 
@@ -374,7 +376,7 @@ class _Narrowing:
         return pairs
 
 
-def _for_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterator[Right]:
+def _common_rights_of_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterator[Right]:
     """Yield the ``common`` rights for each node that has a profile in the enclave."""
     for profile in enclave.all_profiles():
         for group in common:

@@ -120,7 +120,7 @@ class Enclave:
         return replace(self, profiles=tuple(blocks))
 
 
-def in_namespace(policy: Policy, namespace: str) -> Policy:
+def policy_in_namespace(policy: Policy, namespace: str) -> Policy:
     """Return a policy with its enclaves and nodes below a namespace, such as ``/left``.
 
     Names that are written with a ``/`` at their beginning stay.

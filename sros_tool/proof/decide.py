@@ -296,7 +296,7 @@ def _witness_against_only(
 def _uses_of_rights(
     rights: RightNames, world: World, limit: SearchLimit, excluded: Sequence[str] = ()
 ) -> Mapping[str, Sequence[Use]]:
-    """Map enclaves with some of the rights to a use of each; leave out ``excluded``."""
+    """Map each enclave with one of the rights, except ``excluded``, to a use of it."""
     left_out = _matching_enclaves(excluded, world.enclaves)
     uses: defaultdict[str, list[Use]] = defaultdict(list)
     for right, part, topics in _topics_of_rights(rights):

@@ -37,7 +37,7 @@ from sros_tool.dds.permissions import Grant, Permissions, Rule
 from sros_tool.errors import DocumentError, Note
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.comparison import Effect, SettingChange
-from sros_tool.keystore.rights import SourceKind, by_domains
+from sros_tool.keystore.rights import SourceKind, rights_grouped_by_domains
 from sros_tool.names import (
     ROS_DISCOVERY_TOPIC,
     is_expression,
@@ -295,7 +295,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     worlds = _worlds(before, after)
     added = tuple(_gains(before, after, worlds, scope, limit))
     lost = tuple(dict.fromkeys(_lost_protection(base, head, limit, rules=not added)))
-    unclear = tuple(_not_compared(base, head))
+    unclear = tuple(_not_compared_clauses(base, head))
     if unclear and not added and not lost:
         raise DocumentError(
             f"'{head.shown}' cannot be compared: {unclear[0]}",
@@ -318,7 +318,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         tuple(world.title for world in worlds),
         tuple(sorted({domain for world in worlds for domain in world.domains})),
         tuple(_assumptions(base, head)),
-        tuple(_left_out(base, head)),
+        tuple(_left_out_texts(base, head)),
         unclear,
     )
 
@@ -336,7 +336,7 @@ def _lost_protection(
     yield from crossing or (looser_router_rules(old, new, limit) if rules else ())
 
 
-def _not_compared(base: AccessSource, head: AccessSource) -> Iterator[str]:
+def _not_compared_clauses(base: AccessSource, head: AccessSource) -> Iterator[str]:
     """Yield clauses on parts of HEAD that could not be compared."""
     if found := contradiction(head):
         yield f"the protection of HEAD: {found}"
@@ -472,8 +472,8 @@ def _access_on_vendor(vendor: Vendor, fitting_others: _FittingOthers) -> _Access
     ) -> Access:
         """Return the access that an enclave's permissions give to a certificate with a subject.
 
-        Permissions that do not fit the certificate count as if they did: `_not_compared` reports
-        them.
+        Permissions that do not fit the certificate count as if they did; `_not_compared_clauses`
+        reports them.
         """
         granted = (grant.subject for grant in side.permissions[name].grants[:1])
         subject = subject if _permissions_fit(vendor, side, name, subject) else next(granted, "")
@@ -535,7 +535,7 @@ def _access_by_rights(
 
     ``robots`` maps enclaves of a policy to the domain of their robot, if the fleet states one.
     """
-    by_enclave = _by_enclave(side.rights)
+    by_enclave = _rights_by_enclave(side.rights)
 
     def rights_in(enclave: str, domain: int) -> Collection[Right]:
         if side.kind == "policy":
@@ -543,7 +543,9 @@ def _access_by_rights(
             return () if elsewhere else by_enclave.get(enclave, ())
         grants = side.permissions[enclave].grants if enclave in side.permissions else ()
         return [
-            right for grant in grants for right in grant_rights(enclave, _in_domain(grant, domain))
+            right
+            for grant in grants
+            for right in grant_rights(enclave, _grant_in_domain(grant, domain))
         ]
 
     def access(enclave: str, domain: int) -> _Access:
@@ -576,12 +578,12 @@ def _access_by_rights(
     return access
 
 
-def _in_domain(grant: Grant, domain: int) -> Grant:
+def _grant_in_domain(grant: Grant, domain: int) -> Grant:
     rules = (rule for rule in grant.rules if domain in rule.domains.closed())
     return grant._replace(rules=tuple(rules))
 
 
-def _by_enclave(rights: Iterable[Right]) -> dict[str, list[Right]]:
+def _rights_by_enclave(rights: Iterable[Right]) -> dict[str, list[Right]]:
     by_enclave: dict[str, list[Right]] = defaultdict(list)
     for right in sorted(rights):
         by_enclave[right.enclave].append(right)
@@ -785,8 +787,10 @@ class _Stated:
         self._denials_of: dict[tuple[str, AccessVerb, Style], _Denials] = {}
         rights = new.rights if new.zenoh is None else new.rights | new.zenoh
         earlier = old.rights if old.zenoh is None else old.rights | old.zenoh
-        self._allowed = _by_enclave(right for right in rights if right.qualifier is ALLOW)
-        self._denied = _by_enclave(right for right in earlier if right.qualifier is not ALLOW)
+        self._allowed = _rights_by_enclave(right for right in rights if right.qualifier is ALLOW)
+        self._denied = _rights_by_enclave(
+            right for right in earlier if right.qualifier is not ALLOW
+        )
         topics = {topic for right in rights for side in right.topics for topic in side}
         self._exact = sorted(topic for topic in topics if not is_expression(topic))
 
@@ -1006,7 +1010,9 @@ def _edges(side: AccessSource, fitting_pairs: Iterable[tuple[str, str]]) -> _Edg
         names_by_holder[holder].append(name)
     usable = {}
     left = _MOST_HOPS
-    for domains, some in by_domains(rights, side.permissions, side.key_domains).items():
+    for domains, some in rights_grouped_by_domains(
+        rights, side.permissions, side.key_domains
+    ).items():
         left -= sum(
             len(names_by_holder[right.enclave])
             for right in some
@@ -1066,7 +1072,7 @@ def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
     permissions = _certified_as(side, other)
     if domains:
         permissions = {
-            name: _for_domain(each, domains[name]) if name in domains else each
+            name: _permissions_for_domain(each, domains[name]) if name in domains else each
             for name, each in permissions.items()
         }
     if side.governance:
@@ -1116,7 +1122,7 @@ def _domains_of_robots(side: AccessSource, other: AccessSource) -> dict[str, int
     }
 
 
-def _for_domain(permissions: Permissions, domain: int) -> Permissions:
+def _permissions_for_domain(permissions: Permissions, domain: int) -> Permissions:
     only = DomainSet.of((domain, domain))
     return Permissions(
         tuple(
@@ -1199,7 +1205,7 @@ def _assumptions(base: AccessSource, head: AccessSource) -> Iterator[str]:
             yield f"{name} has the Zenoh settings that sros writes"
 
 
-def _left_out(base: AccessSource, head: AccessSource) -> Iterator[str]:
+def _left_out_texts(base: AccessSource, head: AccessSource) -> Iterator[str]:
     """Yield the parts that are not compared on purpose, in words."""
     yield "dates"
     sides = (("BASE", base), ("HEAD", head))

@@ -147,7 +147,7 @@ def less_protection(
     if new.zenoh_files:
         yield from looser_settings(old.zenoh_files, new.zenoh_files)
     if old.protections and new.protections is not None:
-        yield from _no_longer_stated(old.protections, new.protections, limit)
+        yield from _dropped_statements(old.protections, new.protections, limit)
     yield from _looser_later(old, new, limit)
 
 
@@ -248,8 +248,8 @@ def _looser_governance(
 def _looser_topics(
     old: DomainRule, new: DomainRule, style: Style, limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    for before, had in _by_protection(old, style):
-        for after, has in _by_protection(new, style):
+    for before, had in _topics_by_protection(old, style):
+        for after, has in _topics_by_protection(new, style):
             changes = [
                 change
                 for change in attribute_changes(before, after, "protection", "{}")
@@ -267,7 +267,7 @@ def _looser_topics(
                 yield replace(change, meaning=change.meaning.replace("{}", f"DDS topic {topic}"))
 
 
-def _by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRule, NameSet]]:
+def _topics_by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRule, NameSet]]:
     """Return pairs of a protection (a topic rule without expression) and all its topics."""
     rules = [
         (names_of(style, (topic_rule.topic_expression,)), replace(topic_rule, topic_expression="*"))
@@ -279,7 +279,7 @@ def _by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRule, Name
     ]
 
 
-def _no_longer_stated(
+def _dropped_statements(
     old: Iterable[StatedProtection], new: Iterable[StatedProtection], limit: SearchLimit
 ) -> Iterator[SettingChange]:
     """Yield names for which ``new`` demands less protection than ``old``, or none."""

@@ -676,16 +676,16 @@ def _filled_words(text: object, used_placeholders: Iterable[Placeholder], robot:
     return text
 
 
-def _read_only_requirement(table: _Table) -> Only:
+def _only_from(table: _Table) -> Only:
     own = table.known(*KIND_OF, "enclaves")
     return Only(**own, rights=table.rights(), enclaves=table.enclaves("enclaves"))
 
 
-def _read_nobody_requirement(table: _Table) -> Nobody:
+def _nobody_from(table: _Table) -> Nobody:
     return Nobody(**table.known(*KIND_OF), rights=table.rights())
 
 
-def _read_must_requirement(table: _Table) -> Must:
+def _must_from(table: _Table) -> Must:
     own = table.known(*KIND_OF, "enclave")
     enclave = table.text("enclave")
     problem = expression_problem(enclave)
@@ -700,7 +700,7 @@ def _read_must_requirement(table: _Table) -> Must:
     return Must(**own, rights=table.rights(), enclave=enclave)
 
 
-def _read_at_most_requirement(table: _Table) -> AtMost:
+def _at_most_from(table: _Table) -> AtMost:
     own = table.known(*KIND_OF, "enclaves")
     most = table.values.get("enclaves")
     if type(most) is not int or not 0 < most < 2**31:
@@ -712,17 +712,17 @@ def _read_at_most_requirement(table: _Table) -> AtMost:
     return AtMost(**own, rights=table.rights(), most=most)
 
 
-def _read_widest_requirement(table: _Table) -> Widest:
+def _widest_from(table: _Table) -> Widest:
     own = table.known(*KIND_OF, "enclaves")
     return Widest(**own, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
 
 
-def _read_nothing_but_requirement(table: _Table) -> NothingBut:
+def _nothing_but_from(table: _Table) -> NothingBut:
     own = table.known(*KIND_OF, "enclaves")
     return NothingBut(**own, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
 
 
-def _read_not_both_requirement(table: _Table) -> NotBoth:
+def _not_both_from(table: _Table) -> NotBoth:
     rights: list[RightNames] = []
     own = table.known("first", "second")
     for key in ("first", "second"):
@@ -739,7 +739,7 @@ def _read_not_both_requirement(table: _Table) -> NotBoth:
     return NotBoth(**own, first=rights[0], second=rights[1])
 
 
-def _read_protected_requirement(table: _Table) -> Protected:
+def _protected_from(table: _Table) -> Protected:
     own = table.known(*RIGHTS, "level")
     level = table.values.get("level")
     if not isinstance(level, str) or level not in _LEVELS:
@@ -752,7 +752,7 @@ def _read_protected_requirement(table: _Table) -> Protected:
     return Protected(**own, names=names, level=_LEVELS[level])
 
 
-def _read_apart_requirement(table: _Table) -> Apart:
+def _apart_from(table: _Table) -> Apart:
     own = table.known("from", "to", "through")
     through = table.enclaves("through") if "through" in table.values else ()
     return Apart(
@@ -761,15 +761,15 @@ def _read_apart_requirement(table: _Table) -> Apart:
 
 
 _READERS: Mapping[str, Callable[[_Table], Requirement]] = {
-    Only.KIND: _read_only_requirement,
-    Nobody.KIND: _read_nobody_requirement,
-    Must.KIND: _read_must_requirement,
-    Protected.KIND: _read_protected_requirement,
-    Apart.KIND: _read_apart_requirement,
-    AtMost.KIND: _read_at_most_requirement,
-    Widest.KIND: _read_widest_requirement,
-    NothingBut.KIND: _read_nothing_but_requirement,
-    NotBoth.KIND: _read_not_both_requirement,
+    Only.KIND: _only_from,
+    Nobody.KIND: _nobody_from,
+    Must.KIND: _must_from,
+    Protected.KIND: _protected_from,
+    Apart.KIND: _apart_from,
+    AtMost.KIND: _at_most_from,
+    Widest.KIND: _widest_from,
+    NothingBut.KIND: _nothing_but_from,
+    NotBoth.KIND: _not_both_from,
 }
 
 
@@ -868,7 +868,7 @@ def dropped_findings(
     return [
         DROPPED.found(
             ": ".join(filter(None, (first.name, first.demand))),
-            first.text() + _also_for([other.requirement.robot for other in others]),
+            first.text() + _other_robots_text([other.requirement.robot for other in others]),
             file,
             related=(RelatedPlace("required before", first.file, first.line or None),),
         )
@@ -876,7 +876,7 @@ def dropped_findings(
     ]
 
 
-def _also_for(robots: Sequence[str]) -> str:
+def _other_robots_text(robots: Sequence[str]) -> str:
     if not robots:
         return ""
     return f"; the same for {counted(len(robots), 'more robot')}: {first_few(robots, 4)}"
@@ -953,12 +953,12 @@ def _implies(new: Requirement, old: Requirement) -> bool:
             ((right, names),), ((old_right, old_names),) = new.rights, old.rights
             return (
                 right == old_right
-                and _all_within(names, old_names)
+                and _patterns_within(names, old_names)
                 and _enclaves_within(old.enclaves, new.enclaves)
             )
         case NothingBut(), NothingBut():
             return _enclaves_within(old.enclaves, new.enclaves) and all(
-                any(right == one and _all_within(names, some) for one, some in old.rights)
+                any(right == one and _patterns_within(names, some) for one, some in old.rights)
                 for right, names in new.rights
                 if names
             )
@@ -987,7 +987,7 @@ def _right_within(part: OfRights, wide: OfRights) -> bool:
     return right == wide_right and covers(wide_name, name)
 
 
-def _all_within(narrow: Iterable[str], wide: Sequence[str]) -> bool:
+def _patterns_within(narrow: Iterable[str], wide: Sequence[str]) -> bool:
     """Return whether each pattern of ``narrow`` is covered by a pattern of ``wide``."""
     return all(any(covers(one, name) for one in wide) for name in narrow)
 
@@ -998,7 +998,7 @@ def _enclaves_within(narrow: Sequence[str], wide: Sequence[str]) -> bool:
     some = [name for name in narrow if not name.startswith(EXCEPT)]
     more = [name for name in wide if not name.startswith(EXCEPT)]
     free = (e for e in others if any(overlap(e, name) for name in some))
-    return _all_within(some, more) and _all_within(free, ours)
+    return _patterns_within(some, more) and _patterns_within(free, ours)
 
 
 def _is_alike(new: Requirement, old: Requirement) -> bool:

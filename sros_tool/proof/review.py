@@ -723,7 +723,7 @@ class _Review:
     ) -> tuple[int, Content] | None:
         base, head = before(), after()
         first, second = base.as_rights(), head.as_rights()
-        absolute = _made_absolute(base.enclaves.values(), head.enclaves.values())
+        absolute = _rights_made_absolute(base.enclaves.values(), head.enclaves.values())
         compared = compare_sources(first, second)
         if not compared and not absolute:
             return None
@@ -874,7 +874,9 @@ def _is_same_file(base: CommitFiles | None, head: CommitFiles, path: str) -> boo
     return base is not None and base.files.get(path) == head.files.get(path)
 
 
-def _made_absolute(before: Iterable[Enclave], after: Iterable[Enclave]) -> tuple[PlacedRight, ...]:
+def _rights_made_absolute(
+    before: Iterable[Enclave], after: Iterable[Enclave]
+) -> tuple[PlacedRight, ...]:
     """Return the rights that begin with / in ``after``, and were relative in ``before``."""
     relative, absolute = (
         {

@@ -59,7 +59,7 @@ def suggest(
         if not any(verdict.witness or verdict.empty or verdict.always for _, verdict in verdicts):
             last = _joined_requirement(requirements[-1], requirement) if requirements else None
             requirements[-1:] = [last] if last else [*requirements[-1:], requirement]
-    return tuple(_for_each_robot(requirements, fleet) if fleet else requirements)
+    return tuple(_with_placeholders_for_robots(requirements, fleet) if fleet else requirements)
 
 
 def _joined_requirement(requirement: Requirement, other: Requirement) -> Requirement | None:
@@ -139,7 +139,9 @@ def _gate_requirements(world: World) -> Iterator[Apart]:
 Names = tuple[str, ...]
 
 
-def _for_each_robot(requirements: Iterable[Requirement], fleet: Fleet) -> Iterator[Requirement]:
+def _with_placeholders_for_robots(
+    requirements: Iterable[Requirement], fleet: Fleet
+) -> Iterator[Requirement]:
     """Yield requirements that demand the same, with placeholders for the robots of a fleet."""
     stated = tuple(requirements)
     alike: dict[Requirement, dict[str, Requirement]] = {}

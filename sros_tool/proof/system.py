@@ -220,7 +220,7 @@ def policy_system(
             if only_enclaves:
                 raise
             left_out = error
-    return System(policy.file, tuple(worlds), Places.of_policy(policy), rights, left_out)
+    return System(policy.file, tuple(worlds), Places.index_of_policy(policy), rights, left_out)
 
 
 def _planned_zenoh(
@@ -590,7 +590,7 @@ class Places:
         self._by_enclave: dict[str, list[tuple[bool, str, Place]]] = {}
 
     @classmethod
-    def of_policy(cls, policy: Policy) -> Places:
+    def index_of_policy(cls, policy: Policy) -> Places:
         """Return the index of the rights in a policy, with their lines."""
         return cls({enclave.path: _AllowedRights(enclave) for enclave in policy.enclaves})
 

@@ -51,7 +51,7 @@ from sros_tool.distributions import (
 from sros_tool.errors import UsageError
 from sros_tool.faults import FAULTS
 from sros_tool.fleet.expansion import read_policy_for
-from sros_tool.keystore.fleet import of_several_distributions, stated_distributions
+from sros_tool.keystore.fleet import enclaves_of_several_distributions, stated_distributions
 from sros_tool.keystore.layout import (
     KEY_FILE,
     KEY_URI_FILE,
@@ -300,7 +300,7 @@ def _products(
     """
     product = Vendor(vendor).traits.product if vendor not in ("", _ZENOH) else ""
     for old in before.shipped if vendor != _ZENOH else ():
-        if (new := after.of_product(old.product)) and product in ("", old.product):
+        if (new := after.shipped_product(old.product)) and product in ("", old.product):
             yield old, new
 
 
@@ -345,7 +345,7 @@ def check_distributions(
     Raises:
         DocumentError: a file cannot be read, or there are too many wildcards to decide.
     """
-    if not (of_several := of_several_distributions(keystore)):
+    if not (of_several := enclaves_of_several_distributions(keystore)):
         return []
     files = signed_files(keystore, moment=moment, zone=zone, domain=domain)
     findings = []

@@ -97,7 +97,7 @@ class PictureSource:
         """Whether other enclaves of the system may not be in the source."""
         return self.is_export or self.origin.kind in ("enclave", "permissions")
 
-    def in_enclaves(self, homes: Mapping[str, str]) -> PictureSource:
+    def moved_to_homes(self, homes: Mapping[str, str]) -> PictureSource:
         """Return a copy with rights and nodes moved from enclaves to their ``homes``."""
         nodes: dict[str, set[str]] = defaultdict(set)
         for path, names in self.nodes.items():

@@ -350,7 +350,7 @@ class _System:
                     added.add(Edge(enclave, hop.kind, hop.name, right, ALLOW, by))
         for focus in picture.focus:
             if focus.kind != _ENCLAVE and not is_expression(focus.name):
-                added |= set(self._by_wildcards(focus.kind, focus.name))
+                added |= set(self._edges_by_wildcard(focus.kind, focus.name))
         new = {(edge.kind, edge.name) for edge in added} - self._known
         names = (*picture.names, *(self._name(*key) for key in new))
         return replace(
@@ -359,7 +359,7 @@ class _System:
             names=tuple(sorted(names, key=lambda name: (name.kind, name.name))),
         )
 
-    def _by_wildcards(self, kind: str, name: str) -> Iterator[Edge]:
+    def _edges_by_wildcard(self, kind: str, name: str) -> Iterator[Edge]:
         """Yield the rights to a name that is matched only by wildcards."""
         if (kind, name) in self._known:
             return
@@ -461,7 +461,7 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, with_places: bool = True) 
             themselves need neither.
     """
     draft = _Draft(picture, FocusFlow.of(picture), hops)
-    cards = draft.in_columns()
+    cards = draft.cards_in_columns()
     links = draft.links(cards)
     names = {name for card in cards.values() if card.kind for name in card.members}
     scene = Scene(
@@ -573,7 +573,7 @@ class _Draft:
 
     # ── cards ──────────────────────────────────────────────────────────────────────────────
 
-    def in_columns(self) -> dict[str, Card]:
+    def cards_in_columns(self) -> dict[str, Card]:
         """Return all cards by id, with x and width but without y."""
         cards = [*self._side_cards(), *self._further_cards(), *self._names_cards()]
         widths = [0] * self.columns

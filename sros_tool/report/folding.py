@@ -158,8 +158,8 @@ class UnitText:
         first, *rest = self.parts
         return first + "".join(value + part for value, part in zip(named, rest, strict=True))
 
-    def only(self, unit: int | None, word: Callable[[int, int], str]) -> UnitText:
-        """Return the text in which units other than ``unit`` are plain text."""
+    def with_only_unit(self, unit: int | None, word: Callable[[int, int], str]) -> UnitText:
+        """Return the text with only ``unit`` as a unit; the names of others become plain text."""
         parts, named = [self.parts[0]], []
         for named_unit, part in zip(self.named, self.parts[1:], strict=True):
             if named_unit[0] == unit:
@@ -293,7 +293,7 @@ class _Draft:
 
     def _owner(self, enclave: str) -> UnitText:
         """Return the path of an enclave, split only at the name of the enclave's own unit."""
-        return self._text(enclave).only(self._of.get(enclave), self._word)
+        return self._text(enclave).with_only_unit(self._of.get(enclave), self._word)
 
     def _sightings(self) -> Iterator[tuple[int, tuple[int, ...], Edge | str]]:
         """Yield each enclave and drawn right whose texts have names of units.
@@ -364,12 +364,12 @@ class _Draft:
                 before[unit] = number
         classes = _classes(self._views(), before)
         return {
-            number: sorted(found, key=self._by_name)
+            number: sorted(found, key=self._unit_name_order)
             for number, found in classes.items()
             if len(found) > 1
         }
 
-    def _by_name(self, unit: int) -> tuple[object, ...]:
+    def _unit_name_order(self, unit: int) -> tuple[object, ...]:
         return name_order(self._units[unit].name)
 
     def _unit_names(self, units: Iterable[int]) -> tuple[str, ...]:
@@ -502,7 +502,7 @@ class _Draft:
         """Return a function that tells how many other units a right is for, as text."""
         others: dict[object, set[int]] = defaultdict(set)
         families: dict[int, list[int]] = defaultdict(list)
-        for n in sorted(set(self._of.values()), key=self._by_name):
+        for n in sorted(set(self._of.values()), key=self._unit_name_order):
             families[self._units[n].family].append(n)
 
         def key(edge: Edge, unit: int, other: int) -> object:
@@ -598,7 +598,7 @@ class _Draft:
                 usual_of.setdefault((self._units[n].family, self._units[n].group), members[0])
         near = {
             n: usual
-            for n in set(self._of.values()) - self._in_focus()
+            for n in set(self._of.values()) - self._units_in_focus()
             if (usual := usual_of.get((self._units[n].family, self._units[n].group))) is not None
             and self._is_drawn(n)
             and self._inside.get(n) != self._inside[usual]
@@ -609,7 +609,7 @@ class _Draft:
                 seen[unit].setdefault((kind, self._symbols_around(units, unit)), what)
         different: list[DifferentUnit] = []
         differing_parts: set[Edge | str] = set()
-        for n in sorted(near, key=self._by_name):
+        for n in sorted(near, key=self._unit_name_order):
             own, other = seen[n], seen[near[n]]
             if _are_alike(own, other):
                 more = [what for key, what in own.items() if key not in other]
@@ -626,7 +626,7 @@ class _Draft:
                     )
         return tuple(different), differing_parts
 
-    def _in_focus(self) -> set[int]:
+    def _units_in_focus(self) -> set[int]:
         """Return the units in the focus, which differ from all others by that."""
         names = (focus.name for focus in self._picture.focus)
         return {unit for name in names for unit in self._text(name).units}
@@ -702,7 +702,7 @@ def _robots(paths: Iterable[str], robots: Mapping[str, Robot]) -> Iterator[Drawn
 
 def _guessed_units(paths: Iterable[str]) -> Iterator[DrawnUnit]:
     """Yield sibling namespaces or enclaves that contain nearly the same enclaves."""
-    waiting = [_by_first((path[1:], path) for path in paths)]
+    waiting = [_group_by_first_part((path[1:], path) for path in paths)]
     family = 0
     while waiting:
         children = waiting.pop()
@@ -719,12 +719,12 @@ def _guessed_units(paths: Iterable[str]) -> Iterator[DrawnUnit]:
                     yield DrawnUnit(name, what, family, tuple(sorted(below.values())), (name,))
                     del children[name]
         waiting += [
-            _by_first((rest, path) for rest, path in below.items() if rest)
+            _group_by_first_part((rest, path) for rest, path in below.items() if rest)
             for _, below in sorted(children.items())
         ]
 
 
-def _by_first(paths: Iterable[tuple[str, str]]) -> dict[str, dict[str, str]]:
+def _group_by_first_part(paths: Iterable[tuple[str, str]]) -> dict[str, dict[str, str]]:
     """Group paths by their first part: map it to the rest of the path and to the enclave."""
     groups: dict[str, dict[str, str]] = defaultdict(dict)
     for path, enclave in paths:

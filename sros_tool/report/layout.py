@@ -680,7 +680,7 @@ def order_columns(
     inner, outer = range(1, len(columns), 2), range(0, len(columns), 2)
     for sweep in range(_SWEEPS):
         for moved in (*inner, *(outer if sweep % 2 else reversed(outer))):
-            current[moved] = _by_barycentre(current[moved], near, _relative_positions(current))
+            current[moved] = _sort_by_barycentre(current[moved], near, _relative_positions(current))
         crossings = _crossings(current, lines)
         if crossings < fewest:
             best, fewest = [list(column) for column in current], crossings
@@ -696,7 +696,7 @@ def _relative_positions(columns: Sequence[Sequence[ColumnItem]]) -> dict[str, fl
     }
 
 
-def _by_barycentre(
+def _sort_by_barycentre(
     column: Sequence[ColumnItem], near: Mapping[str, Sequence[str]], places: Mapping[str, float]
 ) -> list[ColumnItem]:
     centre = {

@@ -233,7 +233,7 @@ def _sentence(text: str) -> str:
 def _demo_head(result: Json) -> str:
     rows = result["rows"]
     good, skipped = _number_as_expected(rows), sum(row["observed"] == _SKIPPED for row in rows)
-    not_tried = sum(len(_not_tried(scenario)) for scenario in result["scenarios"])
+    not_tried = sum(len(_untried_attempts(scenario)) for scenario in result["scenarios"])
     opened = sum(bool(row.get("open_because")) and not row.get("open_here") for row in rows)
     here = sum(bool(row.get("open_here")) for row in rows)
     where = (
@@ -283,7 +283,7 @@ def _number_as_expected(rows: Sequence[Json]) -> int:
     return sum(bool(row["as_expected"]) and row["observed"] != _SKIPPED for row in rows)
 
 
-def _not_tried(scenario: Json) -> Sequence[str]:
+def _untried_attempts(scenario: Json) -> Sequence[str]:
     """Return the attempts that a proof of a user's keystore needs, but that were not made."""
     keystore = scenario.get("keystore")
     return keystore["not_tried"] if keystore else ()
@@ -307,7 +307,7 @@ def _demo_scenario(scenario: Json) -> str:
         elsewhere = keystore["elsewhere"]
         played += f"; the keys of {elsewhere} are elsewhere" if elsewhere else ""
         parts.append(f'<p class="soft">{played}.</p>')
-    if not_tried := _not_tried(scenario):
+    if not_tried := _untried_attempts(scenario):
         names = escape("; ".join(not_tried))
         parts.append(f"<p>Not tried, and needed for a proof: {names}.</p>")
     if rows:

@@ -24,7 +24,7 @@ from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot, robot_of
 from sros_tool.graph.learn import learn
-from sros_tool.graph.observation import from_json
+from sros_tool.graph.observation import observation_from_json
 from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import PUBLIC, ROUTER_FILE, is_keystore
 from sros_tool.keystore.participant import evaluated
@@ -145,7 +145,7 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     context = Context(common_rights(), places | _hosts(drawing.hosts))
     if drawing.observed:
         seen = union([read_source(path, now=drawing.now) for path in drawing.observed])
-        read.append(seen.in_enclaves(enclaves_of_nodes(seen.nodes, read[0].nodes)))
+        read.append(seen.moved_to_homes(enclaves_of_nodes(seen.nodes, read[0].nodes)))
     picture = _compared_picture(read, context, use=bool(drawing.observed))
     if len(domains := {enclave.domains for enclave in picture.enclaves} - {""}) > 1:
         several = enumerated(sorted(domains))
@@ -484,7 +484,9 @@ def _with_findings(
         right.enclave for right in source.rights
     }
     places = _file_names(path)
-    found = tuple(_without_paths(_on_known_enclave(finding, known), places) for finding in findings)
+    found = tuple(
+        _without_paths(_attach_to_known_enclave(finding, known), places) for finding in findings
+    )
     return replace(source, findings=tuple(dict.fromkeys((*source.findings, *found))))
 
 
@@ -523,7 +525,7 @@ def _template_governance(
 
 def _observation(path: Path) -> PictureSource:
     try:
-        observed = from_json(parse_json(read_bytes(path, "file")))
+        observed = observation_from_json(parse_json(read_bytes(path, "file")))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DocumentError(
             f"'{path}' is not an observation",
@@ -637,7 +639,7 @@ def _authorities(keystore: Keystore) -> Iterator[Validity]:
 # ── removing paths of this machine ─────────────────────────────────────────────────────────
 
 
-def _on_known_enclave(finding: PicturedFinding, known: Set[str]) -> PicturedFinding:
+def _attach_to_known_enclave(finding: PicturedFinding, known: Set[str]) -> PicturedFinding:
     if not finding.enclave or finding.enclave in known:
         return finding
     return replace(finding, enclave="", text=f"{finding.enclave}: {finding.text}")

@@ -169,7 +169,7 @@ def vendor_here(
     why += _lacks_security(rmw, environment) if distribution is None else ""
     vendor = vendor_of(rmw) or Vendor.FAST
     distribution = distribution or sourced_distribution(environment.get(ROS_DISTRO))
-    shipped = distribution.of_product(vendor.traits.product) if distribution else None
+    shipped = distribution.shipped_product(vendor.traits.product) if distribution else None
     if distribution is None or shipped is None:
         return vendor, why or "the default of ROS 2 Jazzy"
     return shipped.vendor, ", ".join(filter(None, (why, distribution.why(shipped.vendor))))
@@ -189,14 +189,16 @@ def chosen_vendor(
         return vendor_here(environment, distribution)
     if not distribution:
         return Vendor(named), "as asked"
-    vendor = distribution.of_vendor(Vendor(named)).vendor
+    vendor = distribution.shipped_vendor_product(Vendor(named)).vendor
     return vendor, distribution.why(vendor)
 
 
 def shipped_vendor(rmw: str, environment: Mapping[str, str]) -> Vendor | None:
     """Return the vendor of an RMW as `vendor_of`, in the release that $ROS_DISTRO ships."""
     vendor, distribution = vendor_of(rmw), sourced_distribution(environment.get(ROS_DISTRO))
-    shipped = distribution.of_product(vendor.traits.product) if vendor and distribution else None
+    shipped = (
+        distribution.shipped_product(vendor.traits.product) if vendor and distribution else None
+    )
     return shipped.vendor if shipped else vendor
 
 

@@ -85,7 +85,7 @@ class RemoteRights:
         """
         return RemoteRights(
             common_name,
-            in_order(rule.mirrored() for rule in self.rules),
+            sorted_rules(rule.mirrored() for rule in self.rules),
             {(flow.opposite(), messages): of for (flow, messages), of in self.made_of.items()},
         )
 
@@ -257,7 +257,7 @@ def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     keys_of_use: dict[tuple[Flow, tuple[Message, ...], bool], list[tuple[str, ...]]] = {}
     for flow, messages, keys, allows in rules:
         keys_of_use.setdefault((flow, messages, allows), []).append(keys)
-    return in_order(
+    return sorted_rules(
         AccessRule(flow, messages, _joined_keys(keys), allows)
         for (flow, messages, allows), keys in keys_of_use.items()
     )
@@ -274,7 +274,7 @@ def _needed_keys(keys: frozenset[str]) -> tuple[str, ...]:
     return tuple(KeyExpressions(keys).needed())
 
 
-def in_order(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
+def sorted_rules(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     """Return rules of different directions and messages in the order of `joined`."""
     return tuple(
         sorted(rules, key=lambda rule: (*_place(rule.flow, rule.messages), not rule.allows))
@@ -307,14 +307,14 @@ class RightsBetween:
         self._mirrored: dict[str, list[_RuleOfPeer]] = {}
         for peer in rights:
             name = peer.common_name
-            self._rules[name] = _RuleOfPeer.of_all(peer)
-            self._mirrored[name] = _RuleOfPeer.of_all(peer.mirrored(name))
+            self._rules[name] = _RuleOfPeer.rights_for_others(peer)
+            self._mirrored[name] = _RuleOfPeer.rights_for_others(peer.mirrored(name))
         self._plain = {
             name: frozenset().union(*(rule_of_peer.keys.plain for rule_of_peer in rules))
             for name, rules in self._rules.items()
         }
 
-    def of_all(self, own: str) -> Iterator[RemoteRights]:
+    def rights_for_others(self, own: str) -> Iterator[RemoteRights]:
         """Yield the rights that a process of the enclave ``own`` gives to every other enclave.
 
         Raises:
@@ -348,7 +348,7 @@ class RightsBetween:
                 AccessRule(flow, messages, keys, allows)
                 for (flow, messages, allows), keys in shared.items()
             )
-            yield RemoteRights(remote, in_order(rules))
+            yield RemoteRights(remote, sorted_rules(rules))
 
 
 _Place = tuple[Flow, tuple[Message, ...], bool]
@@ -361,7 +361,7 @@ class _RuleOfPeer(NamedTuple):
     keys: RuleKeys
 
     @classmethod
-    def of_all(cls, rights: RemoteRights) -> list[_RuleOfPeer]:
+    def rights_for_others(cls, rights: RemoteRights) -> list[_RuleOfPeer]:
         return [
             cls((rule.flow, rule.messages, rule.allows), rule, rights.keys_of(rule))
             for rule in rights.rules
@@ -392,8 +392,8 @@ def narrowed_rights(rights: RemoteRights, most: Iterable[AccessRule], kept: str)
     others = tuple(rule for rule in rights.rules if rule not in graph)
     limit = RemoteRights("", tuple(rule.mirrored() for rule in most))
     some = RemoteRights(rights.common_name, others, rights.made_of)
-    both, _ = RightsBetween((some, limit)).of_all("")
-    return RemoteRights(rights.common_name, in_order((*graph, *both.rules)))
+    both, _ = RightsBetween((some, limit)).rights_for_others("")
+    return RemoteRights(rights.common_name, sorted_rules((*graph, *both.rules)))
 
 
 def is_within(remote: RemoteRights, own_rights: RemoteRights) -> bool:
@@ -581,11 +581,11 @@ class Enforcement:
         ):
             return "it has deny rules, which do not apply to messages with wildcards"
         for subject in self.subjects:
-            if key := self._only_history(subject.id):
+            if key := self._history_only_key(subject.id):
                 return f"its subject {subject.id[:80]!r} gets only the history of {key[:80]!r}"
         return ""
 
-    def _only_history(self, subject: str) -> str:
+    def _history_only_key(self, subject: str) -> str:
         """Return a key of which a subject gets the history (``@adv``) but no messages, or ""."""
         keys: dict[Flow, list[str]] = {flow: [] for flow in Flow}
         history: dict[Flow, set[str]] = {flow: set() for flow in Flow}
@@ -621,9 +621,11 @@ class Enforcement:
         subjects = tuple(subject.id for subject in self.subjects_of(remote))
         default = "ALLOW" if self.allows_by_default else "DENY"
         if not self._rules_of:
-            return self._by_default(subjects, f"no rule is in force, and the default is {default}")
+            return self._default_decision(
+                subjects, f"no rule is in force, and the default is {default}"
+            )
         if not subjects:
-            return self._by_default((), f"no subject matches, and the default is {default}")
+            return self._default_decision((), f"no subject matches, and the default is {default}")
         denying: list[str] = []
         for combination in self._matching_subjects(remote):
             applying = [
@@ -689,7 +691,7 @@ class Enforcement:
             passing.append((everything if self.allows_by_default else allowed) - denied)
         return NameSet.union(passing)
 
-    def _by_default(self, subjects: tuple[str, ...], why: str) -> AccessDecision:
+    def _default_decision(self, subjects: tuple[str, ...], why: str) -> AccessDecision:
         return AccessDecision(self.allows_by_default, (), subjects, why)
 
     @cached_property

@@ -386,7 +386,7 @@ class RenderedReader:
             sections = _SECTIONS.fullmatch(control)
             if not mark or not sections:
                 return None
-            found, rights = self._parse_without_rules(beginning), self._of_all(sections)
+            found, rights = self._parse_without_rules(beginning), self._rendered_rights(sections)
             settings = found.settings
             if settings is not SettingsEdition.FEW and _control(rights, once=True) == control:
                 settings = SettingsEdition.RULES_ONCE
@@ -428,7 +428,7 @@ class RenderedReader:
             )
         return self._beginnings[text]
 
-    def _of_all(self, sections: re.Match[str]) -> list[RenderedRights]:
+    def _rendered_rights(self, sections: re.Match[str]) -> list[RenderedRights]:
         rules, _, policies = (_lines(section) for section in sections.groups())
         by_id = {}
         for line in rules:

@@ -224,7 +224,7 @@ def _root(data: bytes, name: str, *, lines: bool) -> _Section:
         )
     try:
         text = data.decode()
-        value = _of_yaml(text, name) if _has_ending(name) else parse_json5(text, lines=lines)
+        value = _parse_yaml(text, name) if _has_ending(name) else parse_json5(text, lines=lines)
     except UnicodeDecodeError as error:
         raise _json5_error_class(name)(
             f"the Zenoh configuration '{name}' is not UTF-8",
@@ -252,7 +252,7 @@ def _has_ending(name: str, endings: tuple[str, ...] = (*_AS_YAML, *_AS_TOML)) ->
     return name.endswith(endings)
 
 
-def _of_yaml(text: str, name: str) -> object:
+def _parse_yaml(text: str, name: str) -> object:
     """Return the value of YAML that is also valid JSON with the same meaning.
 
     Raises:

@@ -64,15 +64,15 @@ def subtract_all(allowed: frozenset[Chunks], denied: frozenset[Chunks]) -> froze
         CannotSubtract: the result has more than `MOST_EXPRESSIONS`; or a denied expression has a
             chunk or letters between two wildcards where an allowed expression has a wildcard.
     """
-    without = _not_covered(denied)
+    without = _uncovered(denied)
     left: set[Chunks] = set()
-    for wide in sorted(_not_covered(allowed)):
+    for wide in sorted(_uncovered(allowed)):
         left |= _subtract(wide, without)
         _check_number(len(left), MOST_EXPRESSIONS)
     return frozenset(left)
 
 
-def _not_covered(some: frozenset[Chunks]) -> list[Chunks]:
+def _uncovered(some: frozenset[Chunks]) -> list[Chunks]:
     """Return the expressions that no other one covers; if there are many, perhaps more."""
     wide: list[Chunks] = []
     left: list[Chunks] = []
@@ -220,16 +220,16 @@ def _remaining_keys(wide: Chunks, denied: frozenset[Chunks]) -> frozenset[Chunks
     if any(_covers(expression, wide) for expression in denied):
         return frozenset()
     if wide[0] != ANY_CHUNKS:
-        return _by_first_chunk(wide, denied)
+        return _split_by_first_chunk(wide, denied)
     if wide[-1] != ANY_CHUNKS:
-        reversed_rest = _by_first_chunk(
+        reversed_rest = _split_by_first_chunk(
             wide[::-1], frozenset(expression[::-1] for expression in denied)
         )
         return frozenset(expression[::-1] for expression in reversed_rest)
-    return _by_length(wide, denied)
+    return _shorter_keys(wide, denied)
 
 
-def _by_length(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
+def _shorter_keys(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
     """Return the keys of ``**`` that are shorter than all denied ones.
 
     The denied expressions consist only of wildcards.
@@ -242,7 +242,7 @@ def _by_length(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
     return frozenset(_any_chunks(number) for number in range(least) if number not in lengths)
 
 
-def _by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
+def _split_by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
     """Return expressions for the keys of ``wide`` without ``denied``, by the first chunk.
 
     The first chunk of ``wide`` is not ``**``.
@@ -420,9 +420,9 @@ class _Letters:
         if starred and all(chunk in starred or "*" not in chunk for chunk in denied):
             self._keep_backwards(read, wide, denied)
             return ()
-        return self._by_next_letter(place._replace(denied=denied))
+        return self._split_by_next_letter(place._replace(denied=denied))
 
-    def _by_next_letter(self, place: _Place) -> Iterator[_Place]:
+    def _split_by_next_letter(self, place: _Place) -> Iterator[_Place]:
         """Split a place by its next letter, and yield the parts; ``wide`` must begin with "*"."""
         read, wide, denied, letters = place
         if wide == "*" and not any("*" in chunk for chunk in denied):

@@ -24,7 +24,7 @@ from sros_tool.agent.settings import (
     read_settings,
     write_settings,
 )
-from sros_tool.agent.state import agent_status, only_agent, read_state
+from sros_tool.agent.state import agent_lock, agent_status, read_state
 from sros_tool.errors import DocumentError, KeystoreError, UnavailableError
 from sros_tool.keystore.confirmation import (
     Confirmation,
@@ -823,9 +823,9 @@ def test_settings_that_others_can_change_are_not_used(of_others: str, r1: Robot)
 
 def test_one_agent_at_a_time(r1: Robot) -> None:
     with (
-        only_agent(r1.folder),
+        agent_lock(r1.folder),
         pytest.raises(KeystoreError, match="another agent"),
-        only_agent(r1.folder),
+        agent_lock(r1.folder),
     ):
         pass
     assert sros("agent", "run", r1.folder, "--once").status in (1, 2)

@@ -10,7 +10,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
-from sros_tool.checks.kind import by_cause
+from sros_tool.checks.kind import group_by_cause
 from sros_tool.checks.registry import FindingFilter
 from sros_tool.dds.decision.access import Access, GovernedDomain
 from sros_tool.dds.decision.vendors import TESTED, Signers, Vendor, joined_titles
@@ -117,7 +117,7 @@ def test_files_that_expire_soon_are_one_finding(tmp_path: Path) -> None:
     sros("create_keystore", root, "--template", "production").ok()
     sros("create_enclave", root, "/a", "/b").ok()
     found = keystore_findings(Keystore(root), now=NOW + timedelta(days=160))
-    (soon,) = (group for group in by_cause(found) if group[0].id == "enclave.ends-soon")
+    (soon,) = (group for group in group_by_cause(found) if group[0].id == "enclave.ends-soon")
     cause = soon[0].cause
     assert len(soon) == 2 and cause and "2 files of 2 enclaves, the first of /a" in cause.text
     assert f"`sros renew {root} --all-expiring 30d`" in cause.remedy

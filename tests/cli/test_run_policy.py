@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.cli.common import now
-from sros_tool.enclave_environment import other_node
+from sros_tool.enclave_environment import other_node_notes
 from tests.support.harness import Ended, forked, sros
 
 SHOW = "import json, os, sys; print(json.dumps([dict(os.environ), sys.argv]))"
@@ -115,7 +115,7 @@ def test_a_node_that_the_permissions_lack_is_named_before_it_starts(
         (export, "", ""),
     ):
         words = ("true", "--ros-args", *ros_args.split())
-        said = [note.text for note in other_node(root, "/line/talker", words, now=now())]
+        said = [note.text for note in other_node_notes(root, "/line/talker", words, now=now())]
         start = "the command names" if missed == "no namespace" else "the command starts"
         assert [text.startswith(f"{start} {missed}, ") for text in said] == [True] * bool(missed)
 

@@ -19,7 +19,7 @@ from sros_tool.pki.crl import Revoked, sign_crl
 from sros_tool.pki.keys import load_key
 from sros_tool.policy.rights import NodeName
 from sros_tool.translate_zenoh.rights import StatedRight, remote_of
-from sros_tool.zenoh.access import AccessRule, Flow, Message, Remote, RemoteRights, in_order
+from sros_tool.zenoh.access import AccessRule, Flow, Message, Remote, RemoteRights, sorted_rules
 from sros_tool.zenoh.document import parse_configuration
 from tests.support.harness import copy_of, policy_text, publish, snapshot, sros
 
@@ -291,7 +291,7 @@ def test_a_file_of_an_earlier_version_is_refused_with_what_to_do(
         ]
         key = f"@ros2_lv/0/*/*/*/*/%{remote.common_name[1:]}/**"
         every = AccessRule(Flow.INGRESS, TOKEN, (key,))
-        return replace(remote, rules=in_order([*others, every]))
+        return replace(remote, rules=sorted_rules([*others, every]))
 
     with monkeypatch.context() as earlier:
         earlier.setattr(zenoh_files, "remote_of", as_before)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from sros_tool.graph.observation import (
     Endpoint,
     Observation,
-    from_json,
     make_observation,
+    observation_from_json,
 )
 from sros_tool.values import as_plain
 from tests.graph.graphs import graph, node
@@ -65,4 +65,4 @@ def test_a_node_that_spoke_later_is_not_silent() -> None:
 
 def test_json_gives_the_same_back() -> None:
     seen = graph(node("/a", "publish x", "call fib"), node("/n/b", "reply s", participant="p2"))
-    assert from_json(as_plain(seen)) == seen
+    assert observation_from_json(as_plain(seen)) == seen

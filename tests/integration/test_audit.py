@@ -14,7 +14,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.audit import audit, policy_enclaves
 from sros_tool.files import policies_dir
-from sros_tool.graph.observation import from_json
+from sros_tool.graph.observation import observation_from_json
 from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy, write_policy
@@ -90,5 +90,5 @@ def test_ten_missing_rights_of_a_live_robot_are_found_and_added(tmp_path: Path) 
     protection = load_template("production").protection
     governance = governance_for(protection, DomainSet.of((DOMAIN, DOMAIN)))
     context = JoinContext(DOMAIN, datetime.now(UTC))
-    observation = from_json(answer)
+    observation = observation_from_json(answer)
     assert audit(observation, policy_enclaves(merged, governance, Vendor.FAST, context)).allowed

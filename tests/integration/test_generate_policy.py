@@ -26,7 +26,7 @@ from sros_tool.demo.backend import RCLPY
 from sros_tool.files import policies_dir
 from sros_tool.graph import observe
 from sros_tool.graph.learn import is_tool_name
-from sros_tool.graph.observation import Observation, from_json
+from sros_tool.graph.observation import Observation, observation_from_json
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
@@ -331,7 +331,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Learned:
         "older_again": "older.xml",
     }
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(observe, "RosGraph", lambda _: Replayed(from_json(observed)))
+        patch.setattr(observe, "RosGraph", lambda _: Replayed(observation_from_json(observed)))
         for name, words in later.items():
             spelt = ("generate_policy", *words.split(), "--spin-time", "0.1")
             ended[name] = sros(*spelt, cwd=folder)

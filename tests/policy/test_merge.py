@@ -18,7 +18,7 @@ from sros_tool.policy.model import (
     Policy,
     Profile,
     Profiles,
-    in_namespace,
+    policy_in_namespace,
 )
 from sros_tool.policy.rights import Right, policy_rights
 from tests.policy.drawn_policies import PATHS, effective, meant, policies
@@ -69,7 +69,7 @@ def test_merging_with_itself_adds_nothing(policy: Policy) -> None:
     ("namespace", "path", "relative"), [("/left", "/left/a", "/left/x"), ("/", "/a", "/x")]
 )
 def test_a_policy_in_a_namespace(namespace: str, path: str, relative: str) -> None:
-    moved = in_namespace(one(group("topics", "x ~/y /z", publish="ALLOW")), namespace)
+    moved = policy_in_namespace(one(group("topics", "x ~/y /z", publish="ALLOW")), namespace)
     assert [enclave.path for enclave in moved.enclaves] == [path]
     names = {right.name for right in policy_rights(moved)}
     assert names == {relative, f"{relative[:-1]}n/y", "/z"}

@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.checks.keystores.files import UNREADABLE, key_mode_findings
 from sros_tool.checks.keystores.opened import CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE
@@ -372,11 +372,11 @@ robots.
 
 
 def _left_enclave_findings(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]:
-    from sros_tool.fleet.robots import left_robot_of
+    from sros_tool.fleet.robots import former_robot_of
 
     robots: dict[str, list[str]] = {}
     for name in keystore.names:
-        if robot := left_robot_of(fleet, name):
+        if robot := former_robot_of(fleet, name):
             robots.setdefault(robot, []).append(name)
     for robot, names in list(robots.items())[:_MOST_LEFT]:
         clause = f"{robot}: {first_few(names, _SHOWN)}"
@@ -423,7 +423,7 @@ def _record_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
         yield LEDGER_UNCHAINED.found("ledger", f"{count} lines have no chain", file)
         unproven = RecordedRights(keystore.opened, keystore.ledger).unproven_entries()
         if names := [name for name in keystore.names if name in unproven]:
-            yield LEDGER_UNPROVEN.found("ledger", some_names(names), file)
+            yield LEDGER_UNPROVEN.found("ledger", names_text(names), file)
 
 
 def _authority(

@@ -17,7 +17,7 @@ from math import isfinite
 from sros_tool.checks.keystores.enclaves import grant_of, plain
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.keystores.topic_names import check_topic_names
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import (
     CYCLONE_DDS,
@@ -284,9 +284,9 @@ def _form_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
         yield EMPTY_TOPIC.found(name, "a <topic> in a rule is empty", file)
     topics = sorted({topic for criterion in criteria for topic in criterion.topics})
     if odd := [topic for topic in topics if "[^" in topic or "[:" in topic]:
-        yield CHARACTER_CLASS.found(name, f"a rule names {some_names([*map(repr, odd)])}", file)
+        yield CHARACTER_CLASS.found(name, f"a rule names {names_text([*map(repr, odd)])}", file)
     if blank := [topic.strip() for topic in topics if topic != topic.strip() != ""]:
-        yield BLANKS.found(name, f"there are spaces or line ends around {some_names(blank)}", file)
+        yield BLANKS.found(name, f"there are spaces or line ends around {names_text(blank)}", file)
 
 
 def _partitions_text(grant: Grant) -> str:
@@ -299,10 +299,10 @@ def _partitions_text(grant: Grant) -> str:
                 and not any(map(_is_default, criteria.partitions))
             ):
                 word = "partition" if len(criteria.partitions) == 1 else "partitions"
-                topics = some_names(criteria.topics)
+                topics = names_text(criteria.topics)
                 return (
                     f"{topics} {'is' if len(criteria.topics) == 1 else 'are'} allowed only in "
-                    f"{word} {some_names(criteria.partitions)}, which ROS 2 does not use"
+                    f"{word} {names_text(criteria.partitions)}, which ROS 2 does not use"
                 )
     return "a rule names partitions"
 
@@ -358,7 +358,7 @@ def _order_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
                     late.setdefault(met, []).append(topic)
             for met, topics in late.items():
                 text = (
-                    f"rule {index + 1} denies to {direction} {some_names(topics)} after a rule "
+                    f"rule {index + 1} denies to {direction} {names_text(topics)} after a rule "
                     "that "
                 )
                 yield NO_EFFECT.found(name, f"{text}allows {met}", file)
@@ -377,12 +377,12 @@ def _unreachable_rule_findings(
             else:
                 left += 1
     if hidden and not left:
-        text = f"rule {index + 1} allows nothing, as an earlier rule denies {some_names([*hidden])}"
+        text = f"rule {index + 1} allows nothing, as an earlier rule denies {names_text([*hidden])}"
         yield UNREACHABLE.found(name, text, file)
         return
     for by, topics in hidden.items():
         what = " and ".join(
-            f"{direction} {some_names(topic)}" for direction, topic in topics.items()
+            f"{direction} {names_text(topic)}" for direction, topic in topics.items()
         )
         text = f"rule {index + 1} allows to {what} after a rule that denies {by}"
         yield UNREACHABLE.found(name, text, file)
@@ -719,7 +719,7 @@ def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:
     ]
     if not opened:
         return "they reach no topic, because all topics are controlled or protected"
-    return f"anybody can read and write {some_names(opened)}"
+    return f"anybody can read and write {names_text(opened)}"
 
 
 def _domain_rule(rule: DomainRule, vendors: Sequence[Vendor]) -> Iterator[tuple[FindingKind, str]]:

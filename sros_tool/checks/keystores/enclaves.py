@@ -18,8 +18,8 @@ from sros_tool.checks.kind import (
     WARNING,
     Finding,
     FindingKind,
-    by_id,
-    some_names,
+    kinds_by_id,
+    names_text,
 )
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import Grant, Rule
@@ -50,7 +50,7 @@ seconds after the CA.
 _NOT_LOADABLE = "enclave.not-loadable"
 """The group id of all faults, for `--include` and `--exclude`."""
 
-_LOADING_KINDS = by_id(
+_LOADING_KINDS = kinds_by_id(
     *(
         FindingKind(
             f"enclave.{fault.id}",
@@ -360,7 +360,7 @@ def _rights_findings(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]
     if allows_everything(grant):
         text = "the permissions allow publishing and subscribing every topic"
         if denied := _denied_before_everything(grant):
-            yield ONLY_DENIALS.found(enclave.name, f"{text} but {some_names(denied)}", file)
+            yield ONLY_DENIALS.found(enclave.name, f"{text} but {names_text(denied)}", file)
         else:
             # No template accepts it: whoever checks a keystore asks whether its robot is closed.
             accepted = keystore.accepts(EVERYTHING, lambda _: False)

@@ -11,7 +11,7 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, some_names
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.layout import (
     AGENT,
@@ -260,7 +260,7 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
         yield from _hidden_enclave_findings(keystore)
         yield from _folder_findings(root, keystore, links, trusted, kept)
         if kept and not (keystore.is_original and _has_links(keystore)):
-            yield HOME_OR_ROBOT.found(root, f"it has {some_names(kept)}", root)
+            yield HOME_OR_ROBOT.found(root, f"it has {names_text(kept)}", root)
         return
     passed: set[Path] = set()
     for name in names:

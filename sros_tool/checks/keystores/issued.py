@@ -16,7 +16,7 @@ from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance
-from sros_tool.dds.permissions import Grant, mistaken_names, some_pairs
+from sros_tool.dds.permissions import Grant, mistaken_names, pairs_text
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.layout import (
@@ -246,7 +246,7 @@ def check_issued(
     if pairs:
         from sros_tool.checks.policies import ENCLAVE_NAMES
 
-        text = f"Cyclone DDS mistakes {some_pairs(pairs)}"
+        text = f"Cyclone DDS mistakes {pairs_text(pairs)}"
         yield ENCLAVE_NAMES.found(pairs[0][0], text, str(keystore.root))
     if "/" in keystore.names:
         from sros_tool.checks.policies import within_root

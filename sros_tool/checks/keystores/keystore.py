@@ -52,12 +52,12 @@ from sros_tool.checks.keystores.vendors import (
     evaluate,
     with_causes,
 )
-from sros_tool.checks.kind import WARNING, Cause, Finding, some_names
+from sros_tool.checks.kind import WARNING, Cause, Finding, names_text
 from sros_tool.dds.decision.vendors import TESTED, ZENOH, Vendor
 from sros_tool.dds.governance import parse_governance
 from sros_tool.distributions import Distribution, find_distribution
 from sros_tool.errors import SrosError
-from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, in_original_keystore
+from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, remedy_in_original_keystore
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import publish_command, stated_distributions
 from sros_tool.keystore.layout import (
@@ -67,7 +67,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     waits_for_answer,
 )
-from sros_tool.keystore.reader import Keystore, of_one_state
+from sros_tool.keystore.reader import Keystore, read_consistently
 from sros_tool.parallel import map_slices, tick
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right
@@ -88,7 +88,7 @@ _OF_SEVERAL_FILES = frozenset(
 """Ids of findings that have one cause if their texts are equal, such as a shared CA or list."""
 
 
-@of_one_state
+@read_consistently
 def keystore_findings(
     opened: Keystore,
     *,
@@ -314,7 +314,7 @@ def _with_enclave_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
     """
     remedy = finding.remedy
     if not keystore.looks_like_original and NEEDS_CA_KEYS.search(remedy):
-        remedy = remedy if ORIGINAL_KEYSTORE in remedy else in_original_keystore(remedy)
+        remedy = remedy if ORIGINAL_KEYSTORE in remedy else remedy_in_original_keystore(remedy)
     if ORIGINAL_KEYSTORE not in remedy:
         remedy = re.sub(r"\bKEYSTORE\b", lambda _: quote(str(keystore.root)), remedy)
     if keystore.fleet and "generate_artifacts -k" in remedy and "--fleet" not in remedy:
@@ -380,7 +380,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: Keystore) -> list
         f"{len(names)} enclaves that the keystore never issued"
         if len(names) > 1
         else "an enclave that the keystore never issued",
-        f"{some_names(names)}: the ledger has neither the certificate nor the permissions; `ros2 "
+        f"{names_text(names)}: the ledger has neither the certificate nor the permissions; `ros2 "
         f"security create_enclave` leaves enclaves in this state. Found: {_kinds(chosen)}.",
         f"If you made it, state its rights with `{command}`, which also issues the certificate "
         "again. If nobody did, somebody else has the CA key: revoke the enclave, and replace the "

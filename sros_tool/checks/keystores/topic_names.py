@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 
 from sros_tool.checks.keystores.opened import CheckedEnclave
-from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, some_names
+from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.permissions import Criteria, Grant
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.patterns import overlap
@@ -74,7 +74,7 @@ def check_topic_names(enclave: CheckedEnclave, grant: Grant, file: str) -> Itera
     """Yield findings about topic names in the rules of a grant."""
     if not is_for_ros(grant):
         names = [repr(topic) for topic in dict.fromkeys(_rule_topics(grant, allow=True))]
-        yield NOT_FOR_ROS.found(enclave.name, f"they name only {some_names(names)}", file)
+        yield NOT_FOR_ROS.found(enclave.name, f"they name only {names_text(names)}", file)
         return
     named = dict.fromkeys((*_rule_topics(grant, allow=True), *_rule_topics(grant, allow=False)))
     problems = [text for name in named if (text := ros_name_problem(name))]
@@ -83,7 +83,7 @@ def check_topic_names(enclave: CheckedEnclave, grant: Grant, file: str) -> Itera
         yield NO_ROS_NAME.found(enclave.name, text, file)
     relayed = {topic for rule in grant.rules for topic in _topics(rule.relay) if rule.allow}
     if relayed and (only := sorted(relayed.difference(_rule_topics(grant, allow=True)))):
-        text = f"{some_names(only)} {'is' if len(only) == 1 else 'are'} allowed only in <relay>"
+        text = f"{names_text(only)} {'is' if len(only) == 1 else 'are'} allowed only in <relay>"
         yield RELAY_ONLY.found(enclave.name, text, file)
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from cryptography import x509
 
-from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, some_names
+from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.errors import SrosError
@@ -161,8 +161,8 @@ def _strangers(
         if refused := apart[some[0]].get(others[0], ()):
             authorities = " and ".join(f"{ROLES[role]} CA" for role in refused)
             text = (
-                f"nodes of {some_names(some)} do not communicate with nodes of "
-                f"{some_names(others)}: not both of them trust the other's {authorities}"
+                f"nodes of {names_text(some)} do not communicate with nodes of "
+                f"{names_text(others)}: not both of them trust the other's {authorities}"
             )
             yield STRANGERS.found(others[0], text, others[0])
             refused_pairs.update(map(frozenset, product(some, others)))
@@ -224,8 +224,8 @@ def _revoked(targets: Targets) -> Iterator[Finding]:
                 found[shown, names].update(of_list)
     for (shown, names), of_lists in found.items():
         text = (
-            f"nodes of {some_names(list(of_lists))} refuse nodes of {shown} in "
-            f"{some_names(names)}: their revocation list revokes "
+            f"nodes of {names_text(list(of_lists))} refuse nodes of {shown} in "
+            f"{names_text(names)}: their revocation list revokes "
             f"{'the certificate' if len(names) == 1 else 'the certificates'}"
         )
         yield PEERS_REVOKED.found(shown, text, shown)
@@ -347,7 +347,7 @@ def _governed_apart(
             )
             why = f"the former are for domain {own_domains}, the latter for domain {domains}"
         text = (
-            f"nodes of {some_names(alike)} do not communicate with nodes of {some_names(those)}"
+            f"nodes of {names_text(alike)} do not communicate with nodes of {names_text(those)}"
             f"{on}: {why}"
         )
         yield apart.kind.found(alike[0], text, alike[0])

@@ -15,7 +15,7 @@ from sros_tool.checks.keystores.documents import PARTITIONS, UNREACHABLE
 from sros_tool.checks.keystores.enclaves import fault_remedy, grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave
 from sros_tool.checks.keystores.topic_names import NO_ROS_NAME, has_invalid_characters, is_for_ros
-from sros_tool.checks.kind import ERROR, WARNING, Cause, Finding, FindingKind, some_names
+from sros_tool.checks.kind import ERROR, WARNING, Cause, Finding, FindingKind, names_text
 from sros_tool.dds.decision.access import Access, AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import TESTED, Vendor, joined_titles
 from sros_tool.dds.domains import DomainSet
@@ -599,7 +599,7 @@ def with_causes(findings: Sequence[Finding]) -> list[Finding]:
     causes = {
         text: Cause(
             f"{counted(len(group), 'enclave')} in which no ordinary ROS 2 node can start",
-            f"In {some_names([finding.subject for finding in group])}, {text}. {NO_NODE.why}",
+            f"In {names_text([finding.subject for finding in group])}, {text}. {NO_NODE.why}",
             group[0].remedy,
             len(group),
         )

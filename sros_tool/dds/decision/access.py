@@ -785,7 +785,11 @@ class Access:
         writes, reads = rule.enable_write_access_control, rule.enable_read_access_control
         refused = self._join.outcome is Outcome.PEER_DENIES
         if not (writes if verb is AccessVerb.PUBLISH else reads):
-            return _Kind.NOTHING if refused and not self._in_the_open(rule) else _Kind.EVERYTHING
+            return (
+                _Kind.NOTHING
+                if refused and not self._can_exchange_unprotected(rule)
+                else _Kind.EVERYTHING
+            )
         if refused:
             return _Kind.NOTHING
         return _Kind.BOTH_WAYS if self._traits.creates_topics and writes and reads else _Kind.RULES
@@ -883,7 +887,7 @@ class Access:
             if join.hits_peers:
                 return join._replace(topic_rule=rule)
             if join.outcome is Outcome.PEER_DENIES:
-                if not self._in_the_open(rule):
+                if not self._can_exchange_unprotected(rule):
                     return self._peers_refuse(rule)
                 text += " or protect it, so that even peers that refuse the participant exchange it"
             return self._answer(Outcome.ALLOWED, "unrestricted", text, topic_rule=rule)
@@ -900,7 +904,7 @@ class Access:
                 return self._verdict(remote, asked, rule, by_peers=True)
         return self._verdict(verdict, asked, rule)
 
-    def _in_the_open(self, rule: TopicRule) -> bool:
+    def _can_exchange_unprotected(self, rule: TopicRule) -> bool:
         """Return whether a participant that peers refuse can still exchange an unprotected topic.
 
         Peers check only the direction of the refused participant: read access for its readers,

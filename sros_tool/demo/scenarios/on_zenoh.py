@@ -330,7 +330,7 @@ _MEMORY_ROWS = tries(
     _shared_memory_row("large messages in shared memory", OWN, readable=False),
     _shared_memory_row(
         "large messages in shared memory, switched on",
-        zenoh_forger.in_shared_memory,
+        zenoh_forger.allow_shared_memory,
         readable=True,
     ),
 )
@@ -370,7 +370,7 @@ def _let_in(name: str, keystore: KeystoreChoice, defence_removed: str) -> Row:
     )
 
 
-_IN_DATE = _attacker("talker in date", Role.TALKER, zenoh_forger.in_date, "talker")
+_IN_DATE = _attacker("talker in date", Role.TALKER, zenoh_forger.valid_certificate, "talker")
 
 
 def _valid_certificate_row(name: str, defence_removed: str) -> Row:
@@ -755,7 +755,7 @@ _FAR_ROUTER_ROWS = tries(
     _rogue_far_router_row(_PLAYS_FAR_ROUTER, zenoh_forger.another_far_router),
     _rogue_far_router_row(
         f"{_PLAYS_FAR_ROUTER}, a subject for everybody",
-        zenoh_forger.any_far_router,
+        zenoh_forger.guest_as_far_router,
         "a named subject for the router",
     ),
 )

@@ -96,10 +96,12 @@ def sessions_that_limit_themselves(copy: KeystoreCopy) -> None:
     """Let every session enforce only its own rights, towards everybody, and the router nothing."""
     through_the_router(copy)
     for name, path in _files(copy).items():
-        _edit(path, _without_rules if name == copy.router else _for_everybody(copy.router))
+        _edit(
+            path, _without_rules if name == copy.router else _give_rights_to_everybody(copy.router)
+        )
 
 
-def _for_everybody(router: str) -> _Change:
+def _give_rights_to_everybody(router: str) -> _Change:
     """Return a change that gives the router's rights in a file to everybody."""
 
     def change(document: _Document) -> None:
@@ -116,7 +118,7 @@ def subject_for_everybody(copy: KeystoreCopy) -> None:
     another_router(copy)
     for name, path in _files(copy).items():
         if name not in (copy.router, copy.enclave("guest")):
-            _edit(path, _for_everybody(copy.router))
+            _edit(path, _give_rights_to_everybody(copy.router))
 
 
 def another_router(copy: KeystoreCopy) -> None:
@@ -172,10 +174,10 @@ def another_far_router(copy: KeystoreCopy) -> None:
     (copy.folder("guest") / SESSION_FILE).write_bytes(file.read_bytes())
 
 
-def any_far_router(copy: KeystoreCopy) -> None:
+def guest_as_far_router(copy: KeystoreCopy) -> None:
     """Let the guest play the router of the second host, and let the router believe everybody."""
     another_far_router(copy)
-    _edit(enclave_path(copy.root, copy.router) / ROUTER_FILE, _for_everybody(FAR_ROUTER))
+    _edit(enclave_path(copy.root, copy.router) / ROUTER_FILE, _give_rights_to_everybody(FAR_ROUTER))
 
 
 def talkative_router(copy: KeystoreCopy) -> None:
@@ -287,7 +289,7 @@ def earlier_session_file_of_one_that_limits_itself(copy: KeystoreCopy) -> None:
     """Put back the guest's earlier file where every session enforces only its own rights."""
     earlier = json.loads(_session_file_of_earlier_policy(copy))
     sessions_that_limit_themselves(copy)
-    _for_everybody(copy.router)(earlier)
+    _give_rights_to_everybody(copy.router)(earlier)
     (copy.folder("guest") / SESSION_FILE).write_text(json.dumps(earlier), encoding="utf-8")
 
 
@@ -418,7 +420,7 @@ def room_for_few_handshakes(copy: KeystoreCopy) -> None:
     _edit_all(copy, change)
 
 
-def in_shared_memory(copy: KeystoreCopy) -> None:
+def allow_shared_memory(copy: KeystoreCopy) -> None:
     """Let processes of the host exchange large messages in shared memory."""
 
     def change(document: _Document) -> None:
@@ -478,7 +480,7 @@ def _keep_stolen(copy: KeystoreCopy, files: Mapping[str, bytes]) -> None:
         (folder / name).write_bytes(data)
 
 
-def in_date(copy: KeystoreCopy) -> None:
+def valid_certificate(copy: KeystoreCopy) -> None:
     """Issue the talker's certificate again, valid from yesterday to tomorrow."""
     day = timedelta(days=1)
     copy.reissue("talker", Window(copy.now - day, copy.now + day))

@@ -206,7 +206,7 @@ def read_pin(text: str) -> frozenset[str]:
     )
 
 
-def _trusted_in(folder: Path, file: str) -> list[x509.Certificate]:
+def _trusted_certificates(folder: Path, file: str) -> list[x509.Certificate]:
     """Return the distinct certificates in the ``file`` files of all enclaves in ``folder``."""
     certificates: dict[str, x509.Certificate] = {}
     for path in sorted((folder / ENCLAVES).rglob(file)):
@@ -470,7 +470,7 @@ def import_answer(
         assert until
         _check_pinned(answer, state.identity_ca, state.permissions_ca, pinned)
         _check_key(folder, answer, key)
-        known = _trusted_in(folder, "permissions_ca.cert.pem")
+        known = _trusted_certificates(folder, "permissions_ca.cert.pem")
         if not force:
             _check_known(folder, answer, known)
             _check_newer(place, answer, state.certificate)

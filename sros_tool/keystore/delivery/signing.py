@@ -424,7 +424,7 @@ class _Signer:
         )
         issued = self._writer.write(Issuance(name, identity, rights))
         if earlier:
-            change.notes += _lost_rights(change, earlier, issued)
+            change.notes += _lost_rights_notes(change, earlier, issued)
         change.transaction.write(f"{enclave_folder(name)}/{REQUEST}", request.pem)
         link_shared_files(change.transaction, name, present_files(root, name))
         change.notes += issued.notes()
@@ -581,7 +581,7 @@ def _new_key_note(old: x509.Certificate, request: SigningRequest) -> list[Note]:
     ]
 
 
-def _lost_rights(
+def _lost_rights_notes(
     change: KeystoreChange, earlier_permissions: EarlierPermissions, issued: Issued
 ) -> list[Note]:
     """Return a note on the rights that the enclave loses, and how long its old files work."""

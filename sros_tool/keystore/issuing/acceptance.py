@@ -153,7 +153,7 @@ def refuse_stopping(
             "that was revoked: whoever gets the new revocation list refuses it"
         )
         notes.append(Note("keystore.revoked-put-back", text))
-    if unseen := transaction.not_kept():
+    if unseen := transaction.files_not_kept():
         text = (
             f"{_names_text(unseen)} not checked against vendors: this dry run makes too many files"
         )

@@ -33,7 +33,7 @@ from sros_tool.pki.certificates import (
     extension,
     issued_by,
     load_certificate,
-    other_issuer,
+    other_issuer_text,
     subject_text,
     validity_of,
     weakness,
@@ -219,7 +219,7 @@ def _fault(
     if key != request.public_key:
         return f"it is for another key ({algorithm(key)}) than the request"
     if not issued_by(certificate, authority):
-        issuer = other_issuer(certificate, authority)
+        issuer = other_issuer_text(certificate, authority)
         return f"its issuer is {issuer}, not the identity CA of the keystore"
     subject = {(part.oid, part.value) for part in certificate.subject}
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)

@@ -384,7 +384,7 @@ class EnclaveWriter:
             signed = {name: self.signed[name] for name in part if name in self.signed}
             return results, self.entries[first:], signed
 
-        slices = self._transaction.on_all_cores(names, work_on, alone=self._key_on_token)
+        slices = self._transaction.stage_on_all_cores(names, work_on, alone=self._key_on_token)
         results_by_name: dict[str, Result] = {}
         for index, (part, (results, entries, signed)) in enumerate(slices):
             if index:  # this process did the first slice, forked workers did the others

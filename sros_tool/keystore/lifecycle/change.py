@@ -591,14 +591,16 @@ def _take_over_records(
     added = list(entries)
     if not keystore.is_of_ros2:
         return added
-    before = list(_left_by_ros2(keystore, transaction.enclaves, now))
+    before = list(_entries_for_ros2_files(keystore, transaction.enclaves, now))
     transaction.note_adoption()
     if not any(entry.what == "settings" for entry in added):
         before += _settings_of_ros2(transaction, keystore, now)
     return [*before, *added]
 
 
-def _left_by_ros2(keystore: Keystore, names: Iterable[str], now: datetime) -> Iterator[Entry]:
+def _entries_for_ros2_files(
+    keystore: Keystore, names: Iterable[str], now: datetime
+) -> Iterator[Entry]:
     authorities = dict.fromkeys(keystore.ca_certificate(role) for role in ROLES)
     for authority in authorities:
         yield certificate_entry(now, "ca", authority, reason=_ADOPTED)
@@ -693,7 +695,7 @@ def _stage(
         return messages
 
     written: dict[str, bytes] = {}
-    for part, signed in transaction.on_all_cores(changed, stage, alone=authority.on_token):
+    for part, signed in transaction.stage_on_all_cores(changed, stage, alone=authority.on_token):
         for drift, message in zip(part, signed, strict=True):
             if drift.kind is not Drift.UNSIGNED:
                 written[drift.path] = files[drift.path]

@@ -97,7 +97,7 @@ from sros_tool.pki.certificates import (
     enclave_subject,
     has_unique_part,
     issued_by,
-    other_issuer,
+    other_issuer_text,
     parse_subject,
     subject_text,
     validity_of,
@@ -1044,8 +1044,8 @@ class _EnclaveMaker:
             raise KeystoreError(
                 f"the certificate of enclave {name} was not issued by the identity CA of this "
                 "keystore",
-                f"The issuer of '{path}' is {other_issuer(certificate, authority)}; other nodes of "
-                "this keystore would refuse the enclave.",
+                f"The issuer of '{path}' is {other_issuer_text(certificate, authority)}; other "
+                "nodes of this keystore would refuse the enclave.",
                 "Restore the right certificate, or remove the enclave's folder and create it "
                 "again.",
             )

@@ -37,7 +37,7 @@ from sros_tool.pki.certificates import (
     enclave_subject,
     has_unique_part,
     issued_by,
-    other_issuer,
+    other_issuer_text,
 )
 from sros_tool.pki.keys import PrivateKey, generate_key
 from sros_tool.validity import duration_text, iso
@@ -245,7 +245,7 @@ def checked_rights(
         raise KeystoreError(
             f"the certificate of enclave {state.name} was not issued by the identity CA of this "
             "keystore",
-            f"Its issuer is {other_issuer(state.certificate, authority)}.",
+            f"Its issuer is {other_issuer_text(state.certificate, authority)}.",
             "Restore the certificate, or remove the enclave's folder and create it again.",
         )
     state.signed.verify(authorities.permissions.certificate)

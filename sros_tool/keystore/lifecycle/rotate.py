@@ -83,7 +83,7 @@ from sros_tool.pki.certificates import (
     digest,
     issue_ca,
     issued_by,
-    other_issuer,
+    other_issuer_text,
     pem,
     same_key,
     subject_text,
@@ -721,8 +721,8 @@ def _issuance(
     if identity:
         if not issued_by(kept, identity.old[0]):
             raise KeystoreError(
-                f"its certificate was issued by {other_issuer(kept, identity.old[0])}, not by the "
-                "identity CA of this keystore"
+                f"its certificate was issued by {other_issuer_text(kept, identity.old[0])}, not by "
+                "the identity CA of this keystore"
             )
         key: PublicKey = kept.public_key()  # type: ignore[assignment]
         remedy = f"Renew it with `sros renew {quote(str(root))} {name} --new-key`, or revoke it."

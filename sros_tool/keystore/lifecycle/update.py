@@ -495,7 +495,7 @@ class _Updater:
             disturbed = mismatch(self._present.governance, governance)
             change.remarks.append(restart_note(disturbed, revoked=revoked))
             change.remarks.append(exports_note(self._root, names))
-        change.remarks += self._still_open()
+        change.remarks += self._kept_open_notes()
         change.remarks += self._open_tasks(settings)
         ends = [right.works_until for right in rights if right.works_until]
         renewed = dict.fromkeys((document.name for document in reissued if document.old), "renewed")
@@ -657,7 +657,7 @@ class _Updater:
 
     # ── remarks ────────────────────────────────────────────────────────────────────────────
 
-    def _still_open(self) -> list[Note]:
+    def _kept_open_notes(self) -> list[Note]:
         if not self._kept_open:
             return []
         which = "these enclaves" if len(self._kept_open) > 1 else "this enclave"

@@ -302,7 +302,7 @@ class Transaction:
             return kept if isinstance(kept, bytes) else None
         return _content(Path(self._stage_place(place)))
 
-    def not_kept(self) -> list[str]:
+    def files_not_kept(self) -> list[str]:
         """Return the new files that `content_after` does not know, because of a dry run's limit.
 
         Private files are not among them.
@@ -451,7 +451,7 @@ class Transaction:
 
     # ── by forked workers ───────────────────────────────────────────────────────────────
 
-    def on_all_cores(
+    def stage_on_all_cores(
         self,
         items: Sequence[Item],
         work: Callable[[Sequence[Item]], Result],
@@ -620,12 +620,12 @@ def _bridge(folder: Folder, moves: Sequence[Move]) -> None:
     point_live(folder, BEFORE)
     work = _Bridge(folder)
     if _can_exchange(folder):
-        map_slices(moves, work.by_exchange)
+        map_slices(moves, work.exchange_with_links)
         return
     # A file system that cannot exchange two names: make hard links or copies first.
     if any(copied for _, copied in map_slices(moves, work.keep)):
         folder.flush_file_system(f"{STAGE}/{BEFORE}")
-    map_slices(moves, work.by_replacement)
+    map_slices(moves, work.replace_with_links)
 
 
 def _can_exchange(folder: Folder) -> bool:
@@ -640,13 +640,13 @@ def _can_exchange(folder: Folder) -> bool:
 class _Bridge:
     """Replace the paths of a slice of the moves with links, in one of two ways.
 
-    One is `by_exchange`; the other is `keep`, followed by `by_replacement`.
+    One is `exchange_with_links`; the other is `keep`, followed by `replace_with_links`.
     """
 
     def __init__(self, folder: Folder) -> None:
         self._folder = folder
 
-    def by_exchange(self, moves: Sequence[Move]) -> None:
+    def exchange_with_links(self, moves: Sequence[Move]) -> None:
         """Exchange each file with a link created in ``before``."""
         for move in moves:
             if move.before != "":
@@ -673,7 +673,7 @@ class _Bridge:
                 copied = True
         return copied
 
-    def by_replacement(self, moves: Sequence[Move]) -> None:
+    def replace_with_links(self, moves: Sequence[Move]) -> None:
         """Replace each file with its link, after `keep`."""
         for move in moves:
             self._place(move)
