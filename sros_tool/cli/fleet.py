@@ -701,6 +701,8 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     root_end = publication.root_expires if publication else None
     publish += " --root-key FILE" if root_end and root_end <= compared_fleet.at else ""
     restored = f"`{publish} --restored`; docs/howto/keystore_is_lost.md says what else"
+    if status.clock:
+        yield f"{status.clock}: how old the confirmations are is not known. Set the clock"
     if status.older:
         yield f"the keystore is older than its robots: {status.older}. Publish with {restored}"
     elif any(robot.state == "later" for robot in status.robots):

@@ -59,7 +59,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     has_enclave,
 )
-from sros_tool.keystore.ledger import RESTORED, Entry
+from sros_tool.keystore.ledger import RESTORED, Entry, behind_clause, clock_behind
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import Keystore
 from sros_tool.parallel import map_slices
@@ -378,9 +378,9 @@ class PublishedMetadata:
 
 
 @shows(
-    *("keystore", "complete", "stage", "counts", "unassigned", "overdue", "older"),
+    *("keystore", "complete", "stage", "counts", "unassigned", "overdue", "older", "clock"),
     *("publication", "robots"),
-    null_if_empty=("older",),
+    null_if_empty=("older", "clock"),
 )
 @dataclass(frozen=True, slots=True)
 class FleetStatus:
@@ -401,6 +401,9 @@ class FleetStatus:
     """Why the keystore is older than its robots, as a clause: it was restored from a backup, or is
     a copy, and has not published with ``--restored`` since. Null if nothing shows that it is older.
     """
+    clock: str = ""
+    """How far the clock of this machine is behind the last entry of the ledger, or behind the last
+    confirmation, as a clause: ages and expiry are then not known. Null if it is not behind."""
     publication: PublishedMetadata | None = None
     """What robots fetch; null if nothing was published for a robot."""
     is_any_revoked: bool = False
@@ -426,7 +429,12 @@ class FleetStatus:
         published; if not, the exit status is 1. Robots of which all enclaves were revoked do not
         count.
         """
-        if self.overdue or self.older or (self.publication and not self.publication.accepted):
+        if (
+            self.overdue
+            or self.older
+            or self.clock
+            or (self.publication and not self.publication.accepted)
+        ):
             return False
         return all(robot.settled for robot in self.robots)
 
@@ -451,7 +459,12 @@ class FleetStatus:
         publication = self.publication and self.publication.at(now)
         is_accepted = publication is None or bool(publication.accepted)
         to_do = tuple(robot.with_to_do(now, is_accepted=is_accepted) for robot in robots)
-        return replace(self, robots=to_do, overdue=late, publication=publication)
+        received = max((each.received for each in self.robots if each.received), default=None)
+        clock = clock_behind(self.keystore, now)
+        clock = clock or behind_clause(now, received, "the last confirmation")
+        if clock:  # nobody knows how old the confirmations are
+            to_do = tuple(robot.without_list() for robot in to_do)
+        return replace(self, robots=to_do, overdue=late, clock=clock, publication=publication)
 
 
 def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:

@@ -34,7 +34,7 @@ from array import array
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
-from datetime import datetime
+from datetime import datetime, timedelta
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
@@ -56,7 +56,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import digest, subject_text, validity_of
-from sros_tool.validity import Window, iso
+from sros_tool.validity import Window, elapsed, iso, parse_iso
 from sros_tool.xml import open_at_once, read_bytes
 
 if TYPE_CHECKING:
@@ -194,6 +194,36 @@ _quoted = json.encoder.encode_basestring_ascii
 
 
 # ── entries ────────────────────────────────────────────────────────────────────────────────
+
+
+_CLOCK_TOLERANCE = timedelta(hours=1)
+"""How far the clock may be behind before it is called wrong."""
+
+
+def clock_behind(root: Path, now: datetime) -> str:
+    """Return, as a clause, how far the clock is behind the last entry of the ledger; "" if not."""
+    last = None
+    with suppress(SrosError, OSError, ValueError):
+        with _open(root, follow_link=True) or io.BytesIO() as file:
+            size = file.seek(0, io.SEEK_END)
+            file.seek(max(0, size - _LONGEST_LINE))
+            line = file.read().rstrip(b"\n").rpartition(b"\n")[2]
+        entry = _parse(line) or _parse_any(line)
+        last = parse_iso(entry.time) if entry else None
+    return behind_clause(now, last, "the last entry of the ledger")
+
+
+def behind_clause(now: datetime, last: datetime | None, what: str) -> str:
+    """Return, as a clause, how far the clock is behind the moment ``last`` of ``what``; "" if not.
+
+    A little is left to clocks that were set.
+    """
+    if last is None or last - now <= _CLOCK_TOLERANCE:
+        return ""
+    return (
+        f"the clock of this machine shows {iso(now)}, {elapsed(last - now)} behind {what}, of "
+        f"{iso(last)}"
+    )
 
 
 def certificate_entry(

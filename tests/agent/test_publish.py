@@ -37,6 +37,9 @@ from sros_tool.keystore.delivery.release import (
     seal_releases,
 )
 from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer, read_present
+from sros_tool.keystore.fleet_status import fleet_status
+from sros_tool.keystore.ledger import clock_behind
+from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction import transaction
 from sros_tool.pki.crl import load_crl
@@ -826,6 +829,23 @@ def test_damaged_metadata_and_lists_are_said(publisher: Home) -> None:
                 publisher.publish()
         path.write_bytes(kept)
     publisher.publish()
+
+
+def test_a_clock_that_was_set_back(publisher: Home) -> None:
+    """Its own ledger lies in the future: nothing that is published now has the right dates."""
+    before = snapshot(publisher.pub)
+    with pytest.raises(KeystoreError, match=r"30 d behind the last entry of the ledger, of "):
+        publisher.publish(-timedelta(days=30, hours=1))
+    assert snapshot(publisher.pub) == before
+    change = KeystoreChange(publisher.root, now=publisher.now)
+    with change:
+        assert any("the clock of this machine shows" in note.text for note in change.notes)
+    status = fleet_status(Keystore(publisher.root))
+    assert not status.with_overdue(publisher.now + timedelta(days=30, minutes=30)).clock
+    behind = status.with_overdue(publisher.now)
+    assert "30 d behind" in behind.clock and not behind.complete
+    (publisher.root / "ledger.jsonl").write_text("damaged")
+    assert not clock_behind(publisher.root, publisher.now)
 
 
 def test_keystore_and_folder_in_one_another(publisher: Home) -> None:

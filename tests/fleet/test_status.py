@@ -234,6 +234,22 @@ def test_a_robot_without_a_key_that_fits(field: Field) -> None:
     assert (found["state"], found["to_do"]) == ("unusable", "look into it")
 
 
+def test_a_clock_that_is_behind_the_confirmations(field: Field) -> None:
+    """No robot would ever be offline, and nobody knows whether a list is in force."""
+    field.run("revoke", "ks", "--robot", "r3")
+    field.deliver("r1", "r2", restart=[])
+    assert field.status()["robots"]["r1"]["crl_in_force"]
+    for robot in ("r1", "r2"):
+        field.age(robot, -timedelta(days=2))
+    ended = sros("fleet", "status", "ks", "--json", cwd=field.folder)
+    found = json.loads(ended.out)
+    assert ended.status == 1 and not found["complete"]
+    assert "behind the last confirmation, of " in found["clock"]
+    assert not any(robot["crl_in_force"] for robot in found["robots"])
+    said = field.run("fleet", "status", "ks", status=1).out.splitlines()[1]
+    assert said.startswith("the clock of this machine shows ") and said.endswith("Set the clock")
+
+
 def test_files_of_a_robot_that_others_can_read_or_change(field: Field) -> None:
     place = field.folder / "r1" / ENCLAVES / "r1/base"
     place.chmod(0o777)

@@ -63,7 +63,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     fleet_key,
 )
-from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.ledger import Entry, clock_behind
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import Forgotten
 from sros_tool.keystore.lifecycle.revoke import restore_revocations, restored_note
@@ -195,6 +195,13 @@ def publish(
     recorded_fleet(keystore)
     checked_fleet(keystore)
     _check_apart(root, folder)
+    if behind := clock_behind(root, now):
+        raise KeystoreError(
+            behind,
+            "Robots would refuse what is published now, or get it with wrong dates.",
+            "Set the clock, and publish again. If it is right, and was ahead before, first run "
+            f"`sros crl {quote(str(root))} --refresh`, so that the last entry is of today.",
+        )
     with ExitStack() as stack:
         if not dry_run:
             made = make_folders(folder)

@@ -47,7 +47,14 @@ from sros_tool.keystore.layout import (
     ROLES,
     check_keystore,
 )
-from sros_tool.keystore.ledger import Entry, Ledger, append, certificate_entry, document_entry
+from sros_tool.keystore.ledger import (
+    Entry,
+    Ledger,
+    append,
+    certificate_entry,
+    clock_behind,
+    document_entry,
+)
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights, Superseded
 from sros_tool.keystore.outcomes import KeptZenoh
 from sros_tool.keystore.reader import Keystore, check_domain
@@ -181,6 +188,9 @@ class KeystoreChange:
             check_keystore(self.root)
         self.transaction.__enter__()
         self.keystore = Keystore(self.root, locked=not self.dry_run)
+        if behind := clock_behind(self.root, self.now):
+            text = f"{behind}: what is made now is valid for too short a time. Set the clock."
+            self.notes.append(Note("keystore.clock", text))
         return self
 
     def __exit__(
