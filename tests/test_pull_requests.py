@@ -298,17 +298,26 @@ def test_both_code_hosts_run_the_same_command() -> None:
     assert inputs == {f"--{name}" for name in gitlab()[0]} - {"--source", "--stage"}
 
 
-def test_the_files_fit_their_schemas(tmp_path: Path) -> None:
+OF_GITHUB = ("check_jsonschema", "--builtin-schema", "vendor.github-actions")
+OF_GITLAB = ("check_jsonschema", "--builtin-schema", "vendor.gitlab-ci")
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    some(
+        [
+            ("action.yml", OF_GITHUB),
+            ("gitlab.yml", OF_GITLAB),
+            (".pre-commit-hooks.yaml", ("pre_commit", "validate-manifest")),
+        ],
+        1,
+    ),
+)
+def test_the_files_fit_their_schemas(file: str, words: tuple[str, ...], tmp_path: Path) -> None:
     (tmp_path / "gitlab.yml").write_text(yaml.safe_dump({"sros-review": gitlab()[1]}))
-    for name, file in (
-        ("github-actions", PROJECT / "action.yml"),
-        ("gitlab-ci", tmp_path / "gitlab.yml"),
-    ):
-        words = ["--builtin-schema", f"vendor.{name}", str(file)]
-        # -E: with the newest click, also where the tests run with the oldest packages.
-        subprocess.run([sys.executable, "-E", "-m", "check_jsonschema", *words], check=True)
-    words = ["-m", "pre_commit", "validate-manifest", str(PROJECT / ".pre-commit-hooks.yaml")]
-    subprocess.run([sys.executable, *words], check=True)
+    folder = tmp_path if words == OF_GITLAB else PROJECT
+    # -E: with the newest click, also where the tests run with the oldest packages.
+    subprocess.run([sys.executable, "-E", "-m", *words, str(folder / file)], check=True)
 
 
 @sometimes("the hooks of pre-commit")
