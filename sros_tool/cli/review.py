@@ -363,7 +363,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             return chosen.summary()
         case AccessChange(growth=growth):
             return access_summary(growth)
-        case RightsChange(compared=compared, absolute=absolute):
+        case RightsChange(compared=compared, absolute=absolute, relative=relative):
             added, gone = len(compared.rights.only_second), len(compared.rights.only_first)
             clauses = [
                 f"{counted(count, what)} {said}"
@@ -372,6 +372,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
                     (gone, "written right", "gone"),
                     (len(compared.protections), "stated protection", "changed"),
                     (len(absolute), "name", "made absolute"),
+                    (len(relative), "name", "made relative"),
                 )
                 if count
             ]
@@ -454,18 +455,24 @@ def _finding_line(finding: Finding) -> str:
 
 
 def _absolute_lines(change: RightsChange) -> Iterator[str]:
-    """Yield a line for each name that does not move with the namespace of its node any more."""
+    """Yield a line for each name that begins or ceases to move with the namespace of its node."""
     from sros_tool.fleet.robots import folded
+    from sros_tool.policy.model import ALLOW
 
-    lines = (
-        (
-            right.enclave,
-            f"~ {right.enclave} {right.describe()} has a / at its beginning now, so that it does "
-            f"not move with the namespace of its node any more  ({source})",
-        )
-        for right, _, source, _, _ in change.absolute
+    made_absolute = (
+        "has a / at its beginning now, so that it does not move with the namespace of its node any "
+        "more"
     )
-    yield from folded(change.after.fleet, lines)
+    made_relative = (
+        "has no / at its beginning any more, so that it moves with the namespace of its node"
+    )
+    for made, changed in ((made_absolute, change.absolute), (made_relative, change.relative)):
+        lines = []
+        for right, _, source, _, _ in changed:
+            denied = "" if right.qualifier is ALLOW else "DENY "
+            text = f"~ {right.enclave} {denied}{right.describe()} {made}  ({source})"
+            lines.append((right.enclave, text))
+        yield from folded(change.after.fleet, lines)
 
 
 def _verdict(result: Review) -> str:
@@ -552,7 +559,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
         case RightsChange(before=before, after=after, compared=compared) as change:
             parts = [rights_markdown(before, after, compared)] if compared else []
             if lines := list(_absolute_lines(change)):
-                title = f"### {counted(len(change.absolute), 'name')} made absolute"
+                title = f"### {counted(len(lines), 'name')} made absolute or relative"
                 parts += [title, bounded_list(map(code, lines), 6000, rest)]
             return "\n\n".join(part.rstrip("\n") for part in parts)
         case DroppedRequirements(chosen=chosen):

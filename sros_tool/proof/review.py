@@ -119,12 +119,14 @@ class RightsChange:
 
     ``absolute`` are the rights whose names are absolute in HEAD, and were relative to the namespace
     in BASE: users who put the node into another namespace do not move these names any more.
+    ``relative`` are the opposite: these names move now, and were the same for all.
     """
 
     before: RightsSource
     after: RightsSource
     compared: SourcesDifference
     absolute: tuple[PlacedRight, ...]
+    relative: tuple[PlacedRight, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -723,11 +725,14 @@ class _Review:
     ) -> tuple[int, Content] | None:
         base, head = before(), after()
         first, second = base.as_rights(), head.as_rights()
-        absolute = _rights_made_absolute(base.enclaves.values(), head.enclaves.values())
+        absolute, relative = (
+            _rights_made(base.enclaves.values(), head.enclaves.values(), absolute=absolute)
+            for absolute in (True, False)
+        )
         compared = compare_sources(first, second)
-        if not compared and not absolute:
+        if not compared and not (absolute or relative):
             return None
-        return _OK, RightsChange(first, second, compared, absolute)
+        return _OK, RightsChange(first, second, compared, absolute, relative)
 
     # ── requirements ───────────────────────────────────────────────────────────────────────
 
@@ -874,20 +879,20 @@ def _is_same_file(base: CommitFiles | None, head: CommitFiles, path: str) -> boo
     return base is not None and base.files.get(path) == head.files.get(path)
 
 
-def _rights_made_absolute(
-    before: Iterable[Enclave], after: Iterable[Enclave]
+def _rights_made(
+    before: Iterable[Enclave], after: Iterable[Enclave], *, absolute: bool
 ) -> tuple[PlacedRight, ...]:
-    """Return the rights that begin with / in ``after``, and were relative in ``before``."""
-    relative, absolute = (
+    """Return the rights that are ``absolute`` (or else relative) in ``after`` alone."""
+    earlier, later = (
         {
             placed.right: placed
             for enclave in enclaves
             for placed in placed_rights(enclave)
             if placed.written.startswith("/") is begins
         }
-        for enclaves, begins in ((before, False), (after, True))
+        for enclaves, begins in ((before, not absolute), (after, absolute))
     )
-    return tuple(placed for right, placed in absolute.items() if right in relative)
+    return tuple(placed for right, placed in later.items() if right in earlier)
 
 
 def _status(chosen_findings: ChosenFindings) -> int:

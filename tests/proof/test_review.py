@@ -148,6 +148,12 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     (absolute,) = (line for line in said if line.startswith("  ~"))
     assert "/c subscribe topic /x has a / at its beginning now, so that it does" in absolute
     assert absolute.endswith("(second.xml:3)")
+    denies = '<topics publish="DENY"><topic>{}</topic></topics>'
+    change.base = change.commit({"second.xml": policy_text({"/c": denies.format("/stop")})})
+    change.commit({"second.xml": policy_text({"/c": denies.format("stop")})})
+    ended = change.review("--policy", "robot.xml\nsecond.xml")
+    assert "1 name made relative" in ended.out
+    assert "  ~ /c DENY publish topic /stop has no / at its beginning any more, so" in ended.out
 
 
 def test_a_renamed_enclave_is_one_line_and_still_new_access(change: Change) -> None:
