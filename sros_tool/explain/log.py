@@ -491,7 +491,7 @@ def _dropped_finding(dropped: DroppedMessage, enclave: str, what: str, root: str
         return (
             "If it is an enclave of the keystore, `sros zenoh KEYSTORE --check` shows whether the "
             "files are up to date."
-        ).replace("KEYSTORE", quote(root) if root else "KEYSTORE")
+        ).replace("KEYSTORE", quote(root) if root and has_authorities(Path(root)) else "KEYSTORE")
     verb, _, name = asked.partition(" ")
     who = quote(enclave) if enclave else "ENCLAVE"
     command = f"sros explain {quote(root) if root else 'KEYSTORE'} {who}"
