@@ -149,8 +149,12 @@ def open_to_ask(
         own = policy.enclave(enclave.name)
         if own is None and not is_enclave(Path(enclave.name)):
             raise not_in_policy_error(policy, enclave.name, policy_file)
+    lacks_keys = False
+    if keystore and enclave.state and is_keystore(keystore.root):
+        lacks_keys = not keystore.has_keys
     enclave = enclave._replace(
         keystore=keystore,
+        key_elsewhere=enclave.key_elsewhere or lacks_keys,
         policy=own,
         policy_file=policy_file,
         has_placeholders=policy != stated

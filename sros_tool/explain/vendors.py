@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from enum import Enum, auto
 from fnmatch import fnmatchcase
+from pathlib import Path
+from shlex import quote
 from typing import NamedTuple
 
 from sros_tool.dds.decision.access import Outcome, OutcomeWord, ReasonWord
@@ -172,6 +174,8 @@ def explain_on_dds(
     """
     vendor, why = chosen_vendor
     enclave = asked_enclave.enclave
+    if question.word == "join" and enclave.state:
+        enclave = enclave._replace(key_elsewhere=enclave.state.key_on_robot)
     evaluator = Evaluator(vendor, enclave, context)
     question, taken = question_meant(evaluator, asked_enclave, question, kind)
     answer = explain(evaluator, question)
@@ -183,6 +187,7 @@ def explain_on_dds(
         *_other_type_notes(evaluator, answer, kind),
         *_not_a_topic_notes(answer, asked_enclave),
         *_similar_name_notes(answer),
+        *_notes_on_lacking_keys(enclave),
     )
     what = Asked(enclave.name, question, context)
     if every is Compared.VENDORS:
@@ -271,6 +276,23 @@ def _not_a_topic_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[
         what, word = ("an action", "execute") if "actions" in kinds else ("a service", "serve")
         text = f"{name} is {what} in the rights here, not a topic: ask about call or {word}."
         yield Note("explain.no-topic", text)
+
+
+def _notes_on_lacking_keys(enclave: LoadedEnclave) -> Iterator[Note]:
+    """Yield a note if an answer counts the key of an enclave as there, which is not."""
+    on_robot = enclave.state is None or enclave.state.key_on_robot
+    keystore = enclave.keystore
+    if keystore and enclave.key_elsewhere and not on_robot and not keystore.has_keys:
+        yield _note_on_lacking_keys(keystore.root)
+
+
+def _note_on_lacking_keys(root: Path) -> Note:
+    """Return the note for a keystore or export in which no enclave has its key."""
+    text = (
+        f"no enclave in '{root}' has its key: this is answered as if the keys were there. On the "
+        f"robot, `sros verify {quote(str(root))}` says whether they are."
+    )
+    return Note("explain.without-keys", text)
 
 
 def _similar_name_notes(answer: Answer) -> Iterator[Note]:
@@ -470,6 +492,8 @@ class VendorOfKeystore(NamedTuple):
 
         def outcome(name: str) -> VendorOutcome:
             enclave = load_enclave_of(self.keystore, name, moment=self.asking.at)
+            if question.word != "join" and not self.keystore.has_keys:
+                enclave = enclave._replace(key_elsewhere=True)
 
             def decided(domain: int) -> VendorOutcome:
                 context = self.asking._replace(domain=domain).context(None)
@@ -495,4 +519,6 @@ class VendorOfKeystore(NamedTuple):
         """Yield a note on an export, which may lack enclaves."""
         from sros_tool.explain.who import note_on_export  # as in `outcomes`
 
-        return note_on_export(self.keystore.root)
+        yield from note_on_export(self.keystore.root)
+        if not self.keystore.has_keys:
+            yield _note_on_lacking_keys(self.keystore.root)

@@ -434,6 +434,15 @@ class Keystore:
         lists = (self.revocation_list, self.embedded_list(file) if file else None)
         return tuple(filter(None, lists))
 
+    @_Part
+    def has_keys(self) -> bool:
+        """Whether any enclave has its key, or says where it is; a copy for others has none."""
+        return any(
+            os.path.lexists(enclave_path(self.root, name) / file)
+            for name in enclave_names(self.root, hidden=True)
+            for file in (KEY_FILE, KEY_URI_FILE)
+        )
+
     # ── governance ──
 
     @_Part

@@ -5,7 +5,6 @@ The access on one vendor, or on Zenoh, is called a world.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -29,8 +28,6 @@ from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import checked_fleet
 from sros_tool.keystore.layout import (
-    KEY_FILE,
-    KEY_URI_FILE,
     PERMISSIONS_FILE,
     ROUTER_FILE,
     enclave_names,
@@ -349,7 +346,6 @@ def _stated_topics(enclaves: Iterable[str], rights: Iterable[Right]) -> dict[str
 # ── a keystore ─────────────────────────────────────────────────────────────────────────────
 
 
-_KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 _MOST_DOMAINS = 20
 _MOST_GOVERNANCES = 4
 
@@ -376,13 +372,8 @@ def _keystore_system(
     source = load_rights(keystore, hidden=True)
     rights = frozenset(right for right in source.rights if right.qualifier is ALLOW)
     stated = _stated_topics(names, rights)
-    folders = {name: enclave_path(root, name) for name in names}
-    # Without any key this is the public part of a keystore, and the keys are where it came from.
-    public = not any(
-        os.path.lexists(folder / key) for folder in folders.values() for key in _KEY_FILES
-    )
     loaded = {name: load_enclave_of(keystore, name, moment=at) for name in names}
-    if public:
+    if not keystore.has_keys:  # the public part of a keystore: the keys are where it came from
         loaded = {name: enclave._replace(key_elsewhere=True) for name, enclave in loaded.items()}
     for name, enclave in loaded.items():
         if (

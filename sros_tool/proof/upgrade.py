@@ -6,7 +6,6 @@ of both releases decide whether it joins and which topics it may use, for all na
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
@@ -53,8 +52,6 @@ from sros_tool.faults import FAULTS
 from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.keystore.fleet import enclaves_of_several_distributions, stated_distributions
 from sros_tool.keystore.layout import (
-    KEY_FILE,
-    KEY_URI_FILE,
     PERMISSIONS_FILE,
     enclave_names,
     has_zenoh_files,
@@ -85,7 +82,6 @@ from sros_tool.zenoh.releases import version_text
 
 _SHOWN = 4
 _ZENOH = "zenoh"
-_KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,12 +152,8 @@ def signed_files(
     keystore.check()
     names = enclave_names(keystore.root, hidden=True)
     source = load_rights(keystore, hidden=True)
-    # Without any key this is the public part of a keystore, and the keys are where it came from.
-    public = not any(
-        os.path.lexists(keystore.folder(name) / key) for name in names for key in _KEY_FILES
-    )
     enclaves = {name: load_enclave_of(keystore, name, moment=moment) for name in names}
-    if public:
+    if not keystore.has_keys:  # the public part of a keystore: the keys are where it came from
         enclaves = {name: each._replace(key_elsewhere=True) for name, each in enclaves.items()}
     side = AccessSource(str(keystore.root), "keystore", source.rights, source.documents)
     return DecidedFiles(str(keystore.root), enclaves, side, moment, zone, domain, keystore)

@@ -793,3 +793,18 @@ def test_the_distribution_of_the_robot_decides(tmp_path: Path) -> None:
     assert "as in ROS 2 Humble)" in explain(root, *asked).out
     assert "on Fast DDS 3.6" in explain(root, *asked, "--distro", "lyrical").out
     assert "Humble" not in explain(root, "/r2/a", "publish", "/x").out
+
+
+def test_a_copy_without_keys_is_answered_as_if_they_were_there(whole: Path, tmp_path: Path) -> None:
+    """Or who gets a copy to find out why a node is silent learns nothing."""
+    copy = tmp_path / "copy"
+    sros("distribute_key", whole, "--all", copy).ok()
+    for key in copy.glob("enclaves/**/key.pem"):
+        key.unlink()
+    said = explain(copy, ENCLAVE, "publish", "/chatter").ok()
+    assert "note [explain.without-keys]: no enclave in" in said.err
+    assert "no rule allows" in explain(copy, ENCLAVE, "publish", "/nothing").out
+    assert "key.pem: missing" in explain(copy, ENCLAVE, "join").out
+    who = explain(copy, "--who", "publish", "/chatter")
+    assert ENCLAVE in who.out and "explain.without-keys" in who.err
+    assert "without-keys" not in explain(whole, ENCLAVE, "publish", "/chatter").ok().err
