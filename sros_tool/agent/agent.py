@@ -49,6 +49,7 @@ from sros_tool.keystore.confirmation import (
     LONGEST_LIST,
     MESSAGE_FILE,
     MOST_REQUESTS,
+    OF_SAME_NUMBER,
     Confirmation,
     EnclaveExpiry,
     RobotClock,
@@ -352,8 +353,8 @@ class _Round:
         settings, state = self._settings, self._state
         if release.number == state.accepted and self._differs_from_accepted(release):
             self._problems.append(
-                f"The published release has the number {release.number} of the installed release, "
-                "but other files: the keystore comes from a backup, or somebody else publishes. "
+                f"The published release has the number {release.number} {OF_SAME_NUMBER}: "
+                "the keystore comes from a backup, or somebody else publishes. "
                 "Nothing was changed. Where the keystore is: `sros fleet publish KEYSTORE PUB "
                 "--restored`."
             )

@@ -20,6 +20,7 @@ from sros_tool.errors import SrosError, UsageError
 from sros_tool.files import remove_file, replace_file
 from sros_tool.fleet.robots import name_problem
 from sros_tool.folders import Folder
+from sros_tool.keystore.confirmation import EXPIRED_METADATA, OLDER_THAN_SEEN
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
 from sros_tool.keystore.delivery.release import (
     Release,
@@ -36,6 +37,11 @@ if TYPE_CHECKING:
 
     from sros_tool.agent.transport import FolderTransport, HttpTransport
 
+OLD_COPY = (
+    "Look at what the server serves, and publish there again. Only if the keystore comes from a "
+    "backup: `sros fleet publish KEYSTORE PUB --restored`."
+)
+"""Remedy for a source that has less than this robot had."""
 _METADATA = "metadata"
 """The folder in the agent's folder with the trusted metadata, which `tuf` keeps."""
 _PINNED_ROOT = "root.json"
@@ -306,18 +312,17 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
         needs = " KEYSTORE PUB --root-key FILE" if "root.json" in why else ""
         return FetchError(
             FetchProblem.EXPIRED,
-            f"the metadata in {source} has expired",
-            f"{why} The clock here shows {iso(now)}. Nothing is published any more, or "
-            "somebody withholds the new files.",
+            f"{EXPIRED_METADATA[:1].lower()}{EXPIRED_METADATA[1:]}{source} has expired",
+            f"{why} The clock here shows {iso(now)}. Nothing is published any more, {source} has "
+            "an old copy, or somebody withholds the new files.",
             f"Where the keystore is, run `sros fleet publish{needs}`; {_CLOCK}.",
         )
     if isinstance(error, exceptions.BadVersionNumberError):
         return FetchError(
             FetchProblem.ROLLED_BACK,
-            f"the files in {source} are older than files that this robot has seen",
-            why,
-            "Nothing was changed. If the keystore or the folder comes from a backup, run `sros "
-            "fleet publish KEYSTORE PUB --restored` where the keystore is.",
+            f"the files in {source} {OLDER_THAN_SEEN}",
+            f"{why} The server has an older copy than this robot had. Nothing was changed.",
+            OLD_COPY,
         )
     if isinstance(error, exceptions.DownloadLengthMismatchError):
         return FetchError(

@@ -24,9 +24,10 @@ from typing import NamedTuple
 
 from cryptography import x509
 
+from sros_tool.agent.fetch import OLD_COPY
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder
-from sros_tool.keystore.confirmation import KEY_NOT_HERE
+from sros_tool.keystore.confirmation import KEY_NOT_HERE, OF_OTHER_CA, OLDER_THAN_INSTALLED
 from sros_tool.keystore.delivery.release import RELEASE_FILES, Release, seal_problem
 from sros_tool.keystore.delivery.robot import evaluate_delivered
 from sros_tool.keystore.layout import (
@@ -197,13 +198,20 @@ def _check_release(
             "Bring the first enclave with `sros import` or a play, or name the permissions CA with "
             "`sros agent init --ca`.",
         )
+    if release.number < installed:
+        raise KeystoreError(
+            f"release {release.number} is older than release {installed}, {OLDER_THAN_INSTALLED}",
+            "The server has an older copy than this robot had. Nothing was changed.",
+            OLD_COPY,
+        )
     if problem := seal_problem(release, trusted):
         raise KeystoreError(
-            f"release {release.number} comes from another keystore",
-            f"No permissions CA that '{folder}' trusts has sealed it: {problem.rstrip('.')}.",
-            "Nothing was changed. If this robot missed a stage of a CA rotation, bring its files "
-            f"with `sros distribute_key KEYSTORE --robot {robot} FOLDER --force`; if not, find out "
-            "who can write to the publishing folder.",
+            f"release {release.number} {OF_OTHER_CA}",
+            f"{problem.rstrip('.')}. Nothing was changed.",
+            "Look whether the server has an old copy, from before a CA rotation. If this robot "
+            "missed a stage of a rotation, bring its files with `sros distribute_key KEYSTORE "
+            f"--robot {robot} FOLDER --force`. Otherwise the release comes from another "
+            "keystore, or was changed: find out who can write to the publishing folder.",
         )
     with Folder(folder) as opened:
         usable = [name for name in present if _had_certificate(opened, name)]
@@ -214,13 +222,6 @@ def _check_release(
             f"{enumerated(sorted(release.enclaves()))}. Installing it would remove the keys of "
             "these enclaves. Nothing was changed.",
             "Check whether this robot has the right name (`sros agent init --robot`).",
-        )
-    if release.number < installed:
-        raise KeystoreError(
-            f"release {release.number} is older than release {installed}, which this robot has "
-            "installed before",
-            "The keystore may come from a backup. Nothing was changed.",
-            "Where the keystore is, run `sros fleet publish KEYSTORE PUB --restored`.",
         )
 
 

@@ -199,6 +199,12 @@ the robot: there is no key, or the certificate is for another one.
 """
 
 
+OLDER_THAN_SEEN = "are older than files that this robot has seen"
+OLDER_THAN_INSTALLED = "which this robot has installed before"
+EXPIRED_METADATA = "The metadata in "
+OF_OTHER_CA = "is not sealed by a CA that this robot trusts"
+OF_SAME_NUMBER = "of the installed release, but other files"
+"""What the agent says of a release, or of published metadata, that it refuses."""
 COULD_NOT_START = "could not start"
 """What a robot says of an enclave in which no process would start."""
 
@@ -207,6 +213,12 @@ def lacks_key(problem: str) -> bool:
     """Return whether a problem of a robot is about a key, which no release can bring."""
     is_of_key = is_unusable(problem) and KEY_FILE in problem
     return is_of_key or KEY_NOT_HERE in problem or OF_ANOTHER_KEY in problem
+
+
+def is_of_copy(problem: str) -> bool:
+    """Return whether a problem of an agent shows that its source may have an old copy."""
+    shown = (OLDER_THAN_SEEN, OLDER_THAN_INSTALLED, OF_OTHER_CA)
+    return any(text in problem for text in shown)
 
 
 def is_unusable(problem: str) -> bool:

@@ -31,6 +31,7 @@ from sros_tool.fleet.robots import (
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     CONFIRMED_FILES,
+    EXPIRED_METADATA,
     Confirmation,
     Received,
     RobotClock,
@@ -38,6 +39,7 @@ from sros_tool.keystore.confirmation import (
     RunningFiles,
     certificate_digests,
     enclave_of,
+    is_of_copy,
     is_unusable,
     lacks_key,
     last_confirmation,
@@ -335,7 +337,8 @@ class RobotStatus:
         if self.state is State.REVOKED and not self.enclaves:
             return "take it out of the fleet file"
         if self.state in (State.CURRENT, State.NONE):
-            return "look into it" if self.problems else ""
+            look = "look at its `from`" if self.reads_copy else "look into it"
+            return look if self.problems else ""
         if self.state in _TO_DO:
             return _TO_DO[self.state]
         if self.state is State.UNUSABLE:
@@ -346,10 +349,10 @@ class RobotStatus:
             return "deliver"
         if not is_accepted:
             return "publish"
-        if (self.published or 0) == (self.release or 0):
-            return "find out why" if self.is_published else "publish"
         if self.reads_copy:
             return "look at its `from`"
+        if (self.published or 0) == (self.release or 0):
+            return "find out why" if self.is_published else "publish"
         is_silent = self.received is None or now - self.received > _SILENCE
         if self.is_locked_out:
             return "deliver" if is_silent else "wait, else deliver"
@@ -808,11 +811,15 @@ class _Known:
     def reads_copy(self, compared_robot: _ComparedRobot, heard: datetime | None) -> bool:
         """Return whether a robot fetched long after the publication, and got an earlier release.
 
-        Robots that report a problem say themselves why they got no release.
+        Robots that report another problem say themselves why they got no release.
         """
         confirmed = compared_robot.confirmed
+        if confirmed and any(map(is_of_copy, confirmed.problems or ())):
+            return True
         published = self.published.get(compared_robot.robot.name)
-        if not (confirmed and heard and published) or confirmed.problems:
+        if not (confirmed and heard and published and compared_robot.different):
+            return False
+        if not all(EXPIRED_METADATA in problem for problem in confirmed.problems or ()):
             return False
         since = self._releases.get(published)
         return (confirmed.release or 0) < published and bool(since and heard - since > _SILENCE)
@@ -989,8 +996,10 @@ def _status(
         lacks_key=known.lacks_key(compared_robot) if different or state is State.UNUSABLE else (),
         is_locked_out=bool(compared_robot.enclaves) and certificates == {State.REVOKED},
     )
-    if not (different and status.fetches and known.reads_copy(compared_robot, status.last_heard)):
+    if not (status.fetches and known.reads_copy(compared_robot, status.last_heard)):
         return status
+    if status.problems:
+        return replace(status, reads_copy=True)
     text = (
         f"It sent a message long after release {status.published} was published, and has release "
         f"{status.release or 'none'}: its `from` is an old copy."

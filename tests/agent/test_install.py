@@ -137,13 +137,13 @@ REFUSED: dict[str, tuple[Callable[[Home], Release], str]] = {
     "an older number": (lambda home: home.first, "older than release 2"),
     "another keystore's": (
         lambda home: Release("r1", 9, home.renewed.files, home.first.seal),
-        "comes from another keystore",
+        "is not sealed by a CA that this robot trusts",
     ),
     "changed files": (
         lambda home: Release(
             "r1", 3, {**home.revoked.files, f"{A}/crl.pem": b"x"}, home.revoked.seal
         ),
-        "comes from another keystore",
+        "is not sealed by a CA that this robot trusts",
     ),
     "an older list": (lambda home: home.release(home.renewed.files), "is older than the one here"),
 }
@@ -195,7 +195,7 @@ def test_another_keystore_with_the_same_names_is_refused(
     sros("generate_artifacts", "-k", tmp_path / "other", "-e", *NAMES).ok()
     other = authority_of(tmp_path / "other")
     theirs = release_of(files_of(tmp_path / "other"), 9, other)
-    with pytest.raises(KeystoreError, match="comes from another keystore"):
+    with pytest.raises(KeystoreError, match="is not sealed by a CA that this robot trusts"):
         install(robot, theirs)
     shutil.rmtree(robot / "enclaves")
     with pytest.raises(KeystoreError, match="trusts no permissions CA yet"):

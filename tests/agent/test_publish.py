@@ -831,6 +831,19 @@ def test_damaged_metadata_and_lists_are_said(publisher: Home) -> None:
     publisher.publish()
 
 
+def test_restored_is_refused_where_nothing_shows_a_restore(publisher: Home) -> None:
+    """As where a web server has an old copy: it mends nothing, and marks the ledger."""
+    ledger = (publisher.root / "ledger.jsonl").read_bytes()
+    with pytest.raises(KeystoreError, match=r"nothing shows that the keystore .* was restored"):
+        publisher.publish(restored=True)
+    assert (publisher.root / "ledger.jsonl").read_bytes() == ledger
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    publisher.publish()  # only the timestamp is later
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
+
+
 def test_a_clock_that_was_set_back(publisher: Home) -> None:
     """Its own ledger lies in the future: nothing that is published now has the right dates."""
     before = snapshot(publisher.pub)

@@ -234,6 +234,26 @@ def test_a_robot_without_a_key_that_fits(field: Field) -> None:
     assert (found["state"], found["to_do"]) == ("unusable", "look into it")
 
 
+COPIES = (
+    "The files in /pub are older than files that this robot has seen. X.",
+    "Release 4 is older than release 6, which this robot has installed before. X.",
+    "Release 4 is not sealed by a CA that this robot trusts. X.",
+)
+
+
+@pytest.mark.parametrize("problem", COPIES)
+def test_a_robot_whose_server_has_an_old_copy(problem: str, field: Field) -> None:
+    """Waiting never helps, and nothing shows that the keystore is old."""
+    field.run("fleet", "publish", "ks", "pub")
+    field.run("renew", "ks", "--robot", "r1")
+    field.run("fleet", "publish", "ks", "pub")
+    field.send("r1", problems=[problem], release=1)
+    found = field.status()["robots"]["r1"]
+    assert (found["state"], found["to_do"]) == ("earlier", "look at its `from`")
+    assert found["problems"] == [problem] and field.status()["older"] is None
+    assert "was restored" in field.run("fleet", "publish", "ks", "pub", "--restored", status=2).err
+
+
 def test_a_clock_that_is_behind_the_confirmations(field: Field) -> None:
     """No robot would ever be offline, and nobody knows whether a list is in force."""
     field.run("revoke", "ks", "--robot", "r3")

@@ -28,6 +28,7 @@ from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.files import remove_file, staged_file
 from sros_tool.fleet.robots import Fleet
 from sros_tool.folders import Folder, make_folders, remove_folders
+from sros_tool.keystore.confirmation import OF_SAME_NUMBER, last_confirmation
 from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, listed_digests
 from sros_tool.keystore.delivery.export import released_enclave, released_files
 from sros_tool.keystore.delivery.published import (
@@ -63,7 +64,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     fleet_key,
 )
-from sros_tool.keystore.ledger import Entry, clock_behind
+from sros_tool.keystore.ledger import RESTORED, Entry, clock_behind
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import Forgotten
 from sros_tool.keystore.lifecycle.revoke import restore_revocations, restored_note
@@ -557,8 +558,10 @@ class _Run:
         if keystore.has(FLEET_ROOT):
             documents = parse_json(keystore.read(FLEET_ROOT, "root metadata"))["roots"]
         self.roots = Roots(documents)
-        self._published_before = bool(self.roots.versions)
+        own = len(self.roots.versions)
+        self._published_before = bool(own)
         self.roots.follow(folder)
+        self._has_later_root = len(self.roots.versions) > own
         self._folder = folder
         self.list.folder = os.path.abspath(folder)  # noqa: PTH100 - keeps a link as it is named
         self._now = now
@@ -584,13 +587,15 @@ class _Run:
 
         Raises:
             DocumentError: the list of what is published has numbers that were never given.
-            KeystoreError: the keystore was restored from a backup, or it cannot be told what the
-                later releases revoke.
+            KeystoreError: the keystore was restored from a backup, or nothing shows that, although
+                ``restored`` says so, or it cannot be told what the later releases revoke.
         """
         is_lost = self._published_before and not self._present.timestamp
         if is_lost and not new_folder:
             raise self._nothing_published_error()
         is_later = self._has_later_releases(restored)
+        if restored and not (is_later or new_folder or self._shows_restore()):
+            raise self._not_restored_error()
         if restored and not is_later:
             self._check_removed()
         if restored:
@@ -600,6 +605,37 @@ class _Run:
         if is_lost or restored:
             self._least = int(self._now.timestamp())
             self.list.robots.clear()
+
+    def _shows_restore(self) -> bool:
+        """Return whether PUB, the ledger or a robot shows that the keystore was restored."""
+        known, there = self.list.versions, self._present.versions()
+        if self._has_later_root or any(there.get(name, 0) > known[name] for name in known):
+            return True
+        entries = self.keystore.ledger_with("what", "release").entries
+        last = max((entry.number for entry in entries if entry.what == "release"), default=0)
+        marked = self.keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
+        marks = [entry.what for entry in marked if entry.what in (RESTORED, "release")]
+        if marks and marks[-1] == RESTORED:
+            return True
+        for robot in recorded_fleet(self.keystore).robots:
+            with suppress(SrosError):
+                if received := last_confirmation(self.keystore.root, robot):
+                    said = received.confirmation
+                    problems = said.problems or ()
+                    if (said.release or 0) > last or any(OF_SAME_NUMBER in e for e in problems):
+                        return True
+        return False
+
+    def _not_restored_error(self) -> KeystoreError:
+        where = f"{quote(str(self.keystore.root))} {quote(str(self._folder))}"
+        return KeystoreError(
+            f"nothing shows that the keystore '{self.keystore.root}' was restored",
+            f"'{self._folder}' and the messages of robots have nothing later than its ledger. If "
+            "robots say that their server has an older copy, that server does not have the files "
+            f"of '{self._folder}'.",
+            f"Publish with `sros fleet publish {where}`, and copy '{self._folder}' to the server. "
+            "If keystore and folder come from the same backup, add --new-folder.",
+        )
 
     def _nothing_published_error(self) -> KeystoreError:
         return KeystoreError(
