@@ -20,10 +20,12 @@ from sros_tool.dds.permissions import Grant, mistaken_names, pairs_text
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.layout import (
+    CLOSED_OBSERVER,
     CRL_FILE,
     IDENTITY_CA_FILE,
     PERMISSIONS_CA_FILE,
     ROLES,
+    closed_robot,
     enclave_folder,
     enclave_path,
 )
@@ -98,9 +100,10 @@ NOT_IN_POLICY = FindingKind(
     "enclave.not-in-policy",
     NOTE,
     "an enclave that no policy names",
-    "The permissions of this enclave cannot be compared with a policy.",
+    "Its permissions stay valid, also if its node was renamed or removed from the policy.",
     "sros: --policy.",
-    "Write a policy for the enclave, or revoke it if nobody needs it.",
+    "Name its policy, too; or, if nobody needs it, revoke it: `sros revoke KEYSTORE ENCLAVE`.",
+    prominent=True,
 )
 NOT_IN_KEYSTORE = FindingKind(
     "keystore.enclave-missing",
@@ -401,7 +404,8 @@ def check_policy(
         return
     name, grant = enclave.name, grant_of(enclave)
     if name not in wanted_rights:
-        if _is_plain_router(enclave, grant):
+        of_close = name == CLOSED_OBSERVER and closed_robot(enclave.keystore.root)
+        if of_close or _is_plain_router(enclave, grant):
             return
         yield NOT_IN_POLICY.found(name, "none of the given policies names it", str(enclave.folder))
         return
