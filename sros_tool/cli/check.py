@@ -358,7 +358,7 @@ def check(
 
 
 def _is_mended_by(template: str | None, finding: Finding) -> bool:
-    """Return whether keystores of a template do not have a weakness of a policy."""
+    """Return whether a keystore made from ``template`` would not have the reported weakness."""
     from sros_tool.checks.policies import ENCLAVE_NAMES
     from sros_tool.keystore.template import load_template
 
