@@ -121,7 +121,8 @@ def _report(folder: Path, robot: str) -> None:
     The report is JSON. It has the time, the SHA-256 of each file of the enclaves in DIR except
     their keys, and the DDS libraries that processes have loaded or that are installed. As
     problems, it names enclaves in which no process could start, for example because the key does
-    not fit the certificate, and files that other users can read or change. docs/json.md describes the report under "confirmation".
+    not fit the certificate, and files that other users can read or change. docs/json.md describes
+    the report under "confirmation".
 
     Example:
       $ ssh r7 sros fleet report /etc/sros/keystore --robot r7 |
