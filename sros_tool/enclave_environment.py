@@ -7,6 +7,7 @@ import os
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from shlex import quote
 from typing import TYPE_CHECKING
@@ -729,6 +730,10 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
             remedy = (
                 f"Name the namespace: `-r __ns:={other}` after --ros-args. Or, if {full} is right, "
                 f'give it a profile: `<profile ns="{ns}" node="{name}">`.'
+            )
+        elif close := get_close_matches(full, every, 2):
+            remedy = (
+                f"Perhaps you mean {' or '.join(close)}. If {full} is right, give it a profile."
             )
     raise UsageError(f"the policy '{file}' has the node {full} {where}", why, remedy)
 

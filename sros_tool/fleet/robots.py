@@ -191,8 +191,8 @@ def namespace_problem(namespace: str) -> str:
     first, *parts = namespace.split("/")
     if first or not parts or not all(_TOKEN.fullmatch(part) for part in parts):
         return (
-            "A namespace is absolute, and its parts are letters, digits and underscores, such as "
-            "/warehouse/r7."
+            "A namespace is absolute, and its parts are letters, digits and underscores, without a "
+            "digit at the beginning, such as /warehouse/r7."
         )
     return "It contains '__', which ROS does not allow." if "__" in namespace else ""
 

@@ -82,6 +82,7 @@ def test_the_keystore_may_come_from_the_environment(made: Path) -> None:
         (("-r", "__node:=nobody"), "has the node /nobody in no enclave"),
         (("-r", "__node:=talker", "-r", "__ns:=/left"), "node /left/talker in no enclave"),
         (("-r", "__node:=hidden"), "the node /left/hidden. Name the namespace: `-r __ns:=/left`"),
+        (("-r", "__node:=taker"), "Perhaps you mean /talker"),
         (("-r", "__node:=both"), "in 2 enclaves, such as /line/listener, /line/other"),
         (("-r", "__node:=\x1b[2Jtalker"), "\\x1b[2Jtalker in no enclave"),
     ],
