@@ -713,8 +713,8 @@ def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     elif publication and publication.accepted is None:
         yield f"it is not known until when robots accept what was published: `{publish}`"
     if status.stage != "complete":
-        behind = sum(robot.stage != status.stage for robot in status.robots if robot.enclaves)
-        yield f"CA rotation: {status.stage}; {counted(behind, 'robot')} not there yet"
+        behind = counted(len(status.unconfirmed), "robot")
+        yield f"CA rotation: {status.stage}; not confirmed by {behind} yet"
     robots = [robot for robot in status.robots if robot.crl_in_force is not None]
     if robots and status.is_any_revoked:
         in_force = sum(bool(robot.crl_in_force) for robot in robots)

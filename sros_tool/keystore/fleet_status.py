@@ -125,6 +125,8 @@ FileKind = Annotated[str, Words((*_KINDS.values(), _ZENOH))]
 _AUTHORITIES = ("identity_ca", "permissions_ca")
 _EXPIRING = ("certificate", "permissions", "crl")
 """Kinds of files for which the ledger has the expiry of a robot's file."""
+_ISSUED = {"identity": ("certificate",), "permissions": ("permissions", "governance")}
+"""The kinds of files that the CA of each role issues."""
 _LONGEST_SILENCE = timedelta(days=1)
 """Age of the last message from which a robot that fetches is offline, by default."""
 _SILENCE = timedelta(minutes=30)
@@ -413,6 +415,8 @@ class FleetStatus:
     """Whether the revocation list revokes a certificate."""
     groups: Mapping[str, Sequence[str]] = field(default_factory=dict)
     """The groups of the fleet file, with their robots."""
+    awaited: frozenset[str] = frozenset()
+    """The kinds of files that every robot has to have before the next stage of a rotation."""
 
     @property
     def names(self) -> list[str]:
@@ -424,6 +428,28 @@ class FleetStatus:
         """The number of robots by state."""
         counts = Counter(robot.state for robot in self.robots)
         return {state: counts[state] for state in State if counts[state]}
+
+    @property
+    def unconfirmed(self) -> tuple[str, ...]:
+        """Names of the robots that have not confirmed the stage of the CA rotation.
+
+        First they have to confirm that they trust the new CA, then that they have the files it
+        issued.  Those where processes still run with earlier files, those that fetch and are
+        offline, or say that they have what was never published, and those whose last message was
+        refused have not confirmed it either.
+        """
+        return tuple(
+            robot.robot
+            for robot in self.robots
+            if robot.enclaves
+            and (
+                robot.received is None
+                or robot.restart
+                or robot.robot in self.overdue
+                or robot.state in (State.LATER, State.REFUSED)
+                or any(file.kind in self.awaited and not file.surplus for file in robot.pending)
+            )
+        )
 
     @property
     def complete(self) -> bool:
@@ -499,6 +525,7 @@ def fleet_status(keystore: Keystore, names: Sequence[str] = ()) -> FleetStatus:
         publication=known.publication,
         is_any_revoked=known.is_any_revoked(),
         groups=fleet.groups,
+        awaited=stages.awaited,
     )
 
 
@@ -1020,6 +1047,15 @@ class _Stages:
         rotation = read_rotation(keystore)
         is_complete = rotation.stage is RotationStage.NONE
         self.of_keystore = self.COMPLETE if is_complete else rotation.stage.value
+        replaced_roles = {
+            role
+            for replacement in rotation.replacements
+            for role in keystore.authority_files[replacement.file]
+        }
+        awaited = {f"{role}_ca" for role in replaced_roles}
+        if rotation.stage is RotationStage.REISSUE:
+            awaited.update(kind for role in replaced_roles for kind in _ISSUED[role])
+        self.awaited = frozenset(awaited)
         self._new: dict[str, str] = {}
         self._of_kind: dict[str, tuple[tuple[str, ...], str]] = {}
         for file, roles in keystore.authority_files.items():

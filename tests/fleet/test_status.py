@@ -373,13 +373,17 @@ def test_a_rotation_goes_on_when_every_robot_has_confirmed_its_stage(field: Fiel
         if now == "distribute":
             field.confirm("r2", restart=["/r2/base"])
             assert ": r2. " in field.run("rotate_ca", "ks", "--next", status=2).err
+            said = field.run("fleet", "status", "ks", status=1).out
+            assert "CA rotation: distribute; not confirmed by 1 robot yet" in said
             field.confirm("r2", restart=[])
         assert field.states() == dict.fromkeys(ROBOTS, "current")
         assert {each["stage"] for each in field.status()["robots"].values()} == {now}
 
 
 def test_a_rotation_goes_on_without_robots_if_that_is_chosen(field: Field) -> None:
-    assert "a rotation: r1, r2, r3. " in field.run("rotate_ca", "ks", "--finish", status=2).err
+    refused = field.run("rotate_ca", "ks", "--finish", status=2).err
+    assert "several stages at once would cut off every robot: r1, r2, r3. " in refused
+    assert "confirm both" not in refused and "add --allow-unconfirmed" in refused
     field.run("rotate_ca", "ks", "--next", "--identity")
     field.deliver("r1", "r3")
     words = ("rotate_ca", "ks", "--to", "reissue", "--allow-unconfirmed")

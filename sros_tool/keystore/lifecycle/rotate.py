@@ -24,7 +24,7 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.fleet import checked_fleet, load_fleet
-from sros_tool.keystore.fleet_status import State, fleet_status
+from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.authority import (
     Authority,
     ImportedAuthority,
@@ -96,8 +96,6 @@ from sros_tool.wording import first_few
 _SHOWN = 10
 """Largest number of robots that an error names."""
 _ENCLAVES_SHOWN = 5
-_ISSUED = {IDENTITY: ("certificate",), "permissions": ("permissions", "governance")}
-"""The kinds of files that the CA of each role issues, as in `fleet_status`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -159,7 +157,7 @@ def rotate_ca(
                 _refuse_edited(change.keystore)
             cut_off = robots_cut_off(change.keystore, rotation, stage, now)
             if cut_off and not allow_unconfirmed:
-                raise _cut_off_error(root, rotation, cut_off)
+                raise _cut_off_error(root, rotation, stage, cut_off)
             stage = rotator.go_to(stage, roles, new_keys, validity, progress)
             if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
                 change.notes += _no_robot_notes(change.keystore, change.names)
@@ -187,39 +185,24 @@ def robots_cut_off(
 ) -> tuple[str, ...]:
     """Return the sorted names of the robots that the stage ``to`` would cut off from the others.
 
-    These are the robots with enclaves that have not confirmed the previous stage: first that they
-    trust the new CA, then that they have the files it issued; those where processes still run with
-    earlier files; those that fetch and are offline, or say that they have what was never
-    published; and those whose last message was refused.  Without a fleet, or by the first stage, no
-    robot is cut off.
+    These are the robots that have not confirmed the previous stage (`FleetStatus.unconfirmed`), and
+    all robots if stages are left out.  Without a fleet, or by the first stage, no robot is cut off.
 
     Raises:
         KeystoreError: the fleet file is not the file that sros wrote last.
     """
     if to is RotationStage.DISTRIBUTE or checked_fleet(keystore) is None:
         return ()
-    stages = list(RotationStage)
     status = fleet_status(keystore).with_overdue(now)
-    robots = [robot for robot in status.robots if robot.enclaves]
-    if stages.index(to) - stages.index(rotation.stage) > 1:
-        return tuple(robot.robot for robot in robots)  # stages that no robot was ever at
-    roles = {
-        role
-        for replacement in rotation.replacements
-        for role in keystore.authority_files[replacement.file]
-    }
-    needed = {f"{role}_ca" for role in roles}
-    if rotation.stage is RotationStage.REISSUE:
-        needed.update(kind for role in roles for kind in _ISSUED[role])
-    return tuple(
-        robot.robot
-        for robot in robots
-        if robot.received is None
-        or robot.restart
-        or robot.robot in status.overdue
-        or robot.state in (State.LATER, State.REFUSED)
-        or any(file.kind in needed and not file.surplus for file in robot.pending)
-    )
+    if _leaves_out_stages(rotation, to):  # at which no robot ever was
+        return tuple(robot.robot for robot in status.robots if robot.enclaves)
+    return status.unconfirmed
+
+
+def _leaves_out_stages(rotation: Rotation, to: RotationStage) -> bool:
+    """Return whether a rotation goes to a stage that is not the next one."""
+    stages = list(RotationStage)
+    return stages.index(to) - stages.index(rotation.stage) > 1
 
 
 def _no_robot_notes(keystore: Keystore, names: Iterable[str]) -> Iterator[Note]:
@@ -235,14 +218,26 @@ def _no_robot_notes(keystore: Keystore, names: Iterable[str]) -> Iterator[Note]:
         )
 
 
-def _cut_off_error(root: Path, rotation: Rotation, robots: Sequence[str]) -> KeystoreError:
-    stage = "a rotation" if rotation.stage is RotationStage.NONE else f"the stage {rotation.stage}"
+def _cut_off_error(
+    root: Path, rotation: Rotation, to: RotationStage, robots: Sequence[str]
+) -> KeystoreError:
+    where, names = quote(str(root)), first_few(robots, _SHOWN)
+    if _leaves_out_stages(rotation, to):
+        return KeystoreError(
+            f"several stages at once would cut off every robot: {names}",
+            "No robot can trust the new CA before it has the new files: until then, and until its "
+            "processes were restarted, it cannot communicate with others that have them, and it "
+            "does not accept a published release.",
+            "If the robots may stand still, add --allow-unconfirmed, then bring the files to every "
+            f"robot by hand (`sros distribute_key {where} --robot NAME FOLDER --force`), and "
+            f"restart everything. Otherwise go stage by stage, with `sros rotate_ca {where} "
+            "--next`.",
+        )
     return KeystoreError(
-        f"not every robot has confirmed {stage}: {first_few(robots, _SHOWN)}",
+        f"not every robot has confirmed the stage {rotation.stage}: {names}",
         "After the next stage, they could not communicate with the other robots.",
         "Deliver the present files, restart processes that run with earlier files, and confirm "
-        f"both; see `sros fleet status {quote(str(root))}`. --allow-unconfirmed goes on without "
-        "them.",
+        f"both; see `sros fleet status {where}`. --allow-unconfirmed goes on without them.",
     )
 
 
