@@ -58,6 +58,11 @@ if TYPE_CHECKING:
     help="Put the enclaves and nodes of OTHER into this namespace, such as /left, with all names "
     "that do not begin with '/'.",
 )
+@click.option(
+    "--enclave",
+    metavar="ENCLAVE",
+    help="Put all nodes of OTHER into this enclave: one process composes them.",
+)
 @output_option("Write the result to FILE.")
 @click.option("--in-place", is_flag=True, help="Overwrite POLICY with the result.")
 @force_option
@@ -67,6 +72,7 @@ def merge_policy(
     policy: Path,
     others: tuple[Path, ...],
     namespace: str | None,
+    enclave: str | None,
     output: Path | None,
     in_place: bool,
     force: bool,
@@ -89,11 +95,13 @@ def merge_policy(
       note [merge.still-denied]: /talker DENY publish topic /cmd_vel stays ...
       replaced 'robot.xml'
       $ sros merge_policy robot.xml gripper.xml --namespace /left --in-place
+      $ sros merge_policy robot.xml camera.xml --enclave /pipeline --in-place
     """
     from sros_tool.fleet.robots import namespace_problem
+    from sros_tool.names import check_enclave_name
     from sros_tool.policy.document import read_policy
     from sros_tool.policy.merge import EditedText, MergedPolicy, merge_all
-    from sros_tool.policy.model import policy_in_namespace
+    from sros_tool.policy.model import policy_in_enclave, policy_in_namespace
 
     if in_place and output:
         raise UsageError("--in-place and --output exclude each other")
@@ -105,6 +113,9 @@ def merge_policy(
         if problem := namespace_problem(namespace):
             raise UsageError(f"--namespace {namespace!r}: {problem}", "", "Write it as /left.")
         additions = [policy_in_namespace(other, namespace) for other in additions]
+    if enclave is not None:
+        check_enclave_name(enclave)
+        additions = [policy_in_enclave(other, enclave) for other in additions]
     merged = merge_all(policy, additions)
     if merged.added and (output is None or output.parent.resolve() == policy.parent.resolve()):
         from sros_tool.graph.learn import with_common_parts

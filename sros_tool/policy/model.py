@@ -141,6 +141,13 @@ def policy_in_namespace(policy: Policy, namespace: str) -> Policy:
     return replace(policy, enclaves=tuple(enclaves))
 
 
+def policy_in_enclave(policy: Policy, path: str) -> Policy:
+    """Return a policy with all profiles in one enclave, of a process that composes the nodes."""
+    blocks = tuple(block for enclave in policy.enclaves for block in enclave.profiles)
+    enclaves = [replace(enclave, path=path, profiles=blocks) for enclave in policy.enclaves[:1]]
+    return replace(policy, enclaves=tuple(enclaves))
+
+
 def nodes_in_several_namespaces(
     enclaves: Iterable[Enclave],
 ) -> dict[tuple[str, str], tuple[Profile, ...]]:

@@ -68,6 +68,20 @@ def test_a_merge_notes_an_enclave_that_gets_nodes_of_another_policy(folder: Path
     assert "merge.shared-enclave" not in sros("merge_policy", "a.xml", "package.xml").ok().err
 
 
+def test_the_nodes_of_a_package_are_merged_into_the_enclave_that_composes_them(
+    folder: Path,
+) -> None:
+    (folder / "package.xml").write_text(
+        policy_text({"/scanner": publish("image"), "/decoder": publish("code")})
+    )
+    words = ("--namespace", "/left", "--enclave", "/left/pipeline", "--json")
+    found = json.loads(sros("merge_policy", "a.xml", "package.xml", *words).out)
+    assert {right["enclave"] for right in found["added"]} == {"/left/pipeline"}
+    assert {right["name"] for right in found["added"]} == {"/left/image", "/left/code"}
+    ended = sros("merge_policy", "a.xml", "package.xml", "--enclave", "x y")
+    assert ended.status == 2 and "is not a valid enclave name" in ended.err
+
+
 def test_many_rights_of_a_merge_are_folded_by_enclave(folder: Path) -> None:
     names = [f"/n{number:02}" for number in range(12)]
     (folder / "b.xml").write_text(policy_text({"/b": publish(*names), "/c": publish(*names)}))
