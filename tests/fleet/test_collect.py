@@ -25,6 +25,7 @@ from sros_tool.keystore.confirmation import (
     Received,
     keep_confirmation,
     last_confirmation,
+    refusals,
     render_confirmation,
 )
 from sros_tool.keystore.delivery import collect as collecting
@@ -253,6 +254,29 @@ def test_a_robot_cannot_answer_for_another_one(home: Home) -> None:
     assert home.kept("r1") is None and home.kept("r2") is None
     home.put("r1", smime.sign(named_r1, stolen, home.key("r1", "/r1/base")))
     assert home.of("r1").outcome == "kept"
+
+
+def test_an_older_message_in_a_second_inbox(home: Home) -> None:
+    """As of a robot that moved to a web server: its last message stays its state."""
+    first = home.send("r1").read_bytes()
+    home.send("r1")
+    assert home.of("r1").outcome == "kept"
+    home.put("r1", first)
+    path = home.inbox / "r1/confirmation.p7s"
+    os.utime(path, (path.stat().st_mtime - 90,) * 2)
+    done = home.collect()
+    (older,) = (robot for robot in done.robots if robot.robot == "r1")
+    assert older.outcome == "older" and home.kept("r1") == 2 and done.complete
+    (note,) = (note for note in done.notes if note.id == "fleet.older-message")
+    assert note.text.startswith(f"an older message of r1 lies in '{home.inbox}'")
+    assert not refusals(home.root)
+    # It has to be authentic; one that is not is refused, however old.
+    path.write_bytes(home.message("r2", NOW))
+    os.utime(path, (path.stat().st_mtime - 90,) * 2)
+    assert home.of("r1").outcome == "refused" and "r1" in refusals(home.root)
+    path.write_bytes(first)
+    os.utime(path, (path.stat().st_mtime - 90,) * 2)
+    assert home.of("r1").outcome == "older" and "r1" in refusals(home.root), "as before"
 
 
 def test_a_message_that_was_replayed(home: Home) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -88,7 +88,7 @@ _FEW = 4
 
 REQUEST_OUTCOMES = ("renewed", "answered", "not_due", "not_allowed", "refused", "not_signed")
 _GOOD = REQUEST_OUTCOMES[:3]
-MESSAGE_OUTCOMES = ("kept", "unchanged", "missing", "revoked", "refused")
+MESSAGE_OUTCOMES = ("kept", "unchanged", "older", "missing", "revoked", "refused")
 
 
 class CollectedRequest(NamedTuple):
@@ -114,8 +114,10 @@ class CollectedMessage(NamedTuple):
     """Name of the robot."""
     outcome: Annotated[str, Words(MESSAGE_OUTCOMES)]
     """``kept``: a new message, which is the robot's last confirmation now; ``unchanged``: the
-    same message as last time; ``missing``: the inbox has none; ``revoked``: all enclaves of the
-    robot were revoked, so its message is not read; ``refused``: the message proves nothing."""
+    same message as last time; ``older``: an earlier message, which was written before the last one
+    came, such as in an inbox that the robot used before; ``missing``: the inbox has none;
+    ``revoked``: all enclaves of the robot were revoked, so its message is not read; ``refused``:
+    the message proves nothing."""
     why: str
     """Why the message was refused or not read, as a clause; else empty."""
     enclave: str
@@ -252,20 +254,23 @@ def collect(
         None,
         dry_run,
         [*changes, *signed],
-        [*_unknown_file_notes(inbox, fleet), *notes],
+        [*_unknown_file_notes(inbox, fleet), *_older_message_notes(inbox, taken), *notes],
     )
 
 
 def _refusals(
     before: Mapping[str, RefusedMessage], messages: Sequence[_ReceivedMessage]
 ) -> dict[str, str]:
-    """Map robots to why their last messages were refused; a missing message changes nothing."""
+    """Map robots to why their last messages were refused.
+
+    A missing or an older message changes nothing.
+    """
     refused = {}
     for message in messages:
         name = message.robot.name
         if message.outcome == "refused":
             refused[name] = message.why
-        elif message.outcome == "missing" and name in before:
+        elif message.outcome in ("missing", "older") and name in before:
             refused[name] = before[name].why
     return refused
 
@@ -415,6 +420,19 @@ def _unknown_file_notes(inbox: Path, fleet: Fleet) -> Iterator[Note]:
         )
 
 
+def _older_message_notes(inbox: Path, messages: Iterable[_ReceivedMessage]) -> Iterator[Note]:
+    """Yield a note on messages that are older than the last ones of their robots."""
+    robots = [message.robot.name for message in messages if message.outcome == "older"]
+    if robots:
+        what = "an older message" if len(robots) == 1 else "older messages"
+        lies = "lies" if len(robots) == 1 else "lie"
+        yield Note(
+            "fleet.older-message",
+            f"{what} of {first_few(robots, _SHOWN)} {lies} in '{inbox}', from before the last one "
+            "came, and changes nothing: delete it there.",
+        )
+
+
 # ── verifying ──────────────────────────────────────────────────────────────────────────────
 
 
@@ -451,7 +469,12 @@ class _Verifier:
         assert sequence
         if before and before.sha256 == sha256:
             return _ReceivedMessage(robot, "unchanged", verified=verified, remarks=remarks)
-        if before and sequence <= before.sequence and robot.name not in self._restored:
+        is_restored = robot.name in self._restored
+        is_older = before is not None and sequence < before.sequence and not is_restored
+        # One that came later may be of a robot whose disk was restored, or was sent again.
+        if is_older and last and file.written < last.time:
+            return _ReceivedMessage(robot, "older", crl=verified.confirmation.crl, remarks=remarks)
+        if before and sequence <= before.sequence and not is_restored:
             raise _RefusedError(
                 f"its sequence number {sequence} is not higher than {before.sequence}, the number "
                 "of the last message: this is an old message, or the disk of the robot was "
