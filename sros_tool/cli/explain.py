@@ -967,9 +967,9 @@ def _show_reach(
     print_notes(followed.notes)
     if not infrastructure and not as_json:
         topics = ", ".join(topic for topic in followed.left_out if not topic.startswith("*"))
-        text = f"left out: {topics}, which every node writes and reads, and requests "
-        text += "that only ask nodes about themselves, such as get_parameters and get_state"
-        echo(f"{text} (include them with --infrastructure)", err=True)
+        text = f"left out: topics that every node writes and reads ({topics}), and requests that "
+        text += "only ask nodes about themselves (such as get_parameters and get_state)"
+        echo(f"{text}; --infrastructure includes them", err=True)
     return 0
 
 

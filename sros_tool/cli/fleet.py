@@ -421,7 +421,7 @@ def _publish(
     """Publish a release for each robot of KEYSTORE in the folder PUB.
 
     PUB has plain files for any web server, bucket or USB stick, and no private key. For each
-    robot, PUB has an archive with the files of the robot's enclaves, sealed by the permissions CA.
+    robot, PUB has an archive with the files of the robot's enclaves, signed by the permissions CA.
     PUB also has metadata of The Update Framework, with which `sros agent` on the robot refuses
     old, mixed or forged files. Run this verb after each change, and before the time that it prints,
     for example each hour. Archives of unchanged robots stay; archives of robots that were revoked
@@ -567,9 +567,9 @@ def _status(
     published is shown even if its files are current. The last line counts the known vulnerabilities
     of the robots' DDS, by the advisories of sros; --robot and --advisories list them.
 
-    The revocation list is in force on a robot that has the list and reports that no restart is
-    due. A robot does not report which earlier files a process has loaded. So after any change of
-    files, the list is in force again only after the processes were restarted.
+    sros counts the revocation list as in force on a robot that has the list and reports that no
+    restart is due. A robot does not report which earlier files a process has loaded. So after any
+    change of files, sros counts the list as in force only once the processes were restarted.
 
     Example:
       $ sros fleet status keystore

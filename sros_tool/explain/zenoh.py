@@ -747,7 +747,11 @@ _DATA = (Message.PUT, Message.QUERY, Message.LIVELINESS_TOKEN)
 
 
 def _check_to_report(checks: Iterable[Check], enclave: str) -> Check | None:
-    """Return the check to report: on data before others, of other enclaves before ``enclave``."""
+    """Return the check that an answer reports; None if there is none.
+
+    A check of data comes before other checks, and after that, a check that another enclave makes
+    before one that ``enclave`` itself makes.
+    """
     return min(
         checks,
         key=lambda check: (check.message not in _DATA, check.enforcer == enclave),

@@ -88,7 +88,9 @@ def read_fleet(path: Path) -> Fleet:
 
 
 def read_connections(path: Path) -> dict[str, str]:
-    """Return how Ansible connects to the hosts of an inventory, by key; {} for a TOML file.
+    """Return an inventory's settings of how Ansible connects to its hosts; {} for a TOML file.
+
+    The values are texts, by the path of their keys in the inventory.
 
     Raises:
         SrosError: as `read_fleet`.

@@ -21,7 +21,7 @@ from sros_tool.errors import DocumentError
 
 
 class EventKind(StrEnum):
-    """The kind of an event."""
+    """What a process reports with an event, such as that it is ready or heard a message."""
 
     READY = "ready"
     REFUSED = "refused"

@@ -256,9 +256,10 @@ _MOST_SHOWN = 6
 
 
 def shared_nodes(announced: Mapping[str, AnnouncedNodes]) -> Iterator[SharedNodes]:
-    """Yield the nodes that several enclaves may announce, by the nodes of each enclave.
+    """Yield the nodes that several enclaves may announce.
 
-    Nodes with names that change with every start (`CHANGING_NODES`) do not count.
+    ``announced`` maps each enclave to the nodes that it may announce.  Nodes with names that
+    change with every start (`CHANGING_NODES`) do not count.
     """
     owners: dict[str, list[str]] = {}
     wide: dict[AnnouncedNodes, list[str]] = {}

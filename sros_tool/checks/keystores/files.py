@@ -254,7 +254,7 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
     kept: list[str] = []
     for folder, why in replaceable_on_the_way(keystore.root, trusted):
         yield REPLACEABLE.found(str(folder), why, str(folder))
-    yield from _writer_findings(root, state, trusted)
+    yield from _write_access_findings(root, state, trusted)
     links = _Links(root)
     if names is None:
         yield from _hidden_enclave_findings(keystore)
@@ -269,7 +269,7 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
         yield from _folder_findings(os.path.join(root, folder), keystore, links, trusted, kept)
     for folder in sorted(passed):
         path = os.path.join(root, folder)
-        yield from _writer_findings(path, Path(path).stat(), trusted)
+        yield from _write_access_findings(path, Path(path).stat(), trusted)
 
 
 def _hidden_enclave_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
@@ -315,7 +315,7 @@ def _folder_findings(
             if stat.S_ISLNK(info.st_mode):
                 yield from links.check(path)
                 continue
-            yield from _writer_findings(path, info, trusted_users)
+            yield from _write_access_findings(path, info, trusted_users)
             yield from _open_folder(path, root, info.st_mode, original)
         if parent == root and AGENT in folders:
             folders.remove(AGENT)  # of `sros agent`, closed to others
@@ -326,7 +326,7 @@ def _folder_findings(
             if stat.S_ISLNK(info.st_mode):
                 yield from links.check(path)
                 continue
-            yield from _writer_findings(path, info, trusted_users)
+            yield from _write_access_findings(path, info, trusted_users)
             if path in keys:
                 yield from key_mode_findings(path, info.st_mode)
             elif name in _KNOWN and inside.startswith(ENCLAVES) and name != KEY_FILE:
@@ -390,7 +390,7 @@ def _open_folder(path: str, root: str, mode: int, original: bool) -> Iterator[Fi
         yield FOLDER_OPEN.found(path, text, path, remedy=remedy)
 
 
-def _writer_findings(
+def _write_access_findings(
     path: str, info: os.stat_result, trusted_users: frozenset[int]
 ) -> Iterator[Finding]:
     if info.st_mode & stat.S_IWOTH:

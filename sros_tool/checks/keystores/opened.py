@@ -43,7 +43,7 @@ _Part = TypeVar("_Part")
 _load_shipped = cache(load_template)
 
 
-def _shipped(name: str) -> Template | None:
+def _shipped_template(name: str) -> Template | None:
     """Return the template with this name that ships with sros, or None."""
     return _load_shipped(name) if name in template_names() else None
 
@@ -194,7 +194,7 @@ class CheckedKeystore:
         """
         if self.settings:
             name = self.settings.name
-            template = _shipped(name) or self.settings
+            template = _shipped_template(name) or self.settings
             return f"template {name}" if accepts_weakness(template) else ""
         if self.is_original:
             return ""

@@ -232,7 +232,10 @@ def _fault(
         )
     constraints = extension(certificate, x509.BasicConstraints)
     if (constraints and constraints.ca) or not denies_issuing(certificate):
-        return "it is a CA certificate, or does not state that it is not one"
+        return (
+            "it is a CA certificate, or could be used as one: it has neither basicConstraints with "
+            "CA:FALSE nor a keyUsage without keyCertSign"
+        )
     if not (validity.contains(now) or validity.contains(now + _AHEAD)):
         return f"it is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, not now"
     if validity.not_after > request.validity.not_after:
