@@ -202,15 +202,9 @@ _CLOCK_TOLERANCE = timedelta(hours=1)
 
 def clock_behind(root: Path, now: datetime) -> str:
     """Return, as a clause, how far the clock is behind the last entry of the ledger; "" if not."""
-    last = None
-    with suppress(SrosError, OSError, ValueError):
-        with _open(root, follow_link=True) or io.BytesIO() as file:
-            size = file.seek(0, io.SEEK_END)
-            file.seek(max(0, size - _LONGEST_LINE))
-            line = file.read().rstrip(b"\n").rpartition(b"\n")[2]
-        entry = _parse(line) or _parse_any(line)
-        last = parse_iso(entry.time) if entry else None
-    return behind_clause(now, last, "the last entry of the ledger")
+    with suppress(SrosError, OSError):
+        return LedgerFile(root, lambda: ()).clock_behind(now)
+    return ""
 
 
 def behind_clause(now: datetime, last: datetime | None, what: str) -> str:
@@ -304,7 +298,7 @@ class _Files(NamedTuple):
     ``state`` is None without a ledger; ``lines`` is the content of the file, None if it is too long
     to keep in memory, or follows sealed parts.  ``ledger_index`` is None without an index that
     fits.  ``part`` is the number of the last part, which is the file; ``later`` is the name of a
-    later part, "" without one.
+    later part, "" without one.  ``last_line`` is not verified.
     """
 
     head: _Head | None
@@ -313,6 +307,7 @@ class _Files(NamedTuple):
     ledger_index: LedgerIndex | None = None
     part: int = 1
     later: str = ""
+    last_line: bytes = b""
 
 
 class LedgerFile:
@@ -449,6 +444,15 @@ class LedgerFile:
             raise _later_part_error(self.root, files.later)
         return files.part, files.state.st_size if files.state else 0
 
+    def clock_behind(self, now: datetime) -> str:
+        """Return, as a clause, how far the clock is behind the last entry; "" if it is not."""
+        line = self._opened().last_line
+        last = None
+        with suppress(ValueError):
+            entry = _parse(line) or _parse_any(line)
+            last = parse_iso(entry.time) if entry else None
+        return behind_clause(now, last, "the last entry of the ledger")
+
     def content(self) -> Iterator[bytes]:
         """Yield the bytes of the last part, in blocks."""
         if self._files and self._files.lines is not None:
@@ -513,11 +517,14 @@ class LedgerFile:
             state = os.fstat(file.fileno())
             before = _sealed_before(file)
             part = before.number + 1 if before else 1
+            end = os.pread(file.fileno(), _LONGEST_LINE, max(0, state.st_size - _LONGEST_LINE))
+            last = end.rstrip(b"\n").rpartition(b"\n")[2]
             later = _later_than(self.root, part, state)
             if head and (index := self._index(file, head)):
-                return _Files(head, state, None, index, part, later)
+                return _Files(head, state, None, index, part, later, last)
             kept = state.st_size <= _MOST_KEPT and not before
-            return _Files(head, state, file.read() if kept else None, None, part, later)
+            lines = file.read() if kept else None
+            return _Files(head, state, lines, None, part, later, last)
 
     def _index(self, file: BinaryIO, head: _Head) -> LedgerIndex | None:
         """Return the index that the head states; None without one for a ledger with this end.

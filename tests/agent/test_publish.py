@@ -38,7 +38,7 @@ from sros_tool.keystore.delivery.release import (
 )
 from sros_tool.keystore.delivery.repository import Composer, Roots, load_signer, read_present
 from sros_tool.keystore.fleet_status import fleet_status
-from sros_tool.keystore.ledger import clock_behind
+from sros_tool.keystore.ledger import Entry, clock_behind
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.transaction import transaction
@@ -850,8 +850,11 @@ def test_a_clock_that_was_set_back(publisher: Home) -> None:
     with pytest.raises(KeystoreError, match=r"30 d behind the last entry of the ledger, of "):
         publisher.publish(-timedelta(days=30, hours=1))
     assert snapshot(publisher.pub) == before
-    change = KeystoreChange(publisher.root, now=publisher.now)
+    today = publisher.now + timedelta(days=30)
+    change = KeystoreChange(publisher.root, now=today - timedelta(hours=5))
     with change:
+        change.entries.append(Entry(iso(today), "x"))
+        change.record()
         assert any("the clock of this machine shows" in note.text for note in change.notes)
     status = fleet_status(Keystore(publisher.root))
     assert not status.with_overdue(publisher.now + timedelta(days=30, minutes=30)).clock

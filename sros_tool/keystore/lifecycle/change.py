@@ -52,7 +52,6 @@ from sros_tool.keystore.ledger import (
     Ledger,
     append,
     certificate_entry,
-    clock_behind,
     document_entry,
 )
 from sros_tool.keystore.lifecycle.replaced import ReplacedRights, Superseded
@@ -188,9 +187,6 @@ class KeystoreChange:
             check_keystore(self.root)
         self.transaction.__enter__()
         self.keystore = Keystore(self.root, locked=not self.dry_run)
-        if behind := clock_behind(self.root, self.now):
-            text = f"{behind}: what is made now is valid for too short a time. Set the clock."
-            self.notes.append(Note("keystore.clock", text))
         return self
 
     def __exit__(
@@ -470,6 +466,9 @@ class KeystoreChange:
         if signer is None:
             signer = self.permissions if self.identity.service else self.identity
             self._check_served()
+        if behind := self.keystore.ledger_file.clock_behind(self.now):
+            text = f"{behind}: what is made now is valid for too short a time. Set the clock."
+            self.notes.append(Note("keystore.clock", text))
         self.entries = _take_over_records(self.transaction, self.keystore, self.now, self.entries)
         append(
             self.transaction,
