@@ -915,8 +915,8 @@ class OpenRobot:
             raise UsageError(
                 f"{' and '.join(secured)}, so this shell does not see an open robot",
                 "sros looks for open nodes with an observer that is open itself.",
-                "Unset the variables that are named, for example with `env -u NAME sros close "
-                "...`, or run it in a folder without such a file.",
+                "Unset the variables in this message, for example with `env -u NAME sros close "
+                "...`; if it names a file in this folder, run sros in another folder.",
             )
 
     def _check_open(self) -> None:

@@ -84,8 +84,8 @@ VULNERABILITIES = FindingKind(
     "upgrade.vulnerabilities",
     NOTE,
     "known vulnerabilities that the update fixes or brings",
-    "The latest releases that both distributions ship are compared; `sros check runtime` looks at "
-    "the libraries that processes have loaded.",
+    "sros compares the latest release that each of the two distributions ships; `sros check "
+    "runtime` looks at the libraries that processes have loaded.",
     "Advisories in the OSV format: those of sros, and of --advisories FILE.",
     "Take new ones into account before the update. Against those that no release fixes, keep "
     "strangers out of the network.",

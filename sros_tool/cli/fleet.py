@@ -996,7 +996,7 @@ def _summary(robot: RobotStatus, stage: str) -> Iterator[str]:
             f"release {robot.release or 'none'}; the published one is {robot.published or 'none'}"
         )
     elif robot.fetches and robot.pending:
-        other = f"not the files of the published release {robot.release}"
+        other = f"its files are not those of the published release {robot.release}"
         yield other if robot.is_published else "not published yet"
     if robot.fetches and robot.lacks_key:
         names = first_few(robot.lacks_key, _MOST_GROUPS)

@@ -345,7 +345,7 @@ def _show_from(
             )
         )
     else:
-        for line in _lines(document, rights):
+        for line in _configuration_lines(document, rights):
             echo(line)
         for finding in shown:
             echo_findings([finding])
@@ -357,7 +357,9 @@ def _show_from(
     return 1 if any(finding.severity >= ERROR for finding in findings) else 0
 
 
-def _lines(document: ConfigurationDocument, subjects: Sequence[RightsBehindRules]) -> Iterator[str]:
+def _configuration_lines(
+    document: ConfigurationDocument, subjects: Sequence[RightsBehindRules]
+) -> Iterator[str]:
     from sros_tool.checks.zenoh import VERBS
 
     yield f"{document.name}: the configuration of a {_kind(document)}"

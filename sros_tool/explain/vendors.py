@@ -274,7 +274,9 @@ def _not_a_topic_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[
     kinds = {right.kind for right in asked_enclave.other_rights(name) if right.name == name}
     if kinds & {"services", "actions"} and "topics" not in kinds:
         what, word = ("an action", "execute") if "actions" in kinds else ("a service", "serve")
-        text = f"{name} is {what} in the rights here, not a topic: ask about call or {word}."
+        text = (
+            f"in the policy or keystore, {name} is {what}, not a topic: ask about call or {word}."
+        )
         yield Note("explain.no-topic", text)
 
 

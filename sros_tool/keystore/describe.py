@@ -919,8 +919,8 @@ def _describe_configuration(
 def _describe_remote_rights(configuration: Configuration) -> list[RemoteFacts]:
     """Return the rights that a configuration gives remote enclaves.
 
-    In client mode, the remote is the router, which may send what the client may get, and the
-    reverse: its entry shows the rights of the client's own enclave.
+    In client mode, the remote is the router.  Its rules mirror those of the client: it may send
+    what the client may receive.  So its entry shows the rights of the client's own enclave.
     """
     is_client = configuration.mode is Mode.CLIENT
     remotes = []

@@ -479,7 +479,7 @@ def listed_expressions(expression: str, maximum: int) -> list[str]:
     """
     if "?" not in expression and "[" not in expression:
         return [_STARS.sub("*", expression)]
-    pieces = [_choices(*match.groups()) for match in _CHOICE.finditer(expression)]
+    pieces = [_letters_or_text(*match.groups()) for match in _CHOICE.finditer(expression)]
     if prod(map(len, pieces)) > maximum:
         raise TooManyNames
     names = ("".join(choice) for choice in product(*pieces))
@@ -488,10 +488,11 @@ def listed_expressions(expression: str, maximum: int) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def _choices(negated: str, members: str, one: str, text: str) -> Sequence[str]:
+def _letters_or_text(negated: str, listed: str, any_letter: str, text: str) -> Sequence[str]:
+    """Return what one match of `_CHOICE` stands for: several letters, or its text alone."""
     if text:
         return [text]
-    if one:
+    if any_letter:
         return _ROS_LETTERS
-    chosen = _members(members)
+    chosen = _members(listed)
     return [letter for letter in _ROS_LETTERS if (letter in chosen) is not bool(negated)]

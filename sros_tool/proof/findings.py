@@ -175,7 +175,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
 
 
 def _step(use: Use, world: World, system: System) -> Step:
-    """Return a use with the right that allows it, which another enclave may have."""
+    """Return a use with the right that allows it; the right can be one of another enclave."""
     holder = world.whose_permissions(use.enclave, use.writes, use.topic)
     stating = replace(use, enclave=holder) if holder else use
     return Step(use, system.places.find(stating), holder)

@@ -593,9 +593,7 @@ def test_a_topic_that_is_an_action_is_noted(fibonacci: Path) -> None:
         found = explain(fibonacci, CLIENT, word, "/fibonacci")
         assert found.status == 1
         assert "note [explain.no-topic]" in found.err
-        assert (
-            "/fibonacci is an action in the rights here, not a topic: ask about call" in found.err
-        )
+        assert "/fibonacci is an action, not a topic: ask about call" in found.err
     assert "no-topic" not in explain(fibonacci, CLIENT, "publish", "/nothing").err
 
 

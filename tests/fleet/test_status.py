@@ -844,7 +844,7 @@ def test_a_robot_with_other_files_than_the_release_that_it_has(field: Field) -> 
     number = field.status()["robots"]["r1"]["published"]
     field.send("r1", release=number)
     rows = field.run("fleet", "status", "ks", status=1).out
-    assert f"not the files of the published release {number}" in rows
+    assert f"its files are not those of the published release {number}" in rows
     assert field.status()["robots"]["r1"]["to_do"] == "find out why"
 
 

@@ -899,7 +899,7 @@ class _EnclaveMaker:
 
         That is an earlier certificate, or other permissions for the subject of this one.
         """
-        certificates, permissions = self._working.get(name, (set(), []))
+        certificates, permissions = self._recorded_credentials.get(name, (set(), []))
         subject = subject_text(certificate.subject)
         return not (
             has_unique_part(certificate.subject)
@@ -908,7 +908,7 @@ class _EnclaveMaker:
         )
 
     @cached_property
-    def _working(self) -> Mapping[str, tuple[set[int], list[str]]]:
+    def _recorded_credentials(self) -> Mapping[str, tuple[set[int], list[str]]]:
         """The serials of each enclave's certificates, and the subjects of its permissions.
 
         Expired and revoked certificates are left out.  It is empty if the ledger may lack some.
