@@ -961,6 +961,11 @@ class OpenRobot:
         seen_here = {process.enclave for process in processes}
         not_here = (self._not_here - seen_here).union(self._named_elsewhere)
         self._check_elsewhere()
+        # What does not run now is still started by its command.
+        present = {enclave.path for enclave in read_policy(self.policy).enclaves} - seen_here
+        earlier = self.observed.processes if self.observed else ()
+        kept = [process for process in earlier if process.enclave in present - not_here]
+        observed = observed._replace(processes=[*observed.processes, *kept])
         self._write_processes(observed.belonging_elsewhere(not_here))
         number = counted(len(processes), "process", "processes")
         self._shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
@@ -982,7 +987,7 @@ class OpenRobot:
         from sros_tool.graph.learn import draft, learn, write  # only after another watch
 
         common = common_parts(self.folder, policies_dir())
-        if self.seen_again.exists():
+        if os.path.lexists(self.seen_again):
             remove_file(self.seen_again)
         write(draft(self.seen_again, learn(make_observation(nodes), common), common))
 

@@ -749,13 +749,15 @@ def other_node_notes(
     """
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.rights import RecordedRights
+    from sros_tool.names import is_expression
     from sros_tool.policy.patterns import overlap
     from sros_tool.policy.rights import nodes_from_text, nodes_of_rights
     from sros_tool.runtime.environment import node_rules, starts_nodes
     from sros_tool.translate import grant_rights
 
     ns, name = node_rules(command)
-    if not (ns or name or starts_nodes(command)):
+    of_one_node = any(":__ns:=" in word or ":__node:=" in word for word in command)
+    if of_one_node or not (ns or name or starts_nodes(command)):
         return ()
     keystore = Keystore(root)
     state = keystore.enclave(enclave, now=now)
@@ -773,10 +775,11 @@ def other_node_notes(
         return ()
     nodes = first_few([_full_name(*node) for node in named or known], 3)
     if named and not ns:
+        rule = "NAMESPACE" if is_expression(named[0].ns) else quote(named[0].ns)
         text = (
             f"the command names no namespace, and the permissions of enclave {enclave} are for "
-            f"{nodes}: write `-r __ns:={quote(named[0].ns)}` after --ros-args, unless the program "
-            "sets its namespace itself."
+            f"{nodes}: write `-r __ns:={rule}` after --ros-args, unless the program sets its "
+            "namespace itself."
         )
         return (Note("run.other-node", text),)
     started = f"the node {_full_name(ns, name)}" if ns and name else f"a node in the namespace {ns}"

@@ -1063,11 +1063,11 @@ SHARED_NAMESPACE = FindingKind(
     "Give each robot a namespace of its own in the fleet file, or a ROS domain of its own.",
 )
 
-ROBOT_WITHOUT_ENCLAVE = FindingKind(
-    "policy.robot-without-enclave",
+UNKNOWN_GROUP = FindingKind(
+    "policy.unknown-group",
     WARNING,
-    "robots for which no policy has an enclave",
-    "Their processes get no keys. A misspelled group in the fleet file looks like that.",
+    "robots in no group, or in one that no policy names",
+    "Their processes get no enclaves, and no keys.",
     "sros (placeholder {robot:GROUP}).",
     "Correct the groups of the robots in the fleet file, or name all policies of the fleet.",
 )
@@ -1086,6 +1086,7 @@ _PLACE = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
 _SYNTAX = re.compile(r", line (?P<line>\d+), column \d+")  # in messages of libxml2
 _INCLUDES = tuple(f"{{http://www.w3.org/{year}/XInclude}}include" for year in (2001, 2003))
 _MANY = 1000
+_NUMBER = re.compile(r"[0-9]+")
 
 
 def findings_in(policies: Sequence[Policy], distribution: str = "") -> Iterator[Finding]:
@@ -1132,8 +1133,8 @@ def policy_file_findings(
         yield from _include_findings(path)
         if fleet and (shared := [*_shared_namespaces(fleet)]):
             yield SHARED_NAMESPACE.found(str(path), first_few(shared, 3, "; "), str(path))
-    if fleet and read and (text := _robots_without_enclave(paths, fleet)):
-        yield ROBOT_WITHOUT_ENCLAVE.found(str(paths[0]), text, str(paths[0]))
+    if fleet and read and (text := _robots_in_unknown_groups(paths, fleet)):
+        yield UNKNOWN_GROUP.found(str(paths[0]), text, str(paths[0]))
     yield from findings_in(read, distribution)
     if on_zenoh:
         yield from _check_zenoh(enclave for policy in read for enclave in policy.enclaves)
@@ -1172,30 +1173,29 @@ def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
                 )
 
 
-def _robots_without_enclave(paths: Sequence[Path], fleet: Fleet) -> str:
-    """Return a clause on robots that get no enclave by mistake; "" if there are none.
+def _robots_in_unknown_groups(paths: Sequence[Path], fleet: Fleet) -> str:
+    """Return a clause on robots whose group is misspelled, or missing; "" if there are none.
 
-    A robot of a group that no policy names may belong to policies that were not named.  It counts
-    only if it has no group at all, or a group with a name like that of a group in the policies.
+    A group that no policy names may belong to policies that were not named.  So a group counts only
+    if no other robot has it, and its name is like that of a group in the policies, but for more
+    than a number.  A robot without a group counts if every enclave is for a group.
     """
     named = set[str]()
     for path in paths:
         with suppress(SrosError):  # what is wrong with it is a finding of its own
             policy = read_policy(path, placeholders=True)
             named |= {group_of(parts_of(each)) for each in FleetPolicy(policy, fleet).patterns}
-    if not named or "" in named:  # no policy of a fleet, or an enclave for every robot
-        return ""
+    for_all, groups = not named or "" in named, named - {""}
     clauses = []
     for robot in fleet.robots.values():
-        if named.intersection(robot.groups):
-            continue
-        meant = {other for group in robot.groups for other in get_close_matches(group, named)}
-        if meant:
-            groups = ", ".join(robot.groups)
-            clauses.append(f"{robot.name} (group {groups}: perhaps {names_text(sorted(meant))})")
-        elif not robot.groups:
+        for group in set(robot.groups) - groups:
+            close = get_close_matches(group, groups) if len(fleet.groups[group]) < 2 else []
+            letters = _NUMBER.sub("", group)
+            if meant := sorted(each for each in close if _NUMBER.sub("", each) != letters):
+                clauses.append(f"{robot.name} (group {group}: perhaps {first_few(meant, 2)})")
+        if not (robot.groups or for_all):
             clauses.append(f"{robot.name} (in no group)")
-    return f"no enclave for {first_few(clauses, 5)}" if clauses else ""
+    return f"no enclave for the group of {first_few(clauses, 5)}" if clauses else ""
 
 
 def _robots_on_one_domain(

@@ -449,7 +449,9 @@ def _dropped_message_findings(
     groups: dict[tuple[str, str, bool, str], list[DroppedMessage]] = {}
     routers = keystore.zenoh_routers if keystore else frozenset[str]()
     for message in dropped_messages(numbered):
-        lacks_own = message.name in routers and own not in routers
+        # Routers check each other, too: without its name, the process may be one of them.
+        is_node = own not in routers if own else len(routers) == 1
+        lacks_own = message.name in routers and is_node
         kind = message.message, message.ingress is not lacks_own
         _, name = name_of_key(message.key)
         right = _DROPPED.get(kind, "") if name else ""

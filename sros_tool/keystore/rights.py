@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
@@ -27,6 +28,7 @@ from sros_tool.fleet.robots import Fleet, robot_of
 from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.layout import (
     CLOSED_OBSERVER,
+    GOVERNANCE_FILE,
     GOVERNANCE_P7S,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
@@ -580,7 +582,7 @@ class PolicyDifference(NamedTuple):
     domains: Sequence[DifferentDomains]
     """Enclaves of both sides whose ROS domains differ; only where both sides state them."""
     governance_differs: bool
-    """Whether A and B are keystores, no exports, whose governance differs or cannot be read."""
+    """Whether the governance of the enclaves of A and B differs, or cannot be read."""
 
 
 class SourcesDifference(NamedTuple):
@@ -632,15 +634,28 @@ def compare_sources(
 
 
 def _governance_differs(first_source: RightsSource, second_source: RightsSource) -> bool:
-    """Return whether the governance of two keystores differs, or cannot be read."""
-    keystores = [Keystore(s.path) for s in (first_source, second_source) if s.kind == "keystore"]
-    if len(keystores) < 2 or not all(keystore.has(GOVERNANCE_P7S) for keystore in keystores):
-        return False  # an export has the governance in the folders of its enclaves
+    """Return whether the governance of two keystores or enclaves differs, or cannot be read."""
+    if not {first_source.kind, second_source.kind} <= {"keystore", "enclave"}:
+        return False
     try:
-        before, after = (keystore.governance for keystore in keystores)
+        return _governances(first_source) != _governances(second_source)
     except SrosError:
         return True
-    return before != after
+
+
+def _governances(source: RightsSource) -> set[Governance]:
+    """Return the distinct governance documents that enclaves load, without verifying them."""
+    keystore = Keystore(source.path)
+    if source.kind == "enclave":
+        places = {source.path / GOVERNANCE_FILE}
+    else:
+        places = {keystore.folder(name) / GOVERNANCE_FILE for name in keystore.names}
+        places |= {source.path / GOVERNANCE_P7S} if keystore.has(GOVERNANCE_P7S) else set()
+    documents = {keystore.read(place, "governance document") for place in places if place.exists()}
+    return {
+        parse_governance(keystore.files.signed(document).document, f"'{source.path}'")
+        for document in documents
+    }
 
 
 def _without_observer(source: RightsSource, other: RightsSource) -> RightsSource:

@@ -548,17 +548,22 @@ def _observation(path: Path) -> PictureSource:
 def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime) -> PictureSource:
     keystore = sample.keystore
     findings = list(source.findings)
-    governance = None
+    governances: list[Governance | None] = []
+    problem = None
     try:
-        governance = keystore.governance
-    except SrosError as error:
-        findings.append(PicturedFinding("view.no-governance", "error", str(error)))
+        governances.append(keystore.governance)
+    except SrosError as error:  # an export has it in the folders of its enclaves
+        problem = PicturedFinding("view.no-governance", "error", str(error))
     enclaves, validities = [], set()
     for name in sample.enclaves:
         opened = keystore.enclave(name, now=now)
         evaluation = evaluated(name, keystore.folder(name), opened, moment=now)
         enclaves.append(_pictured_enclave(name, evaluation.state, evaluation.problems))
         validities |= set(_validities_of(name, evaluation.state))
+        governances.append(evaluation.state.governance)
+    governance = _joint_governance(governances)
+    if problem and governance is None:
+        findings.append(problem)
     try:
         validities |= set(_authorities(keystore))
     except SrosError as error:
@@ -572,6 +577,14 @@ def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime
         validities=tuple(sorted(validities)),
         findings=tuple(findings),
     )
+
+
+def _joint_governance(governances: Iterable[Governance | None]) -> Governance | None:
+    """Return the rules of all governance documents, so that what one of them opens is open."""
+    distinct = [each for each in dict.fromkeys(governances) if each is not None]
+    if len(distinct) < 2:
+        return distinct[0] if distinct else None
+    return Governance(tuple(rule for each in distinct for rule in each.domain_access_rules))
 
 
 def _with_enclave(source: PictureSource, folder: Path, now: datetime) -> PictureSource:

@@ -31,7 +31,7 @@ FOUND_OTHERWISE = {
     "policy.redundant-include",
     "portable.enclave-names",
     "policy.root-enclave",
-    "policy.robot-without-enclave",
+    "policy.unknown-group",
     "policy.shared-namespace",
     "policy.not-on-zenoh",
 }
@@ -302,10 +302,12 @@ def test_a_misspelled_group_is_found(tmp_path: Path) -> None:
     file.write_text(policy(carts))
     fleet.write_text(
         '[robots]\nh1 = { groups = ["carts"] }\nh2 = { groups = ["cart"] }\nh3 = {}\n'
-        'w1 = { groups = ["windows"] }\n'
+        'w1 = { groups = ["windows"] }\nc2 = { groups = ["carts", "carst"] }\n'
+        'n1 = { groups = ["carts2"] }\n'
     )
-    words = ("check", file, "--fleet", fleet, "--include", "policy.robot-without-enclave")
+    words = ("check", file, "--fleet", fleet, "--include", "policy.unknown-group")
     said = sros(*words).out
-    assert "no enclave for h2 (group cart: perhaps carts), h3 (in no group)\n" in said
+    c2, h2 = "c2 (group carst: perhaps carts)", "h2 (group cart: perhaps carts)"
+    assert f"no enclave for the group of {c2}, {h2}, h3 (in no group)\n" in said
     file.write_text(policy(carts, enclave("", "/{robot}/all", "{namespace}")))
-    assert sros(*words).ok().out == ""
+    assert f"no enclave for the group of {c2}, {h2}\n" in sros(*words).out

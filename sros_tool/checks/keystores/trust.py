@@ -52,8 +52,8 @@ PEERS_REVOKED = FindingKind(
     "it, on either side.",
     "RFC 5280, 5; rmw_dds_common (crl.pem); Fast DDS 2.6 to 3.6; tested.",
     "If an enclave is meant to be revoked, remove its files. If not, export it again from its "
-    "keystore, which may have a new certificate already. If it has the same one there: `sros renew "
-    "KEYSTORE ENCLAVE --new-key`, and export it again.",
+    "keystore, which may have a new certificate already. If it has none there: `sros "
+    "generate_artifacts -k KEYSTORE -e ENCLAVE -p POLICY_FILE`, and export it again.",
 )
 PEERS_PROTECTION = FindingKind(
     "keystore.peers-protection",
