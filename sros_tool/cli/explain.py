@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.who import Decider, Everybody, FollowedReach
     from sros_tool.explain.zenoh import CheckedLink, ZenohAnswer, ZenohExplanation
     from sros_tool.fleet.robots import Fleet
-    from sros_tool.keystore.participant import LoadedEnclave
+    from sros_tool.keystore.reader import Keystore
     from sros_tool.policy.model import Source
     from sros_tool.proof.requirements import Requirement
     from sros_tool.zenoh.delivery import Check
@@ -320,7 +320,10 @@ def explain(
         only = patterns, robots
         if policy:
             return _show_who_in_policy(policy, root, rest, kind, chosen, asking, only, as_json)
-        return _show_who(root, rest, kind, chosen, why_zenoh, asking, only, as_json)
+        by_stated = not (vendor or distro)
+        return _show_who(
+            root, rest, kind, chosen, why_zenoh, asking, only, as_json, stated=by_stated
+        )
     question = _question(root, rest, kind)
     asked = _open(root, rest[0], policy, asking)
     context = asking.context(asked.enclave.joined_domains)
@@ -335,7 +338,7 @@ def explain(
         from sros_tool.explain.vendors import Compared, explain_on_dds
 
         if not (vendor or distro):
-            distro = _stated_distribution(asked.enclave)
+            distro = _stated_distribution(asked.enclave.keystore, asked.enclave.name)
         chosen = chosen_vendor(None if vendor == ZENOH else vendor, distro, os.environ)
         every = Compared.VENDORS if all_vendors else Compared.DISTRIBUTIONS if all_distros else None
         explanation = explain_on_dds(asked, question, chosen, context, kind=kind, every=every)
@@ -429,16 +432,15 @@ def _open(root: Path | None, name: str, policy: Path | None, asking: AskingConte
     return open_to_ask(root, name, policy, asking)
 
 
-def _stated_distribution(enclave: LoadedEnclave) -> Distribution | None:
+def _stated_distribution(keystore: Keystore | None, enclave: str) -> Distribution | None:
     """Return the only ROS 2 distribution that an enclave's fleet or keystore states, or None."""
     from sros_tool.distributions import find_distribution
     from sros_tool.keystore.fleet import stated_distributions
 
-    keystore = enclave.keystore
     if keystore is None or keystore.settings is None:
         return None
     with suppress(SrosError):  # which `sros check` reports
-        stated = stated_distributions(keystore, enclave.name)
+        stated = stated_distributions(keystore, enclave)
         return find_distribution(stated[0]) if len(stated) == 1 else None
     return None
 
@@ -778,10 +780,13 @@ def _show_who(
     asking: AskingContext,
     only: tuple[tuple[str, ...], tuple[str, ...]],
     as_json: bool,
+    *,
+    stated: bool,
 ) -> int:
     """Print which enclaves of the keystore may do something; return 0 if any may, else 1.
 
     ``chosen_vendor`` is the vendor that decides, None for Zenoh; ``only`` are --match and --robot.
+    ``stated``: where the keystore or its fleet states one distribution, that of it decides.
     """
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.layout import has_authorities
@@ -796,8 +801,13 @@ def _show_who(
     decider: Decider
     if chosen_vendor:
         from sros_tool.explain.vendors import VendorOfKeystore
+        from sros_tool.runtime.rmw import vendor_here
 
-        decider = VendorOfKeystore(keystore, *chosen_vendor, asking, names)
+        def vendor_of(name: str) -> Vendor | None:
+            distribution = _stated_distribution(keystore, name) if stated else None
+            return vendor_here(os.environ, distribution)[0] if distribution else None
+
+        decider = VendorOfKeystore(keystore, *chosen_vendor, asking, names, vendor_of)
     else:
         from sros_tool.explain.zenoh import ZenohOfKeystore
 

@@ -815,7 +815,7 @@ def _with_name(text: str, word: str, name: str) -> str:
     return plain.join(re.split(rf"\b{word}\b", text))
 
 
-_COMMAND = re.compile(r"(`sros [^`]*`)")
+_COMMAND = re.compile(r"(`sros\b[^`]*`)")
 _MOST_PEERS = 5
 """Highest number of peers that are examined for one message."""
 _OF_ROTATION = ("peer-signature", "peer-permissions-ca")

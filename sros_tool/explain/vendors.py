@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from enum import Enum, auto
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -477,11 +477,23 @@ class VendorOfKeystore(NamedTuple):
     why: str
     asking: AskingContext
     names: Sequence[str] | None = None
+    stated: Callable[[str], Vendor | None] = lambda _: None
+    """Function that returns the vendor of the distribution that is stated for an enclave."""
 
     @property
     def title(self) -> str:
         """Name of the vendor, and the reason to choose it."""
-        return _title(self.vendor, self.why)
+        return _title(self.vendor, self._reason)
+
+    @property
+    def _reason(self) -> str:
+        names = self.keystore.names if self.names is None else self.names
+        others = {vendor.title for name in names if (vendor := self.stated(name))}
+        if not (others := others - {self.vendor.title}):
+            return self.why
+        return (
+            f"{self.why}; {' and '.join(sorted(others))} for enclaves whose distribution is stated"
+        )
 
     def rights_naming(self, name: str) -> Iterator[Right]:
         """Return the rights to a ROS name in the permissions of all enclaves."""
@@ -499,8 +511,9 @@ class VendorOfKeystore(NamedTuple):
 
             def decided(domain: int) -> VendorOutcome:
                 context = self.asking._replace(domain=domain).context(None)
-                return _outcome(name, Evaluator(self.vendor, enclave, context).answer(question))
+                return _outcome(name, Evaluator(vendor, enclave, context).answer(question))
 
+            vendor = self.stated(name) or self.vendor
             decision, domains = first_allowing_domain(_parts(enclave, self.asking.domain), decided)
             return decision._replace(domains=domains)
 
@@ -511,7 +524,7 @@ class VendorOfKeystore(NamedTuple):
         return WhoByVendor(
             str(question),
             self.vendor,
-            self.why,
+            self._reason,
             self.asking.domain,
             outcomes,
             not has_authorities(self.keystore.root),

@@ -147,6 +147,12 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
         seen = union([read_source(path, now=drawing.now) for path in drawing.observed])
         read.append(seen.moved_to_homes(enclaves_of_nodes(seen.nodes, read[0].nodes)))
     picture = _compared_picture(read, context, use=bool(drawing.observed))
+    governed = [source.governance for source in read if source.governance]
+    if len(governed) == 2 and governed[0] != governed[1]:
+        text = "the governance of the two differs, and that of the second one is drawn: `sros "
+        text += "diff_policy --no-new-access` shows what it opens."
+        finding = PicturedFinding("view.governance-differs", "warning", text)
+        picture = replace(picture, findings=(*picture.findings, finding))
     if len(domains := {enclave.domains for enclave in picture.enclaves} - {""}) > 1:
         several = enumerated(sorted(domains))
         text = f"enclaves are for different ROS domains ({several}), and a name is drawn once for "

@@ -791,6 +791,9 @@ def test_the_distribution_of_the_robot_decides(tmp_path: Path) -> None:
     assert "as in ROS 2 Humble)" in explain(root, *asked).out
     assert "on Fast DDS 3.6" in explain(root, *asked, "--distro", "lyrical").out
     assert "Humble" not in explain(root, "/r2/a", "publish", "/x").out
+    who = explain(root, "--who", "publish", "/x")
+    assert "Fast DDS 2.6 for enclaves whose distribution is stated" in who.err
+    assert "is stated" not in explain(root, "--who", "publish", "/x", "--distro", "lyrical").err
 
 
 def test_a_copy_without_keys_is_answered_as_if_they_were_there(whole: Path, tmp_path: Path) -> None:

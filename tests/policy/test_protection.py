@@ -210,5 +210,12 @@ def test_a_different_governance_of_equal_rights_is_said(keystore: Path, tmp_path
     assert (ended.status, ended.out) == (1, "")
     command = f"sros diff_policy --no-new-access {keystore} {opened}"
     assert f"the governance differs: `{command}` shows what B opens" in ended.err
+    for name, root in (("first", keystore), ("second", opened)):
+        sros("distribute_key", root, "--all", tmp_path / name).ok()
+    exports = tmp_path / "first", tmp_path / "second"
+    assert "the governance differs" in sros("diff_policy", *exports).err
+    assert sros("diff_policy", keystore, exports[0]).ok().err == "the rights are the same\n"
+    table = sros("view", exports[1], "--format", "markdown").ok().out
+    assert "| everybody with an identity |" in table
     found = json.loads(sros("diff_policy", keystore, opened, "--json").out)
     assert (found["equal"], found["governance_differs"]) == (False, True)
