@@ -18,6 +18,7 @@ from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError
 from sros_tool.explain.answer import Evaluator, Question, about_action
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
+    KEY_FILE,
     PERMISSIONS_FILE,
     has_enclave,
     is_keystore,
@@ -150,8 +151,9 @@ def open_to_ask(
         if own is None and not is_enclave(Path(enclave.name)):
             raise not_in_policy_error(policy, enclave.name, policy_file)
     lacks_keys = False
-    if keystore and enclave.state and is_keystore(keystore.root):
-        lacks_keys = not keystore.has_keys
+    # Others are looked at only if this one lacks its key: a process may not be able to.
+    if keystore and enclave.state and KEY_FILE not in enclave.state.files:
+        lacks_keys = is_keystore(keystore.root) and not keystore.has_keys
     enclave = enclave._replace(
         keystore=keystore,
         key_elsewhere=enclave.key_elsewhere or lacks_keys,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from sros_tool.files import templates_dir
@@ -148,8 +149,14 @@ def make_inboxes(folder: Path) -> None:
             message = signed_message(robot, f"/{name}", said)
             (folder / f"from_{keystore}" / name / MESSAGE_FILE).write_bytes(message)
     (folder / "good/a").mkdir(parents=True)
-    message = signed_message(robot, "/a", said_by(robot, "a", datetime.now(UTC)))
+    message = signed_message(robot, "/a", said_by(robot, "a", datetime.now(UTC), sequence=2))
     (folder / "good/a" / MESSAGE_FILE).write_bytes(message)
+    # The last message of an inbox that the robot used before.
+    (folder / "older/a").mkdir(parents=True)
+    before = datetime.now(UTC) - timedelta(hours=1)
+    message = signed_message(robot, "/a", said_by(robot, "a", before))
+    (folder / "older/a" / MESSAGE_FILE).write_bytes(message)
+    os.utime(folder / "older/a" / MESSAGE_FILE, (before.timestamp(),) * 2)
     (folder / "from_fresh/b" / MESSAGE_FILE).write_bytes(b"no message")
     (folder / "from_fresh/stranger").mkdir()
     copy_of(folder / "crew", folder / "unable")
@@ -433,6 +440,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("fresh from_fresh", 1),
         Case("fresh from_fresh", 1, before=("renew fresh /a",)),
         Case("fresh good", before=("revoke fresh /b",)),
+        Case("fresh older", before=("fleet collect fresh good",)),
         Case("unable from_crew", 2),
     ),
     "fleet publish": (
