@@ -207,7 +207,7 @@ def _check_release(
     if problem := seal_problem(release, trusted):
         raise KeystoreError(
             f"release {release.number} {OF_OTHER_CA}",
-            f"{problem.rstrip('.')}. Nothing was changed.",
+            f"{problem[:1].upper()}{problem[1:].rstrip('.')}. Nothing was changed.",
             "Look whether the server has an old copy, from before a CA rotation. If this robot "
             "missed a stage of a rotation, bring its files with `sros distribute_key KEYSTORE "
             f"--robot {robot} FOLDER --force`. Otherwise the release comes from another "

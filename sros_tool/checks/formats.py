@@ -144,7 +144,7 @@ def _kinds(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:
 def findings_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None = None) -> str:
     """Return the findings as Markdown, under a heading with their numbers.
 
-    Findings that differ only in one robot of ``fleet`` are one item.
+    Findings that differ only in one robot of ``fleet``, or in one enclave, are one item.
     """
     rest = "which `sros check` shows"
     groups = folded_findings(group_by_cause(chosen_findings.shown), fleet)

@@ -1133,7 +1133,7 @@ def policy_file_findings(
         yield from _include_findings(path)
         if fleet and (shared := [*_shared_namespaces(fleet)]):
             yield SHARED_NAMESPACE.found(str(path), first_few(shared, 3, "; "), str(path))
-    if fleet and read and (text := _robots_in_unknown_groups(paths, fleet)):
+    if fleet and len(read) == len(paths) and (text := _robots_in_unknown_groups(paths, fleet)):
         yield UNKNOWN_GROUP.found(str(paths[0]), text, str(paths[0]))
     yield from findings_in(read, distribution)
     if on_zenoh:

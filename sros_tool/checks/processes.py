@@ -808,9 +808,7 @@ def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterato
 
 
 def _has_other_files(enclave: ProcessEnclave, root: Path) -> bool:
-    """Return whether ``root`` has the enclave, too, and its certificate, permissions, governance or
-    revocation list are other files there.
-    """
+    """Return whether ``root`` has the enclave, too, with other files than the process loaded."""
     with suppress(SrosError, OSError):
         place = enclave_path(root, check_enclave_name(f"/{enclave.name.strip('/')}"))
         if enclave.is_of(root) or not enclave.is_there or not (place / CERTIFICATE_FILE).exists():

@@ -437,10 +437,10 @@ def _stated_distribution(keystore: Keystore | None, enclave: str) -> Distributio
     from sros_tool.distributions import find_distribution
     from sros_tool.keystore.fleet import stated_distributions
 
-    if keystore is None or keystore.settings is None:
+    if keystore is None:
         return None
     with suppress(SrosError):  # which `sros check` reports
-        stated = stated_distributions(keystore, enclave)
+        stated = stated_distributions(keystore, enclave) if keystore.settings else ()
         return find_distribution(stated[0]) if len(stated) == 1 else None
     return None
 

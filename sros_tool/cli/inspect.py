@@ -83,7 +83,8 @@ def inspect(
     key, a Zenoh configuration or a signed document (.p7s). The exit status is 1 if an enclave
     cannot run, a signature does not verify or is missing (in a .p7s file, or with --ca), a Zenoh
     configuration does not fit its signature or its enclave, a certificate or signed document is
-    missing from the keystore's ledger, or lines of the ledger are missing or were changed.
+    missing from the keystore's ledger, lines of the ledger are missing or were changed, or with
+    --policy, nothing was signed from that file.
 
     Example:
       $ sros inspect keystore/enclaves/talker/permissions.p7s

@@ -265,6 +265,7 @@ def diff_policy(
       + /talker publish topic /arm_*  (robot.xml:7): such as /arm_c
       1 right is new
     """
+    from sros_tool.keystore.layout import has_authorities
     from sros_tool.keystore.rights import compare_sources, load_rights, policy_difference
 
     check_one_format()
@@ -302,7 +303,9 @@ def diff_policy(
             echo("what the policies say about protection differs", err=True)
         if compared.governance_differs:
             command = f"sros diff_policy --no-new-access {quote(str(a))} {quote(str(b))}"
-            shows = f"`{command}` shows what B opens, `sros inspect` what each states"
+            shows = "`sros inspect` shows what each states"
+            if has_authorities(a) and has_authorities(b):
+                shows = f"`{command}` shows what B opens, {shows}"
             echo(f"the governance differs: {shows}", err=True)
     print_notes((*first.notes, *second.notes))
     return 0 if not compared and first.sound and second.sound else 1

@@ -152,8 +152,9 @@ class SearchedKeystore:
         """The enclaves of Zenoh routers: by the settings, by name without them, and by files."""
         from sros_tool.zenoh.configuration import ZenohNetwork  # most logs are not of Zenoh
 
-        settings = self._keystore.settings
-        network = settings.zenoh if settings else None
+        network = None
+        with suppress(SrosError):  # which `sros check` reports
+            network = settings.zenoh if (settings := self._keystore.settings) else None
         names = set((network or ZenohNetwork()).router_names())
         for name in self._keystore.names:
             if (self._keystore.folder(name) / ROUTER_FILE).exists():
@@ -447,8 +448,9 @@ def _dropped_message_findings(
     """
     numbered = ((n, *labelled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
     groups: dict[tuple[str, str, bool, str], list[DroppedMessage]] = {}
-    routers = keystore.zenoh_routers if keystore else frozenset[str]()
-    for message in dropped_messages(numbered):
+    dropped = [*dropped_messages(numbered)]
+    routers = keystore.zenoh_routers if keystore and dropped else frozenset[str]()
+    for message in dropped:
         # Routers check each other, too: without its name, the process may be one of them.
         is_node = own not in routers if own else len(routers) == 1
         lacks_own = message.name in routers and is_node

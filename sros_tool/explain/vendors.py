@@ -530,10 +530,10 @@ class VendorOfKeystore(NamedTuple):
             not has_authorities(self.keystore.root),
         )
 
-    def notes(self, _outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
-        """Yield a note on an export, which may lack enclaves."""
+    def notes(self, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
+        """Yield notes on an export, which may lack enclaves, and on a copy without keys."""
         from sros_tool.explain.who import note_on_export  # as in `outcomes`
 
         yield from note_on_export(self.keystore.root)
-        if not self.keystore.has_keys:
+        if not self.keystore.has_keys and not all(outcome.stopped for outcome in outcomes):
             yield _note_on_lacking_keys(self.keystore.root)

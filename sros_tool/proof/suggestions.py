@@ -108,7 +108,7 @@ def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Req
 
 
 def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
-    """Yield a requirement for each few enclaves that alone have a right to received names."""
+    """Yield a requirement for each up to three enclaves that alone use the same names."""
     other = OTHER_SIDE[right]
     names: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name in stated_rights.names(right):

@@ -228,9 +228,8 @@ class _System:
 
     def __init__(self, picture: Picture, sources: Sequence[PictureSource]) -> None:
         self._picture = picture
-        self.is_partial = all(
-            source.is_partial for source in sources if source.origin.kind != "observation"
-        )
+        known = [source for source in sources if source.origin.kind != "observation"]
+        self.is_partial = bool(known) and all(source.is_partial for source in known)
         enclaves = {enclave.path for enclave in picture.enclaves}
         in_domains: dict[DomainSet | None, list[Right]] = defaultdict(list)
         for source in sources:

@@ -150,7 +150,7 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     governed = [source.governance for source in read if source.governance]
     if len(governed) == 2 and governed[0] != governed[1]:
         text = "the governance of the two differs, and that of the second one is drawn: `sros "
-        text += "diff_policy --no-new-access` shows what it opens."
+        text += "inspect` shows what each states."
         finding = PicturedFinding("view.governance-differs", "warning", text)
         picture = replace(picture, findings=(*picture.findings, finding))
     if len(domains := {enclave.domains for enclave in picture.enclaves} - {""}) > 1:
@@ -586,7 +586,7 @@ def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime
 
 
 def _joint_governance(governances: Iterable[Governance | None]) -> Governance | None:
-    """Return the rules of all governance documents, so that what one of them opens is open."""
+    """Return the rules of all governance documents: access that one of them opens is open."""
     distinct = [each for each in dict.fromkeys(governances) if each is not None]
     if len(distinct) < 2:
         return distinct[0] if distinct else None

@@ -196,10 +196,10 @@ def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
 
 def starts_nodes(command: Sequence[str]) -> bool:
     """Return whether a command certainly starts ROS nodes, as `with_enclave` says."""
-    if Path(command[0]).name == "ros2":
-        return _is_ros2_run(command)
     if any(Path(word).name == _ZENOH_ROUTER for word in command):
         return False
+    if Path(command[0]).name == "ros2":
+        return _is_ros2_run(command)
     return ROS_ARGS in command or _is_of_package(command)
 
 

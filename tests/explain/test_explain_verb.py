@@ -794,6 +794,8 @@ def test_the_distribution_of_the_robot_decides(tmp_path: Path) -> None:
     who = explain(root, "--who", "publish", "/x")
     assert "Fast DDS 2.6 for enclaves whose distribution is stated" in who.err
     assert "is stated" not in explain(root, "--who", "publish", "/x", "--distro", "lyrical").err
+    (root / "sros.toml").write_text("[")  # which `sros check` reports
+    assert explain(root, *asked).ok().out.startswith("yes")
 
 
 def test_a_copy_without_keys_is_answered_as_if_they_were_there(whole: Path, tmp_path: Path) -> None:

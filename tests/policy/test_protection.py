@@ -209,7 +209,7 @@ def test_a_different_governance_of_equal_rights_is_said(keystore: Path, tmp_path
     ended = sros("diff_policy", keystore, opened)
     assert (ended.status, ended.out) == (1, "")
     command = f"sros diff_policy --no-new-access {keystore} {opened}"
-    assert f"the governance differs: `{command}` shows what B opens" in ended.err
+    assert f"the governance differs: `{command}` shows what B opens, " in ended.err
     for name, root in (("first", keystore), ("second", opened)):
         sros("distribute_key", root, "--all", tmp_path / name).ok()
     exports = tmp_path / "first", tmp_path / "second"

@@ -64,6 +64,7 @@ def test_a_ros_node(command: str, prefix: Path) -> None:
         "ros2 run",
         "ros2 run arm",
         "ros2 run --help arm driver",
+        "ros2 run rmw_zenoh_cpp rmw_zenohd",
         "ros2 run arm driver --ros-args --enclave /leg",
         "ros2 run arm driver --ros-args -e /leg",
         "python3 node.py",
