@@ -969,6 +969,8 @@ class OpenRobot:
         self._write_processes(observed.belonging_elsewhere(not_here))
         number = counted(len(processes), "process", "processes")
         self._shell.say(f"saw {counted(len(nodes), 'node')} in {number} of this machine")
+        if os.path.lexists(self.seen_again):  # of an earlier watch
+            remove_file(self.seen_again)
         lacking = learned["added"] if learned["dry_run"] else ()
         if not lacking:
             return ""
@@ -987,8 +989,6 @@ class OpenRobot:
         from sros_tool.graph.learn import draft, learn, write  # only after another watch
 
         common = common_parts(self.folder, policies_dir())
-        if os.path.lexists(self.seen_again):
-            remove_file(self.seen_again)
         write(draft(self.seen_again, learn(make_observation(nodes), common), common))
 
     def _shared_program_texts(self) -> Iterator[str]:

@@ -39,7 +39,7 @@ from sros_tool.dds.permissions import (
 )
 from sros_tool.errors import DocumentError, Note, PolicyError, SrosError
 from sros_tool.files import policies_dir
-from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
+from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot, group_of
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.keystore.protection import contradictions
@@ -1123,9 +1123,15 @@ def policy_file_findings(
         on_zenoh: whether their nodes use Zenoh.
     """
     read: list[Policy] = []
+    groups = set[str]()
     for path in paths:
         try:
-            known = policy if policy and len(paths) == 1 else read_policy_for(path, fleet)
+            known = policy if policy and len(paths) == 1 else None
+            if fleet:
+                expanded = FleetPolicy(read_policy(path, placeholders=True), fleet)
+                groups.update(group_of(parts_of(pattern)) for pattern in expanded.patterns)
+                known = known or expanded.policy()
+            known = known or read_policy(path)
         except SrosError as error:
             yield from _unreadable_policy_findings(path, error)
             continue
@@ -1133,7 +1139,7 @@ def policy_file_findings(
         yield from _include_findings(path)
         if fleet and (shared := [*_shared_namespaces(fleet)]):
             yield SHARED_NAMESPACE.found(str(path), first_few(shared, 3, "; "), str(path))
-    if fleet and len(read) == len(paths) and (text := _robots_in_unknown_groups(paths, fleet)):
+    if fleet and len(read) == len(paths) and (text := _robots_in_unknown_groups(groups, fleet)):
         yield UNKNOWN_GROUP.found(str(paths[0]), text, str(paths[0]))
     yield from findings_in(read, distribution)
     if on_zenoh:
@@ -1173,22 +1179,18 @@ def _shared_namespaces(fleet: Fleet) -> Iterator[str]:
                 )
 
 
-def _robots_in_unknown_groups(paths: Sequence[Path], fleet: Fleet) -> str:
+def _robots_in_unknown_groups(named: Collection[str], fleet: Fleet) -> str:
     """Return a clause on robots whose group is misspelled, or missing; "" if there are none.
 
-    A group that no policy names may belong to policies that were not named.  So a group counts only
-    if no other robot has it, and its name is like that of a group in the policies, but for more
-    than a number.  A robot without a group counts if every enclave is for a group.
+    ``named`` are the groups in the policies, with "" for enclaves of all robots.  Other groups may
+    belong to policies that were not named.  So a group counts only if no other robot has it, and
+    its name is like that of a group in the policies, but for more than a number.  A robot without a
+    group counts if every enclave is for a group.
     """
-    named = set[str]()
-    for path in paths:
-        with suppress(SrosError):  # what is wrong with it is a finding of its own
-            policy = read_policy(path, placeholders=True)
-            named |= {group_of(parts_of(each)) for each in FleetPolicy(policy, fleet).patterns}
-    for_all, groups = not named or "" in named, named - {""}
+    for_all, groups = not named or "" in named, {*named} - {""}
     clauses = []
     for robot in fleet.robots.values():
-        for group in set(robot.groups) - groups:
+        for group in sorted({*robot.groups} - groups):
             close = get_close_matches(group, groups) if len(fleet.groups[group]) < 2 else []
             letters = _NUMBER.sub("", group)
             if meant := sorted(each for each in close if _NUMBER.sub("", each) != letters):

@@ -105,13 +105,13 @@ def _findings_unless_policy(path: Path, circumstances: Circumstances) -> list[Fi
 
         return list(configuration_findings(path))
     if is_keystore(path):
-        return _keystore(path, circumstances, None)
+        return findings_in_keystore(path, circumstances)
     enclave = path if path.is_dir() else path.parent
     if (is_enclave(enclave) or (enclave / PERMISSIONS_FILE).exists()) and (
         path.is_dir() or path.name in _ENCLAVE_FILES
     ):
         root, name = locate_enclave(enclave)
-        return _keystore(root, circumstances, name)
+        return findings_in_keystore(root, circumstances, name)
     return None
 
 
@@ -148,7 +148,10 @@ def _policies_at(path: Path) -> list[Path]:
     )
 
 
-def _keystore(root: Path, circumstances: Circumstances, only: str | None) -> list[Finding]:
+def findings_in_keystore(
+    root: Path, circumstances: Circumstances, only: str | None = None
+) -> list[Finding]:
+    """Return findings about a keystore or an export, or about one enclave of it."""
     return keystore_findings(
         circumstances.keystore(root),
         now=circumstances.now,

@@ -574,8 +574,12 @@ def _refuse_besides_upgrade() -> None:
 
 
 def _findings(family: str, paths: tuple[Path, ...], circumstances: Circumstances) -> list[Finding]:
-    from sros_tool.checks.keystores.keystore import keystore_findings
-    from sros_tool.checks.targets import findings_between_folders, path_findings, policy_findings
+    from sros_tool.checks.targets import (
+        findings_between_folders,
+        findings_in_keystore,
+        path_findings,
+        policy_findings,
+    )
     from sros_tool.keystore.layout import is_keystore
 
     if family == "runtime":
@@ -592,20 +596,7 @@ def _findings(family: str, paths: tuple[Path, ...], circumstances: Circumstances
                 "Go to the folder of the keystore, or name its path.",
             )
         roots = paths or (keystore_from_environment(),)
-        findings = [
-            finding
-            for root in roots
-            for finding in keystore_findings(
-                circumstances.keystore(root),
-                now=circumstances.now,
-                zone=circumstances.zone,
-                domain=circumstances.domain,
-                policies=circumstances.policies,
-                fleet=circumstances.fleet,
-                distribution=circumstances.distribution,
-                vendors=circumstances.vendors,
-            )
-        ]
+        findings = [each for root in roots for each in findings_in_keystore(root, circumstances)]
         return [*findings, *findings_between_folders(roots, circumstances)]
     if paths:
         return path_findings(paths, circumstances)

@@ -310,10 +310,9 @@ def explain(
         text = "Zenoh decides alike in every distribution."
         raise UsageError("--vendor zenoh takes no --distro", text, "Leave it out.")
     why_zenoh = "" if all_vendors or all_distros else _reason_for_zenoh(vendor, root)
-    if not (why_zenoh or vendor or distro or all_vendors or all_distros):
-        from sros_tool.distributions import unknown_distribution
-
-        print_notes(unknown_distribution(os.environ))
+    by_machine = not (why_zenoh or vendor or distro or all_vendors or all_distros)
+    if who and by_machine:
+        _note_unknown_distribution()
     if who:
         asking = asking._replace(domain=domain_of(domain))  # all domains, unless asked
         chosen = None if why_zenoh else chosen_vendor(vendor, distro, os.environ)
@@ -339,6 +338,8 @@ def explain(
 
         if not (vendor or distro):
             distro = _stated_distribution(asked.enclave.keystore, asked.enclave.name)
+        if by_machine and not distro:
+            _note_unknown_distribution()
         chosen = chosen_vendor(None if vendor == ZENOH else vendor, distro, os.environ)
         every = Compared.VENDORS if all_vendors else Compared.DISTRIBUTIONS if all_distros else None
         explanation = explain_on_dds(asked, question, chosen, context, kind=kind, every=every)
@@ -430,6 +431,13 @@ def _open(root: Path | None, name: str, policy: Path | None, asking: AskingConte
     if root is None and not policy and not is_enclave(Path(name)):
         root = keystore_from_environment()
     return open_to_ask(root, name, policy, asking)
+
+
+def _note_unknown_distribution() -> None:
+    """Print a note if $ROS_DISTRO, which decides where nothing else does, is unknown."""
+    from sros_tool.distributions import unknown_distribution
+
+    print_notes(unknown_distribution(os.environ))
 
 
 def _stated_distribution(keystore: Keystore | None, enclave: str) -> Distribution | None:
@@ -803,9 +811,15 @@ def _show_who(
         from sros_tool.explain.vendors import VendorOfKeystore
         from sros_tool.runtime.rmw import vendor_here
 
+        every = (keystore.names if names is None else names) if stated else ()
+        distributions = {name: _stated_distribution(keystore, name) for name in every}
+        vendors = {of: vendor_here(os.environ, of) for of in {*distributions.values()} if of}
+        if len({*distributions.values()}) == 1 and vendors:
+            (chosen_vendor,) = vendors.values()
+
         def vendor_of(name: str) -> Vendor | None:
-            distribution = _stated_distribution(keystore, name) if stated else None
-            return vendor_here(os.environ, distribution)[0] if distribution else None
+            distribution = distributions.get(name)
+            return vendors[distribution][0] if distribution else None
 
         decider = VendorOfKeystore(keystore, *chosen_vendor, asking, names, vendor_of)
     else:

@@ -572,10 +572,10 @@ def check_keystore(root: Path) -> None:
             parent = next((path for path in root.parents[-2::-1] if not path.exists()), None)
             why = "It does not exist."
             why += f" Nor does '{parent}': its disk may not be mounted." if parent else ""
-        raise KeystoreError(f"'{root}' is not a valid keystore", why, _wrong_path_error(root))
+        raise KeystoreError(f"'{root}' is not a valid keystore", why, _wrong_path_remedy(root))
 
 
-def _wrong_path_error(root: Path) -> str:
+def _wrong_path_remedy(root: Path) -> str:
     """Return the remedy if ``root``, which is no keystore, was named as a keystore."""
     if around := keystore_around(root):
         return f"It is a folder in the keystore '{around}': name that keystore."

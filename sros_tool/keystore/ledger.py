@@ -154,6 +154,7 @@ class _Fault(NamedTuple):
 _MOST_BYTES = 4 * 1024**3
 _MOST_LINES = 8_000_000
 _LONGEST_LINE = 4 * 1024**2
+_END_BYTES = 64 * 1024
 _BLOCK = 1024**2
 _TEXTS = tuple(name for name in Entry._fields if name != "number")
 _SERIAL = re.compile(r"[0-9a-f]{1,40}")
@@ -298,7 +299,7 @@ class _Files(NamedTuple):
     ``state`` is None without a ledger; ``lines`` is the content of the file, None if it is too long
     to keep in memory, or follows sealed parts.  ``ledger_index`` is None without an index that
     fits.  ``part`` is the number of the last part, which is the file; ``later`` is the name of a
-    later part, "" without one.  ``last_line`` is not verified.
+    later part, "" without one.  ``last_lines`` are its last ones, which are not verified.
     """
 
     head: _Head | None
@@ -307,7 +308,7 @@ class _Files(NamedTuple):
     ledger_index: LedgerIndex | None = None
     part: int = 1
     later: str = ""
-    last_line: bytes = b""
+    last_lines: tuple[bytes, ...] = ()
 
 
 class LedgerFile:
@@ -445,13 +446,19 @@ class LedgerFile:
         return files.part, files.state.st_size if files.state else 0
 
     def clock_behind(self, now: datetime) -> str:
-        """Return, as a clause, how far the clock is behind the last entry; "" if it is not."""
-        line = self._opened().last_line
-        last = None
-        with suppress(ValueError):
-            entry = _parse(line) or _parse_any(line)
-            last = parse_iso(entry.time) if entry else None
-        return behind_clause(now, last, "the last entry of the ledger")
+        """Return, as a clause, how far the clock is behind the last entries; "" if it is not.
+
+        The latest entry since the last revocation list counts: what was written with the wrong
+        clock hides nothing, and a new list ends what was written with a clock that was ahead.
+        """
+        times = []
+        for line in reversed(self._opened().last_lines):
+            if entry := _parse(line):
+                with suppress(ValueError):
+                    times.append(parse_iso(entry.time))
+                if entry.what == "crl":
+                    break
+        return behind_clause(now, max(times, default=None), "the last entry of the ledger")
 
     def content(self) -> Iterator[bytes]:
         """Yield the bytes of the last part, in blocks."""
@@ -517,8 +524,8 @@ class LedgerFile:
             state = os.fstat(file.fileno())
             before = _sealed_before(file)
             part = before.number + 1 if before else 1
-            end = os.pread(file.fileno(), _LONGEST_LINE, max(0, state.st_size - _LONGEST_LINE))
-            last = end.rstrip(b"\n").rpartition(b"\n")[2]
+            start = max(0, state.st_size - _END_BYTES)
+            last = tuple(os.pread(file.fileno(), _END_BYTES, start).split(b"\n"))[bool(start) :]
             later = _later_than(self.root, part, state)
             if head and (index := self._index(file, head)):
                 return _Files(head, state, None, index, part, later, last)

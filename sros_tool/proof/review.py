@@ -882,7 +882,7 @@ def _is_same_file(base: CommitFiles | None, head: CommitFiles, path: str) -> boo
 def _rights_made(
     before: Iterable[Enclave], after: Iterable[Enclave], *, absolute: bool
 ) -> tuple[PlacedRight, ...]:
-    """Return the rights that are ``absolute`` (or else relative) in ``after`` alone."""
+    """Return the rights of both that are ``absolute`` (or else relative) only in ``after``."""
     earlier, later = (
         {
             placed.right: placed

@@ -856,10 +856,21 @@ def test_a_clock_that_was_set_back(publisher: Home) -> None:
         change.entries.append(Entry(iso(today), "x"))
         change.record()
         assert any("the clock of this machine shows" in note.text for note in change.notes)
+    wrong = today - timedelta(hours=5)
+    with KeystoreChange(publisher.root, now=wrong) as change:  # as by a timer that renews
+        change.entries.append(Entry(iso(wrong), "x"))
+        change.record()
+        change.finish()
+    assert "h 59 min behind" in clock_behind(publisher.root, wrong)
     status = fleet_status(Keystore(publisher.root))
     assert not status.with_overdue(publisher.now + timedelta(days=30, minutes=30)).clock
     behind = status.with_overdue(publisher.now)
     assert "30 d behind" in behind.clock and not behind.complete
+    with KeystoreChange(publisher.root, now=wrong) as change:  # as `crl --refresh` writes
+        change.entries.append(Entry(iso(wrong), "crl"))
+        change.record()
+        change.finish()
+    assert not clock_behind(publisher.root, wrong)
     (publisher.root / "ledger.jsonl").write_text("damaged")
     assert not clock_behind(publisher.root, publisher.now)
 

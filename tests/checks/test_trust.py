@@ -76,7 +76,7 @@ def test_protection_and_domains_that_keep_nodes_apart(keystore: Path, tmp_path: 
     robot, other = tmp_path / "robot", tmp_path / "other"
     sros("distribute_key", keystore, "/a", robot).ok()
     for change, text in (
-        (("--set", "protection.rtps=NONE"), ": protection.rtps is SIGN in "),
+        (("--set", "protection.rtps=NONE"), ": protection.rtps: SIGN in "),
         (
             ("--rule", "topic /scan data=NONE metadata=SIGN"),
             " on topic /scan: protection.topic /scan.",

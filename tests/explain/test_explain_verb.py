@@ -794,6 +794,9 @@ def test_the_distribution_of_the_robot_decides(tmp_path: Path) -> None:
     who = explain(root, "--who", "publish", "/x")
     assert "Fast DDS 2.6 for enclaves whose distribution is stated" in who.err
     assert "is stated" not in explain(root, "--who", "publish", "/x", "--distro", "lyrical").err
+    only = explain(root, "--who", "publish", "/x", "--robot", "r1", env={"ROS_DISTRO": "foo"})
+    assert "decided by Fast DDS 2.6 (" in only.err and "is stated" not in only.err
+    assert "foo" not in explain(root, *asked, env={"ROS_DISTRO": "foo"}).err
     (root / "sros.toml").write_text("[")  # which `sros check` reports
     assert explain(root, *asked).ok().out.startswith("yes")
 

@@ -115,7 +115,7 @@ def findings_between(
     """Yield findings about keystores and exports whose nodes do not communicate with each other.
 
     What cannot be read is a finding of another check, and so are files that are not valid ``now``:
-    if the files of two enclaves are never valid together, those of one are not valid at any moment.
+    if the files of two enclaves are never valid together, at each moment those of one are not.
 
     Args:
         targets: the keystores and exports, as the user named them.
@@ -335,7 +335,7 @@ def _governed_apart(
         on = f" on {first_few(apart.names, _MOST_SHOWN)}" if apart.names else ""
         why = first_few(
             [
-                f"{key} is {own_value} in {alike[0]} and {value} in {those[0]}"
+                f"{key}: {own_value} in {alike[0]}, {value} in {those[0]}"
                 for key, own_value, value in apart.differences
             ],
             _MOST_SHOWN,

@@ -738,7 +738,7 @@ class _Run:
         return forgotten
 
     def _restore(self, forgotten_lists: Forgotten | None, keyring: Keyring) -> None:
-        """Record that the keystore was restored, and revoke again what is ``forgotten_lists``.
+        """Record that the keystore was restored, and revoke again what ``forgotten_lists`` have.
 
         Certificates in releases that the keystore sealed are recorded, so that `revoke` knows them.
         """
