@@ -408,11 +408,11 @@ def _refuse_outdated(keystore: Keystore, name: str, now: datetime) -> None:
 def _choose_domain(domains: DomainSet, wanted_domain: int | None, root: Path) -> int:
     """Return the ROS domain for a process that uses a keystore, which is for ``domains``.
 
-    Without a ``wanted_domain`` domain from an option or ROS_DOMAIN_ID, this is 0, the default of
-    ROS, if the keystore is for it, else the keystore's first domain.
+    Without ``wanted_domain``, from an option or ROS_DOMAIN_ID, this is 0, the default of ROS, if
+    the keystore is for it, else the keystore's first domain.
 
     Raises:
-        KeystoreError: the keystore is not for the ``wanted_domain`` domain.
+        KeystoreError: the keystore is not for ``wanted_domain``.
     """
     from sros_tool.keystore.layout import adding_domains
 
@@ -434,7 +434,7 @@ def _zenoh_domain(
     """Return the ROS domain for a process, one of the domains of its Zenoh configuration.
 
     Raises:
-        KeystoreError: the configuration is not for the ``wanted_domain`` domain.
+        KeystoreError: the configuration is not for ``wanted_domain``.
     """
     own = zenoh.domains()
     if not own:

@@ -231,7 +231,7 @@ def _network(
     routers: Sequence[tuple[str, str]],
     crossing: Sequence[str],
 ) -> ZenohNetwork:
-    """Return the network of the settings, or the default network, with the ``given_values`` values.
+    """Return the network of the settings, or the default network, with ``given_values``.
 
     ``routers`` are further routers with their endpoints; an empty endpoint removes a router.
     """

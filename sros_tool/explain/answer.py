@@ -355,7 +355,7 @@ class DecidedPart(NamedTuple):
 @shows(
     *("vendor", "vendor_title", "documented_only", "allowed", "outcome", "reason", "text"),
     *("denied_by", "rule", "wildcard", "policy", "policy_sha256", "protection", "until"),
-    *("until_file", "problems", "parts", "remedy", "change", "commands"),
+    *("until_file", "problems", "parts", "remedy", "change", "commands", "counts_key"),
     null_if_empty=("denied_by", "wildcard", "policy_sha256", "until_file", "remedy"),
 )
 class Answer(NamedTuple):
@@ -396,6 +396,11 @@ class Answer(NamedTuple):
     remedy: str = ""
     """What to do if no change of the policy can help, or null."""
     sign: bool = False
+
+    @property
+    def counts_key(self) -> bool:
+        """Whether the enclave's key is not here, and the answer counts it as there."""
+        return self.enclave.key_elsewhere
 
     @property
     def vendor_title(self) -> str:

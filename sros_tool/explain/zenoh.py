@@ -636,7 +636,7 @@ class ZenohEvaluator:
             yield from (*delivery.checks, *delivery.replies)
 
     def _delivery(self, route: Route, right: Right, key: str = "") -> Delivery:
-        """Return the delivery of a message, by a right of the first process on the route ``route``.
+        """Return the delivery of a message, by a right of the first process on ``route``.
 
         ``key`` is the key of the message; "" stands for the key of the right.
         """

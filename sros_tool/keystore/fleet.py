@@ -213,7 +213,7 @@ def with_routers_of_robots(
 ) -> ZenohNetwork:
     """Return a Zenoh network with the routers of a fleet's robots, in place of those of ``before``.
 
-    Where a router listens stays as it is.  Routers whose enclaves are ``gone_enclaves`` are left
+    Where a router listens stays as it is.  Routers whose enclaves are in ``gone_enclaves`` are left
     out.
     """
     from sros_tool.zenoh.configuration import ZenohRouter  # most fleets name no routers

@@ -756,7 +756,7 @@ def place_column(
     top: float,
     lead: float = 0,
 ) -> dict[str, float]:
-    """Map items to y positions near their ``wanted_positions`` y, without overlaps.
+    """Map items to y positions near their ``wanted_positions``, without overlaps.
 
     Items keep their order, with ``gap`` between them, and none is above ``top``.  The first item of
     each group has ``lead`` more space above it.  All lengths are in pixels.

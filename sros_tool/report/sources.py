@@ -421,7 +421,7 @@ def _pictured_finding(finding: Finding, enclaves: Container[str]) -> PicturedFin
 
 
 def _finding_text(finding: Finding, subject: str = "") -> str:
-    """Return a finding as one text: file name, line, subject (``subject``) and text."""
+    """Return a finding as one text: file name, line, subject and text."""
     place = f"{Path(finding.file).name}:{finding.line}" if finding.line else ""
     return ": ".join(filter(None, (place, subject, finding.text)))
 

@@ -221,7 +221,7 @@ def untyped(key: str) -> str:
 
 
 def as_router(router: str, own_rights: RemoteRights) -> RemoteRights:
-    """Return the rights that a process with the rights ``own_rights`` gives to its router.
+    """Return the rights that a process with ``own_rights`` gives to its router.
 
     A router passes on messages, so it may send what the process may receive, and receive what the
     process may send.

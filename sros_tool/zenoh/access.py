@@ -397,7 +397,7 @@ def narrowed_rights(rights: RemoteRights, most: Iterable[AccessRule], kept: str)
 
 
 def is_within(remote: RemoteRights, own_rights: RemoteRights) -> bool:
-    """Return whether rights of a remote process allow nothing beyond the rights ``own_rights``."""
+    """Return whether rights of a remote process allow nothing beyond ``own_rights``."""
     mine, theirs = AccessControl((own_rights,)), AccessControl((remote,))
     return all(
         mine.allows(own_rights.common_name, rule.flow.opposite(), message, key)

@@ -108,7 +108,7 @@ def route(
 
 
 def deliver_sample(route: Route, key: str, subscribed_key: str = "") -> Delivery:
-    """Return the delivery of a published sample along the route ``route``.
+    """Return the delivery of a published sample along ``route``.
 
     ``key`` is the key of the sample, perhaps with wildcards; ``subscribed_key`` is the key of the
     subscription ("": the same key).
@@ -125,7 +125,7 @@ def deliver_sample(route: Route, key: str, subscribed_key: str = "") -> Delivery
 
 
 def deliver_query(route: Route, key: str, served_key: str = "", reply_key: str = "") -> Delivery:
-    """Return the delivery of a query along the route ``route``, and of the reply.
+    """Return the delivery of a query along ``route``, and of the reply.
 
     ``key`` is the key of the query; ``served_key`` is the key of the queryable, and ``reply_key``
     the key of the reply ("": the same key).
@@ -145,7 +145,7 @@ def deliver_query(route: Route, key: str, served_key: str = "", reply_key: str =
 def deliver_token(
     route: Route, key: str, asked_key: str, message: Message = Message.DECLARE_LIVELINESS_SUBSCRIBER
 ) -> Delivery:
-    """Return the delivery of a liveliness token along the route ``route``, to a watching process.
+    """Return the delivery of a liveliness token along ``route``, to a watching process.
 
     ``asked_key`` is the key that this process asks for, by a ``message``.  A router answers it;
     peers send each other all tokens without being asked.

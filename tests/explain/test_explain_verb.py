@@ -361,7 +361,7 @@ def test_json_of_one_answer(whole: Path) -> None:
         "enclave", "question", "domain", "at", "time_zone", "vendor", "vendor_title", "vendor_why",
         "documented_only", "allowed", "outcome", "reason", "text", "denied_by", "rule", "wildcard",
         "policy", "protection", "until", "until_file", "problems", "parts", "remedy", "change",
-        "commands", "policy_sha256", "version",
+        "commands", "counts_key", "policy_sha256", "version",
     } == set(told)  # fmt: skip
     assert told["rule"] == {
         "grant": 0,
@@ -809,6 +809,9 @@ def test_a_copy_without_keys_is_answered_as_if_they_were_there(whole: Path, tmp_
         key.unlink()
     said = explain(copy, ENCLAVE, "publish", "/chatter").ok()
     assert "note [explain.without-keys]: no enclave in" in said.err
+    assert "\n  key       not here; the answer counts it as there\n" in said.out
+    assert answer(copy, ENCLAVE, "publish", "/chatter")["counts_key"]
+    assert not answer(whole, ENCLAVE, "publish", "/chatter")["counts_key"]
     assert "no rule allows" in explain(copy, ENCLAVE, "publish", "/nothing").out
     assert "key.pem: missing" in explain(copy, ENCLAVE, "join").out
     who = explain(copy, "--who", "publish", "/chatter")

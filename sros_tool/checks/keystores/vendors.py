@@ -443,8 +443,8 @@ def check_starting(
 ) -> list[Finding]:
     """Return the findings, plus an error if no vendor lets an ordinary node start in the enclave.
 
-    Vendors that refuse the enclave do not count.  ``known_findings`` findings with the same cause
-    are left out.
+    Vendors that refuse the enclave do not count.  Findings with the cause of one of
+    ``known_findings`` are left out.
 
     An enclave with only a part of the rights that every node needs is for a tool such as the
     observer of `sros generate_policy`, which has no log and no services; it gets no error.

@@ -278,7 +278,7 @@ def update_keystore(
         UsageError: more would be allowed without ``allow_looser``, or the keystore cannot be
             changed to ``target``.
         KeystoreError: an enclave cannot be issued again, files were edited by hand, the settings
-            are no longer the ``seen_settings`` settings, or vendors would refuse enclaves that they
+            are no longer ``seen_settings``, or vendors would refuse enclaves that they
             accept today.
     """
     change = KeystoreChange(
