@@ -948,7 +948,7 @@ class OpenRobot:
         Return, as a sentence, which of the observed rights an earlier policy lacks.
         """
         replace_file(self.observer, (policies_dir() / "observer.xml").read_bytes())
-        nodes = [node for node in self._observation(every=True).nodes if not is_tool(node)]
+        nodes = [node for node in self._observation(all_nodes=True).nodes if not is_tool(node)]
         running = ProcessTable().look(self._shell.now()).processes
         of_cyclone = [process.pid for process in running if "libddsc" in process.libraries]
         process_ids = _process_ids_of_cyclone(of_cyclone, self.domain)
@@ -1032,11 +1032,11 @@ class OpenRobot:
         self.observed = observed
         replace_file(self.processes, f"{json.dumps(as_plain(observed), indent=2)}\n".encode())
 
-    def _observation(self, *, every: bool = False) -> Observation:
+    def _observation(self, *, all_nodes: bool = False) -> Observation:
         """Return the nodes that were observed, in the enclaves that the policy has now.
 
         A node whose profile was moved to another enclave is in that one; a node without an enclave
-        is left out, unless ``every`` node is asked for.
+        is left out, unless ``all_nodes``.
         """
         enclaves = read_policy(self.policy).enclaves
         names = {enclave.path for enclave in enclaves}
@@ -1054,7 +1054,7 @@ class OpenRobot:
                     nodes.append(node)
                 elif place := moved.get((node.ns, stable_name(node.name))):
                     nodes.append(replace(node, enclaves=place))
-                elif every:
+                elif all_nodes:
                     nodes.append(node)
             return make_observation(nodes)
         except (ValueError, TypeError, KeyError) as error:

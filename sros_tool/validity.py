@@ -72,10 +72,10 @@ class Window:
     def lifetime(self, made_at: datetime | None = None) -> timedelta:
         """Return how long a document with this validity is valid after it was made.
 
-        ``made_at`` is when it was made, or when its file came here; a time long before the validity
-        does not count.  A document that sros makes is valid from `BACKDATE` before that time; a
-        document of another program may be valid from that time on, which only ``made_at`` shows.
-        sros makes no document whose validity is not longer than `BACKDATE`.
+        ``made_at`` is when it was made, or when its file arrived here; a time long before the
+        validity is ignored.  Without it, the document counts as made by sros, that is, `BACKDATE`
+        after its validity begins; other programs may make documents that are valid only from
+        ``made_at`` on.
         """
         latest = self.not_before + BACKDATE
         if latest >= self.not_after:

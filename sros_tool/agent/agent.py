@@ -409,8 +409,8 @@ class _Round:
     def _time_to_be_valid_at(self, release: Release, certain_time: datetime) -> datetime:
         """Return the time at which a release has to be valid.
 
-        If documents have proven that the clock is behind, the keystore's clock counts, by which the
-        release was made; a clock that may be right is never overruled.
+        If documents prove that the clock is behind, the keystore's time at the release counts
+        instead; a clock that may be right is never overruled.
         """
         made = release_time(release) if self._machine.now < certain_time - _TOLERANCE else None
         return max(certain_time, made) if made else certain_time
@@ -418,7 +418,8 @@ class _Round:
     def _differs_from_accepted(self, release: Release) -> bool:
         """Return whether the accepted release with the same number has other files.
 
-        If the disk had no room for the seal of the accepted release, an earlier seal is here.
+        If the disk had no room for the seal of the accepted release, the kept seal is an earlier
+        one.
         """
         seal = read_seal(self._folder)
         with suppress(SrosError):
@@ -546,7 +547,7 @@ class _Round:
             sequence=sequence,
             release=self._state.release,
             expiry={name: _expiry(opened_enclaves.get(name)) for name in names},
-            running=processes.with_elsewhere(),
+            running=processes.loaded_from_any_folder(),
             clock=clock,
             problems=shortened_problems(self._problems),
             requests=asked.requests,

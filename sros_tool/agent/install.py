@@ -1,8 +1,8 @@
 """Installing a release in the security folder of a robot, verified first, and whole or not at all.
 
-Two things are verified that the publishing folder could not do: that a permissions CA which the
-folder already trusts sealed the release, and that nothing in it is older than what is here.  Then
-each enclave is tried as DDS would load it, with the key that is here.  An enclave that cannot be
+Two things are verified that the publishing folder cannot fake: that a permissions CA which the
+robot already trusts sealed the release, and that nothing in it is older than the robot's files.
+Then each enclave is tried as DDS would load it, with the robot's key.  An enclave that cannot be
 used keeps its files, and no other enclave waits for it.
 
 Units and containers mount the folders of enclaves, so a folder stays the same folder, and a file
@@ -140,7 +140,7 @@ def install_release(
                 changes[name] = _list_alone(opened, name, files, now)
         removed = []
         for name in present:
-            if name in enclaves or _waits(opened, name):
+            if name in enclaves or _waits_for_answer(opened, name):
                 continue
             try:
                 changes[name] = _removal(opened, name)
@@ -483,7 +483,7 @@ def _removal(folder: Folder, name: str) -> _Change:
     return _Change(remove=[path for path in paths if folder.state(path)])
 
 
-def _waits(folder: Folder, name: str) -> bool:
+def _waits_for_answer(folder: Folder, name: str) -> bool:
     """Return whether an enclave waits for the first answer to its signing request."""
     with suppress(SrosError, OSError):
         place = enclave_folder(name)

@@ -61,8 +61,8 @@ class EnclaveProcesses(NamedTuple):
     dds: RobotDds
     """The DDS of the robot."""
 
-    def with_elsewhere(self) -> Mapping[str, RunningFiles]:
-        """Return what the processes of each enclave have loaded, from whatever folder."""
+    def loaded_from_any_folder(self) -> Mapping[str, RunningFiles]:
+        """Return which files the processes of each enclave have loaded, from any folder."""
         return {**self.states, **dict.fromkeys(self.elsewhere, RunningFiles.EARLIER)}
 
 

@@ -40,13 +40,13 @@ class AgentState:
 
     ``release`` is the number of the release that is installed with all its enclaves, and
     ``accepted`` the highest number that was verified: an older release is refused.  ``sequence`` is
-    that of the last message.  ``latest`` is the latest moment that has certainly passed: verified
-    documents begin to be valid then.  ``due`` are the enclaves whose processes were not yet seen
-    with the installed files, since the start ``boot`` of the machine (see `boot_id`); of those in
-    ``unseen``, no process was seen.  ``files`` maps enclaves to a digest of their files at the end
-    of the last round: other files, from whomever, make a restart due.  ``fetched`` and ``sent``
-    tell when the source and the inbox were last reached.  ``repaired`` is a sentence on files that
-    were not those of the release and were replaced, at ``repaired_at``.
+    the number of the last message.  ``latest`` is the latest moment that has certainly passed:
+    verified documents begin to be valid then.  ``due`` are the enclaves whose processes were not
+    yet seen with the installed files, since the start ``boot`` of the machine (see `boot_id`); of
+    those in ``unseen``, no process was seen.  ``files`` maps enclaves to a digest of their files at
+    the end of the last round: other files, from whomever, make a restart due.  ``fetched`` and
+    ``sent`` tell when the source and the inbox were last reached.  ``repaired`` is a sentence on
+    files that were not those of the release and were replaced, at ``repaired_at``.
     """
 
     release: int = 0

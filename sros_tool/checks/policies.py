@@ -336,7 +336,11 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             for candidate in offered[name][:1]
             if candidate.right.right == other and candidate.profile is not statement.profile
         ]
-        if not candidates and len(same_end) == 1 and _is_namespace_apart(statement, same_end[0]):
+        if (
+            not candidates
+            and len(same_end) == 1
+            and _differ_only_by_namespace(statement, same_end[0])
+        ):
             candidates = same_end
         if candidates:
             yield _misspelt_name_finding(statement, other, candidates)
@@ -345,8 +349,8 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             yield statement.found(NO_COUNTERPART, f"no enclave may {other} {statement.name}{hint}")
 
 
-def _is_namespace_apart(statement_a: _Statement, statement_b: _Statement) -> bool:
-    """Return whether the namespace of a profile alone makes one of two names longer.
+def _differ_only_by_namespace(statement_a: _Statement, statement_b: _Statement) -> bool:
+    """Return whether two names differ only by the namespace of a profile.
 
     A name that is written with a namespace, or with ``~``, is longer on purpose.
     """

@@ -568,13 +568,12 @@ def process_findings(
     *,
     now: datetime,
     zone: tzinfo,
-    one_by_one: bool = False,
+    finding_per_node: bool = False,
 ) -> Iterator[Finding]:
     """Yield findings about running processes, compared with the environment of this shell.
 
     ``now`` is the time on the clock of this machine, and ``zone`` is its time zone.  If security
-    is not enabled here, all open nodes share one finding; with ``one_by_one`` each open node has
-    a finding of its own.
+    is not enabled here, all open nodes share one finding, unless ``finding_per_node`` is set.
     """
     is_secured_here = environment.get(ENABLE) == "true"
     here = ("", environment.get(DOMAIN) or "0")
@@ -602,7 +601,7 @@ def process_findings(
                 yield PROCESS_UNSECURED.found(process.label, text)
             else:
                 open_nodes.append(process)
-    yield from _unsecured_node_findings(environment, open_nodes, one_by_one=one_by_one)
+    yield from _unsecured_node_findings(environment, open_nodes, finding_per_node=finding_per_node)
     starts_nodes = is_secured_here and bool(environment.get(ENCLAVE))
     yield from _mixed_vendor_findings(secured, environment if starts_nodes else None)
     yield from _other_keystore_findings(secured, environment if is_secured_here else None)
@@ -714,7 +713,7 @@ def _is_open(environment: Mapping[str, str]) -> bool:
 
 
 def _unsecured_node_findings(
-    environment: Mapping[str, str], nodes: Sequence[Process], *, one_by_one: bool
+    environment: Mapping[str, str], nodes: Sequence[Process], *, finding_per_node: bool
 ) -> Iterator[Finding]:
     """Yield findings about running open nodes; a single finding if no security is requested."""
     asks = environment.get(ENABLE) not in (None, "", "false") or set_without_enable(environment)
@@ -723,7 +722,7 @@ def _unsecured_node_findings(
             if not node.network:  # the others are named as such, with their security
                 yield NODE_OPEN.found(node.label, f"it runs {_domain_text(node)}")
         return
-    if one_by_one:
+    if finding_per_node:
         for node in nodes:
             yield NOT_SECURED.found(node.label, f"it runs open {_domain_text(node)}")
         return
@@ -797,7 +796,7 @@ def _other_keystore_findings(
 
 
 def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterator[Finding]:
-    """Yield a finding for each process, which runs in an enclave of ``folder`` from elsewhere."""
+    """Yield a finding for each process that runs in an enclave of ``folder`` from another one."""
     for process in processes:
         assert process.enclave
         there = _plain_path(process.enclave.keystore)

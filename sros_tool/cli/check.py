@@ -527,7 +527,7 @@ def _circumstances(
 
 
 def _stated_differences(paths: Sequence[Path], circumstances: Circumstances) -> Iterator[Finding]:
-    """Yield where keystores are decided differently on the distributions that they are for."""
+    """Yield findings if the distributions of a keystore decide differently."""
     from sros_tool.keystore.fleet import enclaves_of_several_distributions
     from sros_tool.keystore.layout import is_keystore
 
@@ -929,7 +929,9 @@ def _watch_processes(
             if judged is None or judged[0] != running or moment - judged[1] >= _AGAIN:
                 judged = running, moment
                 findings = [
-                    *process_findings(environment, running, now=moment, zone=zone, one_by_one=True),
+                    *process_findings(
+                        environment, running, now=moment, zone=zone, finding_per_node=True
+                    ),
                     *vulnerability_findings(running, (), advisories),
                 ]
                 for change in news.changes(selection.choose(findings).shown, moment):

@@ -60,13 +60,9 @@ def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
 @click.option(
     "--domain", "domain_text", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or 0]"
 )
-@click.option(
-    "--apply", "applies", is_flag=True, help="Restart the robot's systemd units with security."
-)
-@click.option("--proof", "proves", is_flag=True, help="Prove that the robot is closed.")
-@click.option(
-    "--undo", "undoes", is_flag=True, help="Restart the robot's systemd units open again."
-)
+@click.option("--apply", is_flag=True, help="Restart the robot's systemd units with security.")
+@click.option("--proof", "prove", is_flag=True, help="Prove that the robot is closed.")
+@click.option("--undo", is_flag=True, help="Restart the robot's systemd units open again.")
 @click.option(
     "--partial",
     is_flag=True,
@@ -92,9 +88,9 @@ def close(
     folder: Path,
     duration: str | None,
     domain_text: str | None,
-    applies: bool,
-    proves: bool,
-    undoes: bool,
+    apply: bool,
+    prove: bool,
+    undo: bool,
     partial: bool,
     without: tuple[str, ...],
     elsewhere: tuple[str, ...],
@@ -128,11 +124,11 @@ def close(
     """
     from sros_tool import closing
 
-    if sum((applies, proves, undoes)) > 1:
+    if sum((apply, prove, undo)) > 1:
         raise UsageError("--apply, --proof and --undo exclude each other", "", "Choose one.")
-    if duration and (applies or proves or undoes):
+    if duration and (apply or prove or undo):
         raise UsageError("--for is for watching an open robot", "", "Leave it out.")
-    if elsewhere and (proves or undoes):
+    if elsewhere and (prove or undo):
         raise UsageError(
             "--elsewhere changes the export",
             "",
@@ -143,7 +139,7 @@ def close(
         _run, lambda line: echo(line, err=True), os.environ, now, local_zone(os.environ)
     )
     robot = closing.OpenRobot(folder, domain_of(domain_text), shell, without, elsewhere)
-    if (applies or proves or undoes) and not robot.observed:
+    if (apply or prove or undo) and not robot.observed:
         if not folder.is_dir():
             raise UsageError(
                 f"there is no folder '{folder}' here",
@@ -152,26 +148,26 @@ def close(
             )
         name = shlex.quote(str(folder))
         raise UsageError(f"'{folder}' has no watched robot", "", f"Run `sros close {name}` first.")
-    if undoes:
+    if undo:
         closed = robot.undo(dry_run=dry_run)
-    elif proves:
+    elif prove:
         closed = robot.prove(dry_run=dry_run)
     else:
         closed = robot.prepare(duration, partial=partial, dry_run=dry_run)
-        if applies and not closed.problems:
+        if apply and not closed.problems:
             closed = robot.apply(closed, dry_run=dry_run)
     holds = closed.is_proved(partial=partial)
     if as_json:
         print_json(closed)
-    elif undoes:
+    elif undo:
         _show_undone(robot, closed)
     elif not dry_run:
-        if not (applies or proves):
+        if not (apply or prove):
             _show(robot, closed)
-        _show_end(robot, closed, applies=applies, holds=holds)
+        _show_end(robot, closed, apply=apply, holds=holds)
     if dry_run:
         return 0
-    return int(bool(closed.problems) or ((applies or proves) and not holds))
+    return int(bool(closed.problems) or ((apply or prove) and not holds))
 
 
 def _show(robot: OpenRobot, closed: Closing) -> None:
@@ -237,7 +233,7 @@ def _nodes(policy: Policy, enclave: str) -> str:
     return f", for the nodes {enumerated(sorted(nodes))}" if len(nodes) > 1 else ""
 
 
-def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) -> None:
+def _show_end(robot: OpenRobot, closed: Closing, *, apply: bool, holds: bool) -> None:
     """Print the answer, its reasons, and what to do next."""
     from sros_tool.closing import COMMANDS
 
@@ -245,10 +241,10 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
     for proof in closed.proofs:
         echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}")
     if closed.problems:
-        echo(f"{_state(closed, applies=applies)}; fix this first:")
+        echo(f"{_state(closed, apply=apply)}; fix this first:")
         for problem in closed.problems:
             echo(f"  {problem}")
-        echo(f"next: sros close {folder}{' --apply' if applies else ''}", err=True)
+        echo(f"next: sros close {folder}{' --apply' if apply else ''}", err=True)
     elif holds:
         asked = all(proof.holds for proof in closed.proofs)
         but = "" if asked else ", except for what was not asked"
@@ -261,7 +257,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
         accept = _ACCEPT if closed.is_proved(partial=True) else ""
         again = f"ask again with sros close {folder} --proof, or go back with --undo"
         echo(f"the robot is not proved closed; next: {accept}{again}", err=True)
-    elif applies:
+    elif apply:
         for command, processes in closed.left_by_hand.items():
             stop = _started_together(processes)
             echo(f"stop {stop}, and start it with:" if stop else "start again with:")
@@ -282,7 +278,7 @@ def _show_end(robot: OpenRobot, closed: Closing, *, applies: bool, holds: bool) 
             following = f"sros close {folder} --apply"
         else:
             following = f"{steps}, and ask {ask}"
-        echo(f"{_state(closed, applies=applies)}{_until(closed)}; next: {following}", err=True)
+        echo(f"{_state(closed, apply=apply)}{_until(closed)}; next: {following}", err=True)
 
 
 def _show_undone(robot: OpenRobot, closed: Closing) -> None:
@@ -300,10 +296,10 @@ def _show_undone(robot: OpenRobot, closed: Closing) -> None:
         echo(f"{state}: sros sees no process in an enclave of this folder", err=True)
 
 
-def _state(closed: Closing, *, applies: bool) -> str:
+def _state(closed: Closing, *, apply: bool) -> str:
     """Return how far the processes run closed."""
     if not closed.secured:
-        nothing = "nothing was closed" if applies else "nothing is closed yet"
+        nothing = "nothing was closed" if apply else "nothing is closed yet"
         return "no process of the robot runs" if closed.stopped >= {*closed.left} else nothing
     words = {
         name: _EARLIER

@@ -290,16 +290,16 @@ def several_enclaves(function: Decorated) -> Decorated:
         metavar="PATTERN",
         help="Enclaves whose names match, such as '/arm/*'; * also matches '/'.  Can be repeated.",
     )(function)
-    return click.option("--all", "every", is_flag=True, help="All enclaves of the keystore.")(
-        function
-    )
+    return click.option(
+        "--all", "all_enclaves", is_flag=True, help="All enclaves of the keystore."
+    )(function)
 
 
 def check_chosen(
-    names: Sequence[str], patterns: Sequence[str], robots: Sequence[str], *, every: bool
+    names: Sequence[str], patterns: Sequence[str], robots: Sequence[str], *, all_enclaves: bool
 ) -> None:
     """Raise `UsageError` if the arguments and the options of `several_enclaves` name no enclave."""
-    if not (names or patterns or robots or every):
+    if not (names or patterns or robots or all_enclaves):
         raise UsageError(
             "no enclave is named",
             "",
@@ -313,21 +313,21 @@ def chosen_enclaves(
     patterns: Sequence[str],
     robots: Sequence[str],
     *,
-    every: bool,
+    all_enclaves: bool,
 ) -> tuple[str, ...]:
     """Return the enclaves that the arguments and the options of `several_enclaves` name.
 
     Raises: UsageError: none is named. KeystoreError: a pattern matches no enclave, or a robot has
     none.
     """
-    check_chosen(names, patterns, robots, every=every)
-    if not (patterns or robots or every):
+    check_chosen(names, patterns, robots, all_enclaves=all_enclaves)
+    if not (patterns or robots or all_enclaves):
         return tuple(names)  # the verb says what is wrong with a name
     from sros_tool.keystore.reader import Keystore
     from sros_tool.keystore.selection import select_enclaves
 
     return select_enclaves(
-        Keystore(root), names, patterns, robots=robots, every=every, checked=True
+        Keystore(root), names, patterns, robots=robots, all_enclaves=all_enclaves, checked=True
     )
 
 

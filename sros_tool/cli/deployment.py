@@ -67,7 +67,7 @@ _STREAM = Path("-")
 @json_option
 def distribute_key(
     words: tuple[str, ...],
-    every: bool,
+    all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
     force: bool,
@@ -95,11 +95,13 @@ def distribute_key(
 
     root, rest = split_root(words)
     names = rest[:-1]
-    if not rest or not (names or every or patterns or robots):
+    if not rest or not (names or all_enclaves or patterns or robots):
         raise UsageError("distribute_key takes a keystore, one or more enclaves and a target")
     target = PATH.convert(rest[-1], None, None)
     _check_target(root, rest[-1])
-    selection = select(root, names, patterns, robots=robots, every=every, keyless=keyless)
+    selection = select(
+        root, names, patterns, robots=robots, all_enclaves=all_enclaves, keyless=keyless
+    )
     notes: tuple[Note, ...] = ()
     if target == _STREAM:
         if not dry_run:

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.answer import Answer, Question
     from sros_tool.explain.asking import AskedEnclave, AskingContext
     from sros_tool.explain.log import LogFinding
-    from sros_tool.explain.vendors import Comparison, DdsExplanation, ZenohBeside
+    from sros_tool.explain.vendors import Comparison, DdsExplanation, ZenohNextToDds
     from sros_tool.explain.who import Decider, Everybody, FollowedReach
     from sros_tool.explain.zenoh import CheckedLink, ZenohAnswer, ZenohExplanation
     from sros_tool.fleet.robots import Fleet
@@ -342,7 +342,7 @@ def explain(
             _note_unknown_distribution()
         chosen = chosen_vendor(None if vendor == ZENOH else vendor, distro, os.environ)
         every = Compared.VENDORS if all_vendors else Compared.DISTRIBUTIONS if all_distros else None
-        explanation = explain_on_dds(asked, question, chosen, context, kind=kind, every=every)
+        explanation = explain_on_dds(asked, question, chosen, context, kind=kind, compared=every)
         lines = _vendor_lines(explanation)
     if as_json:
         print_json(explanation)
@@ -529,7 +529,7 @@ def _vendor_lines(explanation: DdsExplanation) -> Iterator[str]:
     yield from _zenoh_decision_lines(explanation.beside)
 
 
-def _zenoh_decision_lines(on_zenoh: ZenohBeside | None) -> Iterator[str]:
+def _zenoh_decision_lines(on_zenoh: ZenohNextToDds | None) -> Iterator[str]:
     if on_zenoh and on_zenoh.zenoh:
         word = "yes" if on_zenoh.zenoh.allowed else f"no, {on_zenoh.zenoh.outcome}"
         yield _labelled_row("zenoh", f"{word}: {on_zenoh.zenoh.text}")
@@ -796,7 +796,7 @@ def _show_who(
     """Print which enclaves of the keystore may do something; return 0 if any may, else 1.
 
     ``chosen_vendor`` is the vendor that decides, None for Zenoh; ``only`` are --match and --robot.
-    ``stated``: where the keystore or its fleet states one distribution, that of it decides.
+    With ``stated``, the vendor of the distribution that the keystore or its fleet states decides.
     """
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.layout import has_authorities
@@ -888,7 +888,7 @@ def _print_everybody(
 ) -> int:
     """Print the decisions on all enclaves; return 0 if any enclave may do it, else 1.
 
-    ``where`` has the fleet that groups enclaves, and the rest as `_who_lines` takes it.
+    ``where`` has the arguments of `_who_lines` after ``everybody``.
     """
     from sros_tool.explain.who import ask_everybody, callable_action, names_meant
 

@@ -943,7 +943,7 @@ def _dds_findings(compared_fleet: ComparedFleet) -> Iterator[str]:
 
 
 def _dds_count_lines(compared_fleet: ComparedFleet) -> Iterator[str]:
-    """Yield the robots with an outdated DDS, or the number of findings on the DDS of robots."""
+    """Yield a line on robots with an outdated DDS, or else with the number of DDS findings."""
     status, outdated = compared_fleet.status, compared_fleet.outdated_dds
     if outdated:
         robots = _robot_names(outdated, status.names, status.groups)

@@ -110,7 +110,7 @@ _revoke_old_option = click.option(
 @json_option
 def create_permission(
     words: tuple[str, ...],
-    every: bool,
+    all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
     fleet_file: Path | None,
@@ -134,7 +134,7 @@ def create_permission(
     from sros_tool.keystore.lifecycle.create import create_permission as create
 
     root, rest = split_root(words)
-    if len(rest) < (1 if every or patterns or robots else 2):
+    if len(rest) < (1 if all_enclaves or patterns or robots else 2):
         raise UsageError(
             "create_permission takes a keystore, one or more enclaves and a policy", "", _ORDER
         )
@@ -144,7 +144,7 @@ def create_permission(
     policy = policy_for(file, fleet_file)
     result = create(
         root,
-        chosen_enclaves(root, given, patterns, robots, every=every),
+        chosen_enclaves(root, given, patterns, robots, all_enclaves=all_enclaves),
         policy,
         now=now(),
         domain=ros_domain(),

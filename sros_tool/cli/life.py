@@ -75,7 +75,7 @@ _crl_option = click.option(
 @json_option
 def renew(
     words: tuple[str, ...],
-    every: bool,
+    all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
     all_expiring: str | None,
@@ -107,8 +107,8 @@ def renew(
     from sros_tool.keystore.lifecycle.renew import renew as work
 
     root, names = split_root(words)
-    if names or patterns or robots or every or all_expiring is None:
-        names = chosen_enclaves(root, names, patterns, robots, every=every)
+    if names or patterns or robots or all_enclaves or all_expiring is None:
+        names = chosen_enclaves(root, names, patterns, robots, all_enclaves=all_enclaves)
     threshold = parse_threshold(all_expiring) if all_expiring is not None else None
     with progress("renewing") as step:
         result = work(
@@ -198,7 +198,7 @@ def _complete_reason(
 @json_option
 def revoke(
     words: tuple[str, ...],
-    every: bool,
+    all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
     reason: str,
@@ -227,8 +227,10 @@ def revoke(
     from sros_tool.keystore.selection import select_to_revoke
 
     root, given = split_root(words)
-    check_chosen(given, patterns, robots, every=every)
-    names, selection_notes = select_to_revoke(Keystore(root), given, patterns, robots, every=every)
+    check_chosen(given, patterns, robots, all_enclaves=all_enclaves)
+    names, selection_notes = select_to_revoke(
+        Keystore(root), given, patterns, robots, all_enclaves=all_enclaves
+    )
     words_of_rfc = reason.replace("-", "_").split("_")
     reason_text = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
     with progress("revoking"):

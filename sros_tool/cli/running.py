@@ -482,7 +482,7 @@ class _WithCommandAfterDashes(_WithCommand):
 def units(
     ctx: click.Context,
     words: tuple[str, ...],
-    every: bool,
+    all_enclaves: bool,
     patterns: tuple[str, ...],
     robots: tuple[str, ...],
     jobs: tuple[str, ...],
@@ -525,7 +525,7 @@ def units(
 
     root, rest = split_root(words)
     command = tuple(ctx.meta[_COMMAND])
-    several = bool(every or patterns or robots)
+    several = bool(all_enclaves or patterns or robots)
     if not rest or not (rest[1:] or several or jobs):
         raise UsageError("units takes a keystore, enclaves or --job, and a folder")
     folder = PATH.convert(rest[-1], None, None)
@@ -550,7 +550,7 @@ def units(
     notes: list[Note] = []
     names: Sequence[str] = ()
     if rest[1:] or several:
-        names = chosen_enclaves(root, rest[:-1], patterns, robots, every=every)
+        names = chosen_enclaves(root, rest[:-1], patterns, robots, all_enclaves=all_enclaves)
         place = target or Path(INSTALLED)
 
         def secure(name: str) -> EnclaveEnvironment:

@@ -1,7 +1,6 @@
 """The library that runs the demo's nodes: rclpy, Cyclone DDS, or Zenoh.
 
-A single node can also be run by hand, in the environment that is there, such as that of
-``sros run``, until it is stopped.
+A single node can also be run by hand, in the present environment, such as that of ``sros run``.
 """
 
 from __future__ import annotations

@@ -207,7 +207,7 @@ class Undefended(NamedTuple):
     template: Callable[[Template], Template] = _same_template
 
 
-def name_of(forgery: Forge | Undefended) -> str:
+def folder_name_of(forgery: Forge | Undefended) -> str:
     """Return the folder name for a forgery's keystore, unique among forgeries."""
     if isinstance(forgery, Undefended):
         return f"undefended_{forgery.template.__name__}_{forgery.forge.__name__}"

@@ -20,7 +20,7 @@ from sros_tool.demo.forger import (
     KeystoreCopy,
     UncastError,
     Undefended,
-    name_of,
+    folder_name_of,
 )
 from sros_tool.demo.scenarios.model import (
     DENIED_TOPIC,
@@ -100,7 +100,9 @@ class KeystoreSet:
         name = self.enclave(identity)
         if self.router:
             router = (enclave_path(root, name) / ROUTER_FILE).exists()
-            return zenoh_variables(root, name, domain, router=router, lawless=identity.lawless)
+            return zenoh_variables(
+                root, name, domain, router=router, ignores_rules=identity.ignores_rules
+            )
         return secured_environment(root, name, domain) | dict(identity.variables)
 
     def announced(self, party: Party) -> str:
@@ -217,7 +219,7 @@ def create_keystores(
     missing: dict[KeystoreChoice, Exception] = {}
     copies: dict[KeystoreChoice, KeystoreCopy] = {}
     for choice in _forgeries_of(scenario):
-        root = keystores[choice] = folder / "forged" / name_of(choice)
+        root = keystores[choice] = folder / "forged" / folder_name_of(choice)
         try:
             copies[choice] = _forge(choice, root, keystores, scenario, spec, user)
         except (SrosError, OSError) as error:

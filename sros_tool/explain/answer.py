@@ -399,7 +399,7 @@ class Answer(NamedTuple):
 
     @property
     def counts_key(self) -> bool:
-        """Whether the enclave's key is not here, and the answer counts it as there."""
+        """Whether the answer assumes the enclave's key, which is not here."""
         return self.enclave.key_elsewhere
 
     @property

@@ -386,7 +386,7 @@ def likely_names(answer: Answer) -> tuple[str, ...]:
 def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]) -> str:
     """Return what a policy may mean instead of a denied right, as a clause; "" for nothing.
 
-    ``used`` are the rights that the node uses, which are meant as they are; ``named`` are the
+    ``used`` are the rights that the node uses, so they are no mistakes; ``named`` are the
     `named_rights` of its enclave.
     """
     if right.kind == "dds":

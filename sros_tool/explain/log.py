@@ -478,13 +478,13 @@ def _dropped_message_findings(
             enclave,
             f"{lacking} may not {what}: the process that logged this drops the message by its "
             "rules, and reports it nowhere else",
-            _dropped_finding(first, enclave, what, root),
+            _remedy_for_dropped(first, enclave, what, root),
             zenoh=True,
         )
 
 
-def _dropped_finding(dropped: DroppedMessage, enclave: str, what: str, root: str) -> str:
-    """Return the remedy where ``enclave``, "" if unknown, may not do ``what``."""
+def _remedy_for_dropped(dropped: DroppedMessage, enclave: str, what: str, root: str) -> str:
+    """Return the remedy if ``enclave``, "" if unknown, may not do ``what``."""
     if not dropped.name:
         return (
             "The log line with `on Interface(...)+CertCommonName(...)` and this zid has the name "

@@ -41,7 +41,7 @@ from sros_tool.values import shows
 
 
 @shows("zenoh")
-class ZenohBeside(NamedTuple):
+class ZenohNextToDds(NamedTuple):
     """The decision of Zenoh, shown next to the decision of DDS.
 
     ``problem`` says why the decision is not known, or is "".
@@ -61,7 +61,7 @@ class VendorExplanation(NamedTuple):
     answer: Answer
     vendor_why: str
     """Why this vendor was chosen."""
-    beside: ZenohBeside | None
+    beside: ZenohNextToDds | None
     notes: tuple[Note, ...]
 
     @property
@@ -130,7 +130,7 @@ class Comparison(NamedTuple):
     distributions: Sequence[DistributionAnswer] | None
     """The decision of each DDS of each distribution, the earliest distribution first; present only
     with ``--all-distros``."""
-    beside: ZenohBeside | None
+    beside: ZenohNextToDds | None
     allowed: bool
     notes: tuple[Note, ...]
 
@@ -165,7 +165,7 @@ def explain_on_dds(
     context: JoinContext,
     *,
     kind: str | None = None,
-    every: Compared | None = None,
+    compared: Compared | None = None,
 ) -> DdsExplanation:
     """Return the decision of the chosen vendor, or those of all vendors or distributions.
 
@@ -190,11 +190,11 @@ def explain_on_dds(
         *_notes_on_lacking_keys(enclave),
     )
     what = Asked(enclave.name, question, context)
-    if every is Compared.VENDORS:
+    if compared is Compared.VENDORS:
         others = {v: Evaluator(v, enclave, context) for v in Vendor if v is not vendor}
         answers = [answer if v is vendor else explain(others[v], question) for v in Vendor]
         return Comparison(what, answers, None, beside, answer.allowed, notes)
-    if every is Compared.DISTRIBUTIONS:
+    if compared is Compared.DISTRIBUTIONS:
         deciding = {v for distribution in SUPPORTED for v in distribution.vendors}
         by_vendor = {v: Evaluator(v, enclave, context).answer(question) for v in deciding}
         by_distribution = [
@@ -281,7 +281,7 @@ def _not_a_topic_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[
 
 
 def _notes_on_lacking_keys(enclave: LoadedEnclave) -> Iterator[Note]:
-    """Yield a note if an answer counts the key of an enclave as there, which is not."""
+    """Yield a note if an answer assumes keys that no enclave has."""
     on_robot = enclave.state is None or enclave.state.key_on_robot
     keystore = enclave.keystore
     if keystore and enclave.key_elsewhere and not on_robot and not keystore.has_keys:
@@ -311,7 +311,7 @@ def _similar_name_notes(answer: Answer) -> Iterator[Note]:
 
 def _zenoh_decision(
     enclave: LoadedEnclave, question: Question, context: JoinContext
-) -> ZenohBeside | None:
+) -> ZenohNextToDds | None:
     """Return Zenoh's decision, or why it is unknown; None if the keystore has no Zenoh files."""
     keystore = enclave.keystore
     if keystore is None or enclave.state is None or not is_keystore(keystore.root):
@@ -324,8 +324,8 @@ def _zenoh_decision(
         evaluator = ZenohEvaluator(keystore, moment=context.at, domain=context.domain)
         answer = evaluator.answer(enclave.name, question, reach=False, brief=True)
     except SrosError as error:
-        return ZenohBeside(None, error.what)
-    return ZenohBeside(answer.in_brief)
+        return ZenohNextToDds(None, error.what)
+    return ZenohNextToDds(answer.in_brief)
 
 
 def _runs_on_zenoh(keystore: Keystore, name: str) -> bool:

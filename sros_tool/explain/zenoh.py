@@ -560,8 +560,8 @@ class ZenohEvaluator:
             )
             other = self._file(name, self._file_of(name)) if not brief else None
             if other and other.process and all(delivery.arrives for delivery in deliveries):
-                lawless = _unrestricted_process(process.name, Mode.ROUTER)
-                deliveries = self._direct_deliveries(lawless, other.process, wanted)
+                unrestricted = _unrestricted_process(process.name, Mode.ROUTER)
+                deliveries = self._direct_deliveries(unrestricted, other.process, wanted)
             if all(delivery.arrives for delivery in deliveries):
                 believing.append(Reached(name, deliveries, other.problem if other else ""))
                 if brief:

@@ -377,7 +377,7 @@ def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterat
         ("endpoints", "sessions connect to these endpoints"),
         ("listen", "the router listens on these endpoints"),
         ("mode", "how sessions reach each other"),
-        ("domains", "ROS domains of the network, within those of the governance"),
+        ("domains", "ROS domains of the network, a part of the governance's"),
         ("routers", "further routers, to which the sessions of their enclaves connect"),
         ("crossing", "names that pass from one router to another"),
     ):

@@ -500,22 +500,23 @@ class _Table:
     def with_names(self, change: Callable[[str], list[str]]) -> _Table:
         """Return the table with other names in place of each name that has a placeholder."""
 
-        def several(part: object) -> list[Any]:
+        def new_names(part: object) -> list[Any]:
             return change(part) if isinstance(part, str) and has_placeholder(part) else [part]
 
-        def changed(value: object) -> object:
+        def with_new_names(value: object) -> object:
             match value:
                 case str():
-                    return several(value)[0]
+                    return new_names(value)[0]
                 case list():
-                    return [one for part in value for one in several(part)]
+                    return [one for part in value for one in new_names(part)]
                 case dict():
-                    return {key: changed(part) for key, part in value.items()}
+                    return {key: with_new_names(part) for key, part in value.items()}
                 case _:
                     return value
 
         values = {
-            key: value if key in _WORDS else changed(value) for key, value in self.values.items()
+            key: value if key in _WORDS else with_new_names(value)
+            for key, value in self.values.items()
         }
         return replace(self, values=values)
 

@@ -76,7 +76,7 @@ class Topics:
 
 @lru_cache(maxsize=65536)
 def names_of_expression(expression: str) -> NameSet:
-    """Return the names that an expression of a policy matches, on which all vendors agree."""
+    """Return the names that an expression of a policy matches; all vendors match the same names."""
     return names_of(Style.FNMATCH, (expression,))
 
 

@@ -71,7 +71,7 @@ class RemoteRights:
     """What a remote process may send and receive if its certificate has this common name.
 
     A denial can turn a key with wildcards into a list of keys.  ``made_of`` has the original keys
-    and what was subtracted from them, by direction and messages of the rule.
+    and what was subtracted from them, by the direction and message kinds of a rule.
     """
 
     common_name: str
@@ -96,7 +96,7 @@ class RemoteRights:
 
 
 _Use = tuple[Flow, tuple[Message, ...]]
-"""The direction and messages of a rule."""
+"""The direction and message kinds of a rule."""
 
 
 @dataclass(frozen=True)

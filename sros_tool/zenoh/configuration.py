@@ -167,8 +167,8 @@ class Configuration:
     """The configuration of one Zenoh process: where it listens and connects, and what it enforces.
 
     Endpoints have the form ``tls/HOST:PORT``.  ``revoked`` is the time of the last revocation, in
-    UTC, by which older files are recognized; "" if no enclave was revoked, or if it does not
-    matter.  ``settings`` is the edition of the file from which the configuration was read.
+    UTC, which shows that a file is older; "" if no enclave was revoked, or if it does not matter.
+    ``settings`` is the edition of the settings in the file that was read.
     """
 
     mode: Mode
@@ -213,7 +213,7 @@ def render_configuration(
 _CONTROL = ',\n "access_control": {\n'
 
 
-def _control(every: Sequence[RenderedRights], *, once: bool) -> str:
+def _control(rendered_rights: Sequence[RenderedRights], *, once: bool) -> str:
     """Return the text of the access control of a file.
 
     With ``once``, a rule that several enclaves have is written once, otherwise once for each
@@ -221,9 +221,9 @@ def _control(every: Sequence[RenderedRights], *, once: bool) -> str:
     """
     rules: dict[str, str] = {}
     lines: dict[str, list[str]] = {"rules": [], "subjects": [], "policies": []}
-    names = [rights.name for rights in every]
-    every_ids = rule_ids([rights.rules for rights in every], names, once=once)
-    for rights, ids in zip(every, every_ids, strict=True):
+    names = [rights.name for rights in rendered_rights]
+    every_ids = rule_ids([rights.rules for rights in rendered_rights], names, once=once)
+    for rights, ids in zip(rendered_rights, every_ids, strict=True):
         rules.update(zip(ids, rights.rules, strict=True))
         own = _list([rights.name])
         lines["subjects"].append(f'   {{"id": {own[1:-1]}, "cert_common_names": {own}}}')

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.demo import forger
-from sros_tool.demo.forger import KeystoreCopy, Undefended, name_of
+from sros_tool.demo.forger import KeystoreCopy, Undefended, folder_name_of
 from sros_tool.demo.keystores import KeystoreSet
 from sros_tool.demo.scenarios import SCENARIOS
 from sros_tool.demo.scenarios.attacks import ATTACKS
@@ -121,7 +121,7 @@ def test_every_forgery_is_used_and_has_a_folder_of_its_own() -> None:
     assert names - {"_forge_nothing"} == public_functions("copy")
     templates = {each.template.__name__ for each in undefended}
     assert templates - {"_same_template"} == public_functions("template")
-    folders = [name_of(each) for each in forged]  # type: ignore[arg-type]
+    folders = [folder_name_of(each) for each in forged]  # type: ignore[arg-type]
     assert len(folders) == len(set(folders)) == len(forged) > 40
 
 

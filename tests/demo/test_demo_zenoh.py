@@ -83,7 +83,7 @@ def test_an_attacker_in_another_enclave_obeys_no_rules_of_its_own() -> None:
         for party in row.parties
         if party.identity.enclave == "guest" and party.role not in (Role.RELAY, Role.FLOODER)
     ]
-    assert {party.name for party in attackers if not party.identity.lawless} == {
+    assert {party.name for party in attackers if not party.identity.ignores_rules} == {
         "guest with an earlier file"
     }
 

@@ -54,13 +54,13 @@ def test_what_may_cross_arrives_and_nothing_else(tmp_path: Path) -> None:
     observed = play("routers", tmp_path, "--endpoint", "10.9.0.1:7447", *ROUTERS, *CROSSING)
     assert observed.pop("listener") == [
         "again",
-        "lawless/chatter",  # a router's key has the rights of all that is behind the router
+        "ignores_rules/chatter",  # a router's key has the rights of all that is behind the router
         "near/inner",
         "near/secret",
         "talker/chatter",
     ]
-    assert observed.pop("lawless") == [
-        f"lawless/{own}" for own in ("chatter", "inner", "secret", "status")
+    assert observed.pop("ignores_rules") == [
+        f"ignores_rules/{own}" for own in ("chatter", "inner", "secret", "status")
     ]
     assert all(observed.values()), observed
     assert len(observed) == 8

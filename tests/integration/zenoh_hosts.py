@@ -177,19 +177,19 @@ def routers(keystore: Path) -> dict[str, object]:
         ):
             host.do("open", name.rpartition("/")[2], name, "session.json5", {})
         # Another robot's router that obeys no rules, with a key that is in the keystore.
-        lawless = {
+        ignores_rules = {
             "rules": False,
             "mode": "client",
             "connect": {"endpoints": [f"tls/{HOSTS['r2']}:7447"]},
             "listen": {"endpoints": []},
         }
-        desk.do("open", "lawless", "/r1/router", "router.json5", lawless)
+        desk.do("open", "ignores_rules", "/r1/router", "router.json5", ignores_rules)
         for topic in ("/chatter", "/secret", "/inner"):
             r2.do("hear", "listener", topic)
         desk.do("hear", "desk", "/chatter")
         desk.do("hear", "desk", "/status")
         for keys in ("/status", "/secret", "0/**"):
-            desk.do("hear", "lawless", keys)
+            desk.do("hear", "ignores_rules", keys)
         r2.do("serve", "server", "/add")
         r1.do("announce", "talker", "/r1/talker", "n")
 
@@ -201,14 +201,14 @@ def routers(keystore: Path) -> dict[str, object]:
 
         for _ in range(3):
             for topic in ("/secret", "/inner", "/status"):
-                desk.do("say", "lawless", topic, f"lawless{topic}")
+                desk.do("say", "ignores_rules", topic, f"ignores_rules{topic}")
             r1.do("say", "talker", "/inner", "talker/inner")
             r2.do("say", "near", "/inner", "near/inner")
         told["chatter"] = say(r1, "talker", "/chatter", (r2, "listener"))
         told["chatter at the desk"] = say(r1, "talker", "/chatter", (desk, "desk"))
         told["secret"] = say(r2, "near", "/secret", (r2, "listener"))
         told["status"] = say(r2, "near", "/status", (desk, "desk"))
-        told["as the robot"] = say(desk, "lawless", "/chatter", (r2, "listener"))
+        told["as the robot"] = say(desk, "ignores_rules", "/chatter", (r2, "listener"))
         answers: set[str] = set()
         told["reply"] = until(
             lambda: "server" in answers, lambda: answers.update(r1.do("call", "client", "/add"))
@@ -221,7 +221,7 @@ def routers(keystore: Path) -> dict[str, object]:
             lambda: r1.do("say", "talker", "/chatter", "again"),
         )
         told["listener"] = r2.do("heard", "listener")
-        told["lawless"] = desk.do("heard", "lawless")
+        told["ignores_rules"] = desk.do("heard", "ignores_rules")
     return told
 
 

@@ -37,13 +37,13 @@ Tried = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class Voice:
-    """A session of an enclave; a lawless one obeys no rules."""
+    """A session of an enclave; a ignores_rules one obeys no rules."""
 
     enclave: str
-    lawless: bool
+    ignores_rules: bool
 
     def __str__(self) -> str:
-        return f"{'lawless ' if self.lawless else ''}{self.enclave}"
+        return f"{'ignores_rules ' if self.ignores_rules else ''}{self.enclave}"
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,9 @@ class Matrix:
 
     def voices(self) -> list[Voice]:
         """All sessions."""
-        return [Voice(each, lawless) for each in self.rights for lawless in (False, True)]
+        return [
+            Voice(each, ignores_rules) for each in self.rights for ignores_rules in (False, True)
+        ]
 
     def may(self, voice: Voice, right: str) -> frozenset[str]:
         """The names that the enclave of a session has a right to."""
@@ -66,7 +68,7 @@ class Matrix:
         """The names that a session tries, first those that it has no right to."""
         names = self.topics if right in ("publish", "subscribe") else self.services
         may = self.may(voice, right)
-        tried = names if voice.lawless else may
+        tried = names if voice.ignores_rules else may
         return sorted(tried, key=lambda each: (each in may, each))
 
     def wanted(self, direct: bool, says: str, hears: str) -> set[Tried]:
@@ -88,7 +90,7 @@ class Matrix:
 def pairs(voices: list[Voice], direct: bool) -> Iterator[tuple[Voice, Voice]]:
     """The pairs of different sessions between which somebody enforces rules."""
     for one, other in product(voices, repeat=2):
-        if one != other and not (direct and one.lawless and other.lawless):
+        if one != other and not (direct and one.ignores_rules and other.ignores_rules):
             yield one, other
 
 
@@ -182,8 +184,8 @@ def counted(seen: set[Tried], direct: bool) -> set[Tried]:
     """What was seen between different sessions of which one obeys rules, or the router enforces."""
 
     def counts(one: str, other: str) -> bool:
-        lawless = one.startswith("lawless") and other.startswith("lawless")
-        return one != other and not (direct and lawless)
+        ignores_rules = one.startswith("ignores_rules") and other.startswith("ignores_rules")
+        return one != other and not (direct and ignores_rules)
 
     return {each for each in seen if counts(each[0], each[1])}
 
@@ -211,7 +213,7 @@ def observed(keystore: Path, matrix: Matrix, *, enforced: bool) -> dict[str, Any
     with world(keystore, rules=enforced) as at:
         at.open(ROUTER, "router.json5")
         sessions = {
-            each: at.open(each.enclave, rules=enforced and not each.lawless)
+            each: at.open(each.enclave, rules=enforced and not each.ignores_rules)
             for each in matrix.voices()
         }
         example = next(iter(matrix.rights))[1:]

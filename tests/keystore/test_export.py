@@ -82,7 +82,7 @@ def test_selection(
     left_out: list[str],
     made_fleet: Path,
 ) -> None:
-    found = select(made_fleet, names, patterns, every=every)
+    found = select(made_fleet, names, patterns, all_enclaves=every)
     assert found == ExportSelection(tuple(chosen), tuple(left_out))
 
 

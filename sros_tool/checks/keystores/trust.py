@@ -115,7 +115,7 @@ def findings_between(
     """Yield findings about keystores and exports whose nodes do not communicate with each other.
 
     What cannot be read is a finding of another check, and so are files that are not valid ``now``:
-    if the files of two enclaves are never valid together, at each moment those of one are not.
+    if the files of two enclaves are never valid together, one of the two is always reported.
 
     Args:
         targets: the keystores and exports, as the user named them.
@@ -128,7 +128,7 @@ def findings_between(
     if not on_zenoh:
         yield from _revoked(targets)
         governed = {shown: _Governed(*target, now) for shown, target in targets.items()}
-        yield from _governed_apart(governed, refused)
+        yield from _incompatible_governance_findings(governed, refused)
 
 
 # ── CAs ────────────────────────────────────────────────────────────────────────────────────
@@ -149,16 +149,16 @@ def _strangers(
         alike[frozenset(of_target)].append(shown)
     parties = {same[0]: list(read[same[0]].values()) for same in alike.values()}
     roles = range(1 if on_zenoh else len(ROLES))
-    # What each target is apart from, and in which roles; targets with the same are one group.
-    apart: dict[str, dict[str, tuple[int, ...]]] = {shown: {} for shown in parties}
+    # Which targets each one is refused by, in which roles; targets with the same are one group.
+    refused_by: dict[str, dict[str, tuple[int, ...]]] = {shown: {} for shown in parties}
     for one, other in combinations(parties, 2):
         if refused := _refused_roles(parties[one], parties[other], roles):
-            apart[one][other] = apart[other][one] = refused
+            refused_by[one][other] = refused_by[other][one] = refused
     groups: dict[tuple[tuple[str, tuple[int, ...]], ...], list[str]] = defaultdict(list)
     for same in alike.values():
-        groups[tuple(apart[same[0]].items())] += same
+        groups[tuple(refused_by[same[0]].items())] += same
     for some, others in combinations(groups.values(), 2):
-        if refused := apart[some[0]].get(others[0], ()):
+        if refused := refused_by[some[0]].get(others[0], ()):
             authorities = " and ".join(f"{ROLES[role]} CA" for role in refused)
             text = (
                 f"nodes of {names_text(some)} do not communicate with nodes of "
@@ -183,7 +183,7 @@ def _refused_roles(
 
 
 def _parties(keystore: Keystore, enclaves: Sequence[str]) -> Iterator[tuple[_Kind, _Party]]:
-    """Yield one of all enclaves that trust and present the same CAs, by what these are."""
+    """Yield one enclave of all that trust and present the same CAs, and these CAs."""
     seen = set()
     for name in enclaves:
         folder = keystore.folder(name)
@@ -304,10 +304,10 @@ def _meet(some: Sequence[DomainSet], others: Sequence[DomainSet]) -> bool:
     return not pairs or any((one & other).ranges for one, other in pairs)
 
 
-class _Apart(NamedTuple):
+class _Incompatibility(NamedTuple):
     """Why two targets do not communicate.
 
-    ``differences`` are settings with their values here and there; () for other domains.
+    ``differences`` are settings with both values; () if only the domains differ.
     """
 
     kind: FindingKind
@@ -315,32 +315,32 @@ class _Apart(NamedTuple):
     differences: tuple[tuple[str, str, str], ...] = ()
 
 
-def _governed_apart(
+def _incompatible_governance_findings(
     governed: Mapping[str, _Governed], refused_pairs: set[frozenset[str]]
 ) -> Iterator[Finding]:
     """Yield findings about targets that trust each other, and differ in governance or domains."""
-    groups: dict[tuple[_Apart, tuple[str, ...]], list[str]] = defaultdict(list)
+    groups: dict[tuple[_Incompatibility, tuple[str, ...]], list[str]] = defaultdict(list)
     shown_before: list[str] = []
     for shown, own in governed.items():
-        found: dict[_Apart, list[str]] = defaultdict(list)
+        found: dict[_Incompatibility, list[str]] = defaultdict(list)
         for other in shown_before:
             if frozenset((shown, other)) not in refused_pairs and (
-                apart := _apart(own, governed[other])
+                incompatibility := _incompatibility_of(own, governed[other])
             ):
-                found[apart].append(other)
-        for apart, others in found.items():
-            groups[apart, tuple(others)].append(shown)
+                found[incompatibility].append(other)
+        for incompatibility, others in found.items():
+            groups[incompatibility, tuple(others)].append(shown)
         shown_before.append(shown)
-    for (apart, those), alike in groups.items():
-        on = f" on {first_few(apart.names, _MOST_SHOWN)}" if apart.names else ""
+    for (incompatibility, those), alike in groups.items():
+        on = f" on {first_few(incompatibility.names, _MOST_SHOWN)}" if incompatibility.names else ""
         why = first_few(
             [
                 f"{key}: {own_value} in {alike[0]}, {value} in {those[0]}"
-                for key, own_value, value in apart.differences
+                for key, own_value, value in incompatibility.differences
             ],
             _MOST_SHOWN,
         )
-        if apart.kind is PEERS_DOMAINS:
+        if incompatibility.kind is PEERS_DOMAINS:
             own_domains, domains = (
                 DomainSet.of(*((d, d) for name in names for d in governed[name].joined()))
                 for names in (alike, those)
@@ -350,24 +350,26 @@ def _governed_apart(
             f"nodes of {names_text(alike)} do not communicate with nodes of {names_text(those)}"
             f"{on}: {why}"
         )
-        yield apart.kind.found(alike[0], text, alike[0])
+        yield incompatibility.kind.found(alike[0], text, alike[0])
 
 
-def _apart(own: _Governed, other: _Governed) -> _Apart | None:
+def _incompatibility_of(own: _Governed, other: _Governed) -> _Incompatibility | None:
     if not own.meets(other):
-        return _Apart(PEERS_DOMAINS)
-    different = [_different(*pair) for pair in product(own.documents, other.documents)]
+        return _Incompatibility(PEERS_DOMAINS)
+    different = [_differences_between(*pair) for pair in product(own.documents, other.documents)]
     if not different or not all(disturbed for disturbed, _ in different):
         return None
     disturbed, values = min(different, key=lambda each: (each[0].everything, len(each[0].names)))
-    return _Apart(PEERS_PROTECTION, () if disturbed.everything else disturbed.names, values)
+    return _Incompatibility(
+        PEERS_PROTECTION, () if disturbed.everything else disturbed.names, values
+    )
 
 
 _MOST_SHOWN = 3
 
 
 @lru_cache(maxsize=256)
-def _different(
+def _differences_between(
     own: Governance, other: Governance
 ) -> tuple[Mismatch, tuple[tuple[str, str, str], ...]]:
     """Return which communication fails between two, and the settings with both values."""

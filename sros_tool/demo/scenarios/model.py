@@ -173,13 +173,13 @@ class Identity:
 
     ``enclave`` is a part of the scenario's cast ("talker") or the name of an enclave
     ("/arm/camera").  ``variables`` replace environment variables of a secured process.  On Zenoh, a
-    ``lawless`` process switches its own access control off.
+    process that ``ignores_rules`` switches its own access control off.
     """
 
     keystore: KeystoreChoice | None = None
     enclave: str = ""
     variables: tuple[tuple[str, str], ...] = ()
-    lawless: bool = False
+    ignores_rules: bool = False
 
 
 UNSECURED = Identity()

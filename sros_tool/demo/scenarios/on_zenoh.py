@@ -1,8 +1,8 @@
 """The scenarios on Zenoh: nodes with the names, tokens and messages of rmw_zenoh.
 
-Every world has a router; several rows share a world.  Attackers are lawless: their process does not
-enforce its own rules, so that only the rules of others stop them.  Each attack has a control, and
-is tried again without the defence that stops it.
+Every world has a router; several rows share a world.  An attacker's process does not enforce its
+own rules, so that only the rules of others stop it.  Each attack has a control, and is tried again
+without the defence that stops it.
 """
 
 from __future__ import annotations
@@ -83,10 +83,10 @@ def _attacker(
     part: str = "guest",
     topic: str = "",
     *,
-    lawless: bool = True,
+    ignores_rules: bool = True,
 ) -> Party:
     """Return an attacker whose enclave lacks the right, or whose files are invalid."""
-    identity = Identity(keystore, part, lawless=lawless)
+    identity = Identity(keystore, part, ignores_rules=ignores_rules)
     return Party(name, role, identity, topic or _TOPIC_OF.get(role, ""), intruder=True, turn=2)
 
 
@@ -147,8 +147,10 @@ def _action_pair() -> tuple[Party, ...]:
 def _topic_rows(link_mode: str, keystore: KeystoreChoice, world: str) -> tuple[Row, ...]:
     """Return the rows for sessions that connect in peer mode, or in client mode."""
     pair = _topic_pair(keystore)
-    talker = _attacker("talker without permission", Role.TALKER, keystore, lawless=False)
-    listener = _attacker("listener without permission", Role.LISTENER, keystore, lawless=False)
+    talker = _attacker("talker without permission", Role.TALKER, keystore, ignores_rules=False)
+    listener = _attacker(
+        "listener without permission", Role.LISTENER, keystore, ignores_rules=False
+    )
     rows = [
         _attempt_row(
             f"talker to listener, {link_mode}",
@@ -208,7 +210,7 @@ def _unpermitted_service_row(
     name: str, role: Role, mechanism: str, party: str, server: str, client: str
 ) -> Row:
     """Return a row in which an enclave calls or serves a service without the right to do so."""
-    intruder = _attacker(party, role, OWN, lawless=False)
+    intruder = _attacker(party, role, OWN, ignores_rules=False)
     calls = role in (Role.CLIENT, Role.ACTION_CLIENT)
     on_service = role in (Role.CLIENT, Role.SERVER)
     return _attempt_row(
@@ -356,8 +358,8 @@ def _refused_connection_row(
     )
 
 
-def _let_in(name: str, keystore: KeystoreChoice, defence_removed: str) -> Row:
-    """Return a row in which messages of such a process arrive, because a defence is missing."""
+def _accepted_connection_row(name: str, keystore: KeystoreChoice, defence_removed: str) -> Row:
+    """Return a row in which such a process is heard, because a defence is missing."""
     wide, _, listener = _topic_pair(keystore)
     party = _attacker("attacker", Role.TALKER, keystore, "talker")
     return _attempt_row(
@@ -394,7 +396,7 @@ _CONNECTION_ROWS = (
             "router and sessions ask for a certificate of the keystore's identity CA",
             "peer sent no certificates",
         ),
-        _let_in(
+        _accepted_connection_row(
             "no certificate, and none is asked for",
             zenoh_forger.certificates_not_asked_for,
             "mutual TLS and named subjects",
@@ -408,7 +410,7 @@ _CONNECTION_ROWS = (
             "the certificate has the talker's name, but the identity CA has not signed it",
             "UnknownIssuer",
         ),
-        _let_in(
+        _accepted_connection_row(
             "a certificate of another CA, which is trusted",
             zenoh_forger.both_cas_trusted,
             "the wrong CA",
@@ -422,7 +424,7 @@ _CONNECTION_ROWS = (
             "the router listens with TLS alone",
             "InvalidContentType",
         ),
-        _let_in(
+        _accepted_connection_row(
             "TCP instead of TLS, which the router also accepts",
             zenoh_forger.tcp_next_to_tls,
             "the list of protocols and named subjects",
@@ -844,19 +846,19 @@ _TOKENS = (
     ),
     _FalseToken(
         "another enclave announces a topic",
-        "a token passes only for names that its sender has a right to",
+        "a token passes only if its sender has a right to the name",
         "admin",
         "/not_its_own",
     ),
     _FalseToken(
         "another enclave poses as a node",
-        "a token passes only for nodes that the policy of its sender names",
+        "a token passes only if the policy of its sender names the node",
         "guest",
         "/rosout",
     ),
     _FalseToken(
         "another enclave announces a service",
-        "a token passes only for names that its sender has a right to: `wait_for_service` finds"
+        "a token passes only if its sender has a right to the name: `wait_for_service` finds"
         " nothing",
         "guest",
         "/not_offered",
@@ -929,7 +931,7 @@ def _erased_token_row(
         RowStatus.ERASED if defence_removed else RowStatus.NOT_ERASED,
         "when a token ends, the graph compares its session and name, but not the enclave"
         if defence_removed
-        else "a token passes only for nodes that the policy of its sender names",
+        else "a token passes only if the policy of its sender names the node",
         Claim(Relation.LOSES, "observer", "eraser"),
         (wide, talker, observer, eraser),
         () if defence_removed else (Claim(Relation.SEES, "observer", "talker"),),
@@ -973,7 +975,7 @@ _TOKEN_ROWS = (
 def _earlier_file_row(
     name: str, keystore: KeystoreChoice, expected: RowStatus, defence_removed: str = ""
 ) -> Row:
-    guest = _attacker("guest with an earlier file", Role.TALKER, keystore, lawless=False)
+    guest = _attacker("guest with an earlier file", Role.TALKER, keystore, ignores_rules=False)
     return _attempt_row(
         name,
         expected,

@@ -497,11 +497,11 @@ def start_network(root: Path, router: str, endpoint: str, mode: Mode, now: datet
 
 
 def zenoh_variables(
-    root: Path, enclave: str, domain: int, *, router: bool, lawless: bool
+    root: Path, enclave: str, domain: int, *, router: bool, ignores_rules: bool
 ) -> Mapping[str, str]:
     """Return the variables with which rmw_zenoh uses the files of an enclave as they are written.
 
-    A ``lawless`` process does not enforce the rules of its own file.  One without a key shows no
+    A process that ``ignores_rules`` does not enforce its own file.  One without a key shows no
     certificate.
     """
     folder = enclave_path(root, enclave).absolute()
@@ -512,6 +512,6 @@ def zenoh_variables(
     override = variables[OVERRIDE]
     if not (folder / KEY_FILE).exists():
         override, _, _ = override.partition(";")  # the CA comes first
-    if lawless:
+    if ignores_rules:
         override = f"{override};{_WITHOUT_RULES}"
     return {**variables, DOMAIN: str(domain), OVERRIDE: override}

@@ -87,13 +87,13 @@ def select(
     patterns: Sequence[str] = (),
     *,
     robots: Sequence[str] = (),
-    every: bool = False,
+    all_enclaves: bool = False,
     keyless: bool = False,
 ) -> ExportSelection:
     """Return the enclaves to export, selected as by `select_enclaves`.
 
     Unless ``keyless`` is set, an enclave whose key is on its robot is left out if only a pattern,
-    ``robots`` or ``every`` selects it; `distribute` refuses such an enclave in ``names``.
+    ``robots`` or ``all_enclaves`` selects it; `distribute` refuses such an enclave in ``names``.
 
     Raises:
         KeystoreError: a pattern matches no enclave, or all selected enclaves have their keys on
@@ -102,7 +102,7 @@ def select(
     chosen: list[str] = []
     left_out: list[str] = []
     for name in select_enclaves(
-        Keystore(root), names, patterns, robots=robots, every=every, checked=True
+        Keystore(root), names, patterns, robots=robots, all_enclaves=all_enclaves, checked=True
     ):
         only_matches = name not in names and not keyless
         at_robot = only_matches and key_on_robot(enclave_path(root, name))

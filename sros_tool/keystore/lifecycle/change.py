@@ -206,7 +206,7 @@ class KeystoreChange:
 
     @cached_property
     def template(self) -> Template:
-        """The settings of the keystore; a verb may replace them."""
+        """The template in the keystore's settings; a verb may replace it."""
         return self.keystore.template
 
     @cached_property
