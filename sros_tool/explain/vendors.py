@@ -361,6 +361,8 @@ class VendorOutcome(NamedTuple):
     """The expression that decided, or null."""
     domains: str = ""
     """The ROS domains in which the enclave may do it, such as ``10`` or ``10,20``, or null."""
+    anybody: bool = False
+    """Whether the enclave's governance also allows it to processes without an identity."""
 
     @property
     def allowed(self) -> bool:
@@ -379,7 +381,10 @@ class VendorOutcome(NamedTuple):
         return "" if runs else self.text.partition(": ")[2]
 
 
-@shows("question", "vendor", "vendor_why", "documented_only", "domain", "enclaves", "export")
+@shows(
+    *("question", "vendor", "vendor_why", "documented_only", "domain", "enclaves", "anybody"),
+    "export",
+)
 class WhoByVendor(NamedTuple):
     """The decision of a vendor for every enclave of a keystore."""
 
@@ -395,6 +400,11 @@ class WhoByVendor(NamedTuple):
     """All enclaves, with the decision for each."""
     export: bool = False
     """Whether an export was asked, which may lack enclaves of its keystore."""
+
+    @property
+    def anybody(self) -> bool:
+        """Whether processes without an identity may do it, too, as the governance admits them."""
+        return any(outcome.anybody for outcome in self.enclaves)
 
     @property
     def documented_only(self) -> bool:
@@ -423,9 +433,25 @@ def _title(vendor: Vendor, why: str) -> str:
     return f"{vendor.title} ({why}{documented})"
 
 
-def _outcome(name: str, answer: Answer) -> VendorOutcome:
+def _outcome(evaluator: Evaluator, name: str, question: Question) -> VendorOutcome:
+    answer = evaluator.answer(question)
     expression = answer.decision.expression or ""
-    return VendorOutcome(name, answer.outcome, answer.reason, answer.text, expression)
+    access = evaluator.access
+    opened = access.topics_of_unauthenticated() if access else None
+    anybody = opened is not None and all(part.topic in opened for part in question.parts)
+    return VendorOutcome(
+        name, answer.outcome, answer.reason, answer.text, expression, anybody=anybody
+    )
+
+
+def _note_on_anybody(outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
+    if any(outcome.anybody for outcome in outcomes):
+        text = (
+            "processes without an identity may do it, too: the governance admits them, and does "
+            "not protect the name. Run `sros update_keystore KEYSTORE --set "
+            "protection.allow_unauthenticated_participants=false`."
+        )
+        yield Note("explain.anybody", text)
 
 
 class VendorOfPolicy(NamedTuple):
@@ -456,17 +482,17 @@ class VendorOfPolicy(NamedTuple):
             if any(fnmatchcase(own.path, pattern) for pattern in self.patterns):
                 enclave = planned_enclave(own, None, self.asking)
                 context = self.asking.context(enclave.joined_domains)
-                answer = Evaluator(self.vendor, enclave, context).answer(question)
-                outcomes.append(_outcome(own.path, answer))
+                evaluator = Evaluator(self.vendor, enclave, context)
+                outcomes.append(_outcome(evaluator, own.path, question))
         return tuple(sorted(outcomes, key=lambda outcome: outcome.enclave))
 
     def printed(self, question: Question, outcomes: Sequence[VendorOutcome]) -> WhoByVendor:
         """Return the outcomes in the form that ``--json`` prints."""
         return WhoByVendor(str(question), self.vendor, self.why, self.asking.domain, outcomes)
 
-    def notes(self, _outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
-        """Yield no notes: DDS needs none."""
-        return iter(())
+    def notes(self, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
+        """Yield a note if processes without an identity may do it, too."""
+        return _note_on_anybody(outcomes)
 
 
 class VendorOfKeystore(NamedTuple):
@@ -511,7 +537,7 @@ class VendorOfKeystore(NamedTuple):
 
             def decided(domain: int) -> VendorOutcome:
                 context = self.asking._replace(domain=domain).context(None)
-                return _outcome(name, Evaluator(vendor, enclave, context).answer(question))
+                return _outcome(Evaluator(vendor, enclave, context), name, question)
 
             vendor = self.stated(name) or self.vendor
             decision, domains = first_allowing_domain(_parts(enclave, self.asking.domain), decided)
@@ -535,5 +561,6 @@ class VendorOfKeystore(NamedTuple):
         from sros_tool.explain.who import note_on_export  # as in `outcomes`
 
         yield from note_on_export(self.keystore.root)
+        yield from _note_on_anybody(outcomes)
         if not self.keystore.has_keys and not all(outcome.stopped for outcome in outcomes):
             yield _note_on_lacking_keys(self.keystore.root)

@@ -35,7 +35,7 @@ from sros_tool.proof.requirements import (
     demand,
 )
 from sros_tool.proof.system import Place, System
-from sros_tool.proof.worlds import World
+from sros_tool.proof.worlds import ANYBODY, World
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,6 +237,13 @@ def _subject(violation: Violation) -> str:
     return use.name if isinstance(violation.requirement, AtMost | Protected) else use.enclave
 
 
+_CLOSE_GOVERNANCE = (
+    "Run `sros update_keystore KEYSTORE --set "
+    "protection.allow_unauthenticated_participants=false` (for a policy: change its template), and "
+    "check the requirement again."
+)
+
+
 def _violation_finding(violation: Violation) -> Finding:
     requirement, steps = violation.requirement, violation.steps
     first = next((step.source for step in steps if step.source), None) or requirement.source
@@ -256,6 +263,7 @@ def _violation_finding(violation: Violation) -> Finding:
         _text(violation),
         first.file,
         first.line,
+        _CLOSE_GOVERNANCE if ANYBODY in violation.witness.enclaves else "",
         related=tuple(dict.fromkeys(related)),
     )
 

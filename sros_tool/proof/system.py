@@ -271,7 +271,9 @@ def _dds_world(
         writes, reads = ([getattr(e, side) for e in every] for side in ("writes", "reads"))
         return TopicAccess(NameSet.union(writes), NameSet.union(reads))
 
-    weak = _weaker_topics(each for accesses in access.values() for each in accesses)
+    every = [each for accesses in access.values() for each in accesses]
+    weak = _weaker_topics(every)
+    opened = [names for each in every if (names := each.topics_of_unauthenticated()) is not None]
     if demanded is not None:
         weak[Level.ENCRYPT] |= demanded[Level.SIGN]
     return World(
@@ -285,6 +287,7 @@ def _dds_world(
         idle=idle,
         fitting_others=fitting_others or {},
         longest=vendor.traits.longest_topic_name or LONGEST,
+        open_topics=NameSet.union(dict.fromkeys(opened)) if opened else None,
     )
 
 

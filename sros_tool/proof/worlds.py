@@ -32,6 +32,8 @@ from sros_tool.zenoh.key_expressions import names_of as names_of_keys
 
 LONGEST = 255
 """Length in bytes of the longest DDS topic name in ROS 2 (rmw, validate_full_topic_name.h)."""
+ANYBODY = "anybody without an identity"
+"""Name that stands for all processes without an enclave, where a governance admits them."""
 _LAST = "\U0010ffff"
 _OF_A_STEP = 4
 """Number of comparisons of wildcard prefixes and suffixes that count as one search step."""
@@ -298,6 +300,7 @@ class World:
         fitting_others: Mapping[str, Sequence[str]] = MappingProxyType({}),
         longest: int = LONGEST,
         crossing: Crossing | None = None,
+        open_topics: NameSet | None = None,
     ) -> None:
         """Create a world from the access of each enclave by its own permissions.
 
@@ -312,6 +315,7 @@ class World:
         nothing.  ``fitting_others`` maps an enclave to others whose permissions it can use as well.
         These count for what it may do, but not for what it must be able to do.  ``crossing`` is
         what passes between several Zenoh routers; None if all enclaves reach each other.
+        ``open_topics`` are what processes without an identity may write and read; None for nothing.
         """
         self.title = title
         self.confirm_own = confirm
@@ -321,6 +325,9 @@ class World:
         self.longest = longest
         self.enclaves = tuple(sorted(access))
         self._access = {name: self._with_fitting(name, access) for name in access}
+        self.open_topics = open_topics
+        if open_topics is not None:
+            self._access[ANYBODY] = TopicAccess(open_topics, open_topics)
         self.needed = tuple(needed)
         self.idle = frozenset(idle)
         self.crossing = crossing
@@ -345,6 +352,8 @@ class World:
 
     def confirm(self, enclave: str, writes: bool, topic: str) -> bool:
         """Return whether an enclave may write (or else read) a topic, as the engine decides."""
+        if enclave == ANYBODY:
+            return self.open_topics is not None and topic in self.open_topics
         able = (enclave, *self.fitting_others.get(enclave, ()))
         return any(self.confirm_own(name, writes, topic) for name in able)
 
@@ -364,7 +373,7 @@ class World:
             (self.longest, self.needed, self.idle) == (other.longest, other.needed, other.idle)
             and self.stated == other.stated
             and (self._weak, self.demanded) == (other._weak, other.demanded)
-            and self.own == other.own
+            and (self.own, self.open_topics) == (other.own, other.open_topics)
             and self.fitting_others == other.fitting_others
             and [world.own for world in self.elsewhere] == [world.own for world in other.elsewhere]
             and self.crossing is other.crossing is None
@@ -372,11 +381,11 @@ class World:
 
     @cached_property
     def _writers(self) -> Side:
-        return Side({enclave: self._access[enclave].writes for enclave in self.enclaves})
+        return Side({name: access.writes for name, access in self._access.items()})
 
     @cached_property
     def _readers(self) -> Side:
-        return Side({enclave: self._access[enclave].reads for enclave in self.enclaves})
+        return Side({name: access.reads for name, access in self._access.items()})
 
     def side(self, writes: bool) -> Side:
         """Return the index of writers, or of readers."""

@@ -12,6 +12,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from sros_tool.dds.decision.access import is_open_to_unauthenticated
+from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.keystore.layout import has_authorities
@@ -611,7 +613,8 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
 
     The protection of whole RTPS messages protects every topic in them.  A topic without a rule
     counts as not protected: vendors refuse it.  Access counts as controlled if all domain rules
-    control it for all of these topics, as in `sros_tool.reach`.
+    control it for all of these topics, as in `sros_tool.reach`.  Topics that are open to
+    participants without an identity on any tested vendor count as not controlled.
     """
     if governance is None or not governance.domain_access_rules:
         return UNKNOWN
@@ -621,11 +624,16 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
         _protection(domain, rule) for topic in topics for rule in _rules_of(domain, topic)
     ]
     anywhere = [
-        rule
+        (access, rule)
         for access in governance.domain_access_rules
         for topic in topics
         for rule in _rules_of(access, topic)
     ]
+    strangers = any(
+        is_open_to_unauthenticated(access, rule, vendor)
+        for access, rule in anywhere
+        for vendor in TESTED
+    )
     weakest = min(
         protections,
         key=lambda protection: _ORDER.index(protection.level),
@@ -633,8 +641,10 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
     )
     return replace(
         weakest,
-        read_control=all(rule.enable_read_access_control for rule in anywhere),
-        write_control=all(rule.enable_write_access_control for rule in anywhere),
+        read_control=not strangers and all(rule.enable_read_access_control for _, rule in anywhere),
+        write_control=not strangers
+        and all(rule.enable_write_access_control for _, rule in anywhere),
+        strangers=strangers,
     )
 
 

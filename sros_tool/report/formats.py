@@ -409,7 +409,7 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
         controls = stated.protection.write_control, stated.protection.read_control
         sides = Lack.SENDER, Lack.RECEIVER
         for end, lack, controlled in zip(ends, sides, controls, strict=True):
-            first = ["everybody with an identity"] if not controlled else []
+            first = [stated.protection.everybody] if not controlled else []
             first += ["nobody"] if stated.lacks is lack else []
             cells.append(", ".join(dict.fromkeys((*first, *end))))
         lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")

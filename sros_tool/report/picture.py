@@ -51,7 +51,8 @@ class Protection:
 
     ``data``, ``metadata`` and ``rtps`` are protection kinds of DDS-Security 1.1.  Without
     ``read_control``, every authenticated participant may read, whatever its permissions; without
-    ``write_control``, every authenticated participant may write.
+    ``write_control``, every authenticated participant may write.  With ``strangers``, participants
+    without an identity may do so as well.
     """
 
     level: WireLevel
@@ -66,12 +67,24 @@ class Protection:
     """Whether permissions control who may read."""
     write_control: bool = True
     """Whether permissions control who may write."""
+    strangers: bool = False
+    """Whether participants without an identity may use the name."""
+
+    @property
+    def everybody(self) -> str:
+        """Who may do what permissions do not control, in words."""
+        return (
+            "everybody, even without an identity"
+            if self.strangers
+            else "everybody with an identity"
+        )
 
     @property
     def open_text(self) -> str:
-        """What everybody with an identity may do: "everybody may send and receive", or ""."""
+        """What permissions do not control: "everybody may send and receive" and such, or ""."""
         sides = ["send"] * (not self.write_control) + ["receive"] * (not self.read_control)
-        return f"everybody may {' and '.join(sides)}" if sides else ""
+        even = ", even without an identity" if self.strangers else ""
+        return f"everybody may {' and '.join(sides)}{even}" if sides else ""
 
 
 UNKNOWN = Protection(WireLevel.UNKNOWN)

@@ -172,6 +172,36 @@ def test_what_is_proposed_can_fail() -> None:
 ENCRYPTED = '[[protected]]\ntopics = ["/scan"]\nlevel = "encrypt"\n'
 SIGNED = ENCRYPTED.replace("encrypt", "sign")
 SCAN = '<topics publish="ALLOW"><topic>{}</topic></topics>'
+OPEN_DOOR = """rtps = "NONE"
+discovery = "NONE"
+liveliness = "NONE"
+allow_unauthenticated_participants = true
+[protection.default]
+discovery = false
+"""
+
+
+def test_who_may_what_counts_processes_without_an_identity(tmp_path: Path) -> None:
+    strict = (templates_dir() / "production.toml").read_text()
+    head, _, rest = strict.partition("[protection]\n")
+    rest = rest.partition("[protection.default]\n")[2].replace("ENCRYPT", "NONE")
+    (tmp_path / "open.toml").write_text(f"{head}[protection]\n{OPEN_DOOR}{rest}")
+    (tmp_path / "p.xml").write_text(policy_text({"/a": may("publish", "/x")}))
+    rules = tmp_path / "r.toml"
+    rules.write_text('[[only]]\npublish = ["/x"]\nenclaves = ["*"]\n')
+    keystore = tmp_path / "ks"
+    sros("create_keystore", keystore, "--template", tmp_path / "open.toml").ok()
+    sros("generate_artifacts", "-k", keystore, "-p", tmp_path / "p.xml").ok()
+    for vendor, is_open in (("cyclonedds", True), ("fastdds", False)):  # measured by the demo
+        judged = sros("check", keystore, "--requirements", rules, "--vendor", vendor)
+        assert ("anybody without an identity: may publish /x" in judged.out) is is_open
+        assert ("allow_unauthenticated_participants=false" in judged.out) is is_open
+        who = sros("explain", keystore, "--who", "publish", "/nobodys", "--vendor", vendor)
+        assert (who.status, "[explain.anybody]" in who.err) == ((0, True) if is_open else (1, False))
+    table = sros("view", keystore, "--format", "markdown").ok().out
+    assert "| topic `/x` | everybody, even without an identity, `/a` |" in table
+
+
 WEAK = "a template that signs, and encrypts nothing"
 PROTECTION = {
     # name in the policy, requirement, template: does it hold, and is it assumed?

@@ -165,6 +165,25 @@ def test_access_is_open_where_it_is_for_any_topic_behind_a_name() -> None:
     assert not protection_of(both, "topics", "/open/x").write_control
 
 
+def test_names_without_protection_are_open_to_strangers_where_a_domain_admits_them() -> None:
+    bare = TopicProtection(data=Level.NONE, metadata=Level.NONE, discovery=False)
+    domain = DomainProtection(
+        allow_unauthenticated_participants=True,
+        rtps=Level.NONE,
+        named=(NamedProtection("topics", "/bare", bare),),
+    )
+    governance = governance_for(domain, DomainSet.of((0, 0)))
+    for name, open_text in (
+        ("/bare", "everybody may send and receive, even without an identity"),
+        ("/*", "everybody may send and receive, even without an identity"),
+        ("/other", ""),
+    ):
+        assert protection_of(governance, "topics", name).open_text == open_text
+    admits_nobody = replace(domain, allow_unauthenticated_participants=False)
+    closed = governance_for(admits_nobody, DomainSet.of((0, 0)))
+    assert not protection_of(closed, "topics", "/bare").open_text
+
+
 def test_what_protects_whole_messages_protects_every_topic() -> None:
     domain = DomainProtection(
         rtps=Level.ENCRYPT_WITH_ORIGIN_AUTHENTICATION,

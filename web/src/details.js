@@ -168,8 +168,8 @@ export function nameDetails(model, kind, name, act) {
         ["Data", protection.data],
         ["Metadata", protection.metadata],
         ["RTPS messages", protection.rtps],
-        ["Who may read", protection.read_control ? "whom permissions allow it" : "everybody with an identity"],
-        ["Who may write", protection.write_control ? "whom permissions allow it" : "everybody with an identity"],
+        ["Who may read", protection.read_control ? "whom permissions allow it" : bundle.everybody],
+        ["Who may write", protection.write_control ? "whom permissions allow it" : bundle.everybody],
       ]),
     );
   }

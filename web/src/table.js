@@ -20,7 +20,7 @@ function mentions(row, text) {
 }
 
 function list(texts, none, all) {
-  if (all) return [el("div", { class: "lack", text: "everybody with an identity" }), ...(texts.length ? list(texts, none) : [])];
+  if (all) return [el("div", { class: "lack", text: all }), ...(texts.length ? list(texts, none) : [])];
   if (!texts.length) return el("span", { class: "soft", text: none });
   const rest = texts.length - SHOWN;
   return [
@@ -79,8 +79,8 @@ function line(row, opens) {
       names,
       rest > 0 ? el("div", { class: "soft", text: `and ${rest} more` }) : null,
     ),
-    el("td", { "data-head": "May send" }, list(row.senders, "nobody", row.all_send)),
-    el("td", { "data-head": "May receive" }, list(row.receivers, "nobody", row.all_receive), denied),
+    el("td", { "data-head": "May send" }, list(row.senders, "nobody", row.all_send && row.everybody)),
+    el("td", { "data-head": "May receive" }, list(row.receivers, "nobody", row.all_receive && row.everybody), denied),
     el("td", { "data-head": "Protection" }, LEVELS[row.level].replace("protection ", "")),
   );
 }

@@ -18,9 +18,9 @@ from sros_tool.checks.keystores.enclaves import grant_of, plain
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.keystores.topic_names import check_topic_names
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, names_text
+from sros_tool.dds.decision.access import is_open_to_unauthenticated
 from sros_tool.dds.decision.grants import read_moment
 from sros_tool.dds.decision.vendors import (
-    CYCLONE_DDS,
     FAST_DDS,
     TESTED,
     Moments,
@@ -699,23 +699,11 @@ def _unauthenticated_text(rule: DomainRule, vendors: Sequence[Vendor]) -> tuple[
 
 
 def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:
-    """Return a clause on the topics that participants without a certificate can use on a vendor.
-
-    Cyclone DDS 0.10.2 does not check the rights of these participants, but it hides from them all
-    topics with enable_discovery_protection, whatever discovery_protection_kind is.
-    """
-    on_cyclone = vendor in CYCLONE_DDS
-    hides = on_cyclone or rule.discovery_protection_kind is not ProtectionKind.NONE
+    """Return a clause on the topics that participants without a certificate can use on a vendor."""
     opened = [
         topic_rule.topic_expression
         for topic_rule in rule.topic_access_rules
-        if (
-            on_cyclone
-            or not (topic_rule.enable_read_access_control or topic_rule.enable_write_access_control)
-        )
-        and not (topic_rule.enable_discovery_protection and hides)
-        and topic_rule.metadata_protection_kind is ProtectionKind.NONE
-        and topic_rule.data_protection_kind is ProtectionKind.NONE
+        if is_open_to_unauthenticated(rule, topic_rule, vendor)
     ]
     if not opened:
         return "they reach no topic, because all topics are controlled or protected"

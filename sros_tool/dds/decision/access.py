@@ -463,6 +463,30 @@ def _partitions(
     return tuple(dict.fromkeys(_trimmed(traits, text) for text in names))
 
 
+def is_open_to_unauthenticated(domain: DomainRule, topic: TopicRule, vendor: Vendor) -> bool:
+    """Return whether participants without an identity may use the topics of a rule of a domain."""
+    traits = vendor.traits
+    if not domain.allow_unauthenticated_participants or traits.ignores_unauthenticated:
+        return False
+    hides = (
+        not traits.controls_unauthenticated
+        or domain.discovery_protection_kind is not ProtectionKind.NONE
+    )
+    controls = topic.enable_read_access_control or topic.enable_write_access_control
+    return (
+        not (traits.controls_unauthenticated and controls)
+        and not (topic.enable_discovery_protection and hides)
+        and all(
+            kind is ProtectionKind.NONE
+            for kind in (
+                domain.rtps_protection_kind,
+                topic.metadata_protection_kind,
+                topic.data_protection_kind,
+            )
+        )
+    )
+
+
 class GovernedDomain:
     """The governance of a domain, as a vendor applies it to all subjects.
 
@@ -496,6 +520,18 @@ class GovernedDomain:
         for rule in self._topic_rules:
             text = _usable_expression(self._traits, rule.topic_expression)
             yield _cached_names(self._traits.style, (text,)), rule
+
+    def topics_of_unauthenticated(self) -> NameSet | None:
+        """Return the topics that participants without an identity may write and read, or None."""
+        domain = self.rule
+        if domain is None or not domain.allow_unauthenticated_participants:
+            return None
+        from sros_tool.automata import NameSet
+
+        return NameSet.first(
+            (names, is_open_to_unauthenticated(domain, rule, self.vendor))
+            for names, rule in self.names_by_rule()
+        )
 
     def all_controlled(self) -> bool:
         """Return whether every topic rule controls reading and writing."""
@@ -777,6 +813,10 @@ class Access:
         if domain is None:
             return ()
         return tuple((names, domain, rule) for names, rule in self._governed.names_by_rule())
+
+    def topics_of_unauthenticated(self) -> NameSet | None:
+        """Return the topics that participants without an identity may write and read, or None."""
+        return self._governed.topics_of_unauthenticated()
 
     def _kind_of(self, verb: AccessVerb, rule: TopicRule) -> _Kind:
         """Return what decides on access to a topic rule's topics, as `_decision_by_rules` does."""

@@ -199,6 +199,12 @@ class VendorTraits:
     """
     ignores_unauthenticated: bool = False
     """Participants without identity are refused even if governance allows them (2.9)."""
+    controls_unauthenticated: bool = True
+    """Access control applies to participants without identity.
+
+    If it does not, all topics with enable_discovery_protection are hidden from them, whatever
+    discovery_protection_kind is (Cyclone DDS 0.10.2).
+    """
     refuses_open_rtps: bool = False
     """RTPS protection is refused if unauthenticated participants are allowed."""
     signers: Signers = Signers.AUTHORITY
@@ -260,6 +266,7 @@ _CYCLONE_0_10 = VendorTraits(
     "Cyclone DDS 0.10",
     product="Cyclone DDS",
     tested=True,
+    controls_unauthenticated=False,
     reader=DocumentReader.CYCLONE,
     style=Style.CYCLONE,
     trims_texts=True,
