@@ -71,7 +71,8 @@ class AccessAnswer:
     rule, or for Zenoh the key expression with a wildcard that allows it, or "".  ``policy_lines``
     are the places ``FILE:LINE`` in the given policy that the rule comes from.  ``until`` is the
     first expiry among the enclave's files, in UTC.  ``remedy`` says what to do if the cause of a
-    denial is not the policy.
+    denial is not the policy.  ``counts_key`` says that the enclave's key is not here, and counts as
+    there: on its robot, or in the keystore of which this is a copy.
     """
 
     allowed: bool
@@ -82,6 +83,7 @@ class AccessAnswer:
     policy_lines: tuple[str, ...] = ()
     until: datetime | None = None
     remedy: str = ""
+    counts_key: bool = False
 
     def __bool__(self) -> bool:
         return self.allowed
@@ -550,7 +552,8 @@ def explain_access(
     context = asking.context(asked.enclave.joined_domains)
     if vendor == ZENOH:
         return _access_on_zenoh(asked, question, context, kind)
-    evaluator = Evaluator(Vendor(vendor), asked.enclave, context)
+    signed = asked.enclave.as_here if action == "join" else asked.enclave
+    evaluator = Evaluator(Vendor(vendor), signed, context)
     question, _ = question_meant(evaluator, asked, question, kind)
     answer = explain(evaluator, question)
     _, colon, reason = answer.text.partition(": ")
@@ -563,6 +566,7 @@ def explain_access(
         tuple(str(line.source) for line in answer.lines),
         answer.until,
         answer.remedy,
+        answer.counts_key,
     )
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from datetime import datetime, tzinfo
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
@@ -18,7 +19,6 @@ from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError
 from sros_tool.explain.answer import Evaluator, Question, about_action
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
-    KEY_FILE,
     PERMISSIONS_FILE,
     has_enclave,
     is_keystore,
@@ -26,7 +26,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.participant import (
     JoinContext,
     LoadedEnclave,
-    load_enclave_of,
+    deciding_enclave,
     loaded_enclave,
 )
 from sros_tool.keystore.reader import Keystore, open_enclave
@@ -150,13 +150,8 @@ def open_to_ask(
         own = policy.enclave(enclave.name)
         if own is None and not is_enclave(Path(enclave.name)):
             raise not_in_policy_error(policy, enclave.name, policy_file)
-    lacks_keys = False
-    # Others are looked at only if this one lacks its key: a process may not be able to.
-    if keystore and enclave.state and KEY_FILE not in enclave.state.files:
-        lacks_keys = is_keystore(keystore.root) and not keystore.has_keys
     enclave = enclave._replace(
         keystore=keystore,
-        key_elsewhere=enclave.key_elsewhere or lacks_keys,
         policy=own,
         policy_file=policy_file,
         has_placeholders=policy != stated
@@ -195,6 +190,16 @@ def not_in_policy_error(policy: Policy, name: str, file: Path) -> PolicyError:
     )
 
 
+def note_on_lacking_keys(keystore: Keystore) -> Iterator[Note]:
+    """Yield a note for a keystore or export in which no enclave has its key."""
+    if is_keystore(keystore.root) and not keystore.has_keys:
+        text = (
+            f"no enclave in '{keystore.root}' has its key: this is answered as if the keys were "
+            f"there. On the robot, `sros verify {quote(str(keystore.root))}` says whether they are."
+        )
+        yield Note("explain.without-keys", text)
+
+
 def signed_enclave(
     keystore: Keystore | None, name: str, moment: datetime, *, planned: bool = False
 ) -> LoadedEnclave | None:
@@ -215,7 +220,7 @@ def signed_enclave(
         return enclave
     keystore.check()
     if has_enclave(root, name):
-        return load_enclave_of(keystore, name, moment=moment)
+        return deciding_enclave(keystore, name, moment=moment)
     if planned:
         return None
     from sros_tool.keystore.selection import missing_enclave_error

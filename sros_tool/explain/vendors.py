@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from enum import Enum, auto
 from fnmatch import fnmatchcase
-from pathlib import Path
-from shlex import quote
 from typing import NamedTuple
 
 from sros_tool.dds.decision.access import Outcome, OutcomeWord, ReasonWord
@@ -20,6 +18,7 @@ from sros_tool.explain.asking import (
     AskedEnclave,
     AskingContext,
     ZenohInBrief,
+    note_on_lacking_keys,
     planned_enclave,
     question_meant,
     rights_naming,
@@ -32,7 +31,12 @@ from sros_tool.keystore.layout import (
     has_zenoh_files,
     is_keystore,
 )
-from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave_of
+from sros_tool.keystore.participant import (
+    JoinContext,
+    LoadedEnclave,
+    deciding_enclave,
+    load_enclave_of,
+)
 from sros_tool.keystore.reader import Keystore
 from sros_tool.names import is_expression
 from sros_tool.policy.model import Policy
@@ -174,8 +178,8 @@ def explain_on_dds(
     """
     vendor, why = chosen_vendor
     enclave = asked_enclave.enclave
-    if question.word == "join" and enclave.state:
-        enclave = enclave._replace(key_elsewhere=enclave.state.key_on_robot)
+    if question.word == "join":
+        enclave = enclave.as_here
     evaluator = Evaluator(vendor, enclave, context)
     question, taken = question_meant(evaluator, asked_enclave, question, kind)
     answer = explain(evaluator, question)
@@ -187,7 +191,7 @@ def explain_on_dds(
         *_other_type_notes(evaluator, answer, kind),
         *_not_a_topic_notes(answer, asked_enclave),
         *_similar_name_notes(answer),
-        *_notes_on_lacking_keys(enclave),
+        *(note_on_lacking_keys(enclave.keystore) if enclave.keystore and answer.counts_key else ()),
     )
     what = Asked(enclave.name, question, context)
     if compared is Compared.VENDORS:
@@ -278,23 +282,6 @@ def _not_a_topic_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[
             f"in the policy or keystore, {name} is {what}, not a topic: ask about call or {word}."
         )
         yield Note("explain.no-topic", text)
-
-
-def _notes_on_lacking_keys(enclave: LoadedEnclave) -> Iterator[Note]:
-    """Yield a note if an answer assumes keys that no enclave has."""
-    on_robot = enclave.state is None or enclave.state.key_on_robot
-    keystore = enclave.keystore
-    if keystore and enclave.key_elsewhere and not on_robot and not keystore.has_keys:
-        yield _note_on_lacking_keys(keystore.root)
-
-
-def _note_on_lacking_keys(root: Path) -> Note:
-    """Return the note for a keystore or export in which no enclave has its key."""
-    text = (
-        f"no enclave in '{root}' has its key: this is answered as if the keys were there. On the "
-        f"robot, `sros verify {quote(str(root))}` says whether they are."
-    )
-    return Note("explain.without-keys", text)
 
 
 def _similar_name_notes(answer: Answer) -> Iterator[Note]:
@@ -531,9 +518,8 @@ class VendorOfKeystore(NamedTuple):
         from sros_tool.explain.who import decide_each, first_allowing_domain
 
         def outcome(name: str) -> VendorOutcome:
-            enclave = load_enclave_of(self.keystore, name, moment=self.asking.at)
-            if question.word != "join" and not self.keystore.has_keys:
-                enclave = enclave._replace(key_elsewhere=True)
+            load = load_enclave_of if question.word == "join" else deciding_enclave
+            enclave = load(self.keystore, name, moment=self.asking.at)
 
             def decided(domain: int) -> VendorOutcome:
                 context = self.asking._replace(domain=domain).context(None)
@@ -562,5 +548,5 @@ class VendorOfKeystore(NamedTuple):
 
         yield from note_on_export(self.keystore.root)
         yield from _note_on_anybody(outcomes)
-        if not self.keystore.has_keys and not all(outcome.stopped for outcome in outcomes):
-            yield _note_on_lacking_keys(self.keystore.root)
+        if not all(outcome.stopped for outcome in outcomes):
+            yield from note_on_lacking_keys(self.keystore)

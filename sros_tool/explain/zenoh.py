@@ -26,10 +26,12 @@ from sros_tool.explain.asking import (
     AskedEnclave,
     AskingContext,
     ZenohInBrief,
+    note_on_lacking_keys,
     question_meant,
     rights_naming,
 )
 from sros_tool.explain.explanation import explain
+from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     IDENTITY_CA_FILE,
@@ -44,7 +46,7 @@ from sros_tool.keystore.layout import (
     is_keystore,
 )
 from sros_tool.keystore.participant import JoinContext
-from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.reader import Keystore, Problem
 from sros_tool.keystore.rights import check_routers
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.keystore.zenoh_files import (
@@ -501,7 +503,11 @@ class ZenohEvaluator:
             )
         identity = self.keystore.identity(enclave, now=self._at)
         certificate = identity.certificate
-        faults = [problem for problem in identity.problems if problem.file in _OF_TLS]
+        faults = [
+            problem
+            for problem in identity.problems
+            if problem.file in _OF_TLS and not self._is_left_out(problem)
+        ]
         if faults or certificate is None:
             problem = str(faults[0]) if faults else f"{CERTIFICATE_FILE} cannot be read"
             return _unusable_file(enclave, file, problem)
@@ -511,6 +517,11 @@ class ZenohEvaluator:
             return _unusable_file(enclave, file, problem)
         until = validity_of(certificate).not_after
         return ZenohFile(enclave, file, ZenohProcess(name, mode, access), "", until, endpoints)
+
+    def _is_left_out(self, problem: Problem) -> bool:
+        """Return whether a copy of the keystore for others lacks the file of a problem, a key."""
+        lacks_key = (problem.file, problem.fault) == (KEY_FILE, Fault.FILE_MISSING)
+        return lacks_key and not self.keystore.has_keys
 
     def _configuration(self, path: Path) -> tuple[Mode, MessageFilter, tuple[ZenohEndpoint, ...]]:
         """Return the mode of a process, what it enforces, and where it connects or listens."""
@@ -889,6 +900,7 @@ class ZenohOfKeystore:
         from sros_tool.explain.who import note_on_export  # as in `outcomes`
 
         yield from note_on_export(self._keystore.root)
+        yield from note_on_lacking_keys(self._keystore)
         if any(outcome.of_router and outcome.allowed for outcome in outcomes):
             yield _ROUTERS_KEY
         if any(outcome.mode is Mode.PEER for outcome in outcomes):
@@ -1013,7 +1025,11 @@ def explain_on_zenoh(
     answer = evaluator.answer(enclave.name, question)
     outdated = evaluator.outdated_enclaves(answer)
     by_permissions = explain(stated, question)
-    notes = (*taken, *_notes(answer, by_permissions, outdated))
+    notes = (
+        *taken,
+        *_notes(answer, by_permissions, outdated),
+        *note_on_lacking_keys(keystore),
+    )
     what = Asked(enclave.name, question, context)
     return ZenohExplanation(what, why, answer, outdated, by_permissions, keystore.root, notes)
 

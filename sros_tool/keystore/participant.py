@@ -123,6 +123,11 @@ class LoadedEnclave(NamedTuple):
         """Return the files that expire, apart from the permissions, with their expiry times."""
         return tuple(_expiries(self.state, self.folder)) if self.state and self.folder else ()
 
+    @property
+    def as_here(self) -> LoadedEnclave:
+        """The enclave as a process here loads it: a key that is not here is missing."""
+        return self._replace(key_elsewhere=self.state.key_on_robot) if self.state else self
+
     def problems(self, traits: VendorTraits) -> tuple[Problem, ...]:
         """Return the faults, except in documents, that keep a vendor's process from starting."""
         if self.state is None or self.at is None:
@@ -145,6 +150,19 @@ def load_enclave_of(keystore: Keystore, name: str, *, moment: datetime) -> Loade
     return loaded_enclave(
         name, keystore.folder(name), keystore.enclave(name, now=moment), moment=moment
     )
+
+
+def deciding_enclave(keystore: Keystore, name: str, *, moment: datetime) -> LoadedEnclave:
+    """Return an enclave as `load_enclave_of` does, to decide what its documents allow.
+
+    In a copy of a keystore without any keys, its key counts as there.
+    """
+    enclave = load_enclave_of(keystore, name, moment=moment)
+    lacks_key = enclave.state is not None and KEY_FILE not in enclave.state.files
+    # Others are looked at only if this one lacks its key: a process may not be able to.
+    if lacks_key and not keystore.has_keys:
+        return enclave._replace(key_elsewhere=True)
+    return enclave
 
 
 def loaded_enclave(

@@ -36,7 +36,7 @@ from sros_tool.keystore.layout import (
     has_zenoh_files,
     is_keystore,
 )
-from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave_of
+from sros_tool.keystore.participant import JoinContext, LoadedEnclave, deciding_enclave
 from sros_tool.keystore.protection import with_stated
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import load_rights, load_zenoh_rights
@@ -375,9 +375,7 @@ def _keystore_system(
     source = load_rights(keystore, hidden=True)
     rights = frozenset(right for right in source.rights if right.qualifier is ALLOW)
     stated = _stated_topics(names, rights)
-    loaded = {name: load_enclave_of(keystore, name, moment=at) for name in names}
-    if not keystore.has_keys:  # the public part of a keystore: the keys are where it came from
-        loaded = {name: enclave._replace(key_elsewhere=True) for name, enclave in loaded.items()}
+    loaded = {name: deciding_enclave(keystore, name, moment=at) for name in names}
     for name, enclave in loaded.items():
         if (
             not enclave.permissions

@@ -62,7 +62,7 @@ from sros_tool.keystore.participant import (
     LoadedEnclave,
     RefusalCause,
     VendorParticipant,
-    load_enclave_of,
+    deciding_enclave,
     plan_enclave,
 )
 from sros_tool.keystore.protection import with_stated
@@ -152,9 +152,7 @@ def signed_files(
     keystore.check()
     names = enclave_names(keystore.root, hidden=True)
     source = load_rights(keystore, hidden=True)
-    enclaves = {name: load_enclave_of(keystore, name, moment=moment) for name in names}
-    if not keystore.has_keys:  # the public part of a keystore: the keys are where it came from
-        enclaves = {name: each._replace(key_elsewhere=True) for name, each in enclaves.items()}
+    enclaves = {name: deciding_enclave(keystore, name, moment=moment) for name in names}
     side = AccessSource(str(keystore.root), "keystore", source.rights, source.documents)
     return DecidedFiles(str(keystore.root), enclaves, side, moment, zone, domain, keystore)
 

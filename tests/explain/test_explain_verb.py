@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from sros_tool.api import explain_access
 from sros_tool.cli.common import now
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.files import policies_dir, templates_dir
@@ -816,4 +817,6 @@ def test_a_copy_without_keys_is_answered_as_if_they_were_there(whole: Path, tmp_
     assert "key.pem: missing" in explain(copy, ENCLAVE, "join").out
     who = explain(copy, "--who", "publish", "/chatter")
     assert ENCLAVE in who.out and "explain.without-keys" in who.err
+    assert explain_access(copy, ENCLAVE, "publish", "/chatter").counts_key
+    assert not explain_access(copy, ENCLAVE, "join").counts_key
     assert "without-keys" not in explain(whole, ENCLAVE, "publish", "/chatter").ok().err

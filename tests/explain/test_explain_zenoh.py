@@ -284,6 +284,14 @@ def test_peers_that_let_through_what_the_router_denies_are_named(
     assert zenoh(changed, "/wide", "publish", "/other")["outcome"] == "dropped"
 
 
+def test_a_copy_without_keys_is_answered_as_if_they_were_there(keystore: Path) -> None:
+    for key in keystore.glob("enclaves/**/key.pem"):
+        key.unlink()
+    for words in (("/talker", "publish", "/chatter"), ("--who", "publish", "/chatter")):
+        said = explain(keystore, *words, "--vendor", "zenoh").ok()
+        assert "note [explain.without-keys]: no enclave in" in said.err
+
+
 def test_a_file_that_zenoh_does_not_accept(keystore: Path) -> None:
     (keystore / "enclaves/router/router.json5").write_text('{"mode": "router\x1b"}')
     shown = explain(keystore, "/talker", "publish", "/chatter", "--vendor", "zenoh")

@@ -927,7 +927,7 @@ def test_how_often_files_are_read_is_not_for_the_log_to_choose(
     def refuse(_file: LedgerFile, *_asked: str) -> Ledger:
         raise AssertionError("the ledger was read")
 
-    monkeypatch.setattr(asking, "load_enclave_of", opened)
+    monkeypatch.setattr(asking, "deciding_enclave", opened)
     monkeypatch.setattr(LedgerFile, "ledger", refuse)
     monkeypatch.setattr(LedgerFile, "with_field", refuse)
     findings = json.loads(sros("explain", keystore, "--log", tmp_path / "log", "--json").out)
