@@ -13,7 +13,7 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from sros_tool.errors import KeystoreError, Note, UsageError
-from sros_tool.keystore.layout import PERMISSIONS_FILE, in_keystore_of
+from sros_tool.keystore.layout import PERMISSIONS_FILE, remedy_in_keystore
 from sros_tool.keystore.reader import read_consistently
 from sros_tool.owners import other_writers
 from sros_tool.wording import first_few
@@ -186,7 +186,7 @@ def _check_key_closed(key: Path, root: Path, name: str) -> None:
     """Raise `KeystoreError` if users other than the owner can read the enclave's private key."""
     mode = stat.S_IMODE(key.stat().st_mode)
     if mode & 0o077:
-        another = in_keystore_of(root, f"`sros renew KEYSTORE {name} --new-key --revoke-old`.")
+        another = remedy_in_keystore(root, f"`sros renew KEYSTORE {name} --new-key --revoke-old`.")
         raise KeystoreError(
             f"others can read the private key of enclave {name}",
             f"The mode of '{key}' is {mode:04o}: whoever has read the key can act as the enclave.",
@@ -414,7 +414,7 @@ def _choose_domain(domains: DomainSet, wanted_domain: int | None, root: Path) ->
     Raises:
         KeystoreError: the keystore is not for ``wanted_domain``.
     """
-    from sros_tool.keystore.layout import adding_domains
+    from sros_tool.keystore.layout import how_to_add_domains
 
     if wanted_domain is None:
         return domains.preferred()
@@ -424,7 +424,7 @@ def _choose_domain(domains: DomainSet, wanted_domain: int | None, root: Path) ->
         f"keystore '{root}' is for domain {domains}, not for {wanted_domain}",
         "DDS would refuse the node.",
         f"Set ROS_DOMAIN_ID to {next(iter(domains))}, or "
-        f"{adding_domains(root, f'{domains},{wanted_domain}')}.",
+        f"{how_to_add_domains(root, f'{domains},{wanted_domain}')}.",
     )
 
 
@@ -447,7 +447,7 @@ def _zenoh_domain(
             f"{wanted_domain}",
             "Its rules deny everything in any other domain.",
             f"Set ROS_DOMAIN_ID to {own[0]}, or write the files for more domains. "
-            f"{in_keystore_of(root, '`sros zenoh KEYSTORE --domain ID`.')}",
+            f"{remedy_in_keystore(root, '`sros zenoh KEYSTORE --domain ID`.')}",
         )
     return wanted_domain
 

@@ -281,13 +281,13 @@ class Folder:
         with self._adding_path_to_errors(target):
             os.link(name, new, src_dir_fd=here, dst_dir_fd=there, follow_symlinks=False)
 
-    def exchange(self, one: str, other: str) -> bool:
+    def exchange(self, first: str, second: str) -> bool:
         """Atomically exchange two names (renameat2(2)).
 
         Return False, without a change, if the kernel, the C library or the file system does not
         support it.
         """
-        return exchange(*self._two_places(one, other))
+        return exchange(*self._two_places(first, second))
 
     def unlink(self, path: str, *, missing_ok: bool = False) -> None:
         """Remove the file or link at ``path``."""
@@ -416,20 +416,20 @@ def write_all(handle: int, data: bytes) -> None:
         view = view[os.write(handle, view) :]
 
 
-def exchange(here: int, one: str, there: int, other: str) -> bool:
+def exchange(first_folder: int, first: str, second_folder: int, second: str) -> bool:
     """Exchange two names in two open folders, as `Folder.exchange`."""
     try:
         rename = _c_library().renameat2
     except AttributeError:
         return False
-    sys.audit("os.rename", one, other, here, there)
-    names = os.fsencode(one), os.fsencode(other)
-    if rename(here, names[0], there, names[1], _RENAME_EXCHANGE) == 0:
+    sys.audit("os.rename", first, second, first_folder, second_folder)
+    names = os.fsencode(first), os.fsencode(second)
+    if rename(first_folder, names[0], second_folder, names[1], _RENAME_EXCHANGE) == 0:
         return True
     number = _last_error()
     if number in _NOT_SUPPORTED:
         return False
-    raise OSError(number, os.strerror(number), one, None, other)
+    raise OSError(number, os.strerror(number), first, None, second)
 
 
 def flush_file_system(handle: int) -> None:

@@ -436,7 +436,7 @@ def secured_by(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
 
 
 def _secured_by_zenoh(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
-    """Yield which variables give a session of rmw_zenoh certificates, rules or a password."""
+    """Yield the variables that give a session of rmw_zenoh certificates, rules or a password."""
     uri, override = environment.get(SESSION_URI, ""), environment.get(OVERRIDE, "")
     named = " with ".join(name for name in (SESSION_URI, OVERRIDE) if environment.get(name))
     try:
@@ -455,7 +455,7 @@ def _secured_by_zenoh(environment: Mapping[str, str], folder: Path) -> Iterator[
 
 
 def _security_in_configuration(sought_text: bytes, name: str, place: bytes | Path) -> Iterator[str]:
-    """Yield that a configuration has security, or cannot be read."""
+    """Yield a clause if a configuration has security, or cannot be read."""
     try:
         data = place if isinstance(place, bytes) else read_bytes(place, "configuration")
     except SrosError as error:

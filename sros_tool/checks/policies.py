@@ -303,7 +303,7 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     yield from _offered_by_others_findings(alone)
     offered: dict[str, list[_Statement]] = defaultdict(list)
     for statement in alone:
-        if not _is_of_a_node(statement.name):
+        if not _is_service_of_every_node(statement.name):
             offered[statement.name].append(statement)
     near = NearNames(offered)
     for statement in checked_policy.statements:
@@ -363,8 +363,8 @@ def _candidates_text(candidates: Sequence[_Statement]) -> str:
     return f"perhaps you mean {' or '.join([*texts][:_NAMES_SHOWN])}, which nobody uses"
 
 
-def _is_of_a_node(name: str) -> bool:
-    """Return whether every node offers this service; it then needs no client in the policy."""
+def _is_service_of_every_node(name: str) -> bool:
+    """Return whether every node offers this service, which then needs no client in a policy."""
     return name.rpartition("/")[2] in NODE_SERVICES
 
 

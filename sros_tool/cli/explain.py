@@ -608,10 +608,10 @@ def _to_do_lines(answer: Answer) -> Iterator[str]:
 
 def _requirements_forbidding(answer: Answer) -> Sequence[Requirement]:
     """Return the requirements next to the keystore of a closed robot that forbid the change."""
-    from sros_tool.keystore.layout import closed_robot
+    from sros_tool.keystore.layout import folder_of_closed_robot
 
     root, change = answer.enclave.root, answer.change
-    robot = closed_robot(root) if root else None
+    robot = folder_of_closed_robot(root) if root else None
     if not (robot and change and change.document) or answer.enclave.has_placeholders:
         return ()
     from sros_tool.closing import requirements_broken_by

@@ -156,7 +156,7 @@ def _form_of(arguments: Sequence[str]) -> str:
 )
 @click.option(
     "--target",
-    "there",
+    "target_dir",
     metavar="DIR",
     help="The path of the keystore where the process runs: on the robot, in the container. "
     f"[default: KEYSTORE; for containers {INSTALLED}]",
@@ -175,7 +175,7 @@ def _form_of(arguments: Sequence[str]) -> str:
 def env(
     words: tuple[str, ...],
     form: str,
-    there: str | None,
+    target_dir: str | None,
     container: str | None,
     image: str | None,
     domain: str | None,
@@ -218,9 +218,9 @@ def env(
             what = f"{option} is empty" if not value else f"the format {form} has no {option}"
             raise UsageError(what, "", f"It is for {COMPOSE} and {KUBERNETES}.")
     in_container = form in CONTAINER_FORMS
-    if there is None and in_container:
-        there = INSTALLED
-    target = None if there is None else target_path(there)
+    if target_dir is None and in_container:
+        target_dir = INSTALLED
+    target = None if target_dir is None else target_path(target_dir)
     secured = enclave_environment(
         root, rest[0], domain, rmw, accept_key=accept_readable_key, target=target
     )
@@ -448,7 +448,7 @@ class _WithCommandAfterDashes(_WithCommand):
 )
 @click.option(
     "--target",
-    "there",
+    "target_dir",
     metavar="DIR",
     help="Path of the keystore on the machine where the units run. "
     f"[default: {INSTALLED} for nodes, KEYSTORE for jobs]",
@@ -488,7 +488,7 @@ def units(
     jobs: tuple[str, ...],
     inbox: Path | None,
     publishing: Path | None,
-    there: str | None,
+    target_dir: str | None,
     user: str | None,
     program: str | None,
     passphrase: str | None,
@@ -539,13 +539,13 @@ def units(
             "Only root can look at the processes of all users.",
             "Write the units for guard with a separate command, without --user.",
         )
-    if jobs and (rest[1:] or several) and there is None:
+    if jobs and (rest[1:] or several) and target_dir is None:
         raise UsageError(
             f"the node units are for the keystore {INSTALLED}, and the job units are for '{root}'",
             "One folder of units is for one machine.",
             "Run two commands with two folders, or name the keystore with --target.",
         )
-    target = None if there is None else target_path(there)
+    target = None if target_dir is None else target_path(target_dir)
     files: dict[str, str] = {}
     notes: list[Note] = []
     names: Sequence[str] = ()

@@ -35,7 +35,7 @@ from sros_tool.runtime.netns import end_with_starter
 from sros_tool.runtime.rmw import (
     RMW,
     built_without_security,
-    cyclone_explains,
+    denial_trace_variables,
     middleware_of,
     rmw_implementations,
     vendor_of,
@@ -170,7 +170,7 @@ class Backend:
             variables |= _ON_THE_WIRE
         if denied and not on_ros:
             # Its C library's stderr is the log of `CycloneLog`.
-            variables |= cyclone_explains("stdout")
+            variables |= denial_trace_variables("stdout")
         elif denied and (below := middleware_of(self.rmw)):
             variables |= below.explains
         return variables

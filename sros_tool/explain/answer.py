@@ -27,7 +27,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import DomainRule, ProtectionKind, TopicRule
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import UsageError
-from sros_tool.keystore.layout import CLOSED_POLICY, FLEET, closed_robot, has_authorities
+from sros_tool.keystore.layout import CLOSED_POLICY, FLEET, folder_of_closed_robot, has_authorities
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, VendorParticipant
 from sros_tool.keystore.reader import Keystore, Problem
 from sros_tool.names import (
@@ -507,7 +507,7 @@ class Answer(NamedTuple):
         if not self.change and not self.sign:
             return []
         keystore = self.enclave.root
-        robot = closed_robot(keystore) if keystore else None
+        robot = folder_of_closed_robot(keystore) if keystore else None
         file = str(self.enclave.policy_file or (robot / CLOSED_POLICY if robot else "POLICY"))
         root = str(keystore if keystore and not self.is_of_export else "KEYSTORE")
         if self.enclave.has_placeholders:

@@ -42,8 +42,8 @@ from sros_tool.keystore.layout import (
     enclave_path,
     has_authorities,
     has_zenoh_files,
-    in_keystore_of,
     is_keystore,
+    remedy_in_keystore,
 )
 from sros_tool.keystore.participant import JoinContext
 from sros_tool.keystore.reader import Keystore, Problem
@@ -304,13 +304,13 @@ class ZenohEvaluator:
                 f"keystore '{self.root}' has no {ROUTER_FILE}",
                 "sros cannot know what the router enforces without the router's file.",
                 "Ask about the keystore that this one was exported from, or write the files again. "
-                f"{in_keystore_of(self.root, '`sros zenoh KEYSTORE`.')}",
+                f"{remedy_in_keystore(self.root, '`sros zenoh KEYSTORE`.')}",
             )
         raise KeystoreError(
             f"keystore '{self.root}' has no Zenoh configurations",
             "Without them its enclaves cannot open a session, and rmw_zenoh with files of its own "
             "runs without any access control.",
-            f"Write them. {in_keystore_of(self.root, '`sros zenoh KEYSTORE`.')}",
+            f"Write them. {remedy_in_keystore(self.root, '`sros zenoh KEYSTORE`.')}",
         )
 
     def _router_of(self, enclave: str) -> ZenohFile:

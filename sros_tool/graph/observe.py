@@ -388,7 +388,7 @@ def _enclaves(
         for process, nodes in processes.items()
     }
     if sighting.ordered:
-        candidates = _decided_by_order(sighting.listed, processes, candidates)
+        candidates = _with_enclaves_by_order(sighting.listed, processes, candidates)
     settled: set[str] = set()
     while True:
         news = [
@@ -411,7 +411,7 @@ def _enclaves(
                 candidates[process] = possible or left
 
 
-def _decided_by_order(
+def _with_enclaves_by_order(
     listed_nodes: Sequence[Listed],
     processes: dict[str, frozenset[_Name]],
     candidates: dict[str, frozenset[str]],

@@ -14,7 +14,7 @@ from cryptography import x509
 
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore.layout import CERTIFICATE_FILE, in_keystore_of
+from sros_tool.keystore.layout import CERTIFICATE_FILE, remedy_in_keystore
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.template import Template
 from sros_tool.parallel import map_slices
@@ -250,7 +250,7 @@ def read_credentials(keystore: Keystore, name: str) -> Credentials:
             f"the permissions of enclave {name} have no grant for {subject}",
             "They belong to another certificate.",
             "Sign them again. "
-            + in_keystore_of(
+            + remedy_in_keystore(
                 keystore.root, f"`sros create_permission KEYSTORE {name} POLICY_FILE`."
             ),
         )

@@ -307,7 +307,7 @@ class RobotStatus:
 
     @property
     def last_heard(self) -> datetime | None:
-        """When the robot was certainly there last; None if it sent no confirmation."""
+        """The last time of a message from the robot, at least; None if it sent no confirmation."""
         if self.fetches and self.received and self.clock:
             return min(self.received, self.clock)
         return self.received

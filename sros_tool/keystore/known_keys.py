@@ -137,7 +137,7 @@ class KnownKeys:
                         enclaves.add(common_name_of(certificate.subject))
         return enclaves.intersection(names)
 
-    def lack_notes(self) -> Iterator[Note]:
+    def missing_key_notes(self) -> Iterator[Note]:
         """Yield a note if the ledger may lack keys that were revoked."""
         if gaps := self._keystore.ledger_with("what", "revocation").gaps:
             yield Note(
@@ -187,7 +187,7 @@ class KnownKeys:
                 f"the key of {holder} was revoked", f"It is the key of {revoked}.", remedy
             )
 
-    def refuse_second(self, key: PublicKey, name: str, remedy: str) -> None:
+    def refuse_shared_key(self, key: PublicKey, name: str, remedy: str) -> None:
         """Raise `KeystoreError` if another enclave than ``name`` has ``key``."""
         if others := self._other_enclaves(key, name):
             raise KeystoreError(

@@ -213,8 +213,8 @@ def has_authorities(root: Path) -> bool:
     return (root / PRIVATE).is_dir() or (root / LEDGER).is_file()
 
 
-def in_keystore_of(root: Path, remedy: str) -> str:
-    """Return a remedy, with commands for KEYSTORE, as it can be followed for a keystore or export.
+def remedy_in_keystore(root: Path, remedy: str) -> str:
+    """Return a remedy with commands for KEYSTORE, adapted to the keystore or export ``root``.
 
     An export has no CA keys: its remedy says to run the commands in the original keystore.
     """
@@ -223,19 +223,19 @@ def in_keystore_of(root: Path, remedy: str) -> str:
     return remedy_in_original_keystore(remedy)
 
 
-def closed_robot(root: Path) -> Path | None:
+def folder_of_closed_robot(root: Path) -> Path | None:
     """Return the folder of `sros close` that has this keystore or export, or None."""
     folder = root.parent
     made = all((folder / file).is_file() for file in (CLOSED_PROCESSES, CLOSED_POLICY))
     return folder if made else None
 
 
-def adding_domains(root: Path, domains: str) -> str:
+def how_to_add_domains(root: Path, domains: str) -> str:
     """Return advice, as a clause, on how to add a domain to a keystore, or to that of an export.
 
     ``domains`` ("0,5") are all its domains afterwards.
     """
-    robot = closed_robot(root)
+    robot = folder_of_closed_robot(root)
     candidates = (root, robot / "keystore") if robot else (root,)
     keystore = next(filter(has_authorities, candidates), None)
     command = f"sros update_keystore {quote(str(keystore or 'KEYSTORE'))} --domain {domains}"
@@ -513,13 +513,13 @@ def hidden_enclaves(root: Path, among: Iterable[str] | None = None) -> tuple[str
         sorted(
             name
             for name, folder in folders.items()
-            if STAGE not in folder.parts and not _is_own_secret(folder)
+            if STAGE not in folder.parts and not _is_kubernetes_secret(folder)
         )
     )
 
 
-def _is_own_secret(folder: Path) -> bool:
-    """Return whether Kubernetes made ``folder``: the enclave above it links to all its files."""
+def _is_kubernetes_secret(folder: Path) -> bool:
+    """Return whether ``folder`` is of a Kubernetes secret: the enclave links to all its files."""
     link = folder.parent / "..data"
     try:
         return link.is_symlink() and all(

@@ -211,7 +211,7 @@ def clock_behind(root: Path, now: datetime) -> str:
 def behind_clause(now: datetime, last: datetime | None, what: str) -> str:
     """Return, as a clause, how far the clock is behind the moment ``last`` of ``what``; "" if not.
 
-    A little is left to clocks that were set.
+    A small difference is ignored.
     """
     if last is None or last - now <= _CLOCK_TOLERANCE:
         return ""
@@ -448,8 +448,8 @@ class LedgerFile:
     def clock_behind(self, now: datetime) -> str:
         """Return, as a clause, how far the clock is behind the last entries; "" if it is not.
 
-        The latest entry since the last revocation list counts: what was written with the wrong
-        clock hides nothing, and a new list ends what was written with a clock that was ahead.
+        The latest entry since the last revocation list counts, so that a later entry with the wrong
+        time hides nothing, and a new list corrects a clock that was ahead.
         """
         times = []
         for line in reversed(self._opened().last_lines):
@@ -493,7 +493,7 @@ class LedgerFile:
             reading = self._compared_with_head(files, self._lines(files, needed_text))
             # A transaction of another process may have ended between the reading of the two files.
             kept = known is not None and known.lines is not None
-            if kept or not reading.unrecorded or self._is_still(files):
+            if kept or not reading.unrecorded or self._is_unchanged(files):
                 self._files = files
                 return reading
             self._files = None
@@ -510,7 +510,9 @@ class LedgerFile:
 
     def _read(self) -> _Files:
         files = self._read_once()
-        while files.later and not self._is_still(files):  # another process has just sealed a part
+        while files.later and not self._is_unchanged(
+            files
+        ):  # another process has just sealed a part
             files = self._read_once()
         return files
 
@@ -595,8 +597,8 @@ class LedgerFile:
             return _Head(fault=f"{LEDGER_HEAD} is not the signed end of a ledger")
         return _Head(int(stated[1]), stated[2].decode(), index_root=(stated[3] or b"").decode())
 
-    def _is_still(self, files: _Files) -> bool:
-        """Return whether ledger and head on disk are still as they were read."""
+    def _is_unchanged(self, files: _Files) -> bool:
+        """Return whether ledger and head on disk did not change since they were read."""
         state = None
         with suppress(OSError):
             state = (self.root / LEDGER).stat()
@@ -663,8 +665,8 @@ class LedgerFile:
     def _new_index(self, last_part: BinaryIO, head: _Head | None) -> tuple[IndexUpdate, bool]:
         """Return the index of all lines, and whether they are the chain that ``head`` signs.
 
-        ``last_part`` is the last part.  Both are said of the same reading: another process that can
-        write to the keystore could exchange a part between two.
+        ``last_part`` is the last part.  Both are from one reading: between two, another process
+        that can write to the keystore could exchange a part.
 
         Raises:
             KeystoreError: as `_every_line`.
@@ -847,7 +849,7 @@ def _read_lines(
             if damaged:
                 faults.append(_not_entries_fault(number - 1, damaged))
             if chained and not entry.previous:
-                faults.append(_Fault(number, f"line {number} was added from outside"))
+                faults.append(_Fault(number, f"line {number} was added by another program"))
             elif entry.previous:
                 expected = last if chained else all_before.hexdigest()
                 if entry.previous != expected and not damaged:
@@ -1045,7 +1047,7 @@ def _head_fault(head: _Head | None, lines: int, signed: str, *, is_chained: bool
     if not head.lines or signed != head.last:
         return _Fault(lines, f"its last lines are not the ones that {LEDGER_HEAD} signs")
     if head.lines < lines:
-        return _Fault(lines, f"line {head.lines + 1} was added from outside")
+        return _Fault(lines, f"line {head.lines + 1} was added by another program")
     return None
 
 

@@ -108,7 +108,7 @@ def vendor_problems(
     They are in the order in which a process meets them.  Only signature and size of governance and
     permissions are checked here; problems in their content are taken from ``state``.
     """
-    specific = [problem for problem in state.problems if _is_specific(problem, state)]
+    specific = [problem for problem in state.problems if _is_vendor_specific(problem, state)]
     kept = [problem for problem in state.problems if problem not in specific]
     if state.token and not traits.reads_tokens:
         text = f"{traits.title} does not read it, and there is no {KEY_FILE}"
@@ -162,7 +162,7 @@ def _is_of_list(problem: Problem) -> bool:
     return problem.fault is Fault.CRL_MALFORMED or problem.fault in _OF_LISTS.values()
 
 
-def _is_specific(problem: Problem, state: OpenedEnclave) -> bool:
+def _is_vendor_specific(problem: Problem, state: OpenedEnclave) -> bool:
     """Return whether a problem is one for which only some vendors refuse an enclave."""
     later = problem.file == IDENTITY_CA_FILE and state.identity_ca is not None
     return problem.fault in _VENDOR_SPECIFIC or (

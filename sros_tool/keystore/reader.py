@@ -48,11 +48,11 @@ from sros_tool.keystore.layout import (
     ROLES,
     SETTINGS,
     STAGE,
-    adding_domains,
     ca_certificate,
     check_keystore,
     enclave_names,
     enclave_path,
+    how_to_add_domains,
     key_on_robot,
 )
 from sros_tool.keystore.ledger import Ledger, LedgerFile
@@ -556,7 +556,7 @@ def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
     raise KeystoreError(
         f"ROS_DOMAIN_ID is {domain}, but keystore '{root}' is for domain {domains} only",
         "In any other domain, DDS refuses a node with this keystore.",
-        f"Set ROS_DOMAIN_ID to {domains}, or {adding_domains(root, f'{domains},{domain}')}.",
+        f"Set ROS_DOMAIN_ID to {domains}, or {how_to_add_domains(root, f'{domains},{domain}')}.",
     )
 
 

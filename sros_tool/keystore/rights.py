@@ -35,9 +35,9 @@ from sros_tool.keystore.layout import (
     ROUTER_FILE,
     SESSION_FILE,
     SETTINGS,
-    closed_robot,
     enclave_names,
     enclave_path,
+    folder_of_closed_robot,
     is_keystore,
     permissions_ca_for,
     refuse_earlier,
@@ -660,7 +660,9 @@ def _governances(source: RightsSource) -> set[Governance]:
 
 def _without_observer(source: RightsSource, other: RightsSource) -> RightsSource:
     """Return a source without the observer of a closed robot, unless ``other`` has it, too."""
-    if closed_robot(source.path) and not any(e.enclave == CLOSED_OBSERVER for e in other.rights):
+    if folder_of_closed_robot(source.path) and not any(
+        e.enclave == CLOSED_OBSERVER for e in other.rights
+    ):
         own = (right for right in source.rights if right.enclave != CLOSED_OBSERVER)
         return replace(source, rights=frozenset(own))
     return source
@@ -793,7 +795,7 @@ read.
 """
 
 
-class _OfLedger:
+class _LedgerPermissions:
     """The permissions in the ledger, or in the part of the ledger about some enclaves.
 
     ``last`` maps enclaves to their last permissions.  ``chained`` are enclaves with permissions
@@ -824,15 +826,15 @@ class RecordedRights:
         self._keystore = keystore
         self._root = keystore.root
         self._whole = ledger
-        self._looked_up: dict[str, _OfLedger] = {}
+        self._looked_up: dict[str, _LedgerPermissions] = {}
 
     @cached_property
-    def _whole_ledger(self) -> _OfLedger:
-        return _OfLedger(
+    def _whole_ledger(self) -> _LedgerPermissions:
+        return _LedgerPermissions(
             self._whole or self._keystore.ledger_with("what", "permissions"), self._keystore
         )
 
-    def _ledger_part(self, name: str) -> _OfLedger:
+    def _ledger_part(self, name: str) -> _LedgerPermissions:
         """Return the part of the ledger about an enclave, and perhaps about others."""
         file, are_few = self._keystore.ledger_file, len(self._looked_up) < _MOST_LOOKUPS
         if self._whole or "_whole_ledger" in self.__dict__ or not file.is_indexed:
@@ -843,7 +845,7 @@ class RecordedRights:
             if not are_few:
                 self._looked_up.clear()
             ledger = self._keystore.ledger_with("enclave", name)
-            self._looked_up[name] = _OfLedger(ledger, self._keystore)
+            self._looked_up[name] = _LedgerPermissions(ledger, self._keystore)
         return self._looked_up[name]
 
     def rights_to_sign(self, name: str, digest: str, grant: Grant) -> SignedRights:

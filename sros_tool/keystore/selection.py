@@ -28,8 +28,8 @@ from sros_tool.keystore.layout import (
     PRIVATE,
     REVOKED,
     SETTINGS,
-    closed_robot,
     enclaves_below,
+    folder_of_closed_robot,
     has_enclave,
 )
 from sros_tool.keystore.ledger import Entry
@@ -249,7 +249,7 @@ def missing_enclave_error(
     except InvalidNameError as error:
         return error
     why = f"The keystore has {first_few(names, _SHOWN) or 'no enclave'}."
-    if robot := closed_robot(root):
+    if robot := folder_of_closed_robot(root):
         folder, policy = quote(str(robot)), quote(str(robot / CLOSED_POLICY))
         return KeystoreError(
             what,

@@ -256,7 +256,7 @@ def _governance_edit(keystore: Keystore) -> str:
 
 
 def with_places(template: Template, places: Template) -> Template:
-    """Return ``template`` with the places of the CA keys of ``places``.
+    """Return ``template`` with the places of the CA keys in ``places``, another template.
 
     Unless it has its own Zenoh network, it also gets the Zenoh network of ``places``.
     """

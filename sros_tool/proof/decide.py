@@ -139,7 +139,7 @@ class Worlds:
         self._first_alike: dict[World, World] = {}
         for world in worlds:
             others = self._first_alike.values()
-            alike = (each for each in others if world.gives_as(each))
+            alike = (each for each in others if world.has_same_access(each))
             self._first_alike[world] = next(alike, world)
 
     def decide(

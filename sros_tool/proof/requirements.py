@@ -99,14 +99,14 @@ RightNames = tuple[tuple[str, tuple[str, ...]], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OfRights(Requirement):
+class RightsRequirement(Requirement):
     """Base class of requirements about ``rights`` to names."""
 
     rights: RightNames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Only(OfRights):
+class Only(RightsRequirement):
     """Only the listed ``enclaves`` may have one of the rights to one of the names."""
 
     KIND = "only"
@@ -115,14 +115,14 @@ class Only(OfRights):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Nobody(OfRights):
+class Nobody(RightsRequirement):
     """No enclave may have one of the rights to one of the names."""
 
     KIND = "nobody"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Must(OfRights):
+class Must(RightsRequirement):
     """The enclave must have all rights to all names."""
 
     KIND = "must"
@@ -131,7 +131,7 @@ class Must(OfRights):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AtMost(OfRights):
+class AtMost(RightsRequirement):
     """No name may be used by more than ``most`` enclaves; a part of a right counts as a use."""
 
     KIND = "at_most"
@@ -140,7 +140,7 @@ class AtMost(OfRights):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Widest(OfRights):
+class Widest(RightsRequirement):
     """Wildcards may give the enclaves these rights only to these names; to none if none is listed.
 
     A name that an enclave may use because a right states exactly that name does not count.
@@ -152,7 +152,7 @@ class Widest(OfRights):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NothingBut(OfRights):
+class NothingBut(RightsRequirement):
     """The enclaves may have only these rights, and the rights that every node needs to start."""
 
     KIND = "nothing_but"
@@ -982,7 +982,7 @@ def _implies(new: Requirement, old: Requirement) -> bool:
             return False
 
 
-def _right_within(part: OfRights, wide: OfRights) -> bool:
+def _right_within(part: RightsRequirement, wide: RightsRequirement) -> bool:
     """Return whether the right of ``part`` is among the rights of ``wide``."""
     ((right, (name,)),), ((wide_right, (wide_name,)),) = part.rights, wide.rights
     return right == wide_right and covers(wide_name, name)
@@ -1019,7 +1019,7 @@ def _is_alike(new: Requirement, old: Requirement) -> bool:
             )
         case Must(), Must() if new.enclave != old.enclave:
             return False
-        case OfRights(), OfRights():
+        case RightsRequirement(), RightsRequirement():
             ((right, (name,)),), ((old_right, (old_name,)),) = new.rights, old.rights
             return right == old_right and overlap(name, old_name)
         case Protected(), Protected():

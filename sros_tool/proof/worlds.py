@@ -367,7 +367,7 @@ class World:
         others = self.fitting_others[enclave]
         return next((each for each in others if self.confirm_own(each, writes, topic)), "")
 
-    def gives_as(self, other: World) -> bool:
+    def has_same_access(self, other: World) -> bool:
         """Return whether another world has equal sets of topics, so all decisions are equal."""
         return (
             (self.longest, self.needed, self.idle) == (other.longest, other.needed, other.idle)

@@ -24,7 +24,7 @@ DEFAULT_RMW = "rmw_fastrtps_cpp"
 """The RMW that ROS 2 Jazzy uses if the variable is not set."""
 
 
-def cyclone_explains(stream: str) -> dict[str, str]:
+def denial_trace_variables(stream: str) -> dict[str, str]:
     """Return variables that make Cyclone DDS trace, to stderr or stdout, why it denies a topic."""
     return {
         "CYCLONEDDS_URI": "<CycloneDDS><Domain><Tracing>"
@@ -52,7 +52,11 @@ class Middleware:
 MIDDLEWARE = (
     Middleware("Fast DDS", "rmw_fastrtps", ("libfastdds.so", "libfastrtps.so"), Vendor.FAST),
     Middleware(
-        "Cyclone DDS", "rmw_cyclonedds", ("libddsc",), Vendor.CYCLONE, cyclone_explains("stderr")
+        "Cyclone DDS",
+        "rmw_cyclonedds",
+        ("libddsc",),
+        Vendor.CYCLONE,
+        denial_trace_variables("stderr"),
     ),
     Middleware("Connext", "rmw_connext", ("libnddsc.so",), Vendor.CONNEXT),
     Middleware("OpenDDS", "rmw_opendds", (), Vendor.OPENDDS),

@@ -349,31 +349,33 @@ def _common_parts(
     """
 
     @cache
-    def common_sequences_from(at: int, there: int) -> frozenset[tuple[str, ...]]:
-        left, right = one[at : at + 1], other[there : there + 1]
+    def common_sequences_from(in_first: int, in_second: int) -> frozenset[tuple[str, ...]]:
+        left, right = one[in_first : in_first + 1], other[in_second : in_second + 1]
         if not left and not right:
             return frozenset({()})
         sequences: set[tuple[str, ...]] = set()
         first, second = (members[0] if members else "" for members in (left, right))
         if first == many == second:
             # One of them stands for no more than the other, which goes on.
-            for rest in common_sequences_from(at + 1, there) | common_sequences_from(at, there + 1):
+            for rest in common_sequences_from(in_first + 1, in_second) | common_sequences_from(
+                in_first, in_second + 1
+            ):
                 sequences.add(rest if rest[:1] == (many,) else (many, *rest))
         elif many in (first, second):
             sequences |= (
-                common_sequences_from(at + 1, there)
+                common_sequences_from(in_first + 1, in_second)
                 if first == many
-                else common_sequences_from(at, there + 1)
+                else common_sequences_from(in_first, in_second + 1)
             )
             if left and right:
                 more = (
-                    common_sequences_from(at, there + 1)
+                    common_sequences_from(in_first, in_second + 1)
                     if first == many
-                    else common_sequences_from(at + 1, there)
+                    else common_sequences_from(in_first + 1, in_second)
                 )
                 sequences |= {(member, *rest) for member in meet(first, second) for rest in more}
         elif left and right:
-            more = common_sequences_from(at + 1, there + 1)
+            more = common_sequences_from(in_first + 1, in_second + 1)
             sequences |= {(member, *rest) for member in meet(first, second) for rest in more}
         if len(sequences) > _MOST_COMMON:
             raise TooManyExpressions

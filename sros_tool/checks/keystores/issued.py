@@ -25,9 +25,9 @@ from sros_tool.keystore.layout import (
     IDENTITY_CA_FILE,
     PERMISSIONS_CA_FILE,
     ROLES,
-    closed_robot,
     enclave_folder,
     enclave_path,
+    folder_of_closed_robot,
 )
 from sros_tool.keystore.protection import less_protected
 from sros_tool.pki.certificates import fingerprints, load_certificates
@@ -404,7 +404,7 @@ def check_policy(
         return
     name, grant = enclave.name, grant_of(enclave)
     if name not in wanted_rights:
-        of_close = name == CLOSED_OBSERVER and closed_robot(enclave.keystore.root)
+        of_close = name == CLOSED_OBSERVER and folder_of_closed_robot(enclave.keystore.root)
         if of_close or _is_plain_router(enclave, grant):
             return
         yield NOT_IN_POLICY.found(name, "none of the given policies names it", str(enclave.folder))

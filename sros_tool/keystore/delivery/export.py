@@ -264,7 +264,7 @@ def released_files(root: Path, name: str) -> dict[str, bytes]:
 
 
 def _evaluated_until(files: Mapping[str, bytes], state: OpenedEnclave, now: datetime) -> datetime:
-    """Return the first moment at which sound files may get a problem, whatever the list has.
+    """Return the first moment at which sound files may get a problem that no list causes.
 
     It is ``now`` for files whose evaluation looks at revocation lists in other ways: there are
     lists in the file of a CA, or Zenoh configurations.
@@ -412,7 +412,7 @@ def _write_folder(
             "Nothing was changed.",
             "Add --force to replace these files, or choose another folder.",
         )
-    with Transaction(target, fresh=True, dry_run=dry_run) as transaction:
+    with Transaction(target, new_keystore=True, dry_run=dry_run) as transaction:
         for path, data in different.items():
             transaction.write(path, data, private=file_mode(path) == 0o600)
         for path in stale:

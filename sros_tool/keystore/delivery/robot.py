@@ -138,7 +138,7 @@ def create_request(
         folder, f"Make the enclave with `sros create_enclave {quote(str(folder))} {name}`."
     )
     place = enclave_folder(name)
-    with Transaction(folder, fresh=True, dry_run=dry_run) as transaction:
+    with Transaction(folder, new_keystore=True, dry_run=dry_run) as transaction:
         path = folder / place / KEY_FILE
         on_token = folder / place / KEY_URI_FILE
         if has_key(folder / place) and not again:
@@ -164,7 +164,7 @@ def create_request(
         elif place_of_key:
             made = make_enclave_key(place_of_key, secrets)
             remedy = "Name another object of the token."
-            KnownKeys(Keystore(folder)).refuse_second(made.public_key(), name, remedy)
+            KnownKeys(Keystore(folder)).refuse_shared_key(made.public_key(), name, remedy)
             transaction.write(f"{place}/{KEY_URI_FILE}", made.file)
         else:
             made = generate_key()
@@ -547,7 +547,7 @@ def _check_key(folder: Path, answer: RequestAnswer, key: PublicKey) -> None:
     path = folder / enclave_folder(answer.name) / "cert.pem"
     present = read_certificate(path) if path.exists() else None
     if not present or present.public_key() != key:
-        KnownKeys(Keystore(folder)).refuse_second(key, answer.name, remedy)
+        KnownKeys(Keystore(folder)).refuse_shared_key(key, answer.name, remedy)
         return
     crl = answer.file("crl.pem")
     for revoked in load_crl(crl, "of the answer").revoked if crl else ():

@@ -453,7 +453,11 @@ class _Signer:
     def keep_zenoh(self) -> None:
         """Stage the Zenoh configurations that follow from all certified requests."""
         change = self._change
-        change.notes += [*self._writer.notes, *change.known.lack_notes(), *change.edit_notes()]
+        change.notes += [
+            *self._writer.notes,
+            *change.known.missing_key_notes(),
+            *change.edit_notes(),
+        ]
         change.keep_zenoh(self._writer.signed, stated=self._certified)
         change.notes += self.name_notes()
         change.entries += self._writer.entries
@@ -533,7 +537,7 @@ def _check_key(
     )
     known_keys.refuse_revoked(request.public_key, f"the request for {request.name}", remedy, same)
     if not same:
-        known_keys.refuse_second(request.public_key, request.name, remedy)
+        known_keys.refuse_shared_key(request.public_key, request.name, remedy)
 
 
 def _check_same_key(

@@ -249,7 +249,7 @@ class EnclaveWriter:
         short = self._template.longest_validity(name) is not None
         return Issued(issuance, certificate, permissions, message, short_lived=short)
 
-    def would_only_date(
+    def would_change_only_dates(
         self, rights: StatedRights, certificate: x509.Certificate, validity: Window, text: bytes
     ) -> bool:
         """Return whether `write` would change only dates, and the present expiry is late enough.

@@ -108,7 +108,7 @@ class ExpressionSets:
         )
 
     def paired_sets(self, other: ExpressionSets) -> Iterator[tuple[set[str], set[str]]]:
-        """Yield pairs of sets for the same side and direction: from here, and from ``other``."""
+        """Yield pairs of sets for the same side and direction: from self, and from ``other``."""
         for own, theirs in ((self.allowed, other.allowed), (self.denied, other.denied)):
             for verb in (_OUT, _IN):
                 yield own[verb], theirs[verb]

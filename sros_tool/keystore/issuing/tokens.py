@@ -93,7 +93,7 @@ class EnclaveTokens:
                     remedy,
                 )
         self.known.refuse_revoked(public, f"enclave {name}", remedy)
-        self.known.refuse_second(public, name, remedy)
+        self.known.refuse_shared_key(public, name, remedy)
         return key
 
     def check_present(self, name: str, root: Path) -> None:

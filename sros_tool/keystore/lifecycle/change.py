@@ -146,7 +146,7 @@ class KeystoreChange:
         keyring: Keyring = IN_KEYSTORE,
         allow_refusal: Sequence[Vendor] = (),
         dry_run: bool = False,
-        fresh: bool = False,
+        new_keystore: bool = False,
     ) -> None:
         """Prepare the change, without reading or writing anything.
 
@@ -156,14 +156,14 @@ class KeystoreChange:
             keyring: opens the keys of the CAs.
             allow_refusal: vendors whose nodes may stop working.
             dry_run: change nothing.
-            fresh: the keystore does not exist yet.
+            new_keystore: the keystore does not exist yet.
         """
         self.root = root
         self.now = now
         self.keyring = keyring
         self.dry_run = dry_run
-        self.is_new = fresh
-        self.transaction = Transaction(root, fresh=fresh, dry_run=dry_run)
+        self.is_new = new_keystore
+        self.transaction = Transaction(root, new_keystore=new_keystore, dry_run=dry_run)
         self.keystore = Keystore(root)
         self.entries: list[Entry] = []
         self.notes: list[Note] = []
@@ -553,9 +553,9 @@ class KeystoreChange:
         self.transaction.commit()
 
     def _another_ca(self, command: str) -> str:
-        from sros_tool.keystore.lifecycle.revocation_list import another_ca
+        from sros_tool.keystore.lifecycle.revocation_list import another_ca_remedy
 
-        return another_ca(self.keystore, command)
+        return another_ca_remedy(self.keystore, command)
 
     def result(self, kind: Callable[..., Result], **more: Any) -> Result:
         """Return the result, of class ``kind``, with the fields ``more`` of the verb."""

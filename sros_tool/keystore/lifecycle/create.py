@@ -170,7 +170,9 @@ def create_keystore(
     if not dry_run:
         recover_keystore(root)
     _check_free(root)
-    with KeystoreChange(root, now=now, keyring=keyring, dry_run=dry_run, fresh=True) as change:
+    with KeystoreChange(
+        root, now=now, keyring=keyring, dry_run=dry_run, new_keystore=True
+    ) as change:
         domains = domains or DomainSet.of((0, 0))
         _write_keystore(change, template, domains, imported_cas)
         change.record()
@@ -278,10 +280,10 @@ def generate_artifacts(
 
     If a policy names an existing enclave, the enclave's permissions are replaced, and with
     ``revoke_old`` its certificate, as by `create_permission`.  Permissions that state the same
-    rights and do not expire soon are kept (`EnclaveWriter.would_only_date`), with ``revoke_old``
-    only if no other permissions fit the certificate.
-    The keystore protects each name at least as the policies demand.  If the keystore does not exist
-    and ``create`` is given, it is created from that template.
+    rights and do not expire soon are kept (`EnclaveWriter.would_change_only_dates`), with
+    ``revoke_old`` only if no other permissions fit the certificate.  The keystore protects each
+    name at least as the policies demand.  If the keystore does not exist and ``create`` is given,
+    it is created from that template.
 
     Policies for a fleet have to be for the same fleet, which the keystore records; a new keystore
     is for the domains of the robots.
@@ -298,8 +300,8 @@ def generate_artifacts(
     places = token_places(key, list(wanted)) if key else {}
     if not dry_run:
         recover_keystore(root)
-    fresh = create is not None and not is_keystore(root)
-    if fresh:
+    new_keystore = create is not None and not is_keystore(root)
+    if new_keystore:
         _check_typo(root)
         _check_free(root)
     change = KeystoreChange(
@@ -308,9 +310,9 @@ def generate_artifacts(
         keyring=keyring,
         allow_refusal=allow_refusal,
         dry_run=dry_run,
-        fresh=fresh,
+        new_keystore=new_keystore,
     )
-    if create is None or not fresh:
+    if create is None or not new_keystore:
         with change:
             _prepare_change(change, domain, fleet, patterns, wanted, protections)
             again = _revoked_before(change, wanted, enclaves, fleet)
@@ -975,9 +977,9 @@ class _EnclaveMaker:
         except (SrosError, ValueError):  # not what `write` would leave
             return False
         text = signed.text
-        return self._writer.would_only_date(rights, certificate, validity, text) and _is_file(
-            xml, text
-        )
+        return self._writer.would_change_only_dates(
+            rights, certificate, validity, text
+        ) and _is_file(xml, text)
 
     def _identity(
         self, name: str, existing_files: set[str], *, replaced: bool
@@ -1018,7 +1020,7 @@ class _EnclaveMaker:
         ).public_key()
         remedy = f"Move '{path}' away: then a new key is created."
         change.known.refuse_revoked(public, f"enclave {name}", remedy)
-        change.known.refuse_second(public, name, remedy)
+        change.known.refuse_shared_key(public, name, remedy)
         return NewIdentity(subject, public)
 
     def _subject_of_permissions(self, name: str, own_subject: x509.Name) -> x509.Name:

@@ -152,7 +152,7 @@ class IssuedEarlier:
                 self._expiry[kind] = max(self._expiry.get(kind, ""), entry.not_after)
 
     def until(self, name: str, known: datetime, *kinds: str) -> datetime:
-        """Return until when files of all ``kinds`` of an enclave work, at least ``known``.
+        """Return until when files of all ``kinds`` of an enclave work: ``known`` or later.
 
         ``kinds`` are "certificate" and "permissions"; revoked certificates do not work.
         """

@@ -680,7 +680,7 @@ def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
         transaction.link_to_first_list(lacking)
 
 
-def another_ca(keystore: Keystore, purpose: str) -> str:
+def another_ca_remedy(keystore: Keystore, purpose: str) -> str:
     """Return the remedy, as a sentence, if DDS refuses the lists of the identity CA.
 
     ``purpose`` is the command to repeat afterwards, such as ``revoke``.

@@ -83,21 +83,26 @@ _MOST_KEPT = 32 << 20
 class Transaction:
     """An atomic change of many files of a keystore, which is locked during the change.
 
-    Use it as a context manager; without `commit` nothing changes.  With ``fresh``, the keystore may
-    be new; otherwise it must exist.  With ``dry_run`` nothing is written, and ``changes`` lists the
-    changes that would be made.  With ``partial``, the caller may leave out enclaves: some may be
+    Use it as a context manager; without `commit` nothing changes.  Unless ``new_keystore`` is set,
+    the keystore must exist.  With ``dry_run`` nothing is written, and ``changes`` lists the changes
+    that would be made.  With ``partial``, the caller may leave out enclaves: some may be
     unreadable.
     """
 
     def __init__(
-        self, root: Path, *, fresh: bool = False, dry_run: bool = False, partial: bool = False
+        self,
+        root: Path,
+        *,
+        new_keystore: bool = False,
+        dry_run: bool = False,
+        partial: bool = False,
     ) -> None:
         self.root = root
         self.changes = Changes()
         self.dry_run = dry_run
-        self._fresh = fresh
+        self._may_be_new = new_keystore
         self._partial = partial
-        self._new_root = fresh and not root.exists()
+        self._new_root = new_keystore and not root.exists()
         self._made_parents: list[Path] = []
         self._folder: Folder | None = None
         self._lock: KeystoreLock | None = None
@@ -144,7 +149,7 @@ class Transaction:
             KeystoreError: the keystore is busy, or a new keystore would belong to another user.
         """
         try:
-            if self._fresh and not self._new_root:
+            if self._may_be_new and not self._new_root:
                 self._refuse_folder_of_stranger()
             if not self.dry_run:
                 self._begin()
