@@ -573,6 +573,11 @@ def _policy(bench: Bench, *changes: tuple[str, str]) -> None:
     bench.options["policies"] = (read_policy(file),)
 
 
+def _policy_of_more_than_an_export(bench: Bench) -> None:
+    bench.export()
+    _policy(bench, ('path="/arm"', 'path="/other"'))
+
+
 def _demanding_policy(bench: Bench) -> None:
     _policy(bench, ("status</topic>", 'status<?sros protect="encrypt"?></topic>'))
     bench.governance(("ENCRYPT", "SIGN"))
@@ -583,6 +588,7 @@ CASES |= {
     "keystore.not-in-ledger": lambda b: b.issue(),
     "enclave.stale-permissions": lambda b: _policy(b, ("status", "state")),
     "enclave.not-in-policy": lambda b: _policy(b, ('path="/arm"', 'path="/other"')),
+    "export.enclave-missing": _policy_of_more_than_an_export,
     "keystore.enclave-missing": lambda b: _policy(b, ('path="/arm"', 'path="/other"')),
 }
 

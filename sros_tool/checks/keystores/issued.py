@@ -28,6 +28,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     enclave_path,
     folder_of_closed_robot,
+    has_authorities,
 )
 from sros_tool.keystore.protection import less_protected
 from sros_tool.pki.certificates import fingerprints, load_certificates
@@ -112,6 +113,17 @@ NOT_IN_KEYSTORE = FindingKind(
     "A node that starts in this enclave fails.",
     "rcl 9 (security.c).",
     "Run `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`.",
+)
+NOT_IN_EXPORT = FindingKind(
+    "export.enclave-missing",
+    NOTE,
+    "enclaves of the policy that the export does not have",
+    "A robot needs only the enclaves of its own processes; a node that starts in another one fails "
+    "there.",
+    "rcl 9 (security.c).",
+    "If a process of this robot runs in one of them, export it, too: `sros distribute_key KEYSTORE "
+    "ENCLAVE EXPORT`.",
+    prominent=True,
 )
 
 AUTHORITIES_DIFFER = FindingKind(
@@ -263,10 +275,13 @@ def check_issued(
     yield from _ledger_findings(keystore, summaries)
     if keystore.policies:
         wanted = {enclave.path for policy in keystore.policies for enclave in policy.enclaves}
-        for name in sorted(wanted.difference(keystore.names)):
-            yield NOT_IN_KEYSTORE.found(
-                name, "the keystore does not have this enclave", str(keystore.root)
-            )
+        root, missing = str(keystore.root), sorted(wanted.difference(keystore.names))
+        if has_authorities(keystore.root):
+            for name in missing:
+                yield NOT_IN_KEYSTORE.found(name, "the keystore does not have this enclave", root)
+        elif missing:
+            text = f"{len(missing)} of {len(wanted)} enclaves of the policy are not in this export"
+            yield NOT_IN_EXPORT.found(root, f"{text}: {first_few(missing, 3)}", root)
         yield from _lower_protection_findings(keystore)
 
 
