@@ -464,7 +464,7 @@ NEEDS_CA_KEYS = re.compile(
     r"`sros (create_\w+|generate_artifacts|update_keystore|renew|revoke|rotate_ca|distribute_key"
     r"|crl KEYSTORE --refresh|zenoh) "
 )
-"""The begin of a command that works only in the keystore that has the CA keys."""
+"""The beginning of a command that works only in the keystore that has the CA keys."""
 
 
 FAULTS = {fault.id: fault for fault in Fault}

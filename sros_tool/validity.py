@@ -45,9 +45,9 @@ class Window:
     """A validity from ``not_before`` to ``not_after``, both included and both in UTC."""
 
     not_before: datetime
-    """The begin of the validity, in UTC."""
+    """Start of the validity, in UTC."""
     not_after: datetime
-    """The end of the validity, in UTC."""
+    """End of the validity, in UTC."""
 
     def __post_init__(self) -> None:
         if self.not_after <= self.not_before:

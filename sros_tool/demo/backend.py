@@ -172,7 +172,7 @@ class Backend:
             # Its C library's stderr is the log of `CycloneLog`.
             variables |= denial_trace_variables("stdout")
         elif denied and (below := middleware_of(self.rmw)):
-            variables |= below.explains
+            variables |= below.trace_variables
         return variables
 
 

@@ -81,7 +81,7 @@ LONGEST_LIST = 1024 * 1024
 """Maximum number of characters of a revocation list in a confirmation."""
 _LIBRARY_VERSION = re.compile(r"\d{1,6}\.\d{1,6}\.\d{1,6}\Z", re.ASCII)
 _LIBRARY_PATH = re.compile(r"/[\w.+/ ?-]{1,199}\Z")
-"""Paths as a robot makes them plain; they are shown, and never opened."""
+"""Paths of plain characters; they are shown, and never opened."""
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 _MOMENT = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z\Z")
 _REQUEST = re.compile(

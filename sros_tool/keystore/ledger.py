@@ -198,7 +198,7 @@ _quoted = json.encoder.encode_basestring_ascii
 
 
 _CLOCK_TOLERANCE = timedelta(hours=1)
-"""How far the clock may be behind before it is called wrong."""
+"""How far behind the clock may be without counting as wrong."""
 
 
 def clock_behind(root: Path, now: datetime) -> str:
@@ -289,7 +289,7 @@ class _Reading(NamedTuple):
 
 _EVERY = b""
 _NONE = b"\n"
-"""Texts for ``having`` of a reading: ``_EVERY`` is in every line, ``_NONE`` in no line."""
+"""Values of ``needed_text``: ``_EVERY`` is in every line, ``_NONE`` in no line."""
 _GAP, _CA = b'"what":"gap"', b'"what":"ca"'
 
 

@@ -690,7 +690,7 @@ def holds_at(form: CertificateForm, now: datetime) -> bool | None:
 
 @lru_cache(maxsize=256)  # certificates that were issued together share it
 def _times(validity: bytes) -> tuple[str, str] | None:
-    """Return the begin and the end of a validity (DER), as GeneralizedTime (RFC 5280, 4.1.2.5)."""
+    """Return the start and the end of a validity (DER), as GeneralizedTime (RFC 5280, 4.1.2.5)."""
     with suppress(PkiError, ValueError):
         begin, end = map(_time, der.children(validity))
         return begin, end

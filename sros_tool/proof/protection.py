@@ -138,7 +138,7 @@ def less_protection(
     yield from _trusted_again(old, new)
     yield from _certified_otherwise(old, new)
     if old.kind == new.kind == "keystore" and old.zenoh is not None and new.zenoh is None:
-        text = "nothing enforces on Zenoh what its files enforced"
+        text = "nothing enforces any more what its Zenoh files enforced"
         yield SettingChange(Effect.LOOSER, "Zenoh files", "present", "missing", text)
     if old.routers and not {*new.routers} <= {*old.routers}:
         text = "anyone who poses as the router reads and changes everything that passes"

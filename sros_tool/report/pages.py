@@ -125,7 +125,10 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
         "of_every_node": OF_EVERY_NODE,
         "join_needs_right": picture.join_needs_right,
         "enclaves": [_enclave_json(enclave) for enclave in picture.enclaves],
-        "bundles": [_bundle_json(each) for each in fold(picture.names, picture.edges, apart=True)],
+        "bundles": [
+            _bundle_json(each)
+            for each in fold(picture.names, picture.edges, separate_questions=True)
+        ],
         "scenes": [_scene_json(each) for each in scenes],
         "equal": as_plain(picture.equal),
         "rows": [_row_json(each) for each in fold(drawn.names, drawn.edges)],

@@ -595,7 +595,7 @@ def fold(
     edges: Iterable[Edge],
     owner: Callable[[str], str] = str,
     *,
-    apart: bool = False,
+    separate_questions: bool = False,
 ) -> tuple[Bundle, ...]:
     """Group the names to which an enclave has a right into bundles, by kind and first name.
 
@@ -603,7 +603,7 @@ def fold(
         names: the names.
         edges: the rights and denials for the names.
         owner: returns the node that stands for an enclave: the enclave, or its group.
-        apart: whether services whose requests change nothing have bundles of their own.
+        separate_questions: whether services whose requests change nothing have bundles of their own.
     """
     ties: dict[tuple[str, str], set[Tie]] = defaultdict(set)
     for edge in edges:
@@ -624,7 +624,7 @@ def fold(
     bundles = defaultdict(list)
     for name in names:
         if name_ties := ties.get((name.kind, name.name)):
-            asking = apart and is_question(name)
+            asking = separate_questions and is_question(name)
             bundles[name.kind, name.protection, frozenset(name_ties), asking, name.lacks].append(
                 name.name
             )

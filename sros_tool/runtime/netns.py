@@ -235,7 +235,7 @@ _SECONDS_TO_END = 8.0
 def end_with_starter() -> Callable[[], None]:
     """Return a function for a child process to call first.
 
-    By the function, the kernel kills the child when this process ends.
+    It makes the kernel kill the child when this process ends.
     """
     starter = os.getpid()
 

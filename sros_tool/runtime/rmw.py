@@ -38,15 +38,15 @@ class Middleware:
     """A middleware that ROS 2 can use, and how to recognize it.
 
     ``rmw`` is a part of the names of its RMWs, and the names of its shared libraries begin with one
-    of ``libraries``.  ``vendor`` is its DDS vendor, or None if it is not a DDS; ``explains`` are
-    environment variables with which it logs why it denies a topic.
+    of ``libraries``.  ``vendor`` is its DDS vendor, or None if it is not a DDS; ``trace_variables``
+    are environment variables with which it logs why it denies a topic.
     """
 
     name: str
     rmw: str
     libraries: tuple[str, ...] = ()
     vendor: Vendor | None = None
-    explains: Mapping[str, str] = field(default_factory=dict)
+    trace_variables: Mapping[str, str] = field(default_factory=dict)
 
 
 MIDDLEWARE = (

@@ -169,7 +169,7 @@ def _probe_rmw(probe: ProbeEnclave, rmw: str) -> Stack:
     if rmw:
         variables[RMW] = rmw
     if below := middleware_of(rmw):
-        variables |= below.explains
+        variables |= below.trace_variables
     stack = Stack(f"rclpy with {rmw or 'its default RMW'}", "rmw", "", rmw=rmw)
     stack = _with_probe_result(stack, "rclpy", probe, variables)
     if below and below.name == "Zenoh":

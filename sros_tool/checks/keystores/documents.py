@@ -682,7 +682,7 @@ def _unauthenticated_text(rule: DomainRule, vendors: Sequence[Vendor]) -> tuple[
     clauses: dict[str, list[str]] = {}
     for vendor in vendors or TESTED:
         if vendor.traits.ignores_unauthenticated:
-            clause = "they are refused all the same"
+            clause = "they are still refused"
         elif rule.rtps_protection_kind is ProtectionKind.NONE:
             kind, clause = UNAUTHENTICATED, _reach_of_strangers(rule, vendor)
         elif vendor.traits.refuses_open_rtps:

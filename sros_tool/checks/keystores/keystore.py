@@ -304,7 +304,7 @@ def _with_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
 _OF_SEVERAL = re.compile(
     r"(\bsros (?:renew|revoke|create_permission|create_enclave|distribute_key) \S+ )([^\s`]+)"
 )
-"""The begin of a command that takes several enclaves, and its first enclave."""
+"""The beginning of a command that takes several enclaves, and its first enclave."""
 
 
 def _with_enclave_names(finding: Finding, keystore: CheckedKeystore) -> Finding:
