@@ -603,7 +603,7 @@ def fold(
         names: the names.
         edges: the rights and denials for the names.
         owner: returns the node that stands for an enclave: the enclave, or its group.
-        separate_questions: whether services whose requests change nothing have bundles of their own.
+        separate_questions: give services whose requests change nothing bundles of their own.
     """
     ties: dict[tuple[str, str], set[Tie]] = defaultdict(set)
     for edge in edges:
