@@ -18,12 +18,11 @@ from pathlib import Path
 
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.report.compose import Context, PictureSource, compose
+from sros_tool.report.compose import PictureSource, compose
 from sros_tool.report.folding import Folding
 from sros_tool.report.formats import render_svg
 from sros_tool.report.pages import render_page
 from sros_tool.report.picture import SourceTitle
-from sros_tool.report.sources import common_rights
 
 ROBOTS, PARTS, TOPICS = 10, 10, 10
 _NOW = datetime(2026, 6, 15, 12, tzinfo=UTC)
@@ -62,13 +61,13 @@ def _picture(file: Path) -> tuple[str, PictureSource]:
 
 
 def _page(file: Path) -> str:
-    picture = compose(_picture(file)[1], Context(common_rights()))
+    picture = compose(_picture(file)[1])
     folding = Folding.of(picture)
     return render_page(picture, folding.scenes(), _NOW, folding.picture)
 
 
 def _svg(file: Path) -> str:
-    picture = compose(_picture(file)[1], Context(common_rights()))
+    picture = compose(_picture(file)[1])
     return render_svg(picture, Folding.of(picture).scenes()[0])
 
 

@@ -68,6 +68,7 @@ from sros_tool.policy.model import (
     nodes_in_several_namespaces,
     stated_protections,
 )
+from sros_tool.policy.node_basics import are_basic
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix
 from sros_tool.policy.placeholders import parts_of
 from sros_tool.policy.rights import WHOLE, Right, Rules, parts, placed_rights, policy_rights
@@ -548,6 +549,15 @@ RELATIVE_GLOBAL = FindingKind(
     "Put a / before the name.",
 )
 
+OTHER_NODES_PARAMETERS = FindingKind(
+    "policy.other-nodes-parameters",
+    WARNING,
+    "a right to serve the parameters of a node that the enclave does not have",
+    "A process in the enclave could pose as that node: it reads and answers requests that set its "
+    "parameters.",
+    "rcl_interfaces; rclcpp and rclpy (parameter services of a node).",
+    "Remove the right. If the node runs in this enclave, give it a profile of its own.",
+)
 _GLOBAL = ("rosout", "parameter_events", "clock")
 _BASICS = (
     (NO_TYPE_DESCRIPTION, "reply", ("~/get_type_description",)),
@@ -608,6 +618,22 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
                 f"{statement.written} becomes {statement.name} in namespace {statement.profile.ns}"
             )
             yield statement.found(RELATIVE_GLOBAL, text, f"Write /{statement.written}.")
+    own = {
+        (enclave.path, expand("~", profile.ns, profile.node))
+        for enclave in checked_policy.policy.enclaves
+        for profile in enclave.all_profiles()
+    }
+    for statement in checked_policy.statements:
+        enclave, name = statement.right.enclave, statement.name
+        node, _, service = name.rpartition("/")
+        if (
+            statement.allows
+            and statement.right.right == "reply"
+            and service in PARAMETER_SERVICES
+            and (enclave, node) not in own
+        ):
+            text = f"{enclave} may serve {name}, and has no node {node}"
+            yield statement.found(OTHER_NODES_PARAMETERS, text)
 
 
 @dataclass(slots=True)
@@ -829,7 +855,7 @@ def _check_root_enclave(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     text = within_root(policy_rights(checked_policy.policy))
     if not text and len(nodes) > 1:
         text = f"/ has the rights of {len(nodes)} nodes"
-    elif not text and not only_basic(policy_rights(Policy((root,)))):
+    elif not text and not are_basic(policy_rights(Policy((root,)))):
         name = root.all_profiles()[0].node
         if name and name[0] != "_" and not is_expression(name):
             text = f"/ has the rights of the node {nodes.pop()}"
@@ -843,10 +869,10 @@ def within_root(rights: Collection[Right]) -> str:
     Rights that every node needs do not count.
     """
     allowed = [right for right in rights if right.qualifier is ALLOW]
-    root, basics = Rules(right for right in rights if right.enclave == "/"), _basic_rights()
+    root = Rules(right for right in rights if right.enclave == "/")
     own: dict[str, list[Right]] = defaultdict(list)
     for right in allowed:
-        if right.enclave != "/" and not basics.cover(right._replace(enclave="/")):
+        if right.enclave != "/" and not are_basic([right]):
             own[right.enclave].append(right)
     names = sorted(
         name
@@ -854,18 +880,6 @@ def within_root(rights: Collection[Right]) -> str:
         if all(root.allow("/", right.right, right.name) for right in allowed_rights)
     )
     return f"/ has all rights of {first_few(names, _NAMES_SHOWN)}" if names else ""
-
-
-def only_basic(rights: Collection[Right]) -> bool:
-    """Return whether all rights of an enclave are rights that every node needs."""
-    basics = _basic_rights()
-    return all(basics.cover(right._replace(enclave="/")) for right in rights)
-
-
-@cache
-def _basic_rights() -> Rules:
-    """Return the rights that every node needs, granted to the enclave /."""
-    return Rules(policy_rights(read_policy(policies_dir() / "defaults" / "node_basics.xml")))
 
 
 _NAMES_SHOWN = 3

@@ -169,9 +169,10 @@ def _print_added(merged: Merged) -> None:
     if not count:
         echo("no right was missing", err=True)
         return
-    from sros_tool.checks.policies import only_basic
+    from sros_tool.policy.node_basics import NodeRights
 
-    own = [right for right in merged.added if not only_basic([right])]
+    nodes = NodeRights(merged.rights)
+    own = [right for right in merged.added if not nodes.needs(right)]
     folded = len(own) > _MOST_ADDED and not logging.getLogger("sros_tool").isEnabledFor(
         logging.INFO
     )

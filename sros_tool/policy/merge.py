@@ -361,6 +361,8 @@ class Merged:
     contradictions: tuple[Contradiction, ...]
     instances: tuple[str, ...] = ()
     shared: tuple[str, ...] = ()
+    rights: frozenset[Right] = frozenset()
+    """All rights of the policy after the merge."""
 
     def notes(self) -> tuple[Note, ...]:
         """Return notes on denials that win, and on enclaves that several nodes share now."""
@@ -422,7 +424,8 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
         if already.get((enclave, node), ()) != profiles
     )
     shared = tuple(_shared_enclaves(first, policies, before))
-    return Merged(document, tuple(added), tuple(contradictions), tuple(several), shared)
+    rights = frozenset(policy_rights(before))
+    return Merged(document, tuple(added), tuple(contradictions), tuple(several), shared, rights)
 
 
 def _shared_enclaves(before: Policy, policies: Iterable[Policy], after: Policy) -> Iterator[str]:

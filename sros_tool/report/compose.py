@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 from sros_tool.dds.decision.access import is_open_to_unauthenticated
 from sros_tool.dds.decision.vendors import TESTED
@@ -20,9 +21,9 @@ from sros_tool.keystore.layout import has_authorities
 from sros_tool.keystore.reader import Keystore
 from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier, StatedProtection
+from sros_tool.policy.node_basics import NodeRights
 from sros_tool.policy.patterns import Names, covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import (
-    KIND_OF,
     RIGHT_ORDER,
     Right,
     compare,
@@ -111,34 +112,25 @@ class PictureSource:
         return replace(self, rights=frozenset(rights), nodes=sorted_nodes)
 
 
-@dataclass(frozen=True, slots=True)
-class Context:
-    """What a picture needs besides its sources.
+_NO_HOSTS: Mapping[str, str] = MappingProxyType({})
 
-    ``common`` are the rights that every node needs; ``hosts`` maps paths of enclaves, or of their
-    namespaces, to names of hosts.
+
+def compose(first_source: PictureSource, hosts: Mapping[str, str] = _NO_HOSTS) -> Picture:
+    """Return the picture of one source.
+
+    ``hosts`` maps paths of enclaves, or of their namespaces, to names of hosts.
     """
-
-    common: Sequence[Right] = ()
-    hosts: Mapping[str, str] = field(default_factory=dict)
-
-
-_NO_CONTEXT = Context()
-
-
-def compose(first_source: PictureSource, context: Context = _NO_CONTEXT) -> Picture:
-    """Return the picture of one source."""
     known = Known(first_source.rights)
-    edges = _edges_of(first_source.rights, known, context.common)
+    edges = _edges_of(first_source.rights, known)
     stated = dict.fromkeys(folded(first_source.rights), OverlaySide.BOTH)
-    return _picture((first_source,), edges, stated, known, context)
+    return _picture((first_source,), edges, stated, known, hosts)
 
 
 def overlay(
     first_source: PictureSource,
     second_source: PictureSource,
     kind: str,
-    context: Context = _NO_CONTEXT,
+    hosts: Mapping[str, str] = _NO_HOSTS,
 ) -> Picture:
     """Return a picture that compares two sources; ``kind`` is a key of `_OVERLAYS`."""
     scope = first_source.scope if second_source.scope is None else second_source.scope
@@ -147,7 +139,7 @@ def overlay(
         for side in (first_source, second_source)
     ]
     known = Known(rights[0] | rights[1])
-    sides = [_edges_of(own, known, context.common) for own in rights]
+    sides = [_edges_of(own, known) for own in rights]
     edges = _marked_rights(*sides, allowed_by=kind == "use")
     normal = [folded(own) for own in rights]
     stated = {
@@ -161,7 +153,7 @@ def overlay(
         unseen = frozenset(right.enclave for right in rights[0] - rights[1])
         unseen -= {right.enclave for right in rights[1]}
         edges = [_neutral_edge(edge, unseen) for edge in edges]
-    picture = _picture((first_source, second_source), edges, stated, known, context)
+    picture = _picture((first_source, second_source), edges, stated, known, hosts)
     return replace(
         picture,
         overlay=_OVERLAYS[kind],
@@ -228,7 +220,7 @@ def _picture(
     edges: Iterable[Edge],
     stated_rights: Mapping[Right, OverlaySide],
     known_names: Known,
-    context: Context,
+    hosts: Mapping[str, str],
 ) -> Picture:
     edges = tuple(sorted(edges, key=edge_order))
     governance = next(
@@ -241,7 +233,7 @@ def _picture(
     return Picture(
         title=" and ".join(source.origin.title for source in sources),
         origins=tuple(source.origin for source in sources),
-        enclaves=_enclaves(sources, stated_rights, known_names, context),
+        enclaves=_enclaves(sources, stated_rights, known_names, hosts),
         names=tuple(
             Name(
                 kind,
@@ -296,7 +288,7 @@ def _enclaves(
     sources: Sequence[PictureSource],
     stated_rights: Mapping[Right, OverlaySide],
     known_names: Known,
-    context: Context,
+    hosts: Mapping[str, str],
 ) -> tuple[PicturedEnclave, ...]:
     described = {enclave.path: enclave for source in sources for enclave in source.enclaves}
     statements: dict[str, list[Statement]] = defaultdict(list)
@@ -315,7 +307,7 @@ def _enclaves(
     return tuple(
         replace(
             described.get(path, PicturedEnclave(path, "")),
-            group=group_of(path, context.hosts),
+            group=group_of(path, hosts),
             nodes=tuple(sorted(nodes.get(path, ()))),
             domains=domains.get(path, ""),
             statements=tuple(statements.get(path, ())),
@@ -525,18 +517,12 @@ _WHOLE: dict[str, frozenset[tuple[str, str]]] = {
 _Found = dict[Qualifier, set[str]]
 
 
-def _edges_of(
-    rights: Iterable[Right], known_names: Known, common: Sequence[Right] = ()
-) -> list[Edge]:
+def _edges_of(rights: Collection[Right], known_names: Known) -> list[Edge]:
     """Return one edge for each right or denial and each name that it matches, unsorted.
 
-    A wildcard that matches no known name is drawn as a name.  ``common`` are the rights that every
-    node of any enclave needs.
+    A wildcard that matches no known name is drawn as a name.
     """
-    needed = {
-        right: [e.name for e in common if e.right == right and e.kind == KIND_OF[right]]
-        for right in RIGHT_ORDER
-    }
+    nodes = NodeRights(rights)
     topics: dict[tuple[str, str, str, str], _Found] = defaultdict(lambda: defaultdict(set))
     for stated in unfolded(rights):
         by = stated.name if is_expression(stated.name) else ""
@@ -552,17 +538,11 @@ def _edges_of(
         if inside and (action in known_names.actions or is_expression(action)):
             whole[enclave, action, qualifier][right, part] = by_qualifier[qualifier]
             continue
-        edges.append(
-            Edge(
-                enclave,
-                kind,
-                name,
-                right,
-                qualifier,
-                _wildcards_used(by_qualifier[qualifier]),
-                common=qualifier is ALLOW and _is_common(name, needed[right]),
-            )
+        wildcards = _wildcards_used(by_qualifier[qualifier])
+        common = qualifier is ALLOW and all(
+            nodes.needs(Right(enclave, qualifier, right, text)) for text in wildcards or (name,)
         )
+        edges.append(Edge(enclave, kind, name, right, qualifier, wildcards, common=common))
     for (enclave, action, qualifier), members in whole.items():
         edges += _action_edges(enclave, action, qualifier, members)
     return edges
@@ -599,10 +579,6 @@ def _wildcards_used(names: set[str], *, action: bool = False) -> tuple[str, ...]
     return tuple(
         sorted({name.rpartition(ACTION_SEPARATOR)[0] or name if action else name for name in names})
     )
-
-
-def _is_common(name: str, common: Sequence[str]) -> bool:
-    return any(matches(expression, name) for expression in common)
 
 
 # ── protection ──────────────────────────────────────────────────────────────────────────

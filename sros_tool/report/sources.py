@@ -20,7 +20,6 @@ from cryptography import x509
 from sros_tool.dds.governance import Governance
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError, SrosError, UsageError
-from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot, robot_of
 from sros_tool.graph.learn import learn
@@ -47,9 +46,8 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.minimize import enclaves_of_nodes
 from sros_tool.policy.model import StatedProtection
 from sros_tool.policy.patterns import Names
-from sros_tool.policy.rights import Right, RightsDifference, policy_rights
+from sros_tool.policy.rights import RightsDifference, policy_rights
 from sros_tool.report.compose import (
-    Context,
     PictureSource,
     compose,
     overlay,
@@ -142,11 +140,11 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     for path, fleet, source in zip(sources, fleets, read, strict=False):
         robots |= _robots(path, fleet, source)
     places = {enclave: robot.name for enclave, robot in robots.items()}
-    context = Context(common_rights(), places | _hosts(drawing.hosts))
+    hosts = places | _hosts(drawing.hosts)
     if drawing.observed:
         seen = union([read_source(path, now=drawing.now) for path in drawing.observed])
         read.append(seen.moved_to_homes(enclaves_of_nodes(seen.nodes, read[0].nodes)))
-    picture = _compared_picture(read, context, use=bool(drawing.observed))
+    picture = _compared_picture(read, hosts, use=bool(drawing.observed))
     governed = [source.governance for source in read if source.governance]
     if len(governed) == 2 and governed[0] != governed[1]:
         text = "the governance of the two differs, and that of the second one is drawn: `sros "
@@ -186,7 +184,7 @@ def _routers(keystore: Keystore | None) -> int:
 
 
 def _compared_picture(
-    sources_read: Sequence[PictureSource], context: Context, *, use: bool
+    sources_read: Sequence[PictureSource], hosts: Mapping[str, str], *, use: bool
 ) -> Picture:
     """Return the picture of one source, or the comparison of two sources.
 
@@ -194,19 +192,19 @@ def _compared_picture(
     kind, "worlds" if one is for Zenoh, and else "drift" (of a keystore from its policy).
     """
     if len(sources_read) == 1:
-        return compose(sources_read[0], context)
+        return compose(sources_read[0], hosts)
     first, second = sources_read
     kinds = [source.origin.kind for source in sources_read]
     if use or kinds[1] == "observation":
-        return overlay(first, second, "use", context)
+        return overlay(first, second, "use", hosts)
     if kinds[0] == kinds[1]:
-        return overlay(first, second, "change", context)
+        return overlay(first, second, "change", hosts)
     if "zenoh" in kinds:
         first, second = sorted(sources_read, key=lambda source: source.origin.kind == "zenoh")
-        return overlay(first, second, "worlds", context)
+        return overlay(first, second, "worlds", hosts)
     # Drift is shown from the side of the policy, whichever was named first.
     first, second = sorted(sources_read, key=lambda source: source.origin.kind != "policy")
-    return overlay(first, second, "drift", context)
+    return overlay(first, second, "drift", hosts)
 
 
 def _read(path: Path, fleet: Fleet | None, drawing: Drawing) -> PictureSource:
@@ -300,13 +298,11 @@ def drawn_difference(
         )
         return PictureSource(SourceTitle(title, source.kind), used, scope=source.scope)
 
-    context = Context(common_rights())
-    picture = overlay(
-        titled_source("before", first_source),
-        titled_source("after", second_source),
-        "change",
-        context,
+    before, after = (
+        titled_source(title, source)
+        for title, source in (("before", first_source), ("after", second_source))
     )
+    picture = overlay(before, after, "change")
     scenes = scenes_of(picture, with_places=False)
     scene = next((scene for scene in scenes if scene.id == "all"), scenes[0])
     text = render_mermaid(picture, scene)
@@ -505,12 +501,6 @@ def _base_name(path: Path) -> str:
     return "".join(
         letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in name
     )
-
-
-def common_rights() -> tuple[Right, ...]:
-    """Return the rights that every node needs, from ``defaults/node_basics.xml``."""
-    policy = read_policy(policies_dir() / "defaults" / "node_basics.xml")
-    return tuple(sorted(policy_rights(policy)))
 
 
 def _template_governance(

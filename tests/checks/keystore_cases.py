@@ -588,7 +588,7 @@ CASES |= {
     "keystore.not-in-ledger": lambda b: b.issue(),
     "enclave.stale-permissions": lambda b: _policy(b, ("status", "state")),
     "enclave.not-in-policy": lambda b: _policy(b, ('path="/arm"', 'path="/other"')),
-    "export.enclave-missing": _policy_of_more_than_an_export,
+    "keystore.not-in-export": _policy_of_more_than_an_export,
     "keystore.enclave-missing": lambda b: _policy(b, ('path="/arm"', 'path="/other"')),
 }
 

@@ -73,6 +73,8 @@ CASES = [
          basics=False),
     Case("policy.relative-global-name", topics("publish", "rosout"), topics("publish", "/rosout"),
          ns="/arm"),
+    Case("policy.other-nodes-parameters", services("reply", "/camera/set_parameters"),
+         services("reply", "~/set_parameters")),
     Case("policy.protection-contradicts",
          topics("publish", '/x/*<?sros protect="sign"?>', '/x/a<?sros protect="encrypt"?>'),
          topics("publish", '/x/*<?sros protect="sign"?>', '/x/a<?sros protect="sign"?>')),

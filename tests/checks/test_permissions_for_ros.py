@@ -228,7 +228,7 @@ UNPROTECTED = (
     [
         ("cyclonedds", "NONE", (), "unauthenticated", "on {} they reach no topic"),
         ("fastdds", "NONE", (), "unauthenticated", "on {} they reach no topic"),
-        ("fastdds-2.9", "NONE", (), "unauthenticated-kept-out", "on {} they are refused"),
+        ("fastdds-2.9", "NONE", (), "unauthenticated-kept-out", "on {} they are still refused"),
         ("cyclonedds", "ENCRYPT", (), "unauthenticated-kept-out", "on {} they are kept out"),
         ("fastdds", "ENCRYPT", (), "unauthenticated", "on {} the document is refused"),
         ("cyclonedds", "NONE", UNPROTECTED, "unauthenticated", OPEN),  # heard, and forged

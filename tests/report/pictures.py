@@ -10,9 +10,8 @@ from xml.sax.saxutils import escape
 from sros_tool.files import policies_dir
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.report.compose import Context, PictureSource, compose
+from sros_tool.report.compose import PictureSource, compose
 from sros_tool.report.picture import Edge, Picture, SourceTitle
-from sros_tool.report.sources import common_rights
 from tests.support.children import PATIENCE
 from tests.support.harness import policy_text
 
@@ -52,15 +51,13 @@ def source_of(folder: Path, enclaves: dict[str, str], name: str = "policy.xml") 
 
 def picture_of(folder: Path, enclaves: dict[str, str]) -> Picture:
     """A picture of a policy from groups by enclave."""
-    return compose(source_of(folder, enclaves), Context(common_rights()))
+    return compose(source_of(folder, enclaves))
 
 
 def mobile_robot() -> Picture:
     """The picture of the mobile robot."""
     rights = policy_rights(read_policy(MOBILE_ROBOT))
-    return compose(
-        PictureSource(SourceTitle("mobile_robot.xml", "policy"), rights), Context(common_rights())
-    )
+    return compose(PictureSource(SourceTitle("mobile_robot.xml", "policy"), rights))
 
 
 def edges(picture: Picture, enclave: str) -> set[tuple[str, str, str]]:

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from sros_tool.dds.domains import DomainSet
+from sros_tool.names import PARAMETER_SERVICES
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.minimize import minimize
 from sros_tool.policy.model import DomainProtection, Level, NamedProtection, TopicProtection
-from sros_tool.report.compose import Context, compose, group_of, overlay, protection_of
+from sros_tool.report.compose import compose, group_of, overlay, protection_of
 from sros_tool.report.picture import OverlaySide
 from sros_tool.report.picture import WireLevel as Shown
 from sros_tool.translate import governance_for
@@ -196,7 +197,7 @@ def test_what_protects_whole_messages_protects_every_topic() -> None:
 
 def test_hosts_reach_the_picture(tmp_path: Path) -> None:
     source = source_of(tmp_path, {"/robot/arm": group("topics", "publish", "/x")})
-    picture = compose(source, Context(hosts={"/robot/arm": "wrist"}))
+    picture = compose(source, {"/robot/arm": "wrist"})
     assert picture.enclaves[0].group == "wrist"
 
 
@@ -204,3 +205,18 @@ def test_everything_is_sorted() -> None:
     picture = mobile_robot()
     assert list(picture.names) == sorted(picture.names, key=lambda n: (n.kind, n.name))
     assert [e.path for e in picture.enclaves] == sorted(e.path for e in picture.enclaves)
+
+
+def test_parameter_services_of_other_nodes_are_no_rights_that_every_node_needs(
+    tmp_path: Path,
+) -> None:
+    own = tuple(f"/camera/{name}" for name in PARAMETER_SERVICES)
+    source = source_of(
+        tmp_path,
+        {
+            "/camera": group("services", "reply", *own),
+            "/gripper": group("services", "reply", "/camera/set_parameters"),
+        },
+    )
+    beyond = [(edge.enclave, edge.name) for edge in compose(source).edges if not edge.common]
+    assert beyond == [("/gripper", "/camera/set_parameters")]

@@ -115,7 +115,7 @@ NOT_IN_KEYSTORE = FindingKind(
     "Run `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`.",
 )
 NOT_IN_EXPORT = FindingKind(
-    "export.enclave-missing",
+    "keystore.not-in-export",
     NOTE,
     "enclaves of the policy that the export does not have",
     "A robot needs only the enclaves of its own processes; a node that starts in another one fails "
@@ -450,9 +450,9 @@ def _is_plain_router(enclave: CheckedEnclave, grant: Grant | None) -> bool:
     network = settings.zenoh if settings else None
     if not (network and enclave.name in network.router_names() and grant):
         return False
-    from sros_tool.checks.policies import only_basic
+    from sros_tool.policy.node_basics import are_basic
 
-    return only_basic(grant_rights(enclave.name, grant))
+    return are_basic(grant_rights(enclave.name, grant))
 
 
 def wanted_rights(keystore: CheckedKeystore) -> dict[str, frozenset[Right]]:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, render_permissions
 from sros_tool.errors import Note
-from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import (
     FleetPolicy,
     absolute,
@@ -35,6 +34,7 @@ from sros_tool.policy.minimize import (
     propose_wildcards,
 )
 from sros_tool.policy.model import Enclave, Group, Policy
+from sros_tool.policy.node_basics import node_basics
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
@@ -183,8 +183,7 @@ def minimized_policy(
 
 def _node_basics() -> Sequence[Group]:
     """Return the rights that every node needs, as groups of a profile."""
-    basics = read_policy(policies_dir() / "defaults" / "node_basics.xml")
-    profiles = (profile for enclave in basics.enclaves for profile in enclave.all_profiles())
+    profiles = (profile for enclave in node_basics().enclaves for profile in enclave.all_profiles())
     return [group for profile in profiles for group in profile.groups]
 
 
