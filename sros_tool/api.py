@@ -599,13 +599,14 @@ def _enclave_to_ask(
     """Return an enclave of a keystore, or of a policy as if it were signed."""
     from sros_tool.explain.asking import (
         AskedEnclave,
+        is_policy,
         not_in_policy_error,
         planned_enclave,
         signed_enclave,
     )
     from sros_tool.keystore.reader import Keystore as OpenedOnce
 
-    if not isinstance(keystore, str | PathLike) or Path(keystore).is_file():
+    if not isinstance(keystore, str | PathLike) or is_policy(Path(keystore)):
         if policy is not None:
             raise UsageError("two policies are named", "", "Leave policy= out.")
         alone = _policy(keystore)

@@ -134,11 +134,11 @@ def policy_findings(paths: Iterable[Path], circumstances: Circumstances) -> list
 
 
 def _policies_at(path: Path) -> list[Path]:
-    from sros_tool.policy.document import policy_files
+    from sros_tool.policy.document import files_of_policies
 
     if not path.is_dir():
         read_bytes(path, "file")
-    if policies := list(policy_files(path)):
+    if policies := list(files_of_policies(path)):
         return policies
     refuse_earlier(path)
     raise DocumentError(

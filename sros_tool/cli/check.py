@@ -720,7 +720,7 @@ def _fleet_of(circumstances: Circumstances, paths: Sequence[Path]) -> Fleet | No
     """
     from sros_tool.fleet.expansion import fleet_with_enclaves
     from sros_tool.keystore.fleet import load_fleet
-    from sros_tool.policy.document import policy_files
+    from sros_tool.policy.document import files_of_policies
 
     if circumstances.fleet is None:
         opened = [circumstances.opened[path] for path in paths if path in circumstances.opened]
@@ -731,7 +731,7 @@ def _fleet_of(circumstances: Circumstances, paths: Sequence[Path]) -> Fleet | No
     for path in paths:
         if path not in circumstances.opened:
             with suppress(SrosError):  # what is wrong with it is a finding
-                files += policy_files(path)
+                files += files_of_policies(path)
     return fleet_with_enclaves(circumstances.fleet, files)
 
 

@@ -289,10 +289,12 @@ def explain(
     _refuse_ignored(mode)
     check_one_decider()
     root, rest = _split(words, keystore, verb=0 if who else 1)
-    is_file = root is not None and root.is_file()
-    if is_file and not (policy or logs or reach):
+    from sros_tool.explain.asking import is_policy
+
+    names_policy = root is not None and is_policy(root)
+    if names_policy and not (policy or logs or reach):
         policy, root = root, None
-    if fleet_file and not (policy or is_file):
+    if fleet_file and not (policy or names_policy):
         raise UsageError("--fleet goes with a policy only", "", "Leave it out.")
     if reach:
         if vendor not in (None, ZENOH):

@@ -63,6 +63,13 @@ if TYPE_CHECKING:
     metavar="ENCLAVE",
     help="Put all nodes of OTHER into this enclave: one process composes them.",
 )
+@click.option(
+    "--node",
+    "nodes",
+    metavar="NODE",
+    multiple=True,
+    help="Take only the nodes of this name from OTHER.  Can be repeated.",
+)
 @output_option("Write the result to FILE.")
 @click.option("--in-place", is_flag=True, help="Overwrite POLICY with the result.")
 @force_option
@@ -73,6 +80,7 @@ def merge_policy(
     others: tuple[Path, ...],
     namespace: str | None,
     enclave: str | None,
+    nodes: tuple[str, ...],
     output: Path | None,
     in_place: bool,
     force: bool,
@@ -95,13 +103,14 @@ def merge_policy(
       note [merge.still-denied]: /talker DENY publish topic /cmd_vel stays ...
       replaced 'robot.xml'
       $ sros merge_policy robot.xml gripper.xml --namespace /left --in-place
-      $ sros merge_policy robot.xml camera.xml --enclave /pipeline --in-place
+      $ sros merge_policy robot.xml camera.xml --enclave /pipeline \
+            --node driver --node rectify --in-place
     """
     from sros_tool.fleet.robots import namespace_problem
     from sros_tool.names import check_enclave_name
     from sros_tool.policy.document import read_policy
     from sros_tool.policy.merge import EditedText, MergedPolicy, merge_all
-    from sros_tool.policy.model import policy_in_enclave, policy_in_namespace
+    from sros_tool.policy.model import policy_in_enclave, policy_in_namespace, policy_of_nodes
 
     if in_place and output:
         raise UsageError("--in-place and --output exclude each other")
@@ -109,6 +118,15 @@ def merge_policy(
     if output:
         check_output(output, force=force)
     additions = [read_policy(path) for path in others]
+    if nodes:
+        additions = [policy_of_nodes(other, nodes) for other in additions]
+        there = {p.node for other in additions for e in other.enclaves for p in e.all_profiles()}
+        if missing := [node for node in nodes if node not in there]:
+            raise UsageError(
+                f"--node {missing[0]}: no policy to merge has a node of this name",
+                "",
+                "Write the name as node= has it.",
+            )
     if namespace is not None:
         if problem := namespace_problem(namespace):
             raise UsageError(f"--namespace {namespace!r}: {problem}", "", "Write it as /left.")

@@ -160,6 +160,15 @@ def open_to_ask(
     return AskedEnclave(enclave, policy)
 
 
+def is_policy(path: Path) -> bool:
+    """Return whether a path is a file, or a folder of policies."""
+    if not path.is_dir() or is_keystore(path) or is_enclave(path):
+        return path.is_file()
+    from sros_tool.policy.document import files_of_policies  # a question to a keystore needs none
+
+    return any(files_of_policies(path))
+
+
 def policy_to_ask(file: Path, fleet: Fleet | None) -> tuple[Policy, Policy]:
     """Return a policy as it is stated, and with the robots of a fleet for its placeholders."""
     from sros_tool.fleet.expansion import FleetPolicy

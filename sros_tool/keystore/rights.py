@@ -47,7 +47,7 @@ from sros_tool.keystore.reader import FilesReadOnce, Keystore
 from sros_tool.names import is_expression
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
-from sros_tool.policy.document import read_policy
+from sros_tool.policy.document import files_of_policies, read_policy
 from sros_tool.policy.model import (
     DENY,
     OFFERING_SIDE,
@@ -124,10 +124,10 @@ def load_rights(
 ) -> RightsSource:
     """Return the rights that ``path`` gives; a policy with placeholders is expanded for ``fleet``.
 
-    ``path`` is a policy file, ``permissions.p7s`` or ``permissions.xml``, an enclave folder, a
-    keystore, or a Zenoh configuration such as ``router.json5``.  With ``hidden``, the enclaves of a
-    keystore in folders whose names begin with a dot are included.  ``only_enclaves`` are the
-    enclaves of a keystore that are read; None for all.
+    ``path`` is a policy file, a folder of policies, ``permissions.p7s`` or ``permissions.xml``, an
+    enclave folder, a keystore, or a Zenoh configuration such as ``router.json5``.  With ``hidden``,
+    the enclaves of a keystore in folders whose names begin with a dot are included.
+    ``only_enclaves`` are the enclaves of a keystore that are read; None for all.
 
     Raises:
         DocumentError: ``path`` is anything else, or malformed.
@@ -140,8 +140,10 @@ def load_rights(
         if (path / PERMISSIONS_FILE).exists():
             return _document_rights(path, "enclave", path / PERMISSIONS_FILE)
         refuse_earlier(path)
+        if any(files_of_policies(path)):
+            return _policy_rights(path, fleet)
         raise DocumentError(
-            f"'{path}' is neither a keystore nor an enclave",
+            f"'{path}' is neither a keystore nor an enclave, and holds no policy",
             f"It has no enclaves folder, and no {PERMISSIONS_FILE}.",
         )
     data = read_bytes(path, "file")
@@ -152,14 +154,18 @@ def load_rights(
     signed = b"multipart/signed" in data[:1000].lower()
     # read_policy says how a policy of an earlier format, with <profiles> at the top, is converted.
     if not signed and parse(data, f"'{path}'").tag in ("policy", "profiles"):
-        policy = read_policy_for(path, fleet)
-        if fleet:
-            written = read_policy(path, placeholders=True)
-            fleet = fleet.with_enclaves(FleetPolicy(written, fleet).patterns)
-        stated = stated_protections(policy.enclaves)
-        rights = policy_rights(policy)
-        return RightsSource(path, "policy", rights, None, True, (), fleet, stated, policy=policy)
+        return _policy_rights(path, fleet)
     return _document_rights(path, "permissions", path)
+
+
+def _policy_rights(path: Path, fleet: Fleet | None) -> RightsSource:
+    policy = read_policy_for(path, fleet)
+    if fleet:
+        written = read_policy(path, placeholders=True)
+        fleet = fleet.with_enclaves(FleetPolicy(written, fleet).patterns)
+    stated = stated_protections(policy.enclaves)
+    rights = policy_rights(policy)
+    return RightsSource(path, "policy", rights, None, True, (), fleet, stated, policy=policy)
 
 
 def rights_by_domains(source: RightsSource) -> dict[DomainSet | None, set[Right]]:

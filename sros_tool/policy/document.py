@@ -391,8 +391,10 @@ def read_policy(
 ) -> Policy:
     """Read a policy file with its includes, which must be in its folder or below.
 
+    The policies in a folder count as one policy.
+
     Args:
-        path: the path of the file.
+        path: the path of the file, or of a folder of policies.
         content: the content of the file, which then need not exist.
         placeholders: accept the placeholders of `sros_tool.policy.placeholders` in names; they are
             not filled in, so only `sros_tool.fleet.expansion` can use the policy.
@@ -402,6 +404,14 @@ def read_policy(
         PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
             a name is not a valid ROS name, or an enclave is defined twice.
     """
+    if content is None and policy_files is None and path.is_dir():
+        files = list(files_of_policies(path))
+        if not files:
+            raise PolicyError(
+                f"'{path}' holds no policy", "", "Name a policy, or a folder of them."
+            )
+        every = join_policies([read_policy(file, placeholders=placeholders) for file in files])
+        return replace(every, file=str(path))
     return _Reader(path, content, placeholders=placeholders, policy_files=policy_files).policy()
 
 
@@ -1168,7 +1178,7 @@ def join_policies(policies: Sequence[Policy]) -> Policy:
     return replace(policies[0], enclaves=tuple(enclaves.values()), fallbacks=fallbacks)
 
 
-def policy_files(folder: Path) -> Iterator[Path]:
+def files_of_policies(folder: Path) -> Iterator[Path]:
     """Yield the paths of the policies in a folder and below it, sorted; for a file, its own path.
 
     Fragments that are only included are left out.

@@ -6,7 +6,7 @@ Names follow SROS2 policy XML 0.2.0.  Values are equal if they state the same; t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Annotated, NamedTuple
@@ -145,6 +145,20 @@ def policy_in_enclave(policy: Policy, path: str) -> Policy:
     """Return a policy with all profiles in one enclave, of a process that composes the nodes."""
     blocks = tuple(block for enclave in policy.enclaves for block in enclave.profiles)
     enclaves = [replace(enclave, path=path, profiles=blocks) for enclave in policy.enclaves[:1]]
+    return replace(policy, enclaves=tuple(enclaves))
+
+
+def policy_of_nodes(policy: Policy, nodes: Collection[str]) -> Policy:
+    """Return a policy with only the profiles of the named nodes, and the enclaves that have one."""
+
+    def with_nodes(enclave: Enclave) -> Enclave:
+        blocks = (
+            block._replace(profiles=tuple(p for p in block.profiles if p.node in nodes))
+            for block in enclave.profiles
+        )
+        return replace(enclave, profiles=tuple(block for block in blocks if block.profiles))
+
+    enclaves = (enclave for enclave in map(with_nodes, policy.enclaves) if enclave.profiles)
     return replace(policy, enclaves=tuple(enclaves))
 
 

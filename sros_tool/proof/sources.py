@@ -56,8 +56,8 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.crl import embedded_lists, load_crl, names_issuers, refusal_of, signed_by
 from sros_tool.policy.document import (
     PolicyFiles,
+    files_of_policies,
     join_policies,
-    policy_files,
     read_policy,
     refuse_fallbacks,
 )
@@ -196,7 +196,7 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
     if str(path).startswith(PREFIX):
         return _access_at_revision(find_revision(str(path)), fleet)
     if path.is_dir() and not is_keystore(path) and not (path / PERMISSIONS_FILE).exists():
-        files = list(policy_files(path))
+        files = list(files_of_policies(path))
         if files:
             return _access_of_policies(str(path), [_read(file, fleet) for file in files])
     source = load_rights(path, fleet, hidden=True)

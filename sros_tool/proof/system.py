@@ -42,7 +42,7 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
-from sros_tool.policy.document import join_policies, policy_files, refuse_fallbacks
+from sros_tool.policy.document import files_of_policies, join_policies, refuse_fallbacks
 from sros_tool.policy.model import (
     ALLOW,
     PROTECT,
@@ -143,7 +143,7 @@ def load_system(
                 "Leave --template out, or check the policy.",
             )
         return _keystore_system(keystore or Keystore(paths[0]), moment, zone, domain, only_enclaves)
-    files = [file for each in paths for file in policy_files(each)]
+    files = [file for each in paths for file in files_of_policies(each)]
     if not files:
         raise PolicyError(
             "requirements need a policy, and there is no policy", "", "Name a policy."

@@ -72,12 +72,20 @@ def test_the_nodes_of_a_package_are_merged_into_the_enclave_that_composes_them(
     folder: Path,
 ) -> None:
     (folder / "package.xml").write_text(
-        policy_text({"/scanner": publish("image"), "/decoder": publish("code")})
+        policy_text({"/scanner": publish("image"), "/decoder": publish("code")}).replace(
+            'node="n"', 'node="scanner"', 1
+        )
     )
     words = ("--namespace", "/left", "--enclave", "/left/pipeline", "--json")
     found = json.loads(sros("merge_policy", "a.xml", "package.xml", *words).out)
     assert {right["enclave"] for right in found["added"]} == {"/left/pipeline"}
     assert {right["name"] for right in found["added"]} == {"/left/image", "/left/code"}
+    (one,) = json.loads(
+        sros("merge_policy", "a.xml", "package.xml", *words, "--node", "scanner").out
+    )["added"]
+    assert one["name"] == "/left/image"
+    ended = sros("merge_policy", "a.xml", "package.xml", "--node", "scaner")
+    assert ended.status == 2 and "--node scaner: no policy to merge has a node" in ended.err
     ended = sros("merge_policy", "a.xml", "package.xml", "--enclave", "x y")
     assert ended.status == 2 and "is not a valid enclave name" in ended.err
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import DocumentError
-from sros_tool.policy.document import policy_files
+from sros_tool.policy.document import files_of_policies
 from tests.support.harness import policy_text, publish, sros
 
 POLICY = policy_text({"/a": publish("/x")})
@@ -41,7 +41,7 @@ def test_every_policy_below_is_found(tmp_path: Path) -> None:
     for name in names:
         write(tmp_path, name, POLICY)
     os.mkfifo(tmp_path / "pipe.xml")
-    assert [str(each.relative_to(tmp_path)) for each in policy_files(tmp_path)] == [
+    assert [str(each.relative_to(tmp_path)) for each in files_of_policies(tmp_path)] == [
         "a.xml",
         "b.XML",
         "sub/c.xml",
@@ -55,11 +55,11 @@ def test_what_is_perhaps_a_policy_is_refused(name: str, tmp_path: Path) -> None:
     text, says = REFUSED[name]
     write(tmp_path, name, text)
     with pytest.raises(DocumentError, match=says):
-        list(policy_files(tmp_path))
+        list(files_of_policies(tmp_path))
     write(tmp_path / "utf16", "a.xml", POLICY)
     (tmp_path / "utf16" / "evil.inc").write_bytes(OTHER.encode("utf-16"))
     with pytest.raises(DocumentError, match="looks like a policy"):
-        list(policy_files(tmp_path / "utf16"))
+        list(files_of_policies(tmp_path / "utf16"))
 
 
 def test_a_link_to_a_folder_is_refused(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_a_link_to_a_folder_is_refused(tmp_path: Path) -> None:
     write(tmp_path / "away", "evil.xml", OTHER)
     (tmp_path / "p" / "robots").symlink_to("../away")
     with pytest.raises(DocumentError, match="robots' is a link to a folder"):
-        list(policy_files(tmp_path / "p"))
+        list(files_of_policies(tmp_path / "p"))
 
 
 @pytest.mark.parametrize("name", ["robots/evil.xml", "evil.XML", "robots/evil.inc"])
