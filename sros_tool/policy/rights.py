@@ -248,7 +248,8 @@ _Place = tuple[str, Qualifier, str]
 class RightsDifference:
     """The rights that only one side has, in normal form and sorted.
 
-    ``covered`` maps some of these rights to the wildcards of the other side that cover them.
+    ``covered`` maps some of these rights to the wildcards of the other side that cover them, unless
+    that side denies a part of them.
     """
 
     only_first: tuple[Right, ...]
@@ -324,7 +325,8 @@ def compare(
     for rights, side in ((only_first, other), (only_second, one)):
         rules = Rules(side if rights else ())
         for right in rights:
-            if by := rules.covering_rights(right):
+            denied = right.qualifier is ALLOW and rules.overlaps(right._replace(qualifier=DENY))
+            if not denied and (by := rules.covering_rights(right)):
                 covered[right] = tuple(sorted(folded(by), key=order))
     return RightsDifference(only_first, only_second, covered)
 

@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
 from functools import cache, partial
+from itertools import chain
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, NamedTuple
@@ -35,7 +36,7 @@ from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave
-from sros_tool.policy.rights import PlacedRight, placed_rights, policy_rights
+from sros_tool.policy.rights import PlacedRight, Right, placed_rights, policy_rights
 from sros_tool.proof.commit_files import (
     CommitFiles,
     includes_files,
@@ -726,7 +727,7 @@ class _Review:
         base, head = before(), after()
         first, second = base.as_rights(), head.as_rights()
         absolute, relative = (
-            _rights_made(base.enclaves.values(), head.enclaves.values(), absolute=absolute)
+            tuple(_rights_made(base.enclaves.values(), head.enclaves.values(), absolute=absolute))
             for absolute in (True, False)
         )
         compared = compare_sources(first, second)
@@ -881,18 +882,35 @@ def _is_same_file(base: CommitFiles | None, head: CommitFiles, path: str) -> boo
 
 def _rights_made(
     before: Iterable[Enclave], after: Iterable[Enclave], *, absolute: bool
-) -> tuple[PlacedRight, ...]:
-    """Return the rights of both that are ``absolute`` (or else relative) only in ``after``."""
-    earlier, later = (
-        {
-            placed.right: placed
-            for enclave in enclaves
-            for placed in placed_rights(enclave)
-            if placed.written.startswith("/") is begins
-        }
-        for enclaves, begins in ((before, not absolute), (after, absolute))
-    )
-    return tuple(placed for right, placed in later.items() if right in earlier)
+) -> Iterator[PlacedRight]:
+    """Yield the rights in ``after`` whose names are ``absolute`` there, and were relative before.
+
+    Without ``absolute``, the opposite.  A name is compared with that of the same node, whatever
+    other nodes write; if the node is new, with those of all nodes.
+    """
+    earlier, later = map(_by_node, (before, after))
+    for right, nodes in later.items():
+        known = earlier.get(right, {})
+        for node, placed in nodes.items():
+            of_nodes = [known, nodes]
+            if node in known:
+                of_nodes = [{node: side[node]} for side in of_nodes]
+            old, new = (
+                {each.written.startswith("/") for each in chain(*side.values())}
+                for side in of_nodes
+            )
+            if old == {not absolute} and new == {absolute}:
+                yield placed[0]
+
+
+def _by_node(enclaves: Iterable[Enclave]) -> dict[Right, dict[tuple[str, str], list[PlacedRight]]]:
+    """Map the rights of enclaves, and the nodes that have them, to their places."""
+    places: dict[Right, dict[tuple[str, str], list[PlacedRight]]] = {}
+    for enclave in enclaves:
+        for placed in placed_rights(enclave):
+            node = placed.profile.ns, placed.profile.node
+            places.setdefault(placed.right, {}).setdefault(node, []).append(placed)
+    return places
 
 
 def _status(chosen_findings: ChosenFindings) -> int:

@@ -92,6 +92,8 @@ def test_wildcards_of_the_other_side_are_told() -> None:
     wide = [right("/*", "request"), right("/*", "subscribe")]
     difference = compare([right("/f", "call"), right("/x")], wide)
     assert difference.covered == {right("/f", "call"): (wide[1], wide[0])}
+    denied = Right("/a", DENY, "subscribe", "/f/_action/*")
+    assert compare([right("/f", "call")], [*wide, denied]).covered == {}
 
 
 def test_a_right_without_its_other_side_is_named(tmp_path: Path) -> None:

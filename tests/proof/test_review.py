@@ -156,6 +156,24 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     assert "  ~ /c DENY publish topic /stop has no / at its beginning any more, so" in ended.out
 
 
+def test_a_name_is_compared_with_that_of_the_same_node(change: Change) -> None:
+    """A node that loses one of two names, or keeps its name, has no line."""
+
+    def rights(*nodes: tuple[str, ...]) -> dict[str, str | bytes]:
+        between = '</profile><profile ns="/" node="other">'
+        return {"robot.xml": policy_text({"/e": between.join(publish(*node) for node in nodes)})}
+
+    for before, after, lines in (
+        ((("one", "/one"), ("one",)), (("/one",), ("one",)), 0),
+        ((("one", "/one"), ("one",)), (("one", "/one"), ("/one",)), 1),
+    ):
+        change.base = change.commit(rights(*before))
+        change.commit(rights(*after))
+        ended = change.review("--policy", "robot.xml")
+        assert ended.out.count("  ~ /e publish topic /one has a /") == lines, ended
+        assert "has no / at" not in ended.out
+
+
 def test_a_renamed_enclave_is_one_line_and_still_new_access(change: Change) -> None:
     reads = publish("/x").replace("publish", "subscribe")
     change.base = change.commit({"robot.xml": policy_text({"/a": publish("/x"), "/b": reads})})
