@@ -253,13 +253,13 @@ def diff_policy(
 ) -> int:
     """Compare the rights that A and B give: "-" is only in A, "+" only in B.
 
-    A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, or Zenoh
-    configurations such as router.json5. Permissions and Zenoh rules are shown in ROS terms; the
-    signature of permissions is verified if the permissions CA is next to them. "!" marks a right of
-    B whose counterpart, such as the subscriber, only A has. If A or B covers only some enclaves,
-    only these are compared. Lines that differ only in the robot of a fleet are shown as one. Two
-    policies are also compared by the protection that they demand, two keystores by their
-    governance.
+    A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, exports,
+    or Zenoh configurations such as router.json5. Permissions and Zenoh rules are shown in ROS
+    terms; the signature of permissions is verified if the permissions CA is next to them. "!" marks
+    a right of B whose counterpart, such as the subscriber, only A has. If A or B covers only some
+    enclaves, as an export does, only these are compared. Lines that differ only in the robot of a
+    fleet are shown as one. Two policies are also compared by the protection that they demand, two
+    keystores by their governance.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
 
@@ -284,7 +284,6 @@ def diff_policy(
       + /talker publish topic /arm_*  (robot.xml:7): such as /arm_c
       1 right is new
     """
-    from sros_tool.keystore.layout import has_authorities
     from sros_tool.keystore.rights import compare_sources, load_rights, policy_difference
 
     check_one_format()
@@ -311,7 +310,7 @@ def diff_policy(
         for line in (*lines, *_protection_lines(protections), *unanswered):
             echo(line)
         count = len(difference.only_first) + len(difference.only_second)
-        of = f" of {', '.join(sorted(compared.scope))}" if compared.scope else ""
+        of = f" of {first_few(sorted(compared.scope), _MOST_NEW_LINES)}" if compared.scope else ""
         differ = f"1 right{of} differs" if count == 1 else f"{count} rights{of} differ"
         if count or not compared.domains:
             echo(differ if count else f"the rights{of} are the same", err=True)
@@ -322,9 +321,7 @@ def diff_policy(
             echo("what the policies say about protection differs", err=True)
         if compared.governance_differs:
             command = f"sros diff_policy --no-new-access {quote(str(a))} {quote(str(b))}"
-            shows = "`sros inspect` shows what each states"
-            if has_authorities(a) and has_authorities(b):
-                shows = f"`{command}` shows what B opens, {shows}"
+            shows = f"`{command}` shows what B opens, `sros inspect` shows what each states"
             echo(f"the governance differs: {shows}", err=True)
     print_notes((*first.notes, *second.notes))
     return 0 if not compared and first.sound and second.sound else 1

@@ -41,6 +41,7 @@ from sros_tool.keystore.layout import (
     is_keystore,
     permissions_ca_for,
     refuse_earlier,
+    remedy_in_keystore,
 )
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import FilesReadOnce, Keystore
@@ -78,15 +79,15 @@ class RightsSource:
     """The rights that a file or folder gives.
 
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh".  ``scope`` are the
-    enclaves that it can give rights to; None for all.  ``sound`` is False if DDS would refuse a
-    part of it: a signature that does not verify, or permissions that are missing or malformed.
-    ``fleet`` is the fleet that it is for, or None.  ``protections`` are a policy's statements about
-    the protection of names; None for anything else.  ``documents`` are the permissions of enclaves,
-    ``enforcers`` the access control of each Zenoh process that checks others; ``routers`` are the
-    enclaves of a keystore's routers, and ``links`` is what passes between several.
-    ``configurations`` are the Zenoh configurations that were read, also those of clients, and
-    ``key_domains`` maps their rights to the ROS domains in their keys, None for a wildcard.
-    ``policy`` is the policy in a policy file.
+    enclaves that it can give rights to, such as those of an export; None for all.  ``sound`` is
+    False if DDS would refuse a part of it: a signature that does not verify, or permissions that
+    are missing or malformed.  ``fleet`` is the fleet that it is for, or None.  ``protections`` are
+    a policy's statements about the protection of names; None for anything else.  ``documents`` are
+    the permissions of enclaves, ``enforcers`` the access control of each Zenoh process that checks
+    others; ``routers`` are the enclaves of a keystore's routers, and ``links`` is what passes
+    between several.  ``configurations`` are the Zenoh configurations that were read, also those of
+    clients, and ``key_domains`` maps their rights to the ROS domains in their keys, None for a
+    wildcard.  ``policy`` is the policy in a policy file.
     """
 
     path: Path
@@ -258,7 +259,7 @@ def load_zenoh_rights(keystore: Keystore, *, hidden: bool = False) -> RightsSour
         raise KeystoreError(
             f"keystore '{root}' has no {ROUTER_FILE}",
             "Only this file shows which rights Zenoh enforces.",
-            f"Write the file with `sros zenoh {quote(str(root))}`.",
+            remedy_in_keystore(root, "Write the file with `sros zenoh KEYSTORE`."),
         )
     sources = []
     configurations: dict[Path, ConfigurationDocument] = {}
@@ -414,7 +415,9 @@ def _keystore_rights(
 ) -> RightsSource:
     root, reader = keystore.root, _Reader(keystore.files)
     rights: set[Right] = set()
-    for name in enclave_names(root, hidden=hidden) if only_enclaves is None else only_enclaves:
+    names = enclave_names(root, hidden=hidden) if only_enclaves is None else only_enclaves
+    enclaves = set(names)
+    for name in names:
         file = enclave_path(root, name) / PERMISSIONS_FILE
         try:
             found, scope = reader.permissions(file, name)
@@ -423,6 +426,7 @@ def _keystore_rights(
             reader.notes.append(Note("rights.unreadable", f"{name}: {error}"))
             continue
         rights |= found
+        enclaves.update(scope)
         if foreign := sorted(set(scope) - {name}):
             text = f"{name}: its permissions are for {', '.join(foreign)}, and DDS refuses them."
             reader.sound = False
@@ -431,7 +435,7 @@ def _keystore_rights(
         root,
         "keystore",
         frozenset(rights),
-        None,
+        None if keystore.is_original else frozenset(enclaves),
         reader.sound,
         tuple(reader.unverified[:1] + reader.notes),
         load_fleet(keystore),
@@ -600,7 +604,7 @@ class SourcesDifference(NamedTuple):
     protections: Sequence[tuple[str, StatedProtection]]
     """Protections that only one of two policies states, with "-" for the first or "+"."""
     unanswered: Sequence[Right]
-    """As in `PolicyDifference`; empty if only some enclaves were compared."""
+    """As in `PolicyDifference`; empty if a source is only for some enclaves."""
     domains: Sequence[DifferentDomains] = ()
     """As in `PolicyDifference`."""
     governance_differs: bool = False
@@ -609,6 +613,23 @@ class SourcesDifference(NamedTuple):
     def __bool__(self) -> bool:
         parts = self.rights, self.protections, self.domains, self.governance_differs
         return any(map(bool, parts))
+
+
+def compared_enclaves(
+    *sides: tuple[SourceKind, frozenset[str] | None],
+) -> frozenset[str] | None:
+    """Return the enclaves in which two sources are compared; None for all.
+
+    If one source is only for some enclaves, it is these.  Two exports are compared in all their
+    enclaves, as are two enclaves; an enclave and an export only in that enclave.
+
+    Args:
+        sides: the kind and the ``scope`` of each source, as in `RightsSource`.
+    """
+    partial = [(kind, scope) for kind, scope in sides if scope is not None]
+    if len({kind == "keystore" for kind, _ in partial}) > 1:
+        partial = [(kind, scope) for kind, scope in partial if kind != "keystore"]
+    return partial[0][1] if len(partial) == 1 else None
 
 
 def compare_sources(
@@ -624,13 +645,12 @@ def compare_sources(
         _without_observer(first_source, second_source),
         _without_observer(second_source, first_source),
     )
-    scope = None
-    if first_source.scope is None or second_source.scope is None:
-        scope = second_source.scope if first_source.scope is None else first_source.scope
+    sides = first_source, second_source
+    scope = compared_enclaves(*((side.kind, side.scope) for side in sides))
     difference = compare(first_source.rights, second_source.rights, scope)
     unanswered = (
         _unanswered_rights(first_source.rights, second_source.rights, difference)
-        if scope is None
+        if all(side.scope is None for side in sides)
         else ()
     )
     protections = _protection_differences(first_source, second_source)
@@ -670,7 +690,8 @@ def _without_observer(source: RightsSource, other: RightsSource) -> RightsSource
         e.enclave == CLOSED_OBSERVER for e in other.rights
     ):
         own = (right for right in source.rights if right.enclave != CLOSED_OBSERVER)
-        return replace(source, rights=frozenset(own))
+        scope = None if source.scope is None else source.scope - {CLOSED_OBSERVER}
+        return replace(source, rights=frozenset(own), scope=scope)
     return source
 
 

@@ -37,7 +37,11 @@ from sros_tool.dds.permissions import Grant, Permissions, Rule
 from sros_tool.errors import DocumentError, Note
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.comparison import Effect, SettingChange
-from sros_tool.keystore.rights import SourceKind, rights_grouped_by_domains
+from sros_tool.keystore.rights import (
+    SourceKind,
+    compared_enclaves,
+    rights_grouped_by_domains,
+)
 from sros_tool.names import (
     ROS_DISCOVERY_TOPIC,
     is_expression,
@@ -288,9 +292,8 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
             protection contradict each other or Zenoh settings are unknown.
     """
     limit = SearchLimit()
-    scope = None
-    if base.scope is None or head.scope is None:
-        scope = head.scope if base.scope is None else base.scope
+    scope = compared_enclaves((base.kind, base.scope), (head.kind, head.scope))
+    partial = base.scope is not None or head.scope is not None
     before, after = _completed(base, head), _completed(head, base)
     worlds = _worlds(before, after)
     added = tuple(_gains(before, after, worlds, scope, limit))
@@ -302,9 +305,9 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
             "Apart from that, nothing is new.",
         )
     sides: tuple[_Edges | None, ...] = ({}, {})
-    if added and scope is None:
+    if added and not partial:
         sides = tuple(_edges(source, _fitting_pairs(source, worlds)) for source in (before, after))
-    unknown = "only some enclaves are compared" if scope is not None else ""
+    unknown = "only some enclaves are compared" if partial else ""
     if None in sides:
         unknown = f"there are more than {_MOST_HOPS:,} hops between enclaves"
     more = dict.fromkeys(_lost_protection(head, base, limit, rules=False))

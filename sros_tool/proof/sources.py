@@ -261,9 +261,13 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
     trusting = {
         name: (folder / IDENTITY_CA_FILE, folder / CRL_FILE) for name, folder in folders.items()
     } | {KEYSTORE_ITSELF: (path / ca_certificate(IDENTITY), path / CRL)}
+    if keystore.is_original:
+        governance = _common_governance(path, folders.values())
+    else:
+        governance = _exported_governance(path, folders.values())
     side = replace(
         side,
-        governance=_common_governance(path, folders.values()),
+        governance=governance,
         authorities=_authorities(folders.values()),
         trusts=_trusts(trusting, _expiries(path)),
         later=keystore.template if keystore.is_original else None,
@@ -337,6 +341,34 @@ def _common_governance(root: Path, folders: Iterable[Path]) -> Governance:
             )
         same.add(data)
     return Keystore(root).governance
+
+
+def _exported_governance(root: Path, folders: Iterable[Path]) -> Governance:
+    """Return the governance of the enclaves of an export, after verifying that of each enclave.
+
+    Raises:
+        DocumentError: enclaves have different ones, or an enclave lacks a file without which no
+            node starts in it.
+    """
+    enclaves: dict[Governance, Path] = {}
+    for folder in folders:
+        for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, CERTIFICATE_FILE):
+            if not (folder / file).exists():
+                raise DocumentError(
+                    f"'{root}' cannot be compared: '{folder}' has no {file}",
+                    "No node starts in this enclave.",
+                    "Export the enclave again.",
+                )
+        enclaves.setdefault(_governance(folder / GOVERNANCE_FILE), folder)
+    if len(enclaves) > 1:
+        first, second, *_ = enclaves.values()
+        raise DocumentError(
+            f"'{root}' cannot be compared: '{first}' and '{second}' have different governance "
+            "documents",
+            "Nodes of these enclaves protect messages differently.",
+            "Export both enclaves again.",
+        )
+    return next(iter(enclaves))
 
 
 def _authorities(folders: Iterable[Path]) -> frozenset[tuple[str, str]]:

@@ -19,6 +19,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.keystore.layout import has_authorities
 from sros_tool.keystore.reader import Keystore
+from sros_tool.keystore.rights import compared_enclaves
 from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier, StatedProtection
 from sros_tool.policy.node_basics import NodeRights
@@ -100,6 +101,15 @@ class PictureSource:
         """Whether other enclaves of the system may not be in the source."""
         return self.is_export or self.origin.kind in ("enclave", "permissions")
 
+    def only_for(self, enclaves: Collection[str]) -> PictureSource:
+        """Return a copy without the rights, nodes and certificates of all other enclaves."""
+        return replace(
+            self,
+            rights=frozenset(right for right in self.rights if right.enclave in enclaves),
+            nodes={path: names for path, names in self.nodes.items() if path in enclaves},
+            enclaves=tuple(each for each in self.enclaves if each.path in enclaves),
+        )
+
     def moved_to_homes(self, homes: Mapping[str, str]) -> PictureSource:
         """Return a copy with rights and nodes moved from enclaves to their ``homes``."""
         nodes: dict[str, set[str]] = defaultdict(set)
@@ -133,11 +143,11 @@ def overlay(
     hosts: Mapping[str, str] = _NO_HOSTS,
 ) -> Picture:
     """Return a picture that compares two sources; ``kind`` is a key of `_OVERLAYS`."""
-    scope = first_source.scope if second_source.scope is None else second_source.scope
-    rights = [
-        frozenset(right for right in side.rights if scope is None or right.enclave in scope)
-        for side in (first_source, second_source)
-    ]
+    sources: tuple[PictureSource, ...] = (first_source, second_source)
+    scope = compared_enclaves(*((source.origin.kind, source.scope) for source in sources))
+    if scope is not None:
+        sources = tuple(source.only_for(scope) for source in sources)
+    rights = [source.rights for source in sources]
     known = Known(rights[0] | rights[1])
     sides = [_edges_of(own, known) for own in rights]
     edges = _marked_rights(*sides, allowed_by=kind == "use")
@@ -153,7 +163,7 @@ def overlay(
         unseen = frozenset(right.enclave for right in rights[0] - rights[1])
         unseen -= {right.enclave for right in rights[1]}
         edges = [_neutral_edge(edge, unseen) for edge in edges]
-    picture = _picture((first_source, second_source), edges, stated, known, hosts)
+    picture = _picture(sources, edges, stated, known, hosts)
     return replace(
         picture,
         overlay=_OVERLAYS[kind],

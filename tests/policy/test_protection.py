@@ -214,7 +214,9 @@ def test_a_different_governance_of_equal_rights_is_said(keystore: Path, tmp_path
         sros("distribute_key", root, "--all", tmp_path / name).ok()
     exports = tmp_path / "first", tmp_path / "second"
     assert "the governance differs" in sros("diff_policy", *exports).err
-    assert sros("diff_policy", keystore, exports[0]).ok().err == "the rights are the same\n"
+    assert (
+        sros("diff_policy", keystore, exports[0]).ok().err == "the rights of /a, /b are the same\n"
+    )
     table = sros("view", exports[1], "--format", "markdown").ok().out
     assert "| everybody with an identity |" in table
     found = json.loads(sros("diff_policy", keystore, opened, "--json").out)

@@ -790,3 +790,25 @@ def test_nothing_is_fetched_with_settings_from_the_work_tree(
     monkeypatch.setenv(name, str(repository.parent / "home"))
     with pytest.raises(DocumentError, match="not allowed"):
         Repository(repository).fetch_missing("0" * 40, "origin")
+
+
+def test_an_export_is_compared_in_its_enclaves(keystore: Path, tmp_path: Path) -> None:
+    robot, policy = tmp_path / "robot", tmp_path / "robot.xml"
+    sros("distribute_key", keystore, "/a", robot).ok()
+    readers = f"{publish('old_b')}{publish('old_a').replace('publish', 'subscribe')}"
+    policy.write_text(policy_text({"/a": publish("old_a"), "/b": readers}))
+    same = sros("diff_policy", policy, robot).ok()
+    assert (same.out, same.err) == ("", "the rights of /a are the same\n")
+    drawn = json.loads(sros("view", policy, robot, "--json").ok().out)
+    assert [each["path"] for each in drawn["enclaves"]] == ["/a"]
+    for other, lacks in ((policy, True), (keystore, True), (robot / "enclaves" / "a", False)):
+        nothing = sros("diff_policy", "--no-new-access", robot, other).ok()
+        assert ("enclaves that BASE does not have" in nothing.err) is lacks
+        sros("diff_policy", "--no-new-access", other, robot).ok()
+    policy.write_text(policy_text({"/a": publish("old_a", "more")}))
+    assert sros("diff_policy", "--no-new-access", robot, policy).out.startswith("+ /a publish")
+    sros("distribute_key", keystore, "--all", tmp_path / "more").ok()
+    assert sros("diff_policy", "--no-new-access", robot, tmp_path / "more").status == 1
+    (robot / "enclaves" / "a" / "governance.p7s").unlink()
+    lacking = sros("diff_policy", "--no-new-access", robot, policy)
+    assert lacking.status == 2 and "governance.p7s' does not exist" in lacking.err

@@ -159,7 +159,7 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
 def test_a_name_is_compared_with_that_of_the_same_node(change: Change) -> None:
     """A node that loses one of two names, or keeps its name, has no line."""
 
-    def rights(*nodes: tuple[str, ...]) -> dict[str, str | bytes]:
+    def rights(*nodes: tuple[str, ...]) -> dict[str, str | bytes | None]:
         between = '</profile><profile ns="/" node="other">'
         return {"robot.xml": policy_text({"/e": between.join(publish(*node) for node in nodes)})}
 
