@@ -30,7 +30,7 @@ from sros_tool.wording import counted
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.proof.repository import Repository
-    from sros_tool.proof.review import Review, ReviewRequest, ReviewStep, RightsChange
+    from sros_tool.proof.review import AccessChange, Review, ReviewRequest, ReviewStep, RightsChange
 
     _PathsType = click.ParamType[tuple[str, ...]]
 else:  # generic from click 8.2 on
@@ -361,8 +361,9 @@ def _sentence(result: Review, step: ReviewStep) -> str:
     match step.content:
         case ChosenFindings() as chosen:
             return chosen.summary()
-        case AccessChange(growth=growth):
-            return access_summary(growth)
+        case AccessChange(growth=growth, undenied=undenied):
+            dropped = f"; {counted(len(undenied), 'DENY', 'DENYs')} gone" if undenied else ""
+            return access_summary(growth) + dropped
         case RightsChange(compared=compared, absolute=absolute, relative=relative):
             added, gone = len(compared.rights.only_second), len(compared.rights.only_first)
             clauses = [
@@ -426,8 +427,8 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
     from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange
 
     match step.content:
-        case AccessChange(before=before, after=after, growth=growth):
-            return added_lines(before, after, growth)
+        case AccessChange(before=before, after=after, growth=growth) as change:
+            return [*added_lines(before, after, growth), *_undenied_lines(change)]
         case RightsChange(before=before, after=after, compared=compared):
             unanswered = unanswered_lines(compared, after.fleet)
             differing = folded_differences(before, after, compared.rights, ("BASE", "HEAD"))
@@ -452,6 +453,20 @@ def _finding_line(finding: Finding) -> str:
     line = f"{finding.place}: {finding.severity.word}: {subject}{finding.text} [{finding.id}]"
     places = finding.related if finding.kind is DROPPED else ()
     return line + "".join(f" ({place.text}: {place})" for place in places)
+
+
+def _undenied_lines(change: AccessChange) -> Iterator[str]:
+    """Yield a line for each DENY that is dropped."""
+    from sros_tool.fleet.robots import folded
+
+    lines = (
+        (
+            right.enclave,
+            f"! {right.enclave} DENY {right.describe()} is gone: other policies may allow it now",
+        )
+        for right in change.undenied
+    )
+    return folded(change.after.fleet, lines)
 
 
 def _absolute_lines(change: RightsChange) -> Iterator[str]:
@@ -554,8 +569,9 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     match step.content:
         case ChosenFindings() as chosen:
             return findings(chosen) if chosen.shown else ""
-        case AccessChange(before=before, after=after, growth=growth):
-            return access_markdown(before, after, growth)
+        case AccessChange(before=before, after=after, growth=growth) as change:
+            gone = bounded_list(map(code, _undenied_lines(change)), 6000, rest)
+            return "\n\n".join(filter(None, (access_markdown(before, after, growth), gone)))
         case RightsChange(before=before, after=after, compared=compared) as change:
             parts = [rights_markdown(before, after, compared)] if compared else []
             if lines := list(_absolute_lines(change)):

@@ -35,8 +35,8 @@ from sros_tool.keystore.layout import FLEET, KEY_FILE, SETTINGS, is_keystore
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import Enclave
-from sros_tool.policy.rights import PlacedRight, Right, placed_rights, policy_rights
+from sros_tool.policy.model import ALLOW, DENY, Enclave
+from sros_tool.policy.rights import PlacedRight, Right, Rules, folded, placed_rights, policy_rights
 from sros_tool.proof.commit_files import (
     CommitFiles,
     includes_files,
@@ -107,11 +107,16 @@ class ReviewRequest:
 
 @dataclass(frozen=True, slots=True)
 class AccessChange:
-    """Access that HEAD allows and BASE does not."""
+    """Access that HEAD allows and BASE does not.
+
+    ``undenied`` are denials that HEAD drops, of names that BASE does not allow: promises to users
+    who merge the policy with others.
+    """
 
     before: AccessSource
     after: AccessSource
     growth: Growth
+    undenied: tuple[Right, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -718,7 +723,18 @@ class _Review:
 
     def _compared_access(self, before: AccessSource, after: AccessSource) -> tuple[int, Content]:
         growth = compare_access(before, after)
-        return (_FOUND if growth else _OK), AccessChange(before, after, growth)
+        stated, denied = Rules(before.rights), Rules(after.rights)
+        left = {right.enclave for right in after.rights}
+        undenied = tuple(
+            right
+            for right in sorted(folded(before.rights))
+            if right.qualifier is DENY
+            and right.enclave in left
+            and not stated.overlaps(right._replace(qualifier=ALLOW))
+            and not denied.cover(right)
+        )
+        status = _FOUND if growth or undenied else _OK
+        return status, AccessChange(before, after, growth, undenied)
 
     @staticmethod
     def _rights(

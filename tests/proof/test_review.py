@@ -154,6 +154,12 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     ended = change.review("--policy", "robot.xml\nsecond.xml")
     assert "1 name made relative" in ended.out
     assert "  ~ /c DENY publish topic /stop has no / at its beginning any more, so" in ended.out
+    # A DENY of what nobody allows is a promise to those who merge the policy with others.
+    change.base = change.commit({"second.xml": policy_text({"/c": denies.format("/stop") + reads})})
+    change.commit({"second.xml": policy_text({"/c": reads})})
+    ended = change.review("--policy", "robot.xml\nsecond.xml")
+    assert ended.status == 1 and "; 1 DENY gone" in ended.out
+    assert "  ! /c DENY publish topic /stop is gone: other policies may allow it now" in ended.out
 
 
 def test_a_name_is_compared_with_that_of_the_same_node(change: Change) -> None:
