@@ -475,12 +475,9 @@ def _absolute_lines(change: RightsChange) -> Iterator[str]:
     from sros_tool.policy.model import ALLOW
 
     made_absolute = (
-        "has a / at its beginning now, so that it does not move with the namespace of its node any "
-        "more"
+        "has a / at its beginning, so that it does not move with the namespace of its node"
     )
-    made_relative = (
-        "has no / at its beginning any more, so that it moves with the namespace of its node"
-    )
+    made_relative = "has no / at its beginning, so that it moves with the namespace of its node"
     for made, changed in ((made_absolute, change.absolute), (made_relative, change.relative)):
         lines = []
         for right, _, source, _, _ in changed:

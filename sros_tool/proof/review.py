@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, tzinfo
 from functools import cache, partial
 from itertools import chain
@@ -35,7 +35,7 @@ from sros_tool.keystore.layout import FLEET, KEY_FILE, SETTINGS, is_keystore
 from sros_tool.keystore.reader import Keystore
 from sros_tool.keystore.rights import RightsSource, SourcesDifference, compare_sources
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import ALLOW, DENY, Enclave
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Profile
 from sros_tool.policy.rights import PlacedRight, Right, Rules, folded, placed_rights, policy_rights
 from sros_tool.proof.commit_files import (
     CommitFiles,
@@ -123,9 +123,8 @@ class AccessChange:
 class RightsChange:
     """How the rights of all reviewed policies in HEAD differ from those in BASE.
 
-    ``absolute`` are the rights whose names are absolute in HEAD, and were relative to the namespace
-    in BASE: users who put the node into another namespace do not move these names any more.
-    ``relative`` are the opposite: these names move now, and were the same for all.
+    ``absolute`` and ``relative`` are rights that are new only for users who put the node into
+    another namespace: absolute names that do not move with it, and relative ones that do.
     """
 
     before: RightsSource
@@ -742,10 +741,9 @@ class _Review:
     ) -> tuple[int, Content] | None:
         base, head = before(), after()
         first, second = base.as_rights(), head.as_rights()
-        absolute, relative = (
-            tuple(_rights_made(base.enclaves.values(), head.enclaves.values(), absolute=absolute))
-            for absolute in (True, False)
-        )
+        named = [*_fixed_or_moving_names([*base.enclaves.values()], [*head.enclaves.values()])]
+        absolute = tuple(each for each in named if each.written.startswith("/"))
+        relative = tuple(each for each in named if not each.written.startswith("/"))
         compared = compare_sources(first, second)
         if not compared and not (absolute or relative):
             return None
@@ -896,37 +894,45 @@ def _is_same_file(base: CommitFiles | None, head: CommitFiles, path: str) -> boo
     return base is not None and base.files.get(path) == head.files.get(path)
 
 
-def _rights_made(
-    before: Iterable[Enclave], after: Iterable[Enclave], *, absolute: bool
+_SOMEWHERE = "/some_namespace"
+"""A namespace that no policy uses, into which users put the nodes of a package."""
+
+
+def _fixed_or_moving_names(
+    before: Sequence[Enclave], after: Sequence[Enclave]
 ) -> Iterator[PlacedRight]:
-    """Yield the rights in ``after`` whose names are ``absolute`` there, and were relative before.
+    """Yield the rights in ``after`` that are new only for nodes in another namespace.
 
-    Without ``absolute``, the opposite.  A name is compared with that of the same node, whatever
-    other nodes write; if the node is new, with those of all nodes.
+    That is because a name there is absolute now, or relative.  Of denials, those are yielded that
+    deny less there.
     """
-    earlier, later = map(_by_node, (before, after))
-    for right, nodes in later.items():
-        known = earlier.get(right, {})
-        for node, placed in nodes.items():
-            of_nodes = [known, nodes]
-            if node in known:
-                of_nodes = [{node: side[node]} for side in of_nodes]
-            old, new = (
-                {each.written.startswith("/") for each in chain(*side.values())}
-                for side in of_nodes
-            )
-            if old == {not absolute} and new == {absolute}:
-                yield placed[0]
+    (was, was_elsewhere), (now, now_elsewhere) = (
+        (
+            Rules(right for enclave in enclaves for right, *_ in placed_rights(enclave)),
+            Rules(moved for enclave in enclaves for _, moved in _moved_rights(enclave)),
+        )
+        for enclaves in (before, after)
+    )
+    for placed, moved in chain.from_iterable(map(_moved_rights, after)):
+        allows = placed.right.qualifier is ALLOW
+        if allows and was.cover(placed.right) and not was_elsewhere.cover(moved):
+            yield placed
+    places = {placed.right: placed for enclave in after for placed in placed_rights(enclave)}
+    for placed, moved in chain.from_iterable(map(_moved_rights, before)):
+        denies = placed.right.qualifier is DENY
+        if denies and now.cover(placed.right) and not now_elsewhere.cover(moved):
+            yield places.get(placed.right, placed)
 
 
-def _by_node(enclaves: Iterable[Enclave]) -> dict[Right, dict[tuple[str, str], list[PlacedRight]]]:
-    """Map the rights of enclaves, and the nodes that have them, to their places."""
-    places: dict[Right, dict[tuple[str, str], list[PlacedRight]]] = {}
-    for enclave in enclaves:
-        for placed in placed_rights(enclave):
-            node = placed.profile.ns, placed.profile.node
-            places.setdefault(placed.right, {}).setdefault(node, []).append(placed)
-    return places
+def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:
+    """Yield each right of an enclave, and what it is for a node in another namespace."""
+
+    def elsewhere(profile: Profile) -> Profile:
+        return replace(profile, ns=f"{_SOMEWHERE}{profile.ns}".rstrip("/"))
+
+    moved = placed_rights(enclave.with_profiles(elsewhere))
+    for placed, there in zip(placed_rights(enclave), moved, strict=True):
+        yield placed, there.right
 
 
 def _status(chosen_findings: ChosenFindings) -> int:
