@@ -44,6 +44,7 @@ from sros_tool.fleet.robots import Fleet, Robot, group_of
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.keystore.protection import contradictions
 from sros_tool.names import (
+    ACTION_SEPARATOR,
     ACTION_SERVICES,
     ACTION_TOPICS,
     GOAL,
@@ -348,6 +349,13 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         else:
             hint = f"; {_candidates_text(same_end)}" if same_end else ""
             yield statement.found(NO_COUNTERPART, f"no enclave may {other} {statement.name}{hint}")
+    for statement in checked_policy.statements:
+        other, name = OFFERING_SIDE.get(statement.right.right), statement.name
+        if other not in ("publish", "reply") or not statement.allows or not is_expression(name):
+            continue
+        if not sides[other].meets(name) and ACTION_SEPARATOR not in name:
+            text = f"no enclave may {other} a name that {name} matches"
+            yield statement.found(NO_COUNTERPART, text)
 
 
 def _differ_only_by_namespace(statement_a: _Statement, statement_b: _Statement) -> bool:

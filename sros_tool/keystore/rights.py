@@ -57,7 +57,7 @@ from sros_tool.policy.model import (
     stated_protections,
 )
 from sros_tool.policy.patterns import Names
-from sros_tool.policy.rights import Right, RightsDifference, Rules, compare, policy_rights
+from sros_tool.policy.rights import Right, RightsDifference, Rules, compare, policy_rights, unfolded
 from sros_tool.translate import grant_rights
 from sros_tool.values import Words, shows
 from sros_tool.xml import parse, read_bytes
@@ -728,7 +728,8 @@ def _unanswered_rights(
     """Return the ``second_rights`` to use a name that enclaves offer only in ``first_rights``.
 
     For example, a right to subscribe to a topic that no enclave may publish any more, because the
-    right to publish it is gone or denied.  Names with wildcards are left out.
+    right to publish it is gone or denied.  A right to use a wildcard counts if enclaves offer no
+    name any more that it matches.
     """
     taken = [right for right in difference.only_first if right.qualifier is not DENY]
     taken += (right for right in difference.only_second if right.qualifier is DENY)
@@ -741,14 +742,25 @@ def _unanswered_rights(
         for right in second_rights
         if (offering := OFFERING_SIDE.get(right.right)) in touched
         and right.qualifier is not DENY
-        and not is_expression(right.name)
         and touched[offering].meets(right.name)
     ]
     if not asked:
         return []
-    names = {(OFFERING_SIDE[right.right], right.name) for right in asked}
+    names = {(OFFERING_SIDE[e.right], e.name) for e in asked if not is_expression(e.name)}
     before, after = _allowed_pairs(first_rights, names), _allowed_pairs(second_rights, names)
+    offered = unfolded(right for right in second_rights if right.qualifier is not DENY)
+    offers = {
+        word: Names(sorted(right.name for right in offered if right.right == word))
+        for word in touched
+    }
     lost = before - after
+    lost |= {
+        (OFFERING_SIDE[right.right], right.name)
+        for right in asked
+        if is_expression(right.name)
+        and right.right in ("subscribe", "request")
+        and not offers[OFFERING_SIDE[right.right]].meets(right.name)
+    }
     return sorted(right for right in asked if (OFFERING_SIDE[right.right], right.name) in lost)
 
 

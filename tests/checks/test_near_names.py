@@ -111,6 +111,9 @@ def test_a_name_in_another_namespace(tmp_path: Path) -> None:
     said = found(file, services("request", one) + OTHER + topics("publish", other))
     assert set(said) == {"policy.no-counterpart"}, "of another kind"
     assert "/left" not in said["policy.no-counterpart"]
+    said = found(file, services("request", "*calibrate") + OTHER + services("reply", other))
+    text = "no enclave may reply a name that /*calibrate matches"
+    assert said["policy.no-counterpart"] == text
     both = services("reply", other) + services("request", other)
     assert set(found(file, services("request", one) + OTHER + both)) == {"policy.no-counterpart"}
 

@@ -97,7 +97,7 @@ def test_wildcards_of_the_other_side_are_told() -> None:
 
 
 def test_a_right_without_its_other_side_is_named(tmp_path: Path) -> None:
-    reader = {"/b": subscribe("/x", "/never")}
+    reader = {"/b": subscribe("/x", "/never"), "/recorder": subscribe("/*")}
     for name, topics in (("a.xml", ("/x",)), ("b.xml", ("/y",)), ("c.xml", ("/y", "/*"))):
         (tmp_path / name).write_text(policy_text({"/a": publish(*topics), **reader}))
     renamed = sros("diff_policy", "a.xml", "b.xml", cwd=tmp_path)
@@ -109,6 +109,12 @@ def test_a_right_without_its_other_side_is_named(tmp_path: Path) -> None:
     (tmp_path / "d.xml").write_text(policy_text({"/a": publish("/x") + denial, **reader}))
     assert f"\n{lost}\n" in sros("diff_policy", "a.xml", "d.xml", cwd=tmp_path).out
     assert "!" not in sros("diff_policy", "d.xml", "b.xml", cwd=tmp_path).out
+    for name, topic in (("e.xml", "/arm/state"), ("f.xml", "/arm/status")):
+        (tmp_path / name).write_text(
+            policy_text({"/a": publish(topic), "/b": subscribe("/*/state")})
+        )
+    lost = "! /b may subscribe /*/state, but no enclave may publish it any more"
+    assert f"\n{lost}\n" in sros("diff_policy", "e.xml", "f.xml", cwd=tmp_path).out
 
 
 def test_an_example_is_a_name_of_the_policy(tmp_path: Path) -> None:
