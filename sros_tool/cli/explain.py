@@ -756,7 +756,7 @@ def _reached_lines(answer: ZenohAnswer) -> Iterator[str]:
 
 
 def _names_text(names: Sequence[str]) -> str:
-    return first_few(names, _MOST_SHOWN) or "nobody"
+    return first_few(names, _MOST_SHOWN) or "no other enclave"
 
 
 def _message_lines(checks: Sequence[Check]) -> Iterator[str]:
